@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Typed errors: each says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class ArmscanError(Exception):
+    """A failure that a person can act on.
+
+    Parameters
+    ----------
+    what
+        The fact: what is wrong, with the numbers that show it.
+    where
+        File, option or stage; empty when the fact already names it.
+    remedy
+        What to do about it, as an imperative.
+    """
+
+    def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
+        self.what = what
+        self.where = where
+        self.remedy = remedy
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        """One sentence: ``where: what. remedy.``."""
+        head = f"{self.where}: {self.what}" if self.where else self.what
+        parts = [head.rstrip("."), self.remedy.rstrip(".")]
+        return ". ".join(part for part in parts if part) + "."
+
+
+class InputError(ArmscanError):
+    """An input value or array is not usable: wrong shape, NaN, out of range."""
+
+
+class FileFormatError(ArmscanError):
+    """A file cannot be read, is cut short, or is not what its name or schema says."""
+
+
+class OptionError(ArmscanError):
+    """A command-line option or a target specification is wrong."""
+
+
+class DetectionError(ArmscanError):
+    """Nothing usable was found in an image or in a set of images."""
+
+
+class EstimationError(ArmscanError):
+    """The data do not determine what was asked for."""
+
+
+class MissingDependencyError(ArmscanError):
+    """An optional package is needed and not installed."""

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an estimator returns: a value with its evidence, or the reason why there is none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, frozen_floats
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate(Generic[T]):
+    """An estimated value with its covariance and residuals.
+
+    Parameters
+    ----------
+    value
+        The estimate.
+    parameter_names
+        Names with units of the P free parameters, in the order of ``covariance``.
+    covariance
+        (P, P) covariance of the parameters.
+    residuals
+        Residuals at the optimum, in the unit that the estimator's docstring gives; any shape.
+    degrees_of_freedom
+        Count of independent observations minus count of free parameters.
+    chi2
+        Sum of squared residuals, each divided by its sigma.
+    """
+
+    value: T
+    parameter_names: tuple[str, ...]
+    covariance: FloatArray
+    residuals: FloatArray
+    degrees_of_freedom: int
+    chi2: float
+
+    def __post_init__(self) -> None:
+        n = len(self.parameter_names)
+        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
+        residuals = np.array(self.residuals, dtype=np.float64)
+        residuals.setflags(write=False)
+        object.__setattr__(self, "residuals", residuals)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(P,) standard deviations of the parameters."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+@dataclass(frozen=True, slots=True)
+class FitFailure:
+    """Why there is no estimate: the fact and what to do. Falsy, so that ``if not fit`` reads."""
+
+    reason: str
+    remedy: str = ""
+
+    def __bool__(self) -> bool:
+        """Return False: a failure is no estimate."""
+        return False

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frame-typed rigid transforms: ``base_from_tool @ tool_from_sensor @ points_sensor``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.frames import Frame
+from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+
+A = TypeVar("A", bound=Frame)
+B = TypeVar("B", bound=Frame)
+C = TypeVar("C", bound=Frame)
+
+ORTHONORMAL_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points(Generic[A]):
+    """Points in the frame ``A``: ``xyz_mm`` of shape (N, 3)."""
+
+    xyz_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "xyz_mm", frozen_floats(self.xyz_mm, (None, 3), "points (mm)"))
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.xyz_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose(Generic[A, B]):
+    """Rigid transform that maps coordinates in ``B`` to coordinates in ``A`` (``a_from_b``).
+
+    Parameters
+    ----------
+    rotation
+        (3, 3) proper rotation; columns are the axes of B seen in A.
+    translation_mm
+        (3,) origin of B in A, in mm.
+
+    Raises
+    ------
+    InputError
+        If the matrix is not a proper rotation within 1e-6.
+    """
+
+    rotation: FloatArray
+    translation_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        rotation = frozen_floats(self.rotation, (3, 3), "rotation")
+        defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0.0:
+            raise InputError(
+                f"matrix is not a rotation: |R R' - 1| = {defect:.2g}, "
+                f"det = {np.linalg.det(rotation):.3f}",
+                remedy="check row/column order and handedness",
+            )
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(
+            self, "translation_mm", frozen_floats(self.translation_mm, (3,), "translation_mm")
+        )
+
+    @staticmethod
+    def from_vectors(rotation_vector_rad: ArrayLike, translation_mm: ArrayLike) -> Pose[A, B]:
+        """Build a pose from a rotation vector (3,) in rad and a translation (3,) in mm."""
+        vector = frozen_floats(rotation_vector_rad, (3,), "rotation_vector_rad")
+        return Pose(rotation_from_vector(vector), np.asarray(translation_mm, dtype=np.float64))
+
+    @property
+    def rotation_vector_rad(self) -> FloatArray:
+        """(3,) rotation vector in rad."""
+        return vector_from_rotation(self.rotation)
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(4, 4) homogeneous matrix, translation in mm."""
+        m = np.eye(4)
+        m[:3, :3] = self.rotation
+        m[:3, 3] = self.translation_mm
+        return m
+
+    def inverse(self) -> Pose[B, A]:
+        """Return ``b_from_a``."""
+        return Pose(self.rotation.T, -self.rotation.T @ self.translation_mm)
+
+    @overload
+    def __matmul__(self, other: Pose[B, C]) -> Pose[A, C]: ...
+    @overload
+    def __matmul__(self, other: Points[B]) -> Points[A]: ...
+    def __matmul__(self, other: Pose[B, C] | Points[B]) -> Pose[A, C] | Points[A]:
+        """Compose with a pose, or map points."""
+        if isinstance(other, Points):
+            return Points(other.xyz_mm @ self.rotation.T + self.translation_mm)
+        return Pose(
+            self.rotation @ other.rotation,
+            self.rotation @ other.translation_mm + self.translation_mm,
+        )

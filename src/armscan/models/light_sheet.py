@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A laser's light sheet: a plane plus a low-order bow (eqs. 2.19 to 2.21, 2.42)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+
+BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
+"""Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth."""
+
+PLANE_PARAMETER_NAMES = ("tilt_u_mm", "tilt_v_mm", "offset_mm")
+NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LightSheet:
+    """The surface ``n.(p - o) = bow(u, v)`` in the Sensor frame.
+
+    With ``u = (p - o).e_u / scale`` and ``v = (p - o).e_v / scale`` the bow is
+    ``sum(bow_mm[k] * u**i * v**j)`` over `BOW_TERMS`; a plane has ``bow_mm = 0``. The scale makes
+    the coefficients lengths: each is the deviation from the plane at the edge of the calibrated
+    region.
+
+    Parameters
+    ----------
+    origin_mm
+        (3,) point o in the middle of the calibrated region.
+    axes
+        (3, 3) rows ``e_u, e_v, n``, right-handed and orthonormal: u along the stripe, v along the
+        depth, n the sheet's normal.
+    scale_mm
+        Half size of the calibrated region.
+    bow_mm
+        (5,) coefficients.
+    """
+
+    origin_mm: FloatArray
+    axes: FloatArray
+    scale_mm: float
+    bow_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        axes = frozen_floats(self.axes, (3, 3), "axes")
+        if np.abs(axes @ axes.T - np.eye(3)).max() > 1e-6 or np.linalg.det(axes) < 0.0:
+            raise InputError("axes of the light sheet are not a right-handed orthonormal triad")
+        if not self.scale_mm > 0.0:
+            raise InputError(f"scale of the light sheet is {self.scale_mm} mm, not positive")
+        object.__setattr__(self, "axes", axes)
+        object.__setattr__(self, "origin_mm", frozen_floats(self.origin_mm, (3,), "origin_mm"))
+        object.__setattr__(self, "bow_mm", frozen_floats(self.bow_mm, (len(BOW_TERMS),), "bow_mm"))
+
+    @property
+    def plane(self) -> FloatArray:
+        """(4,) ``a b c D`` of eq. 2.19 with a unit normal and D in mm: the plane without bow."""
+        normal = self.axes[2]
+        return np.array([*normal, -float(normal @ self.origin_mm)])
+
+    @property
+    def is_bowed(self) -> bool:
+        """True if any bow coefficient differs from zero."""
+        return bool(np.any(self.bow_mm != 0.0))
+
+    def height_with_jacobian(
+        self, points_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signed distance from the sheet along its normal, with derivatives.
+
+        Parameters
+        ----------
+        points_mm
+            (N, 3) points in the Sensor frame.
+
+        Returns
+        -------
+        height_mm
+            (N,) ``n.(p - o) - bow(u, v)``.
+        dheight_dpoint
+            (N, 3).
+        dheight_dparameters
+            (N, 3 + 5) by tilt about the u axis and the v axis (per unit of u and v, in mm: a
+            tilt parameter t adds ``t * u``, ``t * v``), the offset and the bow coefficients;
+            see `updated`.
+        """
+        local = (points_mm - self.origin_mm) @ self.axes.T
+        u, v = local[:, 0] / self.scale_mm, local[:, 1] / self.scale_mm
+        terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
+        dbow_du = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], 1) @ self.bow_mm
+        dbow_dv = np.stack([j * u**i * v ** max(j - 1, 0) for i, j in BOW_TERMS], 1) @ self.bow_mm
+        height = local[:, 2] - terms @ self.bow_mm
+        dheight_dpoint = (
+            self.axes[2]
+            - (dbow_du / self.scale_mm)[:, None] * self.axes[0]
+            - (dbow_dv / self.scale_mm)[:, None] * self.axes[1]
+        )
+        dheight_dparameters = -np.column_stack([u, v, np.ones_like(u), terms])
+        return height, dheight_dpoint, dheight_dparameters
+
+    def intersect(self, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Points where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
+
+        Parameters
+        ----------
+        xy
+            (N, 2) ideal normalised image coordinates.
+
+        Returns
+        -------
+        points_mm
+            (N, 3) in the Sensor frame (eq. 2.21, then Newton steps along the ray for the bow);
+            zero where there is none.
+        is_valid
+            (N,) False where the ray is parallel to the sheet or meets it behind the camera.
+        """
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        plane = self.plane
+        slope = rays @ plane[:3]
+        is_valid = np.abs(slope) > 1e-9 * np.linalg.norm(rays, axis=1)
+        depth = -plane[3] / np.where(is_valid, slope, 1.0)
+        steps = NEWTON_STEPS if self.is_bowed else 0
+        for _ in range(steps):
+            height, gradient, _ = self.height_with_jacobian(rays * depth[:, None])
+            along = np.einsum("ni,ni->n", gradient, rays)
+            is_valid &= np.abs(along) > 1e-9
+            depth = depth - height / np.where(is_valid, along, 1.0)
+        is_valid &= np.isfinite(depth) & (depth > 0.0)
+        depth = np.where(is_valid, depth, 0.0)
+        return rays * depth[:, None], is_valid
+
+    def intersect_with_jacobian(
+        self, xy: FloatArray
+    ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:
+        """As `intersect`, with derivatives from the implicit function theorem.
+
+        Returns
+        -------
+        points_mm, is_valid
+            As from `intersect`.
+        dpoint_dxy
+            (N, 3, 2) by the normalised image coordinates.
+        dpoint_dparameters
+            (N, 3, 8) by the sheet's parameters (tilts, offset, bow).
+        """
+        points, is_valid = self.intersect(xy)
+        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        _, gradient, dh_dparameters = self.height_with_jacobian(points)
+        along = np.einsum("ni,ni->n", gradient, rays)
+        along = np.where(is_valid, along, 1.0)
+        depth = points[:, 2]
+        ddepth_dxy = -gradient[:, :2] * depth[:, None] / along[:, None]
+        dpoint_dxy = rays[:, :, None] * ddepth_dxy[:, None, :]
+        dpoint_dxy[:, 0, 0] += depth
+        dpoint_dxy[:, 1, 1] += depth
+        ddepth_dparameters = -dh_dparameters / along[:, None]
+        return points, is_valid, dpoint_dxy, rays[:, :, None] * ddepth_dparameters[:, None, :]
+
+    def updated(self, step: FloatArray) -> LightSheet:
+        """Apply a step (8,) in (tilt_u, tilt_v, offset_mm, bow).
+
+        To first order the step adds ``t_u u + t_v v + offset + bow_step`` to the surface's height
+        over its plane; the triad is rotated so that it stays orthonormal.
+        """
+        normal = (
+            self.axes[2]
+            - step[0] / self.scale_mm * self.axes[0]
+            - step[1] / self.scale_mm * self.axes[1]
+        )
+        normal = normal / np.linalg.norm(normal)
+        e_u = self.axes[0] - (self.axes[0] @ normal) * normal
+        e_u = e_u / np.linalg.norm(e_u)
+        axes = np.stack([e_u, np.cross(normal, e_u), normal])
+        origin = self.origin_mm + step[2] * self.axes[2]
+        return LightSheet(origin, axes, self.scale_mm, self.bow_mm + step[3:])

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One image as the camera delivered it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import ImageArray
+from armscan.records.sensor_window import SensorWindow
+
+ColourLayout = Literal["mono", "rgb"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """An image with what is needed to read it; pixels are raw, never rescaled.
+
+    Parameters
+    ----------
+    image
+        (H, W) for mono or (H, W, 3) in the order red, green, blue; uint8 or uint16.
+    source
+        Where it came from, usually the file name: shown in messages and reports.
+    bits_used
+        Significant bits, low aligned: full scale is ``2**bits_used - 1``.
+    window
+        The part of the full sensor that the image shows.
+    lasers
+        Names of the laser sources that were on.
+    t_ns
+        Mid-exposure time, or None if unknown.
+    """
+
+    image: ImageArray
+    source: str
+    bits_used: int = 8
+    window: SensorWindow = field(default_factory=SensorWindow)
+    lasers: tuple[str, ...] = ()
+    t_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        image = np.ascontiguousarray(self.image)
+        if image.dtype not in (np.uint8, np.uint16):
+            raise InputError(
+                f"image has type {image.dtype}", where=self.source, remedy="give uint8 or uint16"
+            )
+        if image.size == 0 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+            raise InputError(
+                f"image has shape {image.shape}",
+                where=self.source,
+                remedy="give (rows, columns) or (rows, columns, 3)",
+            )
+        if not 1 <= self.bits_used <= 8 * image.dtype.itemsize:
+            raise InputError(
+                f"{self.bits_used} bits cannot be stored in {image.dtype}", where=self.source
+            )
+        image.setflags(write=False)
+        object.__setattr__(self, "image", image)
+
+    @property
+    def colour(self) -> ColourLayout:
+        """Layout of the channels."""
+        return "mono" if self.image.ndim == 2 else "rgb"
+
+    @property
+    def height_px(self) -> int:
+        """Rows of the image."""
+        return int(self.image.shape[0])
+
+    @property
+    def width_px(self) -> int:
+        """Columns of the image."""
+        return int(self.image.shape[1])
+
+    @property
+    def full_scale(self) -> int:
+        """Grey level at which a pixel is saturated."""
+        return (1 << self.bits_used) - 1

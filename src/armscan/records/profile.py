@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stripe points of one exposure, in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+
+
+class StripeFlag(IntFlag):
+    """What is doubtful about a stripe point; several may hold at once."""
+
+    NONE = 0
+    SATURATED = 1
+    """Clipped pixels in the profile: harmless when symmetric, so not a rejection by itself."""
+    BACKGROUND_STEP = 2
+    """The background differs on the two sides of the line: every method shifts."""
+    ASYMMETRIC = 4
+    """The profile leans beyond what noise explains: a reflectance edge or a bent surface."""
+    NEIGHBOUR = 8
+    """Another line within about four sigma pulls the centre."""
+    OUTLIER = 16
+    """Off the smooth course of its own segment."""
+    SHORT_SEGMENT = 32
+    """Belongs to a segment that is too short to be a stripe."""
+
+
+REJECTING = (
+    StripeFlag.BACKGROUND_STEP
+    | StripeFlag.ASYMMETRIC
+    | StripeFlag.NEIGHBOUR
+    | StripeFlag.OUTLIER
+    | StripeFlag.SHORT_SEGMENT
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Profile:
+    """Stripe centre points of one exposure, ordered along their segments.
+
+    Parameters
+    ----------
+    source
+        The exposure's source name.
+    points_px
+        (N, 2) stripe centres, full-sensor pixels (x, y).
+    normals_px
+        (N, 2) unit vectors across the stripe.
+    sigma_px
+        (N,) standard deviation of the centre along its normal.
+    width_px
+        (N,) sigma of the line's Gaussian cross-section.
+    intensity
+        (N,) peak grey level above the background.
+    flags
+        (N,) bit field of `StripeFlag`.
+    segment
+        (N,) number of the connected segment, counted from 0; a segment's points are consecutive.
+    """
+
+    source: str
+    points_px: FloatArray
+    normals_px: FloatArray
+    sigma_px: FloatArray
+    width_px: FloatArray
+    intensity: FloatArray
+    flags: IntArray
+    segment: IntArray
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.points_px))
+        for name, shape in (
+            ("points_px", (n, 2)),
+            ("normals_px", (n, 2)),
+            ("sigma_px", (n,)),
+            ("width_px", (n,)),
+            ("intensity", (n,)),
+        ):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+        object.__setattr__(self, "flags", frozen_ints(self.flags, (n,), "flags"))
+        object.__setattr__(self, "segment", frozen_ints(self.segment, (n,), "segment"))
+        if n and not bool((self.sigma_px > 0).all()):
+            raise InputError("sigma_px must be positive", where=self.source)
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.points_px)
+
+    @property
+    def is_accepted(self) -> BoolArray:
+        """(N,) True where no rejecting flag is set."""
+        return np.asarray((self.flags & int(REJECTING)) == 0)
+
+    def select(self, keep: BoolArray) -> Profile:
+        """Return the points where ``keep`` (N,) is True; segment numbers stay as they are."""
+        return Profile(
+            self.source,
+            self.points_px[keep],
+            self.normals_px[keep],
+            self.sigma_px[keep],
+            self.width_px[keep],
+            self.intensity[keep],
+            self.flags[keep],
+            self.segment[keep],
+        )

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options of the light sheets' calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from armscan.errors import OptionError
+
+
+@dataclass(frozen=True, slots=True)
+class SheetOptions:
+    """How stripes on boards become light sheets.
+
+    Parameters
+    ----------
+    margin_mm
+        Stripe points up to this far outside the rectangle of the target's points are used;
+        negative keeps that far inside.
+    n_sheets
+        Sheets that were on together; 0 finds out (the count of stripes that most images show).
+    sheet_names
+        Names to give, in the order of the stripes across the first image (left to right, or top
+        to bottom where stripes lie flatter than 45 degrees); empty gives A, B, C, ...
+    line_tolerance_mm
+        Half width of the band on the board in which points belong to one straight stripe, before
+        robust statistics tighten it.
+    outlier_sigma
+        Points further than this many robust sigmas from their stripe or sheet are rejected.
+    min_points
+        Fewest points that make a stripe.
+    lack_of_fit_p
+        A bow is fitted when the plane's lack-of-fit probability is below this.
+    min_boards_for_bow
+        Fewest boards from which a bow is told from the boards' own errors.
+    """
+
+    margin_mm: float = 0.0
+    n_sheets: int = 0
+    sheet_names: tuple[str, ...] = ()
+    line_tolerance_mm: float = 1.0
+    outlier_sigma: float = 4.0
+    min_points: int = 20
+    lack_of_fit_p: float = 0.001
+    min_boards_for_bow: int = 4
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32")
+        _require(
+            self.line_tolerance_mm > 0.0,
+            f"line tolerance of {self.line_tolerance_mm} mm",
+            "give a positive length",
+        )
+        _require(
+            self.outlier_sigma >= 2.0,
+            f"outlier limit of {self.outlier_sigma} sigma",
+            "give at least 2, or good points are lost",
+        )
+        _require(self.min_points >= 5, f"{self.min_points} points a stripe", "give at least 5")
+        _require(
+            0.0 < self.lack_of_fit_p < 0.5,
+            f"lack-of-fit probability {self.lack_of_fit_p}",
+            "give a value between 0 and 0.5",
+        )
+        _require(
+            self.min_boards_for_bow >= 3,
+            f"bow from {self.min_boards_for_bow} boards",
+            "give at least 3",
+        )
+        _require(
+            len(set(self.sheet_names)) == len(self.sheet_names),
+            "sheet names repeat",
+            "give each sheet its own name",
+        )
+        _require(
+            not self.sheet_names or self.n_sheets in (0, len(self.sheet_names)),
+            f"{len(self.sheet_names)} names for {self.n_sheets} sheets",
+            "give one name a sheet",
+        )
+
+
+def _require(holds: bool, what: str, remedy: str) -> None:
+    if not holds:
+        raise OptionError(what, where="light sheet options", remedy=remedy)

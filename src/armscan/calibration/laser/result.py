@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the calibration of light sheets takes and returns, with all evidence for a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal, TypeAlias
+
+from armscan.calibration.laser.options import SheetOptions
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.estimate import Estimate
+from armscan.geometry.frames import Board, Sensor
+from armscan.geometry.poses import Pose
+from armscan.models.calibration import (
+    CameraCalibration,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.light_sheet import LightSheet
+from armscan.records.profile import Profile
+from armscan.vision.targets.view import TargetView
+
+
+class PointUse(IntEnum):
+    """What became of a stripe point."""
+
+    USED = 0
+    FLAGGED = 1
+    """Rejected by the stripe extraction; `Profile.flags` says why."""
+    NO_RAY = 2
+    """The lens model has no inverse there, or the ray misses the board's plane."""
+    OFF_BOARD = 3
+    """Outside the rectangle of the target's points, where nothing says that the board is flat."""
+    OFF_LINE = 4
+    """Not on a straight stripe of the flat board: another reflection, or an outlier."""
+    UNNAMED = 5
+    """On a straight stripe that could not be given to a sheet."""
+    OFF_SHEET = 6
+    """Given to a sheet and too far from it."""
+
+    @property
+    def label(self) -> str:
+        """The words that a report shows."""
+        return _USE_LABELS[self]
+
+
+_USE_LABELS = {
+    PointUse.USED: "used",
+    PointUse.FLAGGED: "flagged by the stripe extraction",
+    PointUse.NO_RAY: "no ray meets the board",
+    PointUse.OFF_BOARD: "off the known region of the board",
+    PointUse.OFF_LINE: "off the straight stripe on the flat board",
+    PointUse.UNNAMED: "stripe not given to a sheet",
+    PointUse.OFF_SHEET: "off the sheet",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardStripes:
+    """Stripes on a flat target whose pose is known: the input of the calibration.
+
+    Parameters
+    ----------
+    profile
+        Stripe points of the exposure with the laser on.
+    view
+        The target as found in the same exposure, or in one without laser of the same placement.
+    sensor_from_board
+        The board's pose with its (6, 6) covariance: rotation-vector increment (rad, Sensor frame,
+        multiplied from the left), then translation (mm), the camera being held fixed.
+    lasers
+        Names of the sheets that were on; empty when not known.
+    """
+
+    profile: Profile
+    view: TargetView
+    sensor_from_board: Estimate[Pose[Sensor, Board]]
+    lasers: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SkippedImage:
+    """An image that gave nothing, and why."""
+
+    source: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetImage:
+    """What one image gave.
+
+    Parameters
+    ----------
+    profile
+        All N stripe points, rejected ones included.
+    view
+        The board; ``view.source`` is the image in which it was found.
+    sensor_from_board
+        The board's pose before the fit.
+    use
+        (N,) `PointUse` of each stripe point.
+    sheet
+        (N,) index of its sheet, -1 for none.
+    points_mm
+        (N, 3) on the board, Sensor frame; NaN where there is no ray.
+    residual_mm
+        (N,) distance from the sheet with the board as measured; NaN where no sheet is given.
+    residual_px
+        (N,) the same across the stripe in the image.
+    remaining_px
+        (N,) what remains after the board's pose is moved within its uncertainty.
+    pose_shift_sigma
+        Length of the shift of the board's pose that the fit chose, in its own sigmas: for six
+        free numbers about 2.4 is typical, and above 4 the pose or the flatness is doubtful.
+    """
+
+    profile: Profile
+    view: TargetView
+    sensor_from_board: Pose[Sensor, Board]
+    use: IntArray
+    sheet: IntArray
+    points_mm: FloatArray
+    residual_mm: FloatArray
+    residual_px: FloatArray
+    remaining_px: FloatArray
+    pose_shift_sigma: float
+
+    def __post_init__(self) -> None:
+        n = len(self.profile)
+        for name in ("use", "sheet"):
+            object.__setattr__(self, name, frozen_ints(getattr(self, name), (n,), name))
+        for name in ("residual_mm", "residual_px", "remaining_px"):
+            values = frozen_floats(getattr(self, name), (n,), name, allow_nan=True)
+            object.__setattr__(self, name, values)
+        points = frozen_floats(self.points_mm, (n, 3), "points_mm", allow_nan=True)
+        object.__setattr__(self, "points_mm", points)
+
+    @property
+    def source(self) -> str:
+        """Source name of the image with the stripes."""
+        return self.profile.source
+
+    def count(self, use: PointUse) -> int:
+        """Count of points with this fate."""
+        return int((self.use == int(use)).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class LackOfFit:
+    """Does the model explain the stripes' shape? An F test against the noise along each stripe.
+
+    Parameters
+    ----------
+    f_ratio
+        Mean square of what the model leaves of each stripe's low-order shape (weights as in the
+        fit, boards free within their covariance), over the mean square of the noise around it.
+    degrees_of_freedom
+        Of the numerator; 0 when nothing is redundant.
+    p_value
+        Probability of a ratio at least this large if the model is right.
+    """
+
+    f_ratio: float
+    degrees_of_freedom: int
+    p_value: float
+
+
+PlaneMethod: TypeAlias = Literal["algebraic", "total least squares", "cross ratio"]
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneComparison:
+    """How the plane of a simpler method lies to the sheet in use, over the calibrated region.
+
+    Parameters
+    ----------
+    method
+        ``algebraic`` is eq. 2.44; ``cross ratio`` is the thesis's way to the points.
+    plane
+        ``a b c D`` with a unit normal and D in mm.
+    angle_deg
+        Between the planes.
+    largest_mm
+        Largest distance between the two over the points used.
+    """
+
+    method: PlaneMethod
+    plane: tuple[float, float, float, float]
+    angle_deg: float
+    largest_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetFit:
+    """One calibrated sheet with what a reader needs to trust it or not.
+
+    Parameters
+    ----------
+    calibration
+        The sheet and its key figures.
+    covariance
+        (8, 8) in the order of `armscan.models.calibration.SHEET_PARAMETER_NAMES`, camera included.
+    rms_px
+        Of the residuals across the stripe, boards as measured.
+    plane_test
+        Lack of fit of the plane.
+    final_test
+        Lack of fit of the model in use (equal to ``plane_test`` where there is no bow).
+    bow_decision
+        Why there is a bow, or none, in words.
+    tilt_sigma_deg
+        Standard deviation of the normal's direction, the worse axis.
+    offset_sigma_mm
+        Standard deviation of the sheet's position in the middle of the calibrated region.
+    coplanarity_mm
+        The one residual of two straight stripes: the distance that the lines, taken as they were
+        measured, miss a common plane by; for more boards the largest over pairs.
+    coplanarity_sigma_mm
+        Its standard deviation by the boards' covariance and the stripe noise.
+    board_angle_deg
+        Largest angle between two of its boards.
+    comparisons
+        Simpler methods on the same points.
+    warnings
+        What is weak, in words.
+    """
+
+    calibration: SheetCalibration
+    covariance: FloatArray
+    rms_px: float
+    plane_test: LackOfFit
+    final_test: LackOfFit
+    bow_decision: str
+    tilt_sigma_deg: float
+    offset_sigma_mm: float
+    coplanarity_mm: float
+    coplanarity_sigma_mm: float
+    board_angle_deg: float
+    comparisons: tuple[PlaneComparison, ...]
+    warnings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (8, 8), "covariance"))
+
+    @property
+    def name(self) -> str:
+        """Name of the sheet."""
+        return self.calibration.name
+
+    @property
+    def sheet(self) -> LightSheet:
+        """The model in the Sensor frame."""
+        return self.calibration.sheet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserFit:
+    """Calibrated light sheets and all evidence.
+
+    Parameters
+    ----------
+    sheets
+        One entry a sheet.
+    images
+        One entry an image, in the order given.
+    camera
+        The camera that was used.
+    covariance
+        (9 + 8 S, 9 + 8 S) joint covariance as `SensorCalibration` wants it.
+    noise_factor
+        Scatter of the stripe points around smooth stripes over what their sigmas claim.
+    correlation_points
+        Points along a stripe that count as one independent point (1: white noise).
+    naming
+        How the stripes were given to sheets, in words.
+    options
+        In force.
+    warnings
+        On the whole calibration; those of one sheet are with the sheet.
+    skipped
+        Images that gave nothing.
+    """
+
+    sheets: tuple[SheetFit, ...]
+    images: tuple[SheetImage, ...]
+    camera: CameraCalibration
+    covariance: FloatArray
+    noise_factor: float
+    correlation_points: float
+    naming: str
+    options: SheetOptions
+    warnings: tuple[str, ...]
+    skipped: tuple[SkippedImage, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = 9 + 8 * len(self.sheets)
+        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
+
+    @property
+    def sheet_names(self) -> tuple[str, ...]:
+        """Names in the order of ``sheets``; `SheetImage.sheet` points into it."""
+        return tuple(sheet.name for sheet in self.sheets)
+
+    def to_calibration(self, provenance: Provenance) -> SensorCalibration:
+        """Return the document that reconstruction needs."""
+        sheets = tuple(sheet.calibration for sheet in self.sheets)
+        return SensorCalibration(self.camera, sheets, self.covariance, provenance)

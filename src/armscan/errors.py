@@ -38,6 +38,10 @@ class FileFormatError(ArmscanError):
     """A file cannot be read, is cut short, or is not what its name or schema says."""
 
 
+class OutputError(ArmscanError):
+    """A result cannot be written: no folder, no permission, no space, or it would be replaced."""
+
+
 class OptionError(ArmscanError):
     """A command-line option or a target specification is wrong."""
 

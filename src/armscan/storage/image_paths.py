@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files, folders and patterns on the command line to a list of image files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from armscan.errors import FileFormatError
+
+IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
+
+MAGIC = re.compile(r"[*?\[]")
+
+
+def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key in which ``frame2`` comes before ``frame10``; ties are broken by the text."""
+    words = re.split(r"(\d+)", text)
+    key = [(1, int(word), "") if word.isdigit() else (0, 0, word) for word in words]
+    return (*key, (0, 0, text))
+
+
+def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
+    """Turn files, folders and quoted patterns into image files.
+
+    A folder stands for the images in it, a pattern for the files that match; each is sorted in
+    natural order, and the order of the arguments is kept. A file that is named twice is taken once.
+
+    Parameters
+    ----------
+    patterns
+        Paths, folders, or patterns with ``*``, ``?``, ``[...]`` and ``**``.
+
+    Raises
+    ------
+    FileFormatError
+        If an argument matches nothing, or a folder holds no image.
+    """
+    found: dict[Path, None] = {}
+    for pattern in patterns:
+        for path in _expand(str(pattern)):
+            found.setdefault(path)
+    if not found:
+        raise FileFormatError("no image was given", remedy="name files, a folder or a pattern")
+    return tuple(found)
+
+
+def _expand(pattern: str) -> list[Path]:
+    path = Path(pattern)
+    if path.is_dir():
+        images = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_SUFFIXES]
+        if not images:
+            raise FileFormatError(
+                "the folder holds no image",
+                where=pattern,
+                remedy="name the folder that holds the PNG, BMP, JPEG, TIFF or PGM files",
+            )
+        return sorted(images, key=lambda item: natural_key(item.as_posix()))
+    if path.exists():
+        return [path]
+    if not MAGIC.search(pattern):
+        raise FileFormatError("there is no such file", where=pattern, remedy="check the path")
+    root = Path(path.anchor)
+    files = [match for match in root.glob(str(path.relative_to(root))) if match.is_file()]
+    if not files:
+        raise FileFormatError(
+            "no file matches the pattern",
+            where=pattern,
+            remedy="check the folder and the ending, and put quotes around the pattern",
+        )
+    return sorted(files, key=lambda item: natural_key(item.as_posix()))

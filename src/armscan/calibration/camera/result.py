@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.calibration.camera.options import CameraOptions
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
 from armscan.geometry.frames import Board, Sensor
 from armscan.geometry.poses import Pose
 from armscan.models.camera import CameraModel
@@ -30,6 +31,8 @@ class ViewFit:
         left; translation in mm), the camera's uncertainty included for views that were used.
     residuals_px
         (M, 2) observed minus predicted.
+    is_outlier
+        (M,) True for points that were left out of the solution as outliers.
     chi2_per_point
         Robust mean square of the residuals over the noise, 1 for a view like the others.
     tilt_deg
@@ -48,6 +51,7 @@ class ViewFit:
     sensor_from_board: Pose[Sensor, Board]
     pose_covariance: FloatArray
     residuals_px: FloatArray
+    is_outlier: BoolArray
     chi2_per_point: float
     tilt_deg: float
     distance_mm: float
@@ -63,6 +67,11 @@ class ViewFit:
         object.__setattr__(
             self, "residuals_px", frozen_floats(self.residuals_px, (m, 2), "residuals_px")
         )
+        is_outlier = np.array(self.is_outlier, dtype=np.bool_)
+        if is_outlier.shape != (m,):
+            raise InputError(f"is_outlier has shape {is_outlier.shape}, expected ({m},)")
+        is_outlier.setflags(write=False)
+        object.__setattr__(self, "is_outlier", is_outlier)
 
     @property
     def source(self) -> str:
@@ -71,7 +80,7 @@ class ViewFit:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square over points of the residual's length (the definition of OpenCV)."""
+        """Root mean square over all its points of the residual's length (as OpenCV defines it)."""
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
 
@@ -262,8 +271,8 @@ class CameraFit:
 
     @property
     def n_points(self) -> int:
-        """Count of points used."""
-        return sum(len(view.view) for view in self.used_views)
+        """Count of points used; outliers are not counted."""
+        return sum(int((~view.is_outlier).sum()) for view in self.used_views)
 
     @property
     def sigma(self) -> FloatArray:

@@ -24,10 +24,10 @@ class ArmscanError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        """One sentence: ``where: what. remedy.``."""
+        """One sentence: ``where: what; remedy.``."""
         head = f"{self.where}: {self.what}" if self.where else self.what
         parts = [head.rstrip("."), self.remedy.rstrip(".")]
-        return ". ".join(part for part in parts if part) + "."
+        return "; ".join(part for part in parts if part) + "."
 
 
 class InputError(ArmscanError):

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tree of commands."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import typer
+import typer.main
+
+from armscan.cli import doctor, info
+
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+
+app = typer.Typer(
+    name="armscan",
+    help="Cameras and line lasers as a calibrated 3-D scanner: calibrate, then measure.",
+    epilog=(
+        "\b\nFirst steps:\n"
+        "  armscan doctor                                  is everything installed?\n"
+        "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n"
+        "  armscan COMMAND -h                              options, and an example that works"
+    ),
+    context_settings=HELP_OPTIONS,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.command("info", epilog=info.EXAMPLE)(info.info)
+app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
+
+
+def _print_version(is_asked: bool) -> None:
+    if is_asked:
+        typer.echo(f"armscan {version('armscan')}")
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    show_version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Cameras and line lasers as a calibrated 3-D scanner: calibrate, then measure."""
+
+
+def command() -> Any:
+    """Return the whole tree as one callable command."""
+    return typer.main.get_command(app)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers as people read them."""
+
+from __future__ import annotations
+
+import math
+
+
+def with_sigma(value: float, sigma: float, unit: str = "") -> str:
+    """A value rounded to two digits of its standard deviation: ``1431.27 ± 0.85 px``.
+
+    A standard deviation of zero or NaN means that none is known: six digits are shown.
+    """
+    tail = f" {unit}" if unit else ""
+    if not math.isfinite(sigma) or sigma <= 0.0 or not math.isfinite(value):
+        return f"{value:.6g}{tail}"
+    decimals = max(0, 1 - math.floor(math.log10(sigma)))
+    return f"{value:.{decimals}f} ± {sigma:.{decimals}f}{tail}"
+
+
+def significant(value: float, unit: str = "", digits: int = 3) -> str:
+    """A value with a few digits, never in exponents between 1e-4 and 1e6."""
+    tail = f" {unit}" if unit else ""
+    if not math.isfinite(value):
+        return "not known"
+    if value == 0.0:
+        return f"0{tail}"
+    magnitude = math.floor(math.log10(abs(value)))
+    if not -5 < magnitude < 6:
+        return f"{value:.{digits - 1}e}{tail}"
+    return f"{value:.{max(0, digits - 1 - magnitude)}f}{tail}"

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Between calibrations in memory and the bodies of their documents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.models.calibration import (
+    CameraCalibration,
+    InputFile,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.light_sheet import BOW_TERMS, LightSheet
+from armscan.storage.calibration_schema import (
+    SENSOR_SCHEMA,
+    AxesBody,
+    CameraBody,
+    CovarianceBody,
+    CoveredBody,
+    InputFileBody,
+    IntrinsicsBody,
+    ObservationsBody,
+    ProvenanceBody,
+    SensorDocument,
+    SheetBody,
+    Triple,
+)
+
+BOW_KEYS = tuple(f"u{i}_v{j}" for i, j in BOW_TERMS)
+SYMMETRY_TOLERANCE = 1e-9
+
+
+def camera_body(calibration: CameraCalibration) -> CameraBody:
+    """Body of a camera's calibration, without its provenance."""
+    camera = calibration.camera
+    values = dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True))
+    low_x, low_y, high_x, high_y = calibration.covered_px.tolist()
+    return CameraBody(
+        intrinsics=IntrinsicsBody(width_px=camera.width_px, height_px=camera.height_px, **values),
+        has_covariance=calibration.has_covariance,
+        covariance=_covariance_body(PARAMETER_NAMES, calibration.covariance),
+        rms_px=calibration.rms_px,
+        sigma_point_px=calibration.sigma_point_px,
+        n_views=calibration.n_views,
+        n_points=calibration.n_points,
+        valid_region=CoveredBody(x_min_px=low_x, y_min_px=low_y, x_max_px=high_x, y_max_px=high_y),
+    )
+
+
+def camera_from_body(body: CameraBody, provenance: Provenance) -> CameraCalibration:
+    """Camera calibration from its body."""
+    inner = body.intrinsics
+    region = body.valid_region
+    return CameraCalibration(
+        camera=CameraModel.from_parameters(
+            [getattr(inner, name) for name in PARAMETER_NAMES], inner.width_px, inner.height_px
+        ),
+        covariance=_covariance_from_body(body.covariance, PARAMETER_NAMES),
+        has_covariance=body.has_covariance,
+        rms_px=body.rms_px,
+        sigma_point_px=body.sigma_point_px,
+        n_views=body.n_views,
+        n_points=body.n_points,
+        covered_px=np.array([region.x_min_px, region.y_min_px, region.x_max_px, region.y_max_px]),
+        provenance=provenance,
+    )
+
+
+def sensor_document_of(
+    calibration: SensorCalibration, observations: ObservationsBody | None
+) -> SensorDocument:
+    """Document of a sensor's calibration."""
+    return SensorDocument(
+        schema=SENSOR_SCHEMA,
+        camera=camera_body(calibration.camera),
+        camera_provenance=provenance_body(calibration.camera.provenance),
+        sheets=tuple(_sheet_body(sheet) for sheet in calibration.sheets),
+        covariance=_covariance_body(calibration.parameter_names, calibration.covariance),
+        observations=observations,
+        provenance=provenance_body(calibration.provenance),
+    )
+
+
+def sensor_from_document(document: SensorDocument) -> SensorCalibration:
+    """Sensor calibration from its document."""
+    camera = camera_from_body(document.camera, provenance_from_body(document.camera_provenance))
+    sheets = tuple(_sheet_from_body(body) for body in document.sheets)
+    size = len(document.covariance.parameter_names)
+    empty = SensorCalibration(
+        camera,
+        sheets,
+        np.zeros((size, size)),
+        provenance_from_body(document.provenance),
+    )
+    covariance = _covariance_from_body(document.covariance, empty.parameter_names)
+    return SensorCalibration(camera, sheets, covariance, empty.provenance)
+
+
+def provenance_body(provenance: Provenance) -> ProvenanceBody:
+    """Body of a provenance."""
+    return ProvenanceBody(
+        document_id=provenance.document_id,
+        created_utc=provenance.created_utc,
+        armscan_version=provenance.armscan_version,
+        command=provenance.command,
+        inputs=tuple(
+            InputFileBody(path=item.path, sha256=item.sha256) for item in provenance.inputs
+        ),
+        parent_ids=provenance.parent_ids,
+        options=dict(provenance.options),
+        warnings=provenance.warnings,
+    )
+
+
+def provenance_from_body(body: ProvenanceBody) -> Provenance:
+    """Provenance from its body."""
+    return Provenance(
+        document_id=body.document_id,
+        created_utc=body.created_utc,
+        armscan_version=body.armscan_version,
+        command=body.command,
+        inputs=tuple(InputFile(item.path, item.sha256) for item in body.inputs),
+        parent_ids=body.parent_ids,
+        options=tuple(body.options.items()),
+        warnings=body.warnings,
+    )
+
+
+def _sheet_body(calibration: SheetCalibration) -> SheetBody:
+    sheet = calibration.sheet
+    low, high = calibration.depth_range_mm
+    return SheetBody(
+        name=calibration.name,
+        origin_sensor_mm=_triple(sheet.origin_mm),
+        axes=AxesBody(
+            u_sensor=_triple(sheet.axes[0]),
+            v_sensor=_triple(sheet.axes[1]),
+            normal_sensor=_triple(sheet.axes[2]),
+        ),
+        scale_mm=sheet.scale_mm,
+        bow_mm=dict(zip(BOW_KEYS, sheet.bow_mm.tolist(), strict=True)),
+        rms_mm=calibration.rms_mm,
+        n_boards=calibration.n_boards,
+        n_points=calibration.n_points,
+        depth_min_sensor_mm=low,
+        depth_max_sensor_mm=high,
+        is_redundant=calibration.is_redundant,
+    )
+
+
+def _sheet_from_body(body: SheetBody) -> SheetCalibration:
+    if set(body.bow_mm) != set(BOW_KEYS):
+        raise InputError(f"sheet {body.name} needs the bow terms {', '.join(BOW_KEYS)}")
+    axes = np.array([body.axes.u_sensor, body.axes.v_sensor, body.axes.normal_sensor])
+    bow = np.array([body.bow_mm[key] for key in BOW_KEYS])
+    return SheetCalibration(
+        name=body.name,
+        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow),
+        rms_mm=body.rms_mm,
+        n_boards=body.n_boards,
+        n_points=body.n_points,
+        depth_range_mm=(body.depth_min_sensor_mm, body.depth_max_sensor_mm),
+        is_redundant=body.is_redundant,
+    )
+
+
+def _triple(values: FloatArray) -> Triple:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _covariance_body(names: Sequence[str], matrix: FloatArray) -> CovarianceBody:
+    return CovarianceBody(
+        parameter_names=tuple(names), matrix=tuple(tuple(row) for row in matrix.tolist())
+    )
+
+
+def _covariance_from_body(body: CovarianceBody, names: Sequence[str]) -> FloatArray:
+    if body.parameter_names != tuple(names):
+        raise InputError("the covariance's parameter names are not those of the model, in order")
+    if any(len(row) != len(names) for row in body.matrix) or len(body.matrix) != len(names):
+        raise InputError(f"the covariance is not a {len(names)} x {len(names)} matrix")
+    matrix = np.array(body.matrix, dtype=np.float64)
+    scale = np.sqrt(np.outer(np.abs(np.diag(matrix)), np.abs(np.diag(matrix))))
+    if np.diag(matrix).min() < 0.0 or np.any(
+        np.abs(matrix - matrix.T) > SYMMETRY_TOLERANCE * (scale + np.abs(matrix))
+    ):
+        raise InputError("the covariance is not symmetric with a positive diagonal")
+    return matrix

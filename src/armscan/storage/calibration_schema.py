@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The keys of calibration documents, schema version 1; every key carries its frame or unit."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+
+SCHEMA_VERSION: Final = 1
+CAMERA_SCHEMA: Final = "armscan/camera-calibration"
+SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
+
+
+def _nan_from_null(value: object) -> object:
+    return math.nan if value is None else value
+
+
+def _null_from_nan(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+KnownOrNot = Annotated[
+    float,
+    Field(allow_inf_nan=True),
+    BeforeValidator(_nan_from_null),
+    PlainSerializer(_null_from_nan, return_type=float | None),
+]
+"""A figure that a foreign calibration may not bring: ``null`` in the file, NaN in the program."""
+
+Triple = tuple[float, float, float]
+
+
+class Body(BaseModel):
+    """Part of a document: unknown keys, NaN and wrong types are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class InputFileBody(Body):
+    """A file that went in."""
+
+    path: str
+    sha256: str
+
+
+class ProvenanceBody(Body):
+    """How the document came to be."""
+
+    document_id: str
+    created_utc: str
+    armscan_version: str
+    command: tuple[str, ...]
+    inputs: tuple[InputFileBody, ...]
+    parent_ids: tuple[str, ...]
+    options: dict[str, str]
+    warnings: tuple[str, ...]
+
+
+class ObservationsBody(Body):
+    """The file beside the document that holds what is needed to solve again."""
+
+    file: str
+    sha256: str
+
+
+class IntrinsicsBody(Body):
+    """The camera model of the full sensor."""
+
+    model: Literal["pinhole k1 k2 p1 p2 k3"] = "pinhole k1 k2 p1 p2 k3"
+    pixel_origin: Literal["centre of the top-left pixel"] = "centre of the top-left pixel"
+    width_px: int = Field(ge=1)
+    height_px: int = Field(ge=1)
+    fx_px: float = Field(gt=0)
+    fy_px: float = Field(gt=0)
+    cx_px: float
+    cy_px: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+    k3: float
+
+
+class CovarianceBody(Body):
+    """A covariance with the names of its rows; the unit of an entry follows from the names."""
+
+    parameter_names: tuple[str, ...]
+    matrix: tuple[tuple[float, ...], ...]
+
+
+class CoveredBody(Body):
+    """The part of the image that the points covered."""
+
+    x_min_px: float
+    y_min_px: float
+    x_max_px: float
+    y_max_px: float
+
+
+class CameraBody(Body):
+    """A camera with its uncertainty."""
+
+    intrinsics: IntrinsicsBody
+    has_covariance: bool
+    covariance: CovarianceBody
+    rms_px: KnownOrNot
+    sigma_point_px: KnownOrNot
+    n_views: int = Field(ge=0)
+    n_points: int = Field(ge=0)
+    valid_region: CoveredBody
+
+
+class AxesBody(Body):
+    """Unit vectors of the sheet in the Sensor frame."""
+
+    u_sensor: Triple
+    v_sensor: Triple
+    normal_sensor: Triple
+
+
+class SheetBody(Body):
+    """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame."""
+
+    name: str = Field(min_length=1)
+    origin_sensor_mm: Triple
+    axes: AxesBody
+    scale_mm: float = Field(gt=0)
+    bow_mm: dict[str, float]
+    rms_mm: KnownOrNot
+    n_boards: int = Field(ge=0)
+    n_points: int = Field(ge=0)
+    depth_min_sensor_mm: float
+    depth_max_sensor_mm: float
+    is_redundant: bool
+
+
+class CameraDocument(Body):
+    """``camera.json``."""
+
+    schema_name: Literal["armscan/camera-calibration"] = Field(alias="schema")
+    schema_version: Literal[1] = SCHEMA_VERSION
+    camera: CameraBody
+    observations: ObservationsBody | None = None
+    provenance: ProvenanceBody
+
+
+class SensorDocument(Body):
+    """``sensor.json``."""
+
+    schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")
+    schema_version: Literal[1] = SCHEMA_VERSION
+    camera: CameraBody
+    camera_provenance: ProvenanceBody
+    sheets: tuple[SheetBody, ...] = Field(min_length=1)
+    covariance: CovarianceBody
+    observations: ObservationsBody | None = None
+    provenance: ProvenanceBody

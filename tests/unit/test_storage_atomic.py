@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Results are complete or not there."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from armscan.errors import OutputError
+from armscan.storage.atomic import check_outputs, write_files
+
+
+def test_files_are_written_together(tmp_path: Path) -> None:
+    write_files({tmp_path / "a": b"1", tmp_path / "b": b"2"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1", "b": b"2"}
+
+
+def test_nothing_is_replaced_without_being_asked(tmp_path: Path) -> None:
+    (tmp_path / "b").write_bytes(b"old")
+    with pytest.raises(OutputError, match="the file exists; choose another name or give --force"):
+        write_files({tmp_path / "a": b"1", tmp_path / "b": b"new"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"b": b"old"}
+    write_files({tmp_path / "b": b"new"}, is_overwriting=True)
+    assert (tmp_path / "b").read_bytes() == b"new"
+
+
+@pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left"), KeyboardInterrupt()])
+def test_a_full_disk_or_an_interrupt_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
+) -> None:
+    (tmp_path / "a").write_bytes(b"old")
+    calls = []
+
+    def sync(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) == 2:
+            raise failure
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with pytest.raises((OutputError, KeyboardInterrupt)):
+        write_files({tmp_path / "a": b"new", tmp_path / "b": b"2"}, is_overwriting=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"old"}
+
+
+def test_places_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="no such folder"):
+        check_outputs([tmp_path / "absent" / "a"])
+    with pytest.raises(OutputError, match="this is a folder"):
+        check_outputs([tmp_path], is_overwriting=True)
+
+
+@pytest.mark.skipif(
+    os.name == "nt" or os.access("/", os.W_OK), reason="this user may write everywhere"
+)
+def test_read_only_folder(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OutputError, match="may not be written"):
+        check_outputs([tmp_path / "a"])

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image files: exact pixels in every format, and a sentence for each broken file."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from armscan.errors import FileFormatError, OptionError
+from armscan.storage.image_options import ImageOptions
+from armscan.storage.image_paths import expand_paths, natural_key
+from armscan.storage.images import read_exposure, read_exposures, source_names
+
+RNG_SEED = 20
+
+
+def noise(shape: tuple[int, ...], bits: int = 8) -> np.ndarray:
+    kind = np.uint8 if bits <= 8 else np.uint16
+    return np.random.default_rng(RNG_SEED).integers(0, 1 << bits, shape).astype(kind)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".pgm"])
+def test_grey_pixels_are_exact(tmp_path: Path, suffix: str) -> None:
+    image = noise((31, 47))
+    path = tmp_path / f"image{suffix}"
+    assert cv2.imwrite(str(path), image)
+    exposure = read_exposure(path)
+    assert exposure.source == path.name
+    assert (exposure.bits_used, exposure.colour) == (8, "mono")
+    np.testing.assert_array_equal(exposure.image, image)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".ppm"])
+def test_colour_order_is_red_green_blue(tmp_path: Path, suffix: str) -> None:
+    rgb = noise((12, 20, 3))
+    path = tmp_path / f"image{suffix}"
+    Image.fromarray(rgb).save(path)
+    exposure = read_exposure(path)
+    assert exposure.colour == "rgb"
+    np.testing.assert_array_equal(exposure.image, rgb)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tiff", ".pgm"])
+def test_sixteen_bits_are_exact(tmp_path: Path, suffix: str) -> None:
+    image = noise((20, 30), bits=16)
+    path = tmp_path / f"image{suffix}"
+    assert cv2.imwrite(str(path), image)
+    exposure = read_exposure(path)
+    assert (exposure.bits_used, exposure.full_scale) == (16, 65535)
+    np.testing.assert_array_equal(exposure.image, image)
+
+
+def test_bits_used_and_high_alignment(tmp_path: Path) -> None:
+    image = noise((20, 30), bits=12)
+    low, high = tmp_path / "low.png", tmp_path / "high.png"
+    cv2.imwrite(str(low), image)
+    cv2.imwrite(str(high), image << 4)
+    assert read_exposure(low, ImageOptions(bits_used=12)).full_scale == 4095
+    aligned = read_exposure(high, ImageOptions(bits_used=12, align="high"))
+    np.testing.assert_array_equal(aligned.image, image)
+    with pytest.raises(OptionError, match="more than 10 bits hold"):
+        read_exposure(low, ImageOptions(bits_used=10))
+
+
+def test_pgm_header_says_the_bits(tmp_path: Path) -> None:
+    image = noise((3, 4), bits=10)
+    path = tmp_path / "ten.pgm"
+    path.write_bytes(b"P5\n# a comment\n4 3\n1023\n" + image.astype(">u2").tobytes())
+    exposure = read_exposure(path)
+    assert exposure.bits_used == 10
+    np.testing.assert_array_equal(exposure.image, image)
+    text = tmp_path / "text.pgm"
+    text.write_text("P2 2 1 # width, height\n255\n7 9\n")
+    np.testing.assert_array_equal(read_exposure(text).image, [[7, 9]])
+
+
+def test_orientation_tag_is_ignored(tmp_path: Path) -> None:
+    """A camera that was held upright must not swap the axes of the sensor."""
+    image = Image.fromarray(noise((16, 40, 3)))
+    orientation = Image.Exif()
+    orientation[0x0112] = 6
+    path = tmp_path / "turned.jpg"
+    image.save(path, exif=orientation)
+    exposure = read_exposure(path)
+    assert (exposure.width_px, exposure.height_px) == (40, 16)
+
+
+def test_alpha_is_dropped_where_opaque_and_refused_otherwise(tmp_path: Path) -> None:
+    grey = noise((9, 9))
+    opaque = Image.merge("LA", (Image.fromarray(grey), Image.new("L", (9, 9), 255)))
+    opaque.save(tmp_path / "opaque.png")
+    np.testing.assert_array_equal(read_exposure(tmp_path / "opaque.png").image, grey)
+    clear = Image.fromarray(noise((9, 9, 3)))
+    clear.putalpha(128)
+    clear.save(tmp_path / "clear.png")
+    with pytest.raises(FileFormatError, match="transparent"):
+        read_exposure(tmp_path / "clear.png")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "BMP", "TIFF", "PPM"])
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.97])
+def test_a_cut_file_is_never_half_a_picture(tmp_path: Path, kind: str, share: float) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(noise((64, 80, 3))).save(buffer, kind)
+    data = buffer.getvalue()
+    path = tmp_path / f"cut.{kind.lower()}"
+    path.write_bytes(data)
+    read_exposure(path)
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(FileFormatError, match=r"cut\.\w+: .*(cut short|holds \d+ of|cannot be)"):
+        read_exposure(path)
+
+
+def test_a_cut_jpeg_with_a_preview_inside_is_noticed(tmp_path: Path) -> None:
+    """The preview in the metadata has its own end marker, which must not count."""
+    preview = io.BytesIO()
+    Image.fromarray(noise((8, 8, 3))).save(preview, "JPEG")
+    buffer = io.BytesIO()
+    Image.fromarray(noise((64, 64, 3))).save(buffer, "JPEG", comment=preview.getvalue())
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(buffer.getvalue()[:-300])
+    with pytest.raises(FileFormatError, match="cut short"):
+        read_exposure(path)
+
+
+def test_progressive_jpeg_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "progressive.jpg"
+    Image.fromarray(noise((64, 64, 3))).save(path, progressive=True)
+    assert read_exposure(path).width_px == 64
+
+
+def test_damaged_png_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "image.png"
+    cv2.imwrite(str(path), noise((30, 30)))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match="damaged near byte"):
+        read_exposure(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (b"hello, this is text", "not a PNG"),
+        (b"P5\n-3 4\n255\n", "header"),
+        (b"P5\n3 4\n0\n0000", "greatest value of 0"),
+        (b"\x89PNG\r\n\x1a\n", "cut short"),
+        (b"BM", "cut short"),
+        (b"II*\0\xff\xff\xff\x7f", "cut short"),
+    ],
+)
+def test_broken_content_has_a_reason(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "image.png"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=message):
+        read_exposure(path)
+
+
+def test_missing_file_and_folder_have_a_reason(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="no such file"):
+        read_exposure(tmp_path / "absent.png")
+    with pytest.raises(FileFormatError, match="folder, not a file"):
+        read_exposure(tmp_path)
+
+
+def test_natural_order() -> None:
+    names = ["frame10.png", "frame2.png", "Frame1.png", "frame02.png", "a"]
+    ordered = sorted(names, key=natural_key)
+    assert ordered == ["Frame1.png", "a", "frame02.png", "frame2.png", "frame10.png"]
+
+
+def test_paths_from_folders_patterns_and_files(tmp_path: Path) -> None:
+    for name in ("f10.png", "f2.png", "f1.jpg", "notes.txt"):
+        (tmp_path / name).write_bytes(b"x")
+    assert [p.name for p in expand_paths([tmp_path])] == ["f1.jpg", "f2.png", "f10.png"]
+    found = expand_paths([f"{tmp_path}/*.png", tmp_path / "f2.png", tmp_path / "notes.txt"])
+    assert [path.name for path in found] == ["f2.png", "f10.png", "notes.txt"]
+
+
+def test_paths_relative_to_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "deep" / "er" / "f.png").write_bytes(b"x")
+    monkeypatch.chdir(tmp_path / "deep")
+    assert expand_paths(["**/*.png"]) == (Path("er/f.png"),)
+    assert expand_paths(["../deep/er/*"]) == (Path("../deep/er/f.png"),)
+
+
+def test_paths_that_match_nothing_have_a_reason(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="folder holds no image"):
+        expand_paths([tmp_path])
+    with pytest.raises(FileFormatError, match="no file matches the pattern"):
+        expand_paths([f"{tmp_path}/*.png"])
+    with pytest.raises(FileFormatError, match="no such file"):
+        expand_paths([f"{tmp_path}/x.png"])
+    with pytest.raises(FileFormatError, match="no image was given"):
+        expand_paths([])
+
+
+def test_repeated_names_are_told_apart(tmp_path: Path) -> None:
+    for folder in ("left", "right"):
+        (tmp_path / folder).mkdir()
+        cv2.imwrite(str(tmp_path / folder / "1.png"), noise((4, 4)))
+    cv2.imwrite(str(tmp_path / "2.png"), noise((4, 4)))
+    paths = [tmp_path / "left/1.png", tmp_path / "right/1.png", tmp_path / "2.png"]
+    names = source_names(paths)
+    assert len(set(names)) == 3
+    assert names[2] == "2.png"
+    assert tuple(exposure.source for exposure in read_exposures(paths)) == names

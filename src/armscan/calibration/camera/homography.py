@@ -60,9 +60,10 @@ def flatness(xy: FloatArray) -> float:
 
 def _normaliser(xy: FloatArray) -> FloatArray:
     centre = xy.mean(axis=0)
-    scale = float(np.sqrt(2.0)) / np.sqrt(np.mean(np.sum((xy - centre) ** 2, axis=1)))
-    shift = -scale * centre
-    return np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]], [0.0, 0.0, 1.0]])
+    scale = float(np.sqrt(2.0 / np.mean(np.sum((xy - centre) ** 2, axis=1))))
+    matrix = np.diag([scale, scale, 1.0])
+    matrix[:2, 2] = -scale * centre
+    return matrix
 
 
 def _apply(homography: FloatArray, xy: FloatArray) -> FloatArray:
@@ -87,7 +88,8 @@ def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> Flo
     """Gauss-Newton on the image distances; the points are centred, so that h33 is not zero."""
     h = homography / homography[2, 2]
     rows = np.column_stack([board, np.ones(len(board))])
-    best, best_cost = h, float(np.sum((_apply(h, board) - image) ** 2))
+    best: FloatArray = h
+    best_cost = float(np.sum((_apply(h, board) - image) ** 2))
     for _ in range(REFINEMENT_STEPS):
         mapped = rows @ h.T
         w = mapped[:, 2:]

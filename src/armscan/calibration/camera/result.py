@@ -34,7 +34,8 @@ class ViewFit:
     is_outlier
         (M,) True for points that were left out of the solution as outliers.
     chi2_per_point
-        Robust mean square of the residuals over the noise, 1 for a view like the others.
+        Robust mean square of the residuals over that of the typical view: 1 for a view like the
+        others.
     tilt_deg
         Angle between the board's normal and the optical axis.
     distance_mm
@@ -82,6 +83,14 @@ class ViewFit:
     def rms_px(self) -> float:
         """Root mean square over all its points of the residual's length (as OpenCV defines it)."""
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
+
+
+@dataclass(frozen=True, slots=True)
+class RefusedView:
+    """A view from which not even a pose can be had, and why."""
+
+    source: str
+    reason: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,7 +216,9 @@ class CameraFit:
         (9 + 6 V, 9 + 6 V) of the camera and of the poses of the V used views, in the order of
         ``used_views``; pose convention as in `ViewFit`.
     views
-        Every view given, in the order given, used or not.
+        Every view given, in the order given, used or left out.
+    refused_views
+        Views from which no pose can be had: too few points, or seen edge-on.
     rms_px
         Root mean square over the used points of the residual's length (the definition of OpenCV).
     sigma_point_px
@@ -240,6 +251,7 @@ class CameraFit:
     free_parameters: tuple[str, ...]
     joint_covariance: FloatArray
     views: tuple[ViewFit, ...]
+    refused_views: tuple[RefusedView, ...]
     rms_px: float
     sigma_point_px: float
     noise_scale: float

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt over a camera and all poses (eq. 2.39), the poses eliminated per view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.camera.observations import Observations, State
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.rotation import nearest_rotation, rotation_from_vector, skew
+from armscan.models.camera import CameraModel
+
+MAX_STEPS = 60
+CONVERGED = 1e-12
+"""Relative decrease of chi2 at which the iteration ends."""
+
+MAX_DAMPING = 1e12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Gauss-Newton normal equations in blocks: F shared unknowns and V poses.
+
+    Parameters
+    ----------
+    chi2
+        Weighted sum of squares.
+    shared, cross, pose
+        (F, F), (V, F, 6) and (V, 6, 6) blocks of ``J' J``.
+    shared_gradient, pose_gradient
+        (F,) and (V, 6) of ``J' r`` with r observed minus predicted.
+    """
+
+    chi2: float
+    shared: FloatArray
+    cross: FloatArray
+    pose: FloatArray
+    shared_gradient: FloatArray
+    pose_gradient: FloatArray
+
+
+def predict(
+    observations: Observations, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Predict the image points, with derivatives.
+
+    Returns
+    -------
+    predicted_px
+        (N, 2).
+    by_shared
+        (N, 2, 11) derivative by the shared unknowns.
+    by_pose
+        (N, 2, 6) derivative by the pose of the point's view: rotation-vector increment (rad,
+        Sensor frame, on the left) and translation (mm).
+
+    None if the state is impossible: a point behind the camera, or a focal length not positive.
+    """
+    if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
+        return None
+    camera = CameraModel.from_parameters(
+        state.shared[:9], observations.width_px, observations.height_px
+    )
+    board = observations.board_mm.copy()
+    board[:, 2] += observations.bow_shape @ state.shared[9:]
+    turned = np.concatenate(
+        [board[observations.rows(v)] @ state.rotations[v].T for v in range(observations.n_views)]
+    )
+    counts = np.diff(observations.starts)
+    points = turned + np.repeat(state.translations_mm, counts, axis=0)
+    if not points[:, 2].min() > 0.0:
+        return None
+    predicted, by_point, by_camera = camera.project_with_jacobian(points)
+    normal = np.repeat(state.rotations[:, :, 2], counts, axis=0)
+    by_height = (by_point @ normal[:, :, None])[:, :, 0]
+    by_bow = by_height[:, :, None] * observations.bow_shape[:, None, :]
+    by_shared = np.concatenate([by_camera, by_bow], axis=2)
+    by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=2)
+    return predicted, by_shared, by_pose
+
+
+def linearise(
+    observations: Observations, state: State, basis: FloatArray, weights: FloatArray
+) -> NormalEquations | None:
+    """Form the normal equations at ``state``; ``weights`` (N,) multiply each point's chi2."""
+    prediction = predict(observations, state)
+    if prediction is None:
+        return None
+    predicted, by_shared, by_pose = prediction
+    whitening = observations.whitening * np.sqrt(weights)[:, None, None]
+    residual = (whitening @ (observations.points_px - predicted)[:, :, None])[:, :, 0]
+    jacobian = whitening @ np.concatenate([by_shared @ basis, by_pose], axis=2)
+    f = basis.shape[1]
+    n = observations.n_views
+    shared, gradient = np.zeros((f, f)), np.zeros(f)
+    cross, pose, pose_gradient = np.zeros((n, f, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6))
+    for v in range(n):
+        rows = observations.rows(v)
+        block = jacobian[rows].reshape(-1, f + 6)
+        normal = block.T @ block
+        projected = block.T @ residual[rows].reshape(-1)
+        shared += normal[:f, :f]
+        gradient += projected[:f]
+        cross[v], pose[v], pose_gradient[v] = normal[:f, f:], normal[f:, f:], projected[f:]
+    return NormalEquations(float(np.sum(residual**2)), shared, cross, pose, gradient, pose_gradient)
+
+
+def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray] | None:
+    """Solve the damped normal equations by Schur's complement of the poses.
+
+    Returns
+    -------
+    shared_step, pose_steps
+        (F,) and (V, 6), or None if the matrix is singular.
+    """
+    pose = equations.pose + damping * _diagonals(equations.pose)
+    shared = equations.shared + damping * np.diag(np.diag(equations.shared))
+    try:
+        inverse = np.linalg.inv(pose)
+        carried = equations.cross @ inverse
+        schur = shared - np.sum(carried @ equations.cross.transpose(0, 2, 1), axis=0)
+        right = equations.shared_gradient - np.sum(
+            (carried @ equations.pose_gradient[:, :, None])[:, :, 0], axis=0
+        )
+        shared_step = _solve_scaled(schur, right)
+    except np.linalg.LinAlgError:
+        return None
+    remaining = equations.pose_gradient - equations.cross.transpose(0, 2, 1) @ shared_step
+    return shared_step, (inverse @ remaining[:, :, None])[:, :, 0]
+
+
+def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve after scaling to unit diagonal: focal lengths and k3 differ by many orders."""
+    if not len(right):
+        return right
+    diagonal = np.diag(matrix)
+    if not diagonal.min() > 0.0:
+        raise np.linalg.LinAlgError
+    scale = 1.0 / np.sqrt(diagonal)
+    return np.asarray(scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right))
+
+
+def _diagonals(blocks: FloatArray) -> FloatArray:
+    return np.asarray(blocks * np.eye(blocks.shape[-1]))
+
+
+def moved(
+    state: State, basis: FloatArray, shared_step: FloatArray, pose_steps: FloatArray
+) -> State:
+    """Apply a step; rotations stay proper."""
+    rotations = np.array(
+        [
+            nearest_rotation(rotation_from_vector(step[:3]) @ rotation)
+            for step, rotation in zip(pose_steps, state.rotations, strict=True)
+        ]
+    )
+    return State(
+        state.shared + basis @ shared_step, rotations, state.translations_mm + pose_steps[:, 3:]
+    )
+
+
+def adjust(
+    observations: Observations,
+    start: State,
+    basis: FloatArray,
+    weights: FloatArray | None = None,
+    max_steps: int = MAX_STEPS,
+) -> tuple[State, NormalEquations] | FitFailure:
+    """Minimise eq. 2.39, weighted by each point's covariance.
+
+    Parameters
+    ----------
+    observations
+        The image points.
+    start
+        Starting values.
+    basis
+        (11, F) from `free_basis`; (11, 0) solves the poses alone.
+    weights
+        (N,) factors of each point's chi2, 0 to leave a point out; all 1 if None.
+    max_steps
+        Most iterations; what is reached by then is returned.
+
+    Returns
+    -------
+    state, equations
+        The minimum and the normal equations there, or why there is none.
+    """
+    if weights is None:
+        weights = np.ones(len(observations.points_px))
+    equations = linearise(observations, start, basis, weights)
+    if equations is None:
+        return FitFailure("the starting values put the board behind the camera")
+    state, damping = start, 1e-4
+    for _ in range(max_steps):
+        step = damped_step(equations, damping)
+        trial = moved(state, basis, *step) if step is not None else None
+        proposed = linearise(observations, trial, basis, weights) if trial is not None else None
+        if trial is None or proposed is None or not proposed.chi2 <= equations.chi2:
+            if damping > MAX_DAMPING or (step is not None and _is_tiny(equations, step)):
+                break
+            damping *= 10.0
+            continue
+        decrease = equations.chi2 - proposed.chi2
+        state, equations, damping = trial, proposed, max(0.1 * damping, 1e-14)
+        if decrease <= CONVERGED * equations.chi2:
+            break
+    return state, equations
+
+
+def _is_tiny(equations: NormalEquations, step: tuple[FloatArray, FloatArray]) -> bool:
+    """True if the step promises a decrease that rounding hides."""
+    promised = float(
+        equations.shared_gradient @ step[0] + np.sum(equations.pose_gradient * step[1])
+    )
+    return promised <= CONVERGED * equations.chi2

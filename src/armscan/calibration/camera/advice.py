@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a person should know about a calibrated camera, in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armscan.calibration.camera.result import CameraFit
+from armscan.geometry.arrays import FloatArray
+from armscan.models.camera import CameraModel
+
+FEW_VIEWS = 8
+SMALL_TILT_DEG = 15.0
+THIN_COVERAGE = 0.6
+UNSEEN_WORSE = 1.3
+BORDER_STEPS = 24
+
+
+def advise(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> CameraFit:
+    """Add warnings to a result.
+
+    Parameters
+    ----------
+    fit
+        The result.
+    repeats
+        Pairs (later, earlier) of views that show the board in the same place.
+    """
+    warnings = [
+        *_about_views(fit, repeats),
+        *_about_coverage(fit),
+        *_about_model(fit),
+        *_about_warp(fit),
+    ]
+    return replace(fit, warnings=tuple(warnings))
+
+
+def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str]:
+    warnings = [f"{view.source}: {view.note}" for view in fit.views if view.is_misfit]
+    warnings += [f"{view.source} cannot be used: {view.reason}" for view in fit.refused_views]
+    warnings += [f"{later} repeats {earlier} and adds little" for later, earlier in repeats]
+    n_outliers = sum(int(view.is_outlier.sum()) for view in fit.used_views)
+    if n_outliers:
+        warnings.append(f"{n_outliers} points lie too far out and were not used")
+    if fit.n_views < FEW_VIEWS:
+        warnings.append(f"only {fit.n_views} views: take 10 to 20")
+    return warnings
+
+
+def _about_coverage(fit: CameraFit) -> list[str]:
+    warnings = []
+    coverage = fit.coverage
+    if coverage.empty:
+        warnings.append(f"no target points in the {', '.join(coverage.empty)} of the image")
+    elif coverage.fraction < THIN_COVERAGE:
+        warnings.append(f"target points in only {100 * coverage.fraction:.0f} % of the image")
+    if float(coverage.tilts_deg.max()) < SMALL_TILT_DEG:
+        warnings.append(
+            f"the board is tilted by at most {coverage.tilts_deg.max():.0f} degrees: "
+            "tilt it by 20 to 45"
+        )
+    return warnings
+
+
+def _about_model(fit: CameraFit) -> list[str]:
+    warnings = []
+    folded = folded_border(fit.camera)
+    if len(folded):
+        warnings.append(
+            "the distortion has no inverse at the image's border: do not measure outside the "
+            "covered part"
+        )
+    validation = fit.cross_validation
+    if validation is not None and validation.rms_px > UNSEEN_WORSE * validation.rms_in_sample_px:
+        warnings.append(
+            f"views not used in the solution fit worse ({validation.rms_px:.3f} px) than those "
+            f"used ({validation.rms_in_sample_px:.3f} px): add views"
+        )
+    return warnings
+
+
+def _about_warp(fit: CameraFit) -> list[str]:
+    if fit.warp is None or not fit.warp.is_significant:
+        return []
+    bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
+    return [f"the board is bowed by {bow} mm (along x, along y)"]
+
+
+def folded_border(camera: CameraModel) -> FloatArray:
+    """(K, 2) pixels on the image's border where the distortion has no inverse."""
+    u = np.linspace(0.0, camera.width_px - 1.0, BORDER_STEPS)
+    v = np.linspace(0.0, camera.height_px - 1.0, BORDER_STEPS)
+    border = np.concatenate(
+        [
+            np.column_stack([u, 0.0 * u]),
+            np.column_stack([u, 0.0 * u + camera.height_px - 1.0]),
+            np.column_stack([0.0 * v, v]),
+            np.column_stack([0.0 * v + camera.width_px - 1.0, v]),
+        ]
+    )
+    _, is_valid = camera.undistort(border)
+    return border[~is_valid]

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which distortion coefficients are free.
+
+The rule of ``auto``: the largest model whose hold-out error is within 1 % of the best model's.
+Where the views cover the image that is all five coefficients, as OpenCV: one that is held at zero
+without being zero makes the covariance too small, and a free one that is near zero costs little.
+With few views, or an empty rim of the image, a large model bends to the noise and predicts unseen
+views worse: then coefficients are held at zero, k3 first, then p1 and p2, then k2. Where too few
+views are left for a hold-out test, k3 is held at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from armscan.calibration.camera.options import DistortionModel
+from armscan.calibration.camera.result import CrossValidation
+from armscan.calibration.camera.robust import Solution
+from armscan.geometry.estimate import FitFailure
+
+TOLERATED = 1.01
+MODELS: tuple[DistortionModel, ...] = ("k1k2p1p2k3", "k1k2p1p2", "k1k2", "k1")
+"""Largest first."""
+
+UNTESTED_MODEL: DistortionModel = "k1k2p1p2"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChosenModel:
+    """A distortion model with its solution and hold-out test.
+
+    Parameters
+    ----------
+    model
+        The model.
+    solution
+        Its solution.
+    cross_validation
+        Its hold-out test, None where there was none.
+    reason
+        Why this model, in words.
+    """
+
+    model: DistortionModel
+    solution: Solution
+    cross_validation: CrossValidation | None
+    reason: str
+
+
+def choose_model(
+    solve: Callable[[DistortionModel], Solution | FitFailure],
+    validate: Callable[[Solution], CrossValidation | None],
+) -> ChosenModel | FitFailure:
+    """Apply the rule of this module.
+
+    Parameters
+    ----------
+    solve
+        Solves with a given model.
+    validate
+        Tests a solution on held-out views.
+    """
+    tried: list[ChosenModel] = []
+    for model in MODELS:
+        solution = solve(model)
+        if isinstance(solution, FitFailure):
+            if model == MODELS[-1] and not tried:
+                return solution
+            continue
+        tried.append(ChosenModel(model, solution, validate(solution), ""))
+    tested = [(c, c.cross_validation.rms_px) for c in tried if c.cross_validation is not None]
+    if not tested:
+        names = [chosen.model for chosen in tried]
+        chosen = tried[names.index(UNTESTED_MODEL)] if UNTESTED_MODEL in names else tried[0]
+        return _with_reason(chosen, "too few views for a hold-out test: k3 is held at zero")
+    best = min(rms for _, rms in tested)
+    chosen, rms = next((c, rms) for c, rms in tested if rms <= TOLERATED * best)
+    if chosen.model == MODELS[0]:
+        return _with_reason(
+            chosen,
+            "all five coefficients: no smaller model predicts unseen views better by more than 1 %",
+        )
+    larger = tested[[c.model for c, _ in tested].index(chosen.model) - 1]
+    worse = 100.0 * (larger[1] / rms - 1.0)
+    return _with_reason(
+        chosen,
+        f"{larger[0].model} predicts unseen views {worse:.1f} % worse than {chosen.model}: "
+        "too few views, or too little of the image covered, for more coefficients",
+    )
+
+
+def _with_reason(chosen: ChosenModel, reason: str) -> ChosenModel:
+    return ChosenModel(chosen.model, chosen.solution, chosen.cross_validation, reason)

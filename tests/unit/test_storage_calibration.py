@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration documents: every bit comes back, and every broken file has a reason."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from armscan.errors import FileFormatError
+from armscan.models.calibration import (
+    CameraCalibration,
+    InputFile,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.storage.calibration_files import (
+    camera_document,
+    read_calibration,
+    read_camera_calibration,
+    read_sensor_calibration,
+    sensor_document,
+)
+
+GOLDEN = Path(__file__).parents[1] / "golden"
+
+
+def covariance(size: int, seed: int) -> np.ndarray:
+    """Without linear algebra libraries, whose last bits differ between machines."""
+    values = 1.0 / np.arange(seed + 2, seed + 2 + size)
+    return np.multiply.outer(values, values) / 7 + np.diag(values / 1e6)
+
+
+def provenance() -> Provenance:
+    return Provenance(
+        document_id="3f0c1a9e-0000-4000-8000-000000000001",
+        created_utc="2026-01-02T03:04:05+00:00",
+        armscan_version="0.1.0",
+        command=("armscan", "calibrate", "camera", "größe *.png"),
+        inputs=(InputFile("photos/größe 1.png", "00" * 32),),
+        parent_ids=("parent",),
+        options=(("CameraOptions.solve_warp", "False"),),
+        warnings=("only three views",),
+    )
+
+
+def camera_calibration() -> CameraCalibration:
+    distortion = np.array([0.1, -0.2, 1e-17, 3e-4, 1 / 3])
+    camera = CameraModel(1431.1 / 3, 1430.9 / 7, 479.0 + 1e-13, 639.0 / 1.1, distortion, 960, 1280)
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance(9, 1),
+        has_covariance=True,
+        rms_px=0.1 + 0.2,
+        sigma_point_px=1 / 7,
+        n_views=16,
+        n_points=1056,
+        covered_px=np.array([10.1, 20.2, 900.3, 1200.4]),
+        provenance=provenance(),
+    )
+
+
+def sensor_calibration() -> SensorCalibration:
+    axes = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+    sheets = tuple(
+        SheetCalibration(
+            name=name,
+            sheet=LightSheet(np.array([1.0, 2.0, 300.0]) / 7, axes, 41.3 / 3, np.arange(5) / 70),
+            rms_mm=0.03,
+            n_boards=3,
+            n_points=900,
+            depth_range_mm=(212.0 / 3, 290.0 / 3),
+            is_redundant=True,
+        )
+        for name in ("A", "B")
+    )
+    return SensorCalibration(camera_calibration(), sheets, covariance(25, 2), provenance())
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Compare dataclasses of arrays exactly, bit for bit."""
+    assert type(left) is type(right)
+    if is_dataclass(left):
+        for item in fields(left):
+            assert_same(getattr(left, item.name), getattr(right, item.name))
+    elif isinstance(left, tuple):
+        assert len(left) == len(right)
+        for a, b in zip(left, right, strict=True):
+            assert_same(a, b)
+    elif isinstance(left, float) and math.isnan(left):
+        assert math.isnan(right)
+    else:
+        np.testing.assert_array_equal(left, right)
+
+
+def test_camera_document_round_trip_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    path.write_bytes(camera_document(camera_calibration()))
+    assert_same(read_camera_calibration(path), camera_calibration())
+    assert_same(read_calibration(path), camera_calibration())
+
+
+def test_sensor_document_round_trip_is_exact(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.json"
+    path.write_bytes(sensor_document(sensor_calibration(), ("sensor.npz", b"abc")))
+    assert_same(read_sensor_calibration(path), sensor_calibration())
+    assert json.loads(path.read_text("utf-8"))["observations"]["file"] == "sensor.npz"
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_floats_of_any_size_survive(tmp_path: Path, seed: int) -> None:
+    """All 64 bits, drawn at random, of the five distortion coefficients."""
+    bits = np.random.default_rng(seed).integers(0, 2**63, 40, dtype=np.uint64)
+    numbers = bits.view(np.float64)
+    usable = numbers[np.isfinite(numbers) & (np.abs(numbers) > 1e-300)][:5]
+    known = camera_calibration()
+    changed = CameraModel(1.0, 1.0, 0.0, 0.0, usable, 1, 1)
+    values = {item.name: getattr(known, item.name) for item in fields(known)} | {"camera": changed}
+    path = tmp_path / "camera.json"
+    path.write_bytes(camera_document(CameraCalibration(**values)))
+    np.testing.assert_array_equal(read_camera_calibration(path).camera.distortion, usable)
+
+
+def test_unknown_figures_of_foreign_calibrations_are_null(tmp_path: Path) -> None:
+    known = camera_calibration()
+    values = {item.name: getattr(known, item.name) for item in fields(known)}
+    values |= {"rms_px": math.nan, "sigma_point_px": math.nan, "has_covariance": False}
+    path = tmp_path / "camera.json"
+    path.write_bytes(camera_document(CameraCalibration(**values)))
+    assert json.loads(path.read_text("utf-8"))["camera"]["rms_px"] is None
+    assert math.isnan(read_camera_calibration(path).rms_px)
+
+
+@pytest.mark.parametrize("name", ["camera_v1.json", "sensor_v1.json"])
+def test_released_schema_is_still_read(name: str) -> None:
+    """Written by the first release; only a new schema version may add a file here."""
+    expected = camera_calibration() if name.startswith("camera") else sensor_calibration()
+    assert_same(read_calibration(GOLDEN / name), expected)
+
+
+def test_documents_are_written_as_they_were_released() -> None:
+    assert camera_document(camera_calibration()) == (GOLDEN / "camera_v1.json").read_bytes()
+    assert sensor_document(sensor_calibration()) == (GOLDEN / "sensor_v1.json").read_bytes()
+
+
+def broken(path: tuple[str, ...], value: Any) -> bytes:
+    content = json.loads(camera_document(camera_calibration()))
+    place = content
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    return json.dumps(content).encode()
+
+
+BROKEN = {
+    "NaN": (broken(("camera", "intrinsics", "fx_px"), math.nan), "holds NaN"),
+    "overflow": (
+        camera_document(camera_calibration()).replace(b'"cy_px": ', b'"cy_px": 1e999, "x": '),
+        "cy_px.*finite",
+    ),
+    "text for a number": (broken(("camera", "intrinsics", "k1"), "0.1"), "k1.*valid number"),
+    "negative focal length": (broken(("camera", "intrinsics", "fx_px"), -3.0), "greater than 0"),
+    "unknown key": (broken(("camera", "focal"), 1.0), "camera.focal.*not permitted"),
+    "missing": (broken(("camera",), {}), "camera.intrinsics.*field required"),
+    "newer": (broken(("schema_version",), 2), "schema version 2.*update armscan"),
+    "other pixel origin": (
+        broken(("camera", "intrinsics", "pixel_origin"), "corner"),
+        "pixel_origin",
+    ),
+    "other schema": (broken(("schema",), "other/thing"), "not a camera calibration of armscan"),
+    "lopsided": (broken(("camera", "covariance", "matrix"), [[1.0] * 9] * 8), "9 x 9 matrix"),
+    "not symmetric": (
+        broken(("camera", "covariance", "matrix"), (np.eye(9) + np.eye(9, k=1)).tolist()),
+        "not symmetric",
+    ),
+    "reordered": (
+        broken(("camera", "covariance", "parameter_names"), list("abcdefghi")),
+        "parameter names",
+    ),
+    "list": (b"[1, 2]", "not a camera calibration|not a JSON object"),
+    "twice": (
+        camera_document(camera_calibration()).replace(b'"k1"', b'"k2"'),
+        "'k2' appears twice",
+    ),
+    "empty": (b"", "empty"),
+    "binary": (b"{\xff\xfe\x00", "not a JSON document"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_documents_have_a_reason(tmp_path: Path, case: str) -> None:
+    content, message = BROKEN[case]
+    path = tmp_path / "camera.json"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        read_camera_calibration(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("share", np.linspace(0.01, 0.99, 12))
+def test_a_cut_document_is_noticed(tmp_path: Path, share: float) -> None:
+    content = camera_document(camera_calibration())
+    path = tmp_path / "camera.json"
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(FileFormatError, match="not a complete JSON document"):
+        read_camera_calibration(path)
+
+
+def test_swapped_files_are_noticed(tmp_path: Path) -> None:
+    camera, sensor = tmp_path / "camera.json", tmp_path / "sensor.json"
+    camera.write_bytes(camera_document(camera_calibration()))
+    sensor.write_bytes(sensor_document(sensor_calibration()))
+    with pytest.raises(FileFormatError, match="is a sensor calibration, and a camera calibration"):
+        read_camera_calibration(sensor)
+    with pytest.raises(FileFormatError, match="is a camera calibration, and a sensor calibration"):
+        read_sensor_calibration(camera)

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pages say what the code does: examples run, links lead somewhere, named code exists."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGE_IDS = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+def test_the_examples_of_the_conventions_page_run() -> None:
+    result = doctest.testfile(str(ROOT / "docs" / "conventions.md"), module_relative=False)
+    assert result.attempted > 10
+    assert result.failed == 0
+
+
+@pytest.mark.parametrize("page", PAGES, ids=PAGE_IDS)
+def test_links_between_pages_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def named_objects(page: Path) -> list[str]:
+    return sorted(set(re.findall(r"`(armscan(?:\.\w+)+)`", page.read_text())))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=PAGE_IDS)
+def test_code_named_on_a_page_exists(page: Path) -> None:
+    for name in named_objects(page):
+        assert resolves(name), f"{page.name} names {name}"
+
+
+def resolves(name: str) -> bool:
+    parts = name.split(".")
+    for cut in range(len(parts), 0, -1):
+        try:
+            found: object = importlib.import_module(".".join(parts[:cut]))
+        except ModuleNotFoundError:
+            continue
+        for attribute in parts[cut:]:
+            if not hasattr(found, attribute):
+                return False
+            found = getattr(found, attribute)
+        return True
+    return False
+
+
+def test_a_name_that_does_not_exist_is_noticed() -> None:
+    assert resolves("armscan.models.camera.CameraModel.project")
+    assert not resolves("armscan.models.camera.CameraModel.no_such_method")
+
+
+def test_every_numbered_equation_of_the_first_stages_is_mapped() -> None:
+    table = (ROOT / "docs" / "reference" / "thesis-equations.md").read_text()
+    mapped = {int(n) for n in re.findall(r"^\| 2\.(\d+)", table, flags=re.MULTILINE)}
+    assert set(range(11, 45)) <= mapped

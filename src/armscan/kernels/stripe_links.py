@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linking of ridge points into chains of any direction."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, types
+
+from armscan.kernels.arrays import (
+    INTS_OUT,
+    ROW,
+    TABLE_IN,
+    Float64Array,
+    Int64Array,
+)
+
+REACH_PX = 2.9
+"""One missing point on a diagonal leaves a distance of 2.83 px."""
+SAME_PX = 0.75
+LEAST_COSINE = 0.77
+NONE = -1
+
+MAP_OUT = types.Array(types.int32, 2, "C")
+
+
+@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT), cache=True, nogil=True)
+def place_points(points: Float64Array, owner: Int64Array, is_kept: Int64Array) -> None:
+    """Enter points into a map of pixels, dropping row points that repeat a column point.
+
+    Parameters
+    ----------
+    points
+        (N, 6) from `refine_candidates`.
+    owner
+        (H, W) int32, filled with -1; receives the index of the point in each pixel.
+    is_kept
+        (N,) output, 1 or 0.
+    """
+    height, width = owner.shape
+    for side in range(2):
+        for i in range(points.shape[0]):
+            if int(points[i, 5]) != side:
+                continue
+            x = int(points[i, 0] + 0.5)
+            y = int(points[i, 1] + 0.5)
+            is_kept[i] = 1
+            if side == ROW:
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        j = owner[v, u]
+                        if j >= 0 and points[j, 5] != ROW:
+                            distance = math.hypot(
+                                points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                            )
+                            if distance < SAME_PX:
+                                is_kept[i] = 0
+            if is_kept[i] == 1 and owner[y, x] < 0:
+                owner[y, x] = i
+            else:
+                is_kept[i] = 0
+
+
+@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
+def find_neighbours(
+    points: Float64Array, owner: Int64Array, ahead: Int64Array, behind: Int64Array
+) -> None:
+    """Best continuation of each point to both sides along its tangent.
+
+    Parameters
+    ----------
+    points
+        (N, 6) from `refine_candidates`.
+    owner
+        (H, W) map from `place_points`.
+    ahead, behind
+        (N,) output: index of the neighbour, or -1. The tangent is the normal turned by a quarter.
+    """
+    height, width = owner.shape
+    for i in range(points.shape[0]):
+        x = int(points[i, 0] + 0.5)
+        y = int(points[i, 1] + 0.5)
+        if owner[y, x] != i:
+            continue
+        nx = points[i, 2]
+        ny = points[i, 3]
+        best_ahead = best_behind = 1e9
+        for v in range(max(y - 3, 0), min(y + 4, height)):
+            for u in range(max(x - 3, 0), min(x + 4, width)):
+                j = owner[v, u]
+                if j < 0 or j == i:
+                    continue
+                dx = points[j, 0] - points[i, 0]
+                dy = points[j, 1] - points[i, 1]
+                along = dy * nx - dx * ny
+                across = abs(dx * nx + dy * ny)
+                if dx * dx + dy * dy > REACH_PX * REACH_PX or across > 0.6 * abs(along) + 0.4:
+                    continue
+                if abs(nx * points[j, 2] + ny * points[j, 3]) < LEAST_COSINE:
+                    continue
+                cost = abs(along) + 2.0 * across
+                if along > 0.2 and cost < best_ahead:
+                    best_ahead = cost
+                    ahead[i] = j
+                elif along < -0.2 and cost < best_behind:
+                    best_behind = cost
+                    behind[i] = j
+
+
+@njit(types.int64(INTS_OUT, INTS_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
+def walk_chains(
+    ahead: Int64Array, behind: Int64Array, order: Int64Array, chain: Int64Array
+) -> int:
+    """Order the points along their chains, ends first, then loops; lone points are left out.
+
+    Parameters
+    ----------
+    ahead, behind
+        (N,) from `find_neighbours`; links that are not mutual are cut here.
+    order, chain
+        (N,) output: index of the k-th point, and the number of its chain.
+
+    Returns
+    -------
+    int
+        Count of points in chains.
+    """
+    n = ahead.shape[0]
+    for i in range(n):
+        for side in range(2):
+            j = ahead[i] if side == 0 else behind[i]
+            if j >= 0 and ahead[j] != i and behind[j] != i:
+                if side == 0:
+                    ahead[i] = NONE
+                else:
+                    behind[i] = NONE
+    is_used = np.zeros(n, np.uint8)
+    count = 0
+    number = 0
+    for want_loops in range(2):
+        for start in range(n):
+            is_end = (ahead[start] < 0) != (behind[start] < 0)
+            is_loop = ahead[start] >= 0 and behind[start] >= 0
+            if is_used[start] or not (is_end or (want_loops == 1 and is_loop)):
+                continue
+            previous = NONE
+            i = start
+            while i >= 0 and not is_used[i]:
+                is_used[i] = 1
+                order[count] = i
+                chain[count] = number
+                count += 1
+                following = ahead[i]
+                if following < 0 or following == previous:
+                    following = behind[i]
+                if following == previous:
+                    following = NONE
+                previous = i
+                i = following
+            number += 1
+    return count

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Candidates: runs of pixels above the local background, down the columns and along the rows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+from armscan.kernels.arrays import (
+    COLUMN,
+    IMAGE_IN,
+    ROW,
+    ROW_OUT,
+    TABLE_OUT,
+    Float32Array,
+    Float64Array,
+)
+
+VALLEY_RATIO = 0.5
+"""A dip below this share of the peak splits a run into two lines."""
+
+
+@njit(types.void(IMAGE_IN, types.int64, types.int64, ROW_OUT), cache=True, nogil=True)
+def interpolate_row(grid: Float32Array, cell_px: int, y: int, row: Float32Array) -> None:
+    """Write row ``y`` of the bilinear surface through the centres of square cells.
+
+    Parameters
+    ----------
+    grid
+        (rows, columns) value per cell of ``cell_px`` pixels.
+    cell_px
+        Side of a cell.
+    y
+        Image row.
+    row
+        (W,) output.
+    """
+    rows, columns = grid.shape
+    v = min(max((y + 0.5) / cell_px - 0.5, 0.0), rows - 1.0)
+    i = min(int(v), max(rows - 2, 0))
+    j = min(i + 1, rows - 1)
+    fraction = v - i
+    for x in range(row.shape[0]):
+        u = min(max((x + 0.5) / cell_px - 0.5, 0.0), columns - 1.0)
+        k = min(int(u), max(columns - 2, 0))
+        m = min(k + 1, columns - 1)
+        a = grid[i, k] + fraction * (grid[j, k] - grid[i, k])
+        b = grid[i, m] + fraction * (grid[j, m] - grid[i, m])
+        row[x] = a + (u - k) * (b - a)
+
+
+@njit(
+    types.int64(
+        IMAGE_IN,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.float64,
+        types.float64,
+        TABLE_OUT,
+        types.int64,
+    ),
+    cache=True,
+    nogil=True,
+)
+def split_run(
+    image: Float32Array,
+    axis: int,
+    line: int,
+    first: int,
+    last: int,
+    background: float,
+    rise: float,
+    runs: Float64Array,
+    count: int,
+) -> int:
+    """Append the centroid of each hump of one run; return the new count.
+
+    A run is split where the three-pixel mean dips below half of the peaks on both sides, so that
+    two lines that share a foot become two candidates.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    axis, line, first, last
+        The run: pixels ``first..last`` of column (axis 0) or row (axis 1) ``line``.
+    background, rise
+        Local background, and the height above it at which the run was cut.
+    runs
+        (capacity, 3) output rows ``x, y, axis``; rows beyond the capacity are counted only.
+    count
+        Rows used so far.
+    """
+    peak = 0.0
+    low = np.inf
+    weight = 0.0
+    moment = 0.0
+    low_weight = 0.0
+    low_moment = 0.0
+    for k in range(first, last + 2):
+        is_end = k > last
+        value = 0.0
+        smooth = 0.0
+        if not is_end:
+            before = max(k - 1, first)
+            after = min(k + 1, last)
+            if axis == COLUMN:
+                value = image[k, line] - background
+                smooth = (image[before, line] + image[k, line] + image[after, line]) / 3.0
+            else:
+                value = image[line, k] - background
+                smooth = (image[line, before] + image[line, k] + image[line, after]) / 3.0
+            smooth -= background
+        is_split = not is_end and low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise
+        if is_end or is_split:
+            share = weight if is_end else low_weight
+            part = moment if is_end else low_moment
+            if share > 0.0:
+                if count < runs.shape[0]:
+                    centre = part / share
+                    runs[count, 0] = line if axis == COLUMN else centre
+                    runs[count, 1] = centre if axis == COLUMN else line
+                    runs[count, 2] = axis
+                count += 1
+            weight -= low_weight
+            moment -= low_moment
+            peak = smooth
+            low = np.inf
+        if not is_end:
+            above = max(value - rise, 0.0)
+            weight += above
+            moment += above * k
+            if smooth >= peak:
+                peak = smooth
+                low = np.inf
+            if smooth < low:
+                low = smooth
+                low_weight = weight
+                low_moment = moment
+    return count
+
+
+@njit(
+    types.int64(IMAGE_IN, IMAGE_IN, types.int64, types.float64, types.int64, TABLE_OUT),
+    cache=True,
+    nogil=True,
+)
+def find_runs(
+    image: Float32Array,
+    background: Float32Array,
+    cell_px: int,
+    rise: float,
+    longest_px: int,
+    runs: Float64Array,
+) -> int:
+    """Find runs of pixels more than ``rise`` above the background in one pass over the image.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    background
+        (rows, columns) background per cell of ``cell_px`` pixels, interpolated in between.
+    cell_px
+        Side of a background cell.
+    rise
+        Height above the background.
+    longest_px
+        Longer runs are no cross-sections of a line and are left out.
+    runs
+        (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and the axis
+        (0: the run goes down a column, 1: along a row).
+
+    Returns
+    -------
+    int
+        Count of candidates; more than the capacity if the output was too short.
+    """
+    height, width = image.shape
+    level = np.zeros(width, np.float32)
+    start = np.full(width, -1, np.int64)
+    count = 0
+    for y in range(height + 1):
+        row_start = -1
+        if y < height:
+            interpolate_row(background, cell_px, y, level)
+        for x in range(width):
+            if y < height and image[y, x] > level[x] + rise:
+                if start[x] < 0:
+                    start[x] = y
+                if row_start < 0:
+                    row_start = x
+                if x < width - 1:
+                    continue
+                stop = x
+            else:
+                if start[x] >= 0:
+                    if y - start[x] <= longest_px:
+                        base = float(level[x])
+                        count = split_run(
+                            image, COLUMN, x, start[x], y - 1, base, rise, runs, count
+                        )
+                    start[x] = -1
+                stop = x - 1
+            if row_start >= 0:
+                if stop - row_start < longest_px:
+                    base = float(level[x])
+                    count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
+                row_start = -1
+    return count

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Local quadratic along the line, with the widest window that the line's course allows."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, types
+
+from armscan.kernels.arrays import (
+    FLOATS_IN,
+    INTS_IN,
+    TABLE_IN,
+    TABLE_OUT,
+    Float64Array,
+    Int64Array,
+)
+
+SHIFT, SLOPE, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(6)
+"""Columns of a smoothing result."""
+LEAST_POINTS = 5
+
+
+@njit(types.UniTuple(types.float64, 3)(FLOATS_IN), cache=True, nogil=True)
+def solve_quadratic(moments: Float64Array) -> tuple[float, float, float]:
+    """Value and slope at 0 of a weighted parabola, and the variance of the value.
+
+    Parameters
+    ----------
+    moments
+        (8,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d.
+
+    Returns
+    -------
+    value, slope, variance
+        The variance is negative if the parabola is not determined.
+    """
+    s0, s1, s2, s3, s4 = moments[0], moments[1], moments[2], moments[3], moments[4]
+    c00 = s2 * s4 - s3 * s3
+    c01 = s2 * s3 - s1 * s4
+    c02 = s1 * s3 - s2 * s2
+    determinant = s0 * c00 + s1 * c01 + s2 * c02
+    if not determinant > 1e-9 * s0 * s2 * s4:
+        return 0.0, 0.0, -1.0
+    c11 = s0 * s4 - s2 * s2
+    c12 = s1 * s2 - s0 * s3
+    value = (c00 * moments[5] + c01 * moments[6] + c02 * moments[7]) / determinant
+    slope = (c01 * moments[5] + c11 * moments[6] + c12 * moments[7]) / determinant
+    return value, slope, c00 / determinant
+
+
+@njit(
+    types.void(
+        TABLE_IN, TABLE_IN, FLOATS_IN, INTS_IN, INTS_IN, FLOATS_IN, FLOATS_IN, types.float64,
+        TABLE_OUT,
+    ),
+    cache=True,
+    nogil=True,
+)
+def smooth_chains(
+    points: Float64Array,
+    normals: Float64Array,
+    sigma_px: Float64Array,
+    is_used: Int64Array,
+    chain: Int64Array,
+    windows_px: Float64Array,
+    inflation: Float64Array,
+    confidence: float,
+    result: Float64Array,
+) -> None:
+    """Smooth every point along its chain by a local quadratic in its own tangent frame.
+
+    Windows grow while their estimates agree within the noise (intersection of confidence
+    intervals): a bend stops the growth before its bias exceeds the noise.
+
+    Parameters
+    ----------
+    points, normals
+        (N, 2) centres and unit normals, ordered along the chains.
+    sigma_px
+        (N,) standard deviation along the normal.
+    is_used
+        (N,) 0 for points that must not pull their neighbours.
+    chain
+        (N,) chain number of each point; a chain is consecutive.
+    windows_px
+        (K,) half widths along the tangent, increasing.
+    inflation
+        (K,) factor on the variance of each window because neighbours' noise is correlated.
+    confidence
+        Half width of the confidence intervals in sigmas.
+    result
+        (N, 6) output: shift along the normal, slope of the line against the tangent, sigma of the
+        shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
+        alone, and that prediction's sigma (0: there is none).
+    """
+    n = points.shape[0]
+    moments = np.zeros(8)
+    others = np.zeros(8)
+    for i in range(n):
+        nx = normals[i, 0]
+        ny = normals[i, 1]
+        for k in range(8):
+            moments[k] = 0.0
+        own = 1.0 / (sigma_px[i] * sigma_px[i])
+        n_used = 0
+        if is_used[i] != 0:
+            moments[0] = own
+            n_used = 1
+        result[i, SHIFT] = 0.0
+        result[i, SLOPE] = 0.0
+        result[i, SIGMA] = sigma_px[i]
+        result[i, WINDOW] = 0.0
+        result[i, PREDICTED] = 0.0
+        result[i, PREDICTED_SIGMA] = 0.0
+        lower = -1e9
+        upper = 1e9
+        down = i - 1
+        up = i + 1
+        for k in range(windows_px.shape[0]):
+            reach = windows_px[k]
+            for side in range(2):
+                j = down if side == 0 else up
+                while 0 <= j < n and chain[j] == chain[i]:
+                    dx = points[j, 0] - points[i, 0]
+                    dy = points[j, 1] - points[i, 1]
+                    s = dy * nx - dx * ny
+                    if abs(s) > reach or abs(normals[j, 0] * nx + normals[j, 1] * ny) < 0.6:
+                        break
+                    if is_used[j] != 0:
+                        d = dx * nx + dy * ny
+                        w = 1.0 / (sigma_px[j] * sigma_px[j])
+                        moments[0] += w
+                        moments[1] += w * s
+                        moments[2] += w * s * s
+                        moments[3] += w * s * s * s
+                        moments[4] += w * s * s * s * s
+                        moments[5] += w * d
+                        moments[6] += w * s * d
+                        moments[7] += w * s * s * d
+                        n_used += 1
+                    j += 1 if side == 1 else -1
+                if side == 0:
+                    down = j
+                else:
+                    up = j
+            if n_used < LEAST_POINTS:
+                continue
+            value, slope, variance = solve_quadratic(moments)
+            if variance <= 0.0:
+                continue
+            sigma = math.sqrt(variance * inflation[k])
+            lower = max(lower, value - confidence * sigma)
+            upper = min(upper, value + confidence * sigma)
+            if lower > upper:
+                break
+            result[i, SHIFT] = value
+            result[i, SLOPE] = slope
+            result[i, SIGMA] = sigma
+            result[i, WINDOW] = reach
+            for m in range(8):
+                others[m] = moments[m]
+            if is_used[i] != 0:
+                others[0] -= own
+            value, _, variance = solve_quadratic(others)
+            if variance > 0.0 and n_used > LEAST_POINTS:
+                result[i, PREDICTED] = value
+                result[i, PREDICTED_SIGMA] = math.sqrt(variance * inflation[k])

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an exposure to the stripe's centre points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.kernels.stripe_fit import AMPLITUDE, CENTRE, SIGMA, VARIANCE
+from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile, StripeFlag
+from armscan.vision.stripe.flags import (
+    is_asymmetric,
+    is_background_step,
+    is_near_other_line,
+    is_saturated,
+    is_short,
+)
+from armscan.vision.stripe.level import measure_level
+from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.stripe.plane import StripePlane, mono_plane
+from armscan.vision.stripe.profile_fit import ProfileFits, axis_component, fit_ridge
+from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, trace_ridges
+from armscan.vision.stripe.smoothing import smooth
+
+LEAST_SIGMA_PX = 1e-4
+
+
+def extract_stripes(
+    exposure: Exposure,
+    options: StripeOptions | None = None,
+    background: Exposure | None = None,
+) -> Profile:
+    """Find every laser line in an exposure and return its centre points with their sigma.
+
+    Candidates are runs above the local background; the Hessian at each candidate gives point and
+    direction (eq. 2.41); a Gaussian profile (eq. 2.40) is fitted with weights from the image's own
+    noise; the centres are smoothed along the line where its course allows.
+
+    Parameters
+    ----------
+    exposure
+        The image with the laser on.
+    options
+        Method, laser colour, thresholds; defaults when None.
+    background
+        The same view with the laser off, or None.
+
+    Returns
+    -------
+    Profile
+        Points in full-sensor pixels; empty if there is no line.
+
+    Raises
+    ------
+    InputError
+        If the background's size or window differs from the exposure's.
+    """
+    options = options or StripeOptions()
+    plane = mono_plane(exposure)
+    threshold = options.threshold
+    if threshold is not None:
+        threshold /= plane.grey_levels_per_unit
+    level = measure_level(plane.image, threshold)
+    runs = find_candidates(plane.image, level)
+    sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
+    ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+    if not len(ridge):
+        return empty_profile(exposure.source)
+    fits = fit_ridge(plane, ridge, sigma, level.noise)
+    return to_profile(exposure, plane, fits, options)
+
+
+def empty_profile(source: str) -> Profile:
+    """A profile without points."""
+    none = np.zeros(0)
+    pairs = np.zeros((0, 2))
+    index = np.zeros(0, np.int64)
+    return Profile(source, pairs, pairs, none, none, none, index, index)
+
+
+def to_profile(
+    exposure: Exposure, plane: StripePlane, fits: ProfileFits, options: StripeOptions
+) -> Profile:
+    """Flag the fitted centres, smooth them along their chains and map them to the full sensor."""
+    if not len(fits.ridge):
+        return empty_profile(exposure.source)
+    points, normals, sigma = fitted_centres(fits)
+    chain = fits.ridge.chain
+    across = axis_component(fits.ridge.table)
+    width = fits.values[:, SIGMA] * across
+    flags = np.zeros(len(points), np.int64)
+    flags[is_saturated(fits)] |= int(StripeFlag.SATURATED)
+    flags[is_background_step(fits, options)] |= int(StripeFlag.BACKGROUND_STEP)
+    flags[is_asymmetric(fits)] |= int(StripeFlag.ASYMMETRIC)
+    near = is_near_other_line(points, chain, width, options.neighbour_sigmas)
+    flags[near] |= int(StripeFlag.NEIGHBOUR)
+    flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
+    usable = (flags & ~int(StripeFlag.SATURATED)) == 0
+    smoothed = smooth(points, normals, sigma, chain, usable, options.smoothing_px)
+    flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
+    binning = exposure.window.binning
+    return Profile(
+        exposure.source,
+        exposure.window.to_full_sensor(smoothed.points),
+        smoothed.normals,
+        np.maximum(smoothed.sigma, LEAST_SIGMA_PX) * binning,
+        width * binning,
+        fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
+        flags,
+        np.unique(chain, return_inverse=True)[1],
+    )
+
+
+def fitted_centres(fits: ProfileFits) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fitted centres (N, 2), normals (N, 2) and sigma along the normal (N,), in image pixels."""
+    table = fits.ridge.table
+    axis: IntArray = table[:, 5].astype(np.int64)
+    points = table[:, :2].copy()
+    points[np.arange(len(table)), 1 - axis] = fits.values[:, CENTRE]
+    sigma = np.sqrt(fits.values[:, VARIANCE]) * axis_component(table)
+    return points, table[:, 2:4].copy(), np.maximum(sigma, LEAST_SIGMA_PX)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linked ridge points: candidates, then the Hessian at the candidates, then chains."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.kernels.stripe_hessian import gaussian_taps, refine_candidates
+from armscan.kernels.stripe_links import find_neighbours, place_points, walk_chains
+from armscan.kernels.stripe_runs import find_runs
+from armscan.vision.stripe.level import CELL_PX, ImageLevel
+
+LONGEST_RUN_PX = 90
+NARROW_PX, WIDE_PX = 2.0, 4.0
+"""Two scales whose responses tell a line's width."""
+WIDTH_SAMPLE = 600
+SIGMA_LIMITS_PX = (0.7, 9.0)
+HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RidgePoints:
+    """Points on ridges, ordered along chains.
+
+    Parameters
+    ----------
+    table
+        (N, 6) x, y, normal x, normal y (image pixels), negative second derivative across the line,
+        axis (0: at an integer column, 1: at an integer row).
+    chain
+        (N,) number of the chain; a chain's points are consecutive.
+    """
+
+    table: FloatArray
+    chain: IntArray
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.table)
+
+    def select(self, keep: NDArray[np.bool_]) -> RidgePoints:
+        """Return the points where ``keep`` (N,) is True."""
+        return RidgePoints(self.table[keep], self.chain[keep])
+
+
+def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray:
+    """Centroids (N, 3) of the runs above the background: x, y, axis."""
+    height, width = image.shape
+    capacity = max(1000, height * width // 32)
+    while True:
+        runs = np.zeros((capacity, 3))
+        count = find_runs(image, level.background, CELL_PX, level.rise, LONGEST_RUN_PX, runs)
+        if count <= capacity:
+            return runs[:count]
+        capacity = count
+
+
+def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
+    """Typical sigma of the lines from their second derivatives at two scales, in px.
+
+    A Gaussian line of sigma s seen at scale h has the second derivative
+    ``A s / (s^2 + h^2)^(3/2)``: the ratio at two scales gives s.
+    """
+    sample = np.ascontiguousarray(runs[:: max(len(runs) // WIDTH_SAMPLE, 1)])
+    found = []
+    for scale in (NARROW_PX, WIDE_PX):
+        points = np.zeros((len(sample), 6))
+        least = least_bend(level.rise, scale, scale)
+        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), least, points)
+        found.append(points[:n])
+    narrow, wide = found
+    if not len(narrow) or not len(wide):
+        return NARROW_PX
+    pairs = _pair(narrow, wide)
+    if not len(pairs):
+        return NARROW_PX
+    ratio = np.maximum(pairs[:, 0] / pairs[:, 1], 1.02) ** (2.0 / 3.0)
+    square = (WIDE_PX**2 - ratio * NARROW_PX**2) / (ratio - 1.0)
+    bright = pairs[:, 1] >= np.median(pairs[:, 1])
+    sigma = float(np.sqrt(max(np.median(square[bright]), 0.0)))
+    return float(np.clip(sigma, *SIGMA_LIMITS_PX))
+
+
+def _pair(narrow: FloatArray, wide: FloatArray) -> FloatArray:
+    """Second derivatives (K, 2) of the points that both scales found on the same pixel line."""
+    keys = [
+        {(int(p[5]), int(p[int(p[5])])): p for p in points} for points in (narrow, wide)
+    ]
+    both = keys[0].keys() & keys[1].keys()
+    pairs = [
+        (keys[0][k][4], keys[1][k][4])
+        for k in sorted(both)
+        if np.hypot(*(keys[0][k][:2] - keys[1][k][:2])) < WIDE_PX
+    ]
+    return np.array(pairs).reshape(-1, 2)
+
+
+def least_bend(height: float, sigma_px: float, scale_px: float) -> float:
+    """Second derivative at scale ``scale_px`` of a line of this height and sigma."""
+    return height * sigma_px / (sigma_px**2 + scale_px**2) ** 1.5
+
+
+def hessian_sigma(line_sigma_px: float) -> float:
+    """Scale of the Hessian for lines of this sigma."""
+    return float(np.clip(line_sigma_px, *HESSIAN_SIGMA_LIMITS_PX))
+
+
+def trace_ridges(
+    image: NDArray[np.float32], runs: FloatArray, line_sigma_px: float, rise: float
+) -> RidgePoints:
+    """Ridge points at the candidates, linked into chains.
+
+    Parameters
+    ----------
+    image
+        (H, W) float32.
+    runs
+        (N, 3) from `find_candidates`.
+    line_sigma_px
+        Typical sigma of the lines.
+    rise
+        Least height of a line above its background.
+    """
+    scale = hessian_sigma(line_sigma_px)
+    found = np.zeros((max(len(runs), 1), 6))
+    bend = least_bend(rise, line_sigma_px, scale)
+    n = refine_candidates(image, runs, len(runs), gaussian_taps(scale), bend, found)
+    return link(found[:n], image.shape)
+
+
+def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
+    """Order points (N, 6) along chains; points without a neighbour are dropped.
+
+    Parameters
+    ----------
+    points
+        Rows as in `RidgePoints.table`.
+    shape
+        Rows and columns of the image.
+    """
+    n = len(points)
+    owner = np.full(shape, -1, np.int32)
+    is_kept = np.zeros(n, np.int64)
+    place_points(points, owner, is_kept)
+    ahead = np.full(n, -1, np.int64)
+    behind = np.full(n, -1, np.int64)
+    find_neighbours(points, owner, ahead, behind)
+    order = np.zeros(n, np.int64)
+    chain = np.zeros(n, np.int64)
+    count = walk_chains(ahead, behind, order, chain)
+    return RidgePoints(points[order[:count]], chain[:count])

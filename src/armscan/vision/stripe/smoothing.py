@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smoothing along the line, with the sigma that correlated neighbours leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.kernels.stripe_smooth import (
+    PREDICTED,
+    PREDICTED_SIGMA,
+    SHIFT,
+    SIGMA,
+    SLOPE,
+    smooth_chains,
+)
+
+SMALLEST_WINDOW_PX = 3.0
+WINDOW_RATIO = 1.6
+CONFIDENCE = 2.2
+LAGS = 8
+LEAST_PAIRS = 200
+OUTLIER_SIGMAS = 6.0
+NO_LIMIT = 1e6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedCentres:
+    """Centres after smoothing.
+
+    Parameters
+    ----------
+    points
+        (N, 2) image pixels.
+    normals
+        (N, 2) unit normals.
+    sigma
+        (N,) standard deviation along the normal.
+    is_outlier
+        (N,) True where the raw centre disagrees with its neighbours' course.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    sigma: FloatArray
+    is_outlier: BoolArray
+
+
+def windows(largest_px: float) -> FloatArray:
+    """Half windows from small to ``largest_px``, growing by a constant ratio."""
+    steps = max(round(np.log(largest_px / SMALLEST_WINDOW_PX) / np.log(WINDOW_RATIO)), 0)
+    return largest_px / WINDOW_RATIO ** np.arange(steps, -1, -1, dtype=np.float64)
+
+
+def smooth(
+    points: FloatArray,
+    normals: FloatArray,
+    sigma: FloatArray,
+    chain: IntArray,
+    is_used: BoolArray,
+    largest_px: float,
+) -> SmoothedCentres:
+    """Smooth centres along their chains and give each its standard deviation.
+
+    The noise of neighbours is measured from the residuals, not assumed: its size corrects the
+    sigmas, and its correlation widens those of the smoothed centres.
+
+    Parameters
+    ----------
+    points, normals
+        (N, 2) image pixels and unit normals, ordered along the chains.
+    sigma
+        (N,) standard deviation along the normal as the fit predicts it.
+    chain
+        (N,) chain numbers.
+    is_used
+        (N,) False for points that must not pull their neighbours.
+    largest_px
+        Largest half window; 0 only measures the noise.
+    """
+    half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
+    used = is_used.astype(np.int64)
+    rough = np.zeros((len(points), 6))
+    ones = np.ones(len(half))
+    smooth_chains(points, normals, sigma, used, chain, half, ones, CONFIDENCE, rough)
+    spread = np.hypot(rough[:, PREDICTED_SIGMA], sigma)
+    score = np.abs(rough[:, PREDICTED]) / spread
+    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * _scale(score))
+    is_used = is_used & ~is_outlier
+    correlation = noise_correlation(points, normals, sigma, chain, is_used, half[-1])
+    sigma = sigma * np.sqrt(correlation[0])
+    if largest_px <= 0.0:
+        return SmoothedCentres(points, normals, sigma, is_outlier)
+    inflation = np.array([_inflation(correlation, h) for h in half])
+    result = np.zeros((len(points), 6))
+    smooth_chains(
+        points, normals, sigma, is_used.astype(np.int64), chain, half, inflation, CONFIDENCE, result
+    )
+    shift = np.where(is_used, result[:, SHIFT], 0.0)
+    slope = np.where(is_used, result[:, SLOPE], 0.0)
+    tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+    turned = normals - slope[:, None] * tangents
+    return SmoothedCentres(
+        points + shift[:, None] * normals,
+        turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        np.where(is_used, result[:, SIGMA], sigma),
+        is_outlier,
+    )
+
+
+def _scale(score: FloatArray) -> float:
+    """Typical size of scores that should have unit variance; at least 1."""
+    return max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
+
+
+def _weights(half: int) -> FloatArray:
+    """Weights (2 half + 1,) of a uniform local quadratic at its centre."""
+    k = np.arange(-half, half + 1, dtype=np.float64)
+    design = np.stack([np.ones_like(k), k, k * k], axis=1)
+    return np.asarray(np.linalg.pinv(design)[0])
+
+
+def _inflation(correlation: FloatArray, half_px: float) -> float:
+    """Variance of a uniform local quadratic's centre, divided by its value for white noise."""
+    weights = _weights(max(int(half_px), 2))
+    overlap = np.correlate(weights, weights, "full")[len(weights) - 1 :][:LAGS]
+    factor = np.where(np.arange(len(overlap)) == 0, 1.0, 2.0)
+    shape = correlation[: len(overlap)] / correlation[0]
+    return max(float((factor * overlap * shape).sum() / overlap[0]), 0.3)
+
+
+def noise_correlation(
+    points: FloatArray,
+    normals: FloatArray,
+    sigma: FloatArray,
+    chain: IntArray,
+    is_used: BoolArray,
+    half_px: float,
+) -> FloatArray:
+    """Covariance (LAGS,) of normalised raw centres at distances 0, 1, ... along the chain.
+
+    Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
+    it, the measured covariances are a known linear mixture of the true ones, which is inverted.
+    """
+    white = np.zeros(LAGS)
+    white[0] = 1.0
+    half = max(int(half_px), 4)
+    residual = _filter_residuals(points, normals, sigma, chain, is_used, half)
+    if residual is None:
+        return white
+    measured = np.zeros(LAGS)
+    for lag in range(LAGS):
+        a, b = residual[: len(residual) - lag], residual[lag:]
+        same = np.isfinite(a) & np.isfinite(b) & (chain[: len(chain) - lag] == chain[lag:])
+        if same.sum() < LEAST_PAIRS:
+            return white
+        product = a[same] * b[same]
+        measured[lag] = product.mean()
+    kernel = -_weights(half)
+    kernel[half] += 1.0
+    spread = np.correlate(kernel, kernel, "full")
+    middle = len(spread) // 2
+    mixture = np.zeros((LAGS, LAGS))
+    for lag in range(LAGS):
+        for m in range(LAGS):
+            for signed in {m, -m}:
+                at = middle + lag - signed
+                if 0 <= at < len(spread):
+                    mixture[lag, m] += spread[at]
+    solved = np.linalg.lstsq(mixture, measured, rcond=1e-3)[0]
+    solved[0] = max(solved[0], 0.05)
+    return np.asarray(solved)
+
+
+def _filter_residuals(
+    points: FloatArray,
+    normals: FloatArray,
+    sigma: FloatArray,
+    chain: IntArray,
+    is_used: BoolArray,
+    half: int,
+) -> FloatArray | None:
+    """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
+    n = len(points)
+    size = 2 * half + 1
+    if n < size:
+        return None
+    span = np.lib.stride_tricks.sliding_window_view
+    inside = (chain[: n - size + 1] == chain[size - 1 :]) & span(is_used, size).all(axis=1)
+    weights = _weights(half)
+    smooth_x = span(points[:, 0], size) @ weights
+    smooth_y = span(points[:, 1], size) @ weights
+    middle = slice(half, n - half)
+    offset = (points[middle, 0] - smooth_x) * normals[middle, 0]
+    offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
+    residual = np.full(n, np.nan)
+    residual[middle] = np.where(inside, offset / sigma[middle], np.nan)
+    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 1e-3) if inside.any() else 0.0
+    residual[np.abs(residual) > limit * 1.4826] = np.nan
+    return residual

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from armscan.cli.output import AsJson, show
+
+if TYPE_CHECKING:
+    from armscan.report.summary import Summary
 
 EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 
@@ -20,6 +23,11 @@ def info(
     as_json: AsJson = False,
 ) -> None:
     """Say what files are: image, calibration, cloud, observations or folder."""
+    show(describe(files), as_json=as_json)
+
+
+def describe(files: list[str]) -> Summary:
+    """Load the heavy libraries only now, and describe."""
     from armscan.report.file_info import describe_files
 
-    show(describe_files(files), as_json=as_json)
+    return describe_files(files)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line's frame: help, version, exit codes, one sentence for each failure."""
+
+from __future__ import annotations
+
+import errno
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from armscan.cli import info, main
+from armscan.cli.app import command
+
+HELP_SECONDS = 0.6
+HELP_SECONDS_ON_A_BUSY_MACHINE = 4 * HELP_SECONDS
+
+
+def command_paths() -> list[tuple[str, ...]]:
+    """Every command and group of the tree."""
+    found: list[tuple[str, ...]] = []
+
+    def walk(node: object, path: tuple[str, ...]) -> None:
+        found.append(path)
+        for name, child in getattr(node, "commands", {}).items():
+            walk(child, (*path, name))
+
+    walk(command(), ())
+    return found
+
+
+@pytest.mark.parametrize("path", command_paths(), ids=" ".join)
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_help_of_every_command_has_an_example(
+    path: tuple[str, ...], word: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*path, word]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    assert "\n    armscan " in out or "\n  armscan " in out
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("armscan 0.")
+
+
+def test_help_is_quick() -> None:
+    """Heavy libraries are imported inside the commands only."""
+    start = time.perf_counter()
+    code = (
+        "import sys\nfrom armscan.cli import main\nmain(['-h'])\n"
+        "heavy = {'numpy', 'cv2', 'scipy', 'numba', 'matplotlib', 'pydantic'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.splitlines()[-1] == "[]"
+    assert time.perf_counter() - start < HELP_SECONDS_ON_A_BUSY_MACHINE
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["nonsense"], "No such command 'nonsense'"),
+        (["info"], "Missing argument"),
+        (["info", "--nonsense", "x"], "No such option"),
+        (["info", "absent.png"], "absent.png: there is no such file"),
+    ],
+)
+def test_a_wrong_line_gets_one_sentence(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("failure", "code", "message"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted, nothing was written"),
+        (OSError(errno.ENOSPC, "No space left on device", "x.json"), 2, "x.json: No space left"),
+        (PermissionError(errno.EACCES, "Permission denied", "x.json"), 2, "Permission denied"),
+        (MemoryError(), 2, "not enough memory"),
+        (ZeroDivisionError("division by zero"), 70, "ARMSCAN_DEBUG=1"),
+    ],
+)
+def test_failures_become_codes(
+    failure: BaseException,
+    code: int,
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("ARMSCAN_DEBUG", raising=False)
+    monkeypatch.setattr(info, "describe", _raiser(failure))
+    assert main(["info", "x"]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_a_bug_shows_its_traceback_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ARMSCAN_DEBUG", "1")
+    monkeypatch.setattr(info, "describe", _raiser(ZeroDivisionError()))
+    with pytest.raises(ZeroDivisionError):
+        main(["info", "x"])
+
+
+def _raiser(failure: BaseException) -> object:
+    def fail(*_: object) -> None:
+        raise failure
+
+    return fail
+
+
+def test_info_of_images_and_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = np.full((4, 6), 17, np.uint8)
+    image[0, 0] = 255
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    assert main(["info", str(tmp_path), str(tmp_path / "a.png"), "--json"]) == 0
+    folder, file = json.loads(capsys.readouterr().out)["items"]
+    assert folder["files_png"] == 1
+    assert (file["width_px"], file["height_px"], file["bits_used"]) == (6, 4, 8)
+    assert file["saturated_fraction"] == pytest.approx(1 / 24, abs=1e-6)
+    assert main(["info", str(tmp_path / "a.png")]) == 0
+    assert "image, 6 x 4 px, grey, 8 bits" in capsys.readouterr().out
+
+
+def test_info_of_documents(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    golden = Path(__file__).parents[1] / "golden"
+    assert main(["info", str(golden / "camera_v1.json"), str(golden / "sensor_v1.json")]) == 0
+    out = capsys.readouterr().out
+    assert "camera calibration, 960 x 1280 px" in out
+    assert "sensor calibration, 2 light sheets" in out
+    (tmp_path / "x.txt").write_text("text")
+    assert main(["info", str(tmp_path / "x.txt")]) == 2
+    assert "does not know this kind of file" in capsys.readouterr().err
+
+
+def test_doctor_is_content(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["is_ready"] is True
+    assert report["found"]["numpy"] == np.__version__
+
+
+def test_completion_is_offered() -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", "import sys; from armscan.cli import main; sys.exit(main())"],
+        env={"_ARMSCAN_COMPLETE": "complete_bash", "COMP_WORDS": "armscan do", "COMP_CWORD": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "doctor" in result.stdout

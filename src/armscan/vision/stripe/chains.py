@@ -38,3 +38,12 @@ def chain_lengths_px(points_px: FloatArray, chain: IntArray) -> FloatArray:
     step = np.hypot(*np.diff(points_px, axis=0).T) * (np.diff(chain) == 0)
     total = np.bincount(chain[1:], weights=step, minlength=n) if n else np.zeros(0)
     return np.asarray(total[chain])
+
+
+def strong_median(values: FloatArray) -> float:
+    """Median of values (N,) >= 0 weighted by their squares: typical of the strong ones."""
+    order = np.sort(values)
+    weight = np.cumsum(order * order)
+    if not len(order) or weight[-1] <= 0.0:
+        return 0.0
+    return float(order[np.searchsorted(weight, 0.5 * weight[-1])])

@@ -9,6 +9,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.stripe_fit import AMPLITUDE, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
+from armscan.vision.stripe.colour import colour_plane
 from armscan.vision.stripe.flags import (
     is_asymmetric,
     is_background_step,
@@ -16,6 +17,8 @@ from armscan.vision.stripe.flags import (
     is_saturated,
     is_short,
 )
+from armscan.vision.stripe.gate import has_laser_colour
+from armscan.vision.stripe.laser_off import check_background
 from armscan.vision.stripe.level import measure_level
 from armscan.vision.stripe.options import StripeOptions
 from armscan.vision.stripe.plane import StripePlane, mono_plane
@@ -57,7 +60,12 @@ def extract_stripes(
         If the background's size or window differs from the exposure's.
     """
     options = options or StripeOptions()
-    plane = mono_plane(exposure)
+    if background is not None:
+        check_background(exposure, background)
+    if exposure.colour == "mono":
+        plane = mono_plane(exposure, background)
+    else:
+        plane = colour_plane(exposure, background, options.laser_colour)
     threshold = options.threshold
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
@@ -65,6 +73,8 @@ def extract_stripes(
     runs = find_candidates(plane.image, level)
     sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
     ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+    if plane.gate is not None and len(ridge):
+        ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma))
     if not len(ridge):
         return empty_profile(exposure.source)
     fits = fit_ridge(plane, ridge, sigma, level.noise)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 CELL_PX = 64
 SAMPLE_STEP_PX = 5
+CLUTTER_LAG_PX = 12
 BACKGROUND_QUANTILE = 0.4
 MAD_TO_SIGMA = 1.4826
 LEAST_NOISE = 0.35
@@ -29,13 +30,17 @@ class ImageLevel:
     background
         (rows, columns) float32 background level per cell of `CELL_PX` pixels.
     noise
-        Standard deviation of a background pixel.
+        Standard deviation of a background pixel against its neighbour.
+    clutter
+        The same at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and
+        surface texture show; never less than ``noise``.
     rise
         Height above the background at which a line begins.
     """
 
     background: NDArray[np.float32]
     noise: float
+    clutter: float
     rise: float
 
 
@@ -50,12 +55,13 @@ def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageL
         Least height of a line above the background, or None to set it from the noise.
     """
     background = _cell_quantiles(image)
-    noise = _noise(image)
+    noise = _noise(image, 1)
+    clutter = max(_noise(image, CLUTTER_LAG_PX), noise)
     if threshold is None:
         sample = image[::2, ::2]
         peak = float(np.quantile(sample, PEAK_QUANTILE)) - float(np.median(background))
-        threshold = max(THRESHOLD_SIGMAS * noise, LEAST_PEAK_SHARE * peak)
-    return ImageLevel(background, noise, threshold)
+        threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
+    return ImageLevel(background, noise, clutter, threshold)
 
 
 def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -73,11 +79,11 @@ def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return grid
 
 
-def _noise(image: NDArray[np.float32]) -> float:
+def _noise(image: NDArray[np.float32], lag: int) -> float:
     rows = image[:: 2 * SAMPLE_STEP_PX]
-    if rows.shape[1] < 2:
+    if rows.shape[1] <= lag:
         return LEAST_NOISE
-    step = np.abs(np.diff(rows[:, : rows.shape[1] // 2 * 2].reshape(rows.shape[0], -1, 2), axis=2))
+    step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
     typical = float(np.median(step)) * MAD_TO_SIGMA
-    clipped_mean = float(np.minimum(step, max(4.0 * typical, 2.0)).mean()) * np.sqrt(np.pi / 2.0)
-    return max(typical, clipped_mean, LEAST_NOISE * np.sqrt(2.0)) / float(np.sqrt(2.0))
+    trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * float(np.sqrt(np.pi / 2.0))
+    return max(typical, trimmed, LEAST_NOISE * np.sqrt(2.0)) / float(np.sqrt(2.0))

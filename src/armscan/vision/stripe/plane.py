@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
+from armscan.vision.stripe.laser_off import subtract
 
 NORMAL_SCALE = 255.0
 """Grey levels are scaled to 8 bits, so that no constant depends on the camera's depth."""
@@ -49,9 +50,10 @@ def to_units(channel: ImageArray, full_scale: int) -> NDArray[np.float32]:
     return channel.astype(np.float32) * np.float32(NORMAL_SCALE / full_scale)
 
 
-def mono_plane(exposure: Exposure) -> StripePlane:
-    """Plane of a grey exposure."""
+def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
+    """Plane of a grey exposure, less the background."""
     scale = exposure.full_scale
-    return StripePlane(
-        to_units(exposure.image, scale), saturated(exposure.image, scale), scale / NORMAL_SCALE
-    )
+    image = to_units(exposure.image, scale)
+    if background is not None:
+        image = subtract(image, to_units(background.image, background.full_scale), NORMAL_SCALE)
+    return StripePlane(image, saturated(exposure.image, scale), scale / NORMAL_SCALE)

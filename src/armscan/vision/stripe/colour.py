@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choice of the channel in colour exposures, and the gate by the laser's colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.records.exposure import Exposure
+from armscan.vision.stripe.laser_off import subtract
+from armscan.vision.stripe.options import LaserColour
+from armscan.vision.stripe.plane import NORMAL_SCALE, StripePlane, saturated, to_units
+
+CHANNELS: tuple[LaserColour, ...] = ("red", "green", "blue")
+RIDGE_STEP_PX = 14
+RIDGE_QUANTILE = 0.9995
+LEAST_COLOUR_SHARE = 0.25
+"""A laser's colour shows at least this share of the grey contrast, else the line is grey."""
+SATURATED_SHARE = 0.12
+"""More clipped line pixels than this, and another channel is used."""
+LEAST_CHANNEL_SHARE = 0.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourImages:
+    """Channels of a colour exposure after background subtraction.
+
+    Parameters
+    ----------
+    channels
+        Red, green, blue: (H, W) float32.
+    clipped
+        The mask of saturated pixels of each.
+    """
+
+    channels: tuple[NDArray[np.float32], ...]
+    clipped: tuple[NDArray[np.uint8], ...]
+
+
+def split_channels(exposure: Exposure, background: Exposure | None) -> ColourImages:
+    """Red, green and blue of an exposure, less the background."""
+    scale = exposure.full_scale
+    channels, clipped = [], []
+    for k in range(3):
+        raw = np.ascontiguousarray(exposure.image[:, :, k])
+        channel = to_units(raw, scale)
+        if background is not None:
+            dark = to_units(np.ascontiguousarray(background.image[:, :, k]), background.full_scale)
+            channel = subtract(channel, dark, NORMAL_SCALE)
+        channels.append(channel)
+        clipped.append(saturated(raw, scale))
+    return ColourImages(tuple(channels), tuple(clipped))
+
+
+def colour_excess(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
+    """How much stronger the laser's colour is than the mean of the two others, (H, W)."""
+    k = CHANNELS.index(colour)
+    others = [images.channels[m] for m in range(3) if m != k]
+    return np.asarray(images.channels[k] - np.float32(0.5) * (others[0] + others[1]))
+
+
+def ridge_height(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Height (H - 2 s, W - 2 s) above both neighbours at distance s, along rows or columns."""
+    s = RIDGE_STEP_PX
+    if min(image.shape) <= 2 * s:
+        return np.zeros((0, 0), np.float32)
+    middle = image[s:-s, s:-s]
+    along_row = middle - np.maximum(image[s:-s, : -2 * s], image[s:-s, 2 * s :])
+    down_column = middle - np.maximum(image[: -2 * s, s:-s], image[2 * s :, s:-s])
+    return np.asarray(np.maximum(along_row, down_column))
+
+
+def _strength(image: NDArray[np.float32]) -> float:
+    ridge = ridge_height(image)
+    return float(np.quantile(ridge, RIDGE_QUANTILE)) if ridge.size else 0.0
+
+
+def find_laser_colour(images: ColourImages) -> LaserColour:
+    """Colour whose excess forms the strongest thin lines; grey if none stands out."""
+    strengths = [_strength(colour_excess(images, colour)) for colour in CHANNELS]
+    grey = _strength(np.asarray(sum(images.channels) / np.float32(3.0)))
+    best = int(np.argmax(strengths))
+    return CHANNELS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"
+
+
+def colour_plane(
+    exposure: Exposure, background: Exposure | None, colour: LaserColour
+) -> StripePlane:
+    """Choose the channel for the stripe in a colour exposure.
+
+    The laser's own channel is used unless its core is saturated; then the least saturated channel
+    that still shows the line, where only pixels with the laser's colour around them count.
+    """
+    images = split_channels(exposure, background)
+    factor = exposure.full_scale / NORMAL_SCALE
+    if colour == "auto":
+        colour = find_laser_colour(images)
+    if colour == "grey":
+        mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
+        masks = [mask for mask in images.clipped if mask.size > 1]
+        clipped = np.maximum.reduce(masks) if masks else np.zeros((1, 1), np.uint8)
+        return StripePlane(mean, clipped, factor)
+    excess = colour_excess(images, colour)
+    k = _least_saturated(images, excess, CHANNELS.index(colour))
+    return StripePlane(images.channels[k], images.clipped[k], factor, excess)
+
+
+def _least_saturated(images: ColourImages, excess: NDArray[np.float32], own: int) -> int:
+    s = RIDGE_STEP_PX
+    ridge = ridge_height(excess)
+    if not ridge.size:
+        return own
+    line = ridge > 0.4 * float(np.quantile(ridge, RIDGE_QUANTILE))
+    if not line.any():
+        return own
+    shares = [
+        float(mask[s:-s, s:-s][line].mean()) if mask.size > 1 else 0.0 for mask in images.clipped
+    ]
+    if shares[own] <= SATURATED_SHARE:
+        return own
+    heights = [float(np.quantile(ridge_height(c)[line], 0.75)) for c in images.channels]
+    usable = [k for k in range(3) if heights[k] > LEAST_CHANNEL_SHARE * max(heights)]
+    return min(usable, key=lambda k: (shares[k] > SATURATED_SHARE, shares[k] > 0.0, -heights[k]))

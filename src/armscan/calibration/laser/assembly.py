@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint fit of all sheets, and the evidence of every image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.laser.conditioning import geometry_warnings, refuse_loose_tilt
+from armscan.calibration.laser.coplanarity import CommonPlane, PosedSighting, fit_common_plane
+from armscan.calibration.laser.naming import NamedStripes
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.planes import compare_planes
+from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
+from armscan.calibration.laser.sheet_model import SheetModel, sheet_geometry
+from armscan.calibration.laser.sightings import BoardImage
+from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import CameraCalibration, SheetCalibration
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetCase:
+    """Everything that the joint fit rests on.
+
+    Parameters
+    ----------
+    images
+        Stripe points on their boards.
+    named
+        The sheet of each straight stripe.
+    observations
+        All named points.
+    kept
+        (N,) False for points that are too far from their sheet.
+    models
+        The model of each sheet.
+    errors
+        Covariance of boards and camera.
+    camera
+        The camera.
+    options
+        In force.
+    """
+
+    images: Sequence[BoardImage]
+    named: NamedStripes
+    observations: SheetObservations
+    kept: BoolArray
+    models: Sequence[SheetModel]
+    errors: CommonErrors
+    camera: CameraCalibration
+    options: SheetOptions
+
+
+def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
+    """Solve all sheets together and put the result into words and numbers.
+
+    Where the final lack-of-fit test of a sheet fails, the covariance of the sheets is widened by
+    its F ratio: what the model does not explain must not make the sheets look better known.
+    """
+    models, used = case.models, case.observations.select(case.kept)
+    is_bowed = [model.is_bowed for model in models]
+    sigma_factor = max(model.noise.sigma_factor for model in models)
+    start = [model.sheet for model in models]
+    solution = solve_sheets(used, start, case.errors, is_bowed, sigma_factor=sigma_factor)
+    unexplained = [
+        model.final_test.f_ratio
+        for model in models
+        if model.final_test.p_value < case.options.lack_of_fit_p
+    ]
+    widening = max([1.0, *unexplained])
+    covariance = solution.covariance.copy()
+    covariance[9:, 9:] *= widening
+    sheets = []
+    for k in range(len(models)):
+        fit = _sheet_fit(k, case, solution, covariance)
+        if isinstance(fit, FitFailure):
+            return fit
+        sheets.append(fit)
+    warnings = list(case.named.warnings)
+    if widening > 1.0:
+        warnings.append(
+            f"the model does not explain the stripes within their noise and the boards' errors; "
+            f"the sheets' sigmas are widened {np.sqrt(widening):.1f} times"
+        )
+    if not case.camera.has_covariance:
+        warnings.append(
+            "the camera came without covariance: the sheets' sigmas leave its errors out"
+        )
+    return LaserFit(
+        tuple(sheets),
+        _image_evidence(case, solution),
+        case.camera,
+        covariance,
+        max(model.noise.factor for model in models),
+        max(model.noise.correlation_points for model in models),
+        case.named.how,
+        case.options,
+        tuple(warnings),
+    )
+
+
+def _sheet_fit(
+    k: int, case: SheetCase, solution: SheetSolution, joint: FloatArray
+) -> SheetFit | FitFailure:
+    images, named, model = case.images, case.named, case.models[k]
+    used = case.observations.select(case.kept)
+    own = used.sheet == k
+    points, sheet = used.points_mm[own], solution.sheets[k]
+    covariance = joint[9 + 8 * k : 17 + 8 * k, 9 + 8 * k : 17 + 8 * k]
+    geometry = sheet_geometry(sheet, used.select(own), images)
+    tilt_variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    tilt_sigma_deg = float(np.degrees(np.sqrt(max(tilt_variance, 0.0)) / sheet.scale_mm))
+    loose = refuse_loose_tilt(named.names[k], geometry, tilt_sigma_deg)
+    if loose is not None:
+        return loose
+    common = _common_plane(k, named, images)
+    stripes = _stripes_of(used.select(own))
+    warnings = geometry_warnings(geometry, common, tilt_sigma_deg)
+    return SheetFit(
+        SheetCalibration(
+            named.names[k],
+            sheet,
+            float(np.sqrt((solution.height_mm[own] ** 2).mean())),
+            geometry.n_boards,
+            int(own.sum()),
+            geometry.depth_range_mm,
+            geometry.n_boards > 2,
+        ),
+        covariance,
+        float(np.sqrt((solution.residual_px[own] ** 2).mean())),
+        model.plane_test,
+        model.final_test,
+        model.decision,
+        tilt_sigma_deg,
+        float(np.sqrt(covariance[2, 2])),
+        common.largest_mm if common else 0.0,
+        common.sigma_largest_mm if common else 0.0,
+        geometry.board_angle_deg,
+        compare_planes(sheet, points, images, stripes, case.camera.camera),
+        warnings,
+    )
+
+
+def _common_plane(k: int, named: NamedStripes, images: Sequence[BoardImage]) -> CommonPlane | None:
+    members = [
+        PosedSighting(sighting, image.data.sensor_from_board.covariance)
+        for image, sheets in zip(images, named.sheets, strict=True)
+        for sighting, sheet in zip(image.sightings, sheets, strict=True)
+        if sheet == k
+    ]
+    common = fit_common_plane(members)
+    return None if isinstance(common, FitFailure) else common
+
+
+def _stripes_of(own: SheetObservations) -> list[tuple[int, IntArray]]:
+    return [
+        (int(own.image[own.stripe == s][0]), own.row[own.stripe == s])
+        for s in np.unique(own.stripe)
+    ]
+
+
+def _image_evidence(case: SheetCase, solution: SheetSolution) -> tuple[SheetImage, ...]:
+    observations, kept = case.observations, case.kept
+    height, residual, _, _ = observations.residuals_px(solution.sheets)
+    remaining = np.full(len(observations), np.nan)
+    remaining[kept] = solution.remaining_px
+    evidence = []
+    for i, image in enumerate(case.images):
+        own = observations.image == i
+        rows = observations.row[own]
+        n = len(image.data.profile)
+        use, sheet = image.use.copy(), np.full(n, -1)
+        use[rows] = np.where(kept[own], int(PointUse.USED), int(PointUse.OFF_SHEET))
+        sheet[rows] = observations.sheet[own]
+        columns = np.full((3, n), np.nan)
+        columns[:, rows] = height[own], residual[own], remaining[own]
+        evidence.append(
+            SheetImage(
+                image.data.profile,
+                image.data.view,
+                image.data.sensor_from_board.value,
+                use,
+                sheet,
+                image.points.points_mm,
+                columns[0],
+                columns[1],
+                columns[2],
+                float(np.linalg.norm(solution.common[6 * i : 6 * i + 6])),
+            )
+        )
+    return tuple(evidence)

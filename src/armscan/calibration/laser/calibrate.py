@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Light sheets from stripes on a flat target (thesis 2.3.2.2, eqs. 2.42 to 2.44)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armscan.calibration.laser.assembly import SheetCase, assemble_fit
+from armscan.calibration.laser.conditioning import refuse_few_boards
+from armscan.calibration.laser.naming import name_stripes
+from armscan.calibration.laser.observations import SheetObservations, collect_observations
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import BoardStripes, LaserFit
+from armscan.calibration.laser.sheet_model import SheetModel, choose_model, start_sheet
+from armscan.calibration.laser.sightings import sight_stripes
+from armscan.calibration.laser.solve import CommonErrors, solve_sheets
+from armscan.geometry.arrays import BoolArray
+from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import CameraCalibration
+from armscan.models.light_sheet import LightSheet
+
+OUTLIER_ROUNDS = 4
+
+
+def calibrate_sheets(
+    boards: Sequence[BoardStripes],
+    camera: CameraCalibration,
+    options: SheetOptions | None = None,
+) -> LaserFit | FitFailure:
+    """Calibrate one or several light sheets that lie on boards of known pose.
+
+    The stripe points are carried to the board (`meet_board`), sorted into straight stripes, named
+    over the images, and fitted: generalised least squares of the residuals across the stripe in
+    the image, with the stripe's sigma of each point, and with the errors of the boards' poses and
+    of the camera as common unknowns of known covariance. A bow is added where the lack-of-fit
+    test asks for it and the boards support it.
+
+    Parameters
+    ----------
+    boards
+        One entry an image.
+    camera
+        Its covariance goes into the weights and into the result.
+    options
+        Defaults if None.
+
+    Returns
+    -------
+    LaserFit or FitFailure
+        A failure for one board, for stripes that are all one line in space, for stripes that
+        cannot be named, and where nothing usable is left.
+    """
+    options = options or SheetOptions()
+    model = camera.camera
+    images = [sight_stripes(board, model, options) for board in boards]
+    if not any(image.sightings for image in images):
+        return FitFailure(
+            f"no straight stripe with {options.min_points} accepted points lies on the board in "
+            f"any of {len(images)} images",
+            "check that laser-on and board images belong together, the target's size, and the "
+            "stripe extraction",
+        )
+    named = name_stripes(images, options)
+    if isinstance(named, FitFailure):
+        return named
+    for k, name in enumerate(named.names):
+        failure = refuse_few_boards(name, sum(k in sheets for sheets in named.sheets))
+        if failure is not None:
+            return failure
+    observations = collect_observations(images, named, model)
+    errors = CommonErrors(
+        [board.sensor_from_board.covariance for board in boards], camera.covariance
+    )
+    models: list[SheetModel] = []
+    kept = np.ones(len(observations), dtype=np.bool_)
+    for k, name in enumerate(named.names):
+        own = observations.sheet == k
+        start = start_sheet(name, observations.select(own), images)
+        if isinstance(start, FitFailure):
+            return start
+        kept[own] = _without_outliers(observations.select(own), start, errors, options)
+        models.append(choose_model(observations.select(own & kept), start, errors, options))
+    return assemble_fit(
+        SheetCase(images, named, observations, kept, models, errors, camera, options)
+    )
+
+
+def _without_outliers(
+    observations: SheetObservations,
+    start: LightSheet,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> BoolArray:
+    """Keep the points near the plane; a bow widens the robust scale and so keeps its points."""
+    keep = np.ones(len(observations), dtype=np.bool_)
+    alone = observations.as_one_sheet()
+    for _ in range(OUTLIER_ROUNDS):
+        used = alone.select(keep)
+        solution = solve_sheets(used, [start], errors, [False], is_robust=True)
+        normalised = np.full(len(keep), np.inf)
+        normalised[keep] = np.abs(solution.remaining_px / used.sigma_px)
+        scale = max(1.0, 1.4826 * float(np.median(normalised[keep])))
+        before = int(keep.sum())
+        keep = normalised < options.outlier_sigma * scale
+        if int(keep.sum()) == before:
+            break
+    return keep

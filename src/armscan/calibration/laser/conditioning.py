@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do the boards determine a sheet? Refusals and warnings with the numbers that show it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.laser.coplanarity import CommonPlane
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.models.light_sheet import LightSheet
+
+MIN_SPREAD_RATIO = 0.01
+"""Spread across the stripes over that along them, below which there is only one line."""
+MAX_TILT_SIGMA_DEG = 2.0
+WEAK_TILT_SIGMA_DEG = 0.2
+PARALLEL_DEG = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetGeometry:
+    """How the boards of one sheet lie.
+
+    Parameters
+    ----------
+    n_boards
+        Board placements.
+    board_angle_deg
+        Largest angle between two boards.
+    depth_range_mm
+        Smallest and largest Z of the points.
+    spread_mm
+        (2,) root mean square spread of the points along the stripes and across them, in the sheet.
+    """
+
+    n_boards: int
+    board_angle_deg: float
+    depth_range_mm: tuple[float, float]
+    spread_mm: FloatArray
+
+    @property
+    def facts(self) -> str:
+        """The numbers, in words."""
+        low, high = self.depth_range_mm
+        return (
+            f"{self.n_boards} boards, largest angle between them {self.board_angle_deg:.2f} deg, "
+            f"depth {low:.1f} to {high:.1f} mm, points spread {self.spread_mm[0]:.2f} mm along "
+            f"the stripes and {self.spread_mm[1]:.3f} mm across them"
+        )
+
+
+def describe_geometry(
+    sheet: LightSheet, points_mm: FloatArray, board_normals: FloatArray
+) -> SheetGeometry:
+    """Measure how the (N, 3) points and the (M, 3) boards' normals spread over a sheet."""
+    local = (points_mm - points_mm.mean(axis=0)) @ sheet.axes[:2].T
+    cosine = np.clip(np.abs(board_normals @ board_normals.T), 0.0, 1.0)
+    return SheetGeometry(
+        len(board_normals),
+        float(np.degrees(np.arccos(cosine.min()))),
+        (float(points_mm[:, 2].min()), float(points_mm[:, 2].max())),
+        np.sqrt((local**2).mean(axis=0)),
+    )
+
+
+def refuse_few_boards(name: str, n_boards: int) -> FitFailure | None:
+    """Refuse fewer than two boards."""
+    if n_boards >= 2:
+        return None
+    return FitFailure(
+        f"sheet {name}: {n_boards or 'no'} board placement shows its stripe, and one stripe is a "
+        "line through which any number of planes pass",
+        "photograph the stripe on the board in at least two placements, better six, tilted "
+        "differently and at different distances",
+    )
+
+
+def refuse_one_line(name: str, geometry: SheetGeometry) -> FitFailure | None:
+    """Refuse boards whose stripes are all (nearly) the same line in space."""
+    along, across = (float(value) for value in geometry.spread_mm)
+    if across > MIN_SPREAD_RATIO * along:
+        return None
+    return FitFailure(
+        f"sheet {name}: all stripes lie on nearly one line in space, so that the sheet may turn "
+        f"about it ({geometry.facts}; ratio {across / max(along, 1e-12):.2g}, need "
+        f"{MIN_SPREAD_RATIO})",
+        "move the board in depth or tilt it between the images",
+    )
+
+
+def refuse_loose_tilt(
+    name: str, geometry: SheetGeometry, tilt_sigma_deg: float
+) -> FitFailure | None:
+    """Refuse a sheet whose direction the boards' own errors leave open."""
+    if tilt_sigma_deg <= MAX_TILT_SIGMA_DEG:
+        return None
+    return FitFailure(
+        f"sheet {name}: its direction is known to {tilt_sigma_deg:.1f} deg only, need "
+        f"{MAX_TILT_SIGMA_DEG} ({geometry.facts})",
+        "move the board further in depth, tilt it more, or show more of the target",
+    )
+
+
+def geometry_warnings(
+    geometry: SheetGeometry, common: CommonPlane | None, tilt_sigma_deg: float
+) -> tuple[str, ...]:
+    """What is weak about the boards of a solved sheet."""
+    warnings = []
+    if geometry.n_boards == 2 and common is not None:
+        sigmas = common.largest_mm / max(common.sigma_largest_mm, 1e-12)
+        warnings.append(
+            "two boards only: nothing is redundant but that their two stripes must lie in one "
+            f"plane (they miss it by {common.largest_mm:.3f} mm, {sigmas:.1f} sigma); a wrong "
+            "depth of a board, or a bow, would not be noticed: use three boards or more"
+        )
+    if geometry.board_angle_deg < PARALLEL_DEG:
+        warnings.append(
+            f"the boards are parallel (largest angle {geometry.board_angle_deg:.2f} deg): the "
+            "sheet rests on their distances alone, and stripes given to the wrong sheet would be "
+            "coplanar all the same: tilt the board by 20 deg or more between images"
+        )
+    if tilt_sigma_deg > WEAK_TILT_SIGMA_DEG:
+        warnings.append(
+            f"the sheet's direction is known to {tilt_sigma_deg:.2f} deg only: spread the boards "
+            "over more depth"
+        )
+    return tuple(warnings)

@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise along the stripes, and whether a sheet's model explains the stripes' shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.laser.result import LackOfFit
+from armscan.calibration.laser.solve import SheetSolution
+from armscan.geometry.arrays import FloatArray
+
+SHAPE_DEGREE = 3
+N_SHAPE = SHAPE_DEGREE + 1
+MAX_LAG = 100
+
+
+@dataclass(frozen=True, slots=True)
+class StripeNoise:
+    """Scatter of the points around a smooth course of each stripe.
+
+    Parameters
+    ----------
+    factor
+        Standard deviation over what the stripes' sigmas claim.
+    correlation_points
+        Variance of a mean over that of independent points: 1 + 2 sum of the correlations.
+    degrees_of_freedom
+        Of ``factor``, counted in points.
+    """
+
+    factor: float
+    correlation_points: float
+    degrees_of_freedom: int
+
+    @property
+    def sigma_factor(self) -> float:
+        """By which a sigma must be multiplied so that points count as independent."""
+        return self.factor * float(np.sqrt(self.correlation_points))
+
+    @property
+    def effective_freedom(self) -> float:
+        """Degrees of freedom counted in independent points."""
+        return self.degrees_of_freedom / self.correlation_points
+
+
+def stripe_noise(observations: SheetObservations, residual_px: FloatArray) -> StripeNoise:
+    """Estimate the noise of the stripes from their scatter around a cubic course.
+
+    Parameters
+    ----------
+    observations
+        The points, ordered along each stripe.
+    residual_px
+        (N,) residuals from the sheets; a smooth misfit does not matter.
+    """
+    rest, squares, freedom = [], 0.0, 0
+    for stripe in np.unique(observations.stripe):
+        own = observations.stripe == stripe
+        points = observations.points_mm[own]
+        along = (points - points[0]) @ (points[-1] - points[0])
+        t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
+        sigma = observations.sigma_px[own]
+        design = np.polynomial.legendre.legvander(t, SHAPE_DEGREE) / sigma[:, None]
+        normalised = residual_px[own] / sigma
+        left = normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0]
+        rest.append(left)
+        squares += float(left @ left)
+        freedom += len(left) - N_SHAPE
+    factor = float(np.sqrt(squares / max(freedom, 1)))
+    return StripeNoise(factor, _correlation(rest), freedom)
+
+
+def _correlation(rest: list[FloatArray]) -> float:
+    """Sum the correlations over the lags until they drown in their own noise."""
+    total = sum(len(left) for left in rest)
+    power = sum(float(left @ left) for left in rest) / total
+    correlation = 1.0
+    for lag in range(1, MAX_LAG + 1):
+        pairs = [(left[:-lag], left[lag:]) for left in rest if len(left) > 4 * lag]
+        count = sum(len(a) for a, _ in pairs)
+        if count == 0 or power == 0.0:
+            break
+        rho = sum(float(a @ b) for a, b in pairs) / count / power
+        if rho < 2.5 / np.sqrt(count):
+            break
+        correlation += 2.0 * rho
+    return correlation
+
+
+def lack_of_fit(
+    observations: SheetObservations, solution: SheetSolution, noise: StripeNoise
+) -> LackOfFit:
+    """Test a solution that was weighted with ``noise.sigma_factor``.
+
+    Of each stripe the first four shape terms (offset, slope, curvature, twist) are compared with
+    the model; what scatters around them is the noise. Board and camera errors are free within
+    their covariance, and cost what that covariance says.
+    """
+    n_stripes = len(np.unique(observations.stripe))
+    freedom = N_SHAPE * n_stripes - solution.n_parameters
+    if freedom <= 0:
+        return LackOfFit(0.0, 0, 1.0)
+    squares = max(solution.chi2 - noise.effective_freedom, 0.0)
+    ratio = squares / freedom
+    p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
+    return LackOfFit(ratio, freedom, p_value)
+
+
+def gain_of_bow(
+    flat: SheetSolution, bowed: SheetSolution, noise: StripeNoise
+) -> tuple[float, float]:
+    """F ratio and probability of the bow's gain in chi2 if there were no bow."""
+    n_terms = bowed.n_parameters - flat.n_parameters
+    ratio = max(flat.chi2 - bowed.chi2, 0.0) / n_terms
+    return ratio, float(stats.f.sf(ratio, n_terms, max(noise.effective_freedom, 1.0)))

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One sheet: where the fit starts, and whether it needs a bow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.laser.conditioning import (
+    SheetGeometry,
+    describe_geometry,
+    refuse_few_boards,
+    refuse_one_line,
+)
+from armscan.calibration.laser.lack_of_fit import (
+    StripeNoise,
+    gain_of_bow,
+    lack_of_fit,
+    stripe_noise,
+)
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.planes import sheet_from_plane
+from armscan.calibration.laser.result import LackOfFit
+from armscan.calibration.laser.sightings import BoardImage
+from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.fitting import fit_plane
+from armscan.models.light_sheet import LightSheet
+
+MAX_BOW_CONDITION = 1e7
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetModel:
+    """The model chosen for one sheet, fitted to this sheet's points alone.
+
+    Parameters
+    ----------
+    sheet
+        Start of the joint fit.
+    is_bowed
+        Whether the bow is free.
+    noise
+        Scatter along its stripes.
+    plane_test, final_test
+        Lack of fit of the plane, and of the model chosen.
+    decision
+        Why there is a bow, or none.
+    """
+
+    sheet: LightSheet
+    is_bowed: bool
+    noise: StripeNoise
+    plane_test: LackOfFit
+    final_test: LackOfFit
+    decision: str
+
+
+def sheet_geometry(
+    sheet: LightSheet, observations: SheetObservations, images: Sequence[BoardImage]
+) -> SheetGeometry:
+    """Describe the boards on which one sheet's points lie."""
+    normals = np.stack(
+        [
+            images[i].data.sensor_from_board.value.rotation[:, 2]
+            for i in np.unique(observations.image)
+        ]
+    )
+    return describe_geometry(sheet, observations.points_mm, normals)
+
+
+def start_sheet(
+    name: str, observations: SheetObservations, images: Sequence[BoardImage]
+) -> LightSheet | FitFailure:
+    """Total least squares plane of one sheet's points; refused where they are one line."""
+    few = refuse_few_boards(name, len(np.unique(observations.image)))
+    if few is not None:
+        return few
+    plane = fit_plane(observations.points_mm)
+    if isinstance(plane, FitFailure):
+        return FitFailure(f"sheet {name}: {plane.reason}", plane.remedy)
+    directions = _stripe_directions(observations)
+    sheet = sheet_from_plane(plane.value, observations.points_mm, directions)
+    one_line = refuse_one_line(name, sheet_geometry(sheet, observations, images))
+    return sheet if one_line is None else one_line
+
+
+def _stripe_directions(observations: SheetObservations) -> FloatArray:
+    directions = []
+    for stripe in np.unique(observations.stripe):
+        points = observations.points_mm[observations.stripe == stripe]
+        directions.append((points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0]))
+    return np.stack(directions)
+
+
+def choose_model(
+    observations: SheetObservations,
+    start: LightSheet,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> SheetModel:
+    """Fit the plane, test its fit, and let the sheet bow if the test asks for it."""
+    alone = observations.as_one_sheet()
+    first = solve_sheets(alone, [start], errors, [False])
+    noise = stripe_noise(alone, first.remaining_px)
+    flat = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
+    plane_test = lack_of_fit(alone, flat, noise)
+    test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
+
+    def plane(decision: str) -> SheetModel:
+        return SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision)
+
+    if plane_test.p_value >= options.lack_of_fit_p:
+        return plane(f"a plane is enough ({test})")
+    n_boards = len(np.unique(observations.image))
+    if n_boards < options.min_boards_for_bow:
+        return plane(
+            f"a plane does not explain the stripes ({test}), but {n_boards} boards cannot tell a "
+            f"bow from their own errors: {options.min_boards_for_bow} are needed"
+        )
+    condition = _bow_condition(alone, flat)
+    if condition > MAX_BOW_CONDITION:
+        return plane(
+            f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
+            f"to determine a bow (condition {condition:.2g})"
+        )
+    bowed = solve_sheets(alone, [start], errors, [True], sigma_factor=noise.sigma_factor)
+    ratio, p_value = gain_of_bow(flat, bowed, noise)
+    if p_value >= options.lack_of_fit_p:
+        return plane(
+            f"a plane does not explain the stripes ({test}), and a bow does not either "
+            f"(gain F {ratio:.2f}, p {p_value:.2g}): look at the boards' flatness and poses"
+        )
+    final = lack_of_fit(alone, bowed, noise)
+    decision = (
+        f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
+        f"(gain F {ratio:.1f}); left F {final.f_ratio:.2f}, p {final.p_value:.2g}"
+    )
+    return SheetModel(bowed.sheets[0], True, noise, plane_test, final, decision)
+
+
+def _bow_condition(observations: SheetObservations, flat: SheetSolution) -> float:
+    """Condition number of plane and bow terms together, columns scaled alike."""
+    _, _, by_sheet = flat.sheets[0].height_with_jacobian(observations.points_mm)
+    scaled = by_sheet / np.maximum(np.linalg.norm(by_sheet, axis=0), 1e-300)
+    values = np.linalg.eigvalsh(scaled.T @ scaled)
+    return float(values[-1] / max(values[0], 1e-300))

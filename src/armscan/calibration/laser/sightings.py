@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One stripe on one board as a straight piece in space, with its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.ray_board import BoardPoints, meet_board
+from armscan.calibration.laser.result import BoardStripes, PointUse
+from armscan.calibration.laser.straight_stripes import find_straight_stripes
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.models.camera import CameraModel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """One straight stripe of one image.
+
+    Parameters
+    ----------
+    rows
+        (K,) rows of the image's profile, ordered along the stripe.
+    ends_mm
+        (2, 3) ends of the fitted straight piece, Sensor frame.
+    ends_by_pose
+        (2, 3, 6) their derivative by the board's pose.
+    sigma_ends_mm
+        (2,) standard deviation of the ends across the stripe by the stripe's noise alone.
+    middle_px
+        (2,) middle of the stripe in the image.
+    direction_px
+        (2,) unit direction of the stripe in the image.
+    """
+
+    rows: IntArray
+    ends_mm: FloatArray
+    ends_by_pose: FloatArray
+    sigma_ends_mm: FloatArray
+    middle_px: FloatArray
+    direction_px: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardImage:
+    """All stripe points of one image on its board, and the straight stripes among them.
+
+    Parameters
+    ----------
+    data
+        What was given.
+    points
+        The points on the board.
+    sigma_mm
+        (N,) stripe noise across the stripe, in space.
+    use
+        (N,) `PointUse` so far: `PointUse.UNNAMED` for points on a straight stripe.
+    sightings
+        The straight stripes, in their order across the image.
+    """
+
+    data: BoardStripes
+    points: BoardPoints
+    sigma_mm: FloatArray
+    use: IntArray
+    sightings: tuple[Sighting, ...]
+
+
+def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions) -> BoardImage:
+    """Carry the stripe points of one image to its board and sort them into straight stripes."""
+    profile, pose = data.profile, data.sensor_from_board.value
+    points = meet_board(profile.points_px, pose, camera)
+    across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
+    sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
+    on_board = (points.points_mm - pose.translation_mm) @ pose.rotation
+    corners = data.view.points_board_mm[:, :2]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    with np.errstate(invalid="ignore"):
+        known = (on_board[:, :2] >= low - options.margin_mm) & (
+            on_board[:, :2] <= high + options.margin_mm
+        )
+    use = np.full(len(profile), int(PointUse.OFF_LINE))
+    use[~known.all(axis=1)] = PointUse.OFF_BOARD
+    use[~points.is_valid] = PointUse.NO_RAY
+    use[~profile.is_accepted] = PointUse.FLAGGED
+    candidates = np.flatnonzero(use == PointUse.OFF_LINE)
+    stripes = find_straight_stripes(
+        on_board[candidates, :2],
+        sigma_mm[candidates],
+        profile.segment[candidates],
+        (float(high[0] - low[0]), float(high[1] - low[1])),
+        options,
+    )
+    for stripe in stripes:
+        use[candidates[stripe.rows]] = PointUse.UNNAMED
+    sightings = [_sighting(data, points, sigma_mm, candidates[stripe.rows]) for stripe in stripes]
+    return BoardImage(data, points, sigma_mm, use, tuple(_across_image(sightings)))
+
+
+def _sighting(
+    data: BoardStripes, points: BoardPoints, sigma_mm: FloatArray, rows: IntArray
+) -> Sighting:
+    """Fit a straight line in space through the points and express it by its two ends."""
+    here, weight = points.points_mm[rows], sigma_mm[rows] ** -2.0
+    along = here - here[0]
+    direction = along[-1] / np.linalg.norm(along[-1])
+    t = along @ direction
+    design = np.stack([np.ones_like(t), t], axis=1)
+    normal = np.linalg.inv(design.T @ (design * weight[:, None]))
+    at_ends = np.array([[1.0, t.min()], [1.0, t.max()]])
+    gain = at_ends @ normal @ (design * weight[:, None]).T
+    q = data.profile.points_px[rows]
+    direction_px = (q[-1] - q[0]) / np.linalg.norm(q[-1] - q[0])
+    return Sighting(
+        rows,
+        gain @ here,
+        np.einsum("ek,kij->eij", gain, points.dpoint_dpose[rows]),
+        np.sqrt(np.einsum("ei,ij,ej->e", at_ends, normal, at_ends)),
+        0.5 * (q[0] + q[-1]),
+        direction_px,
+    )
+
+
+def _across_image(sightings: list[Sighting]) -> list[Sighting]:
+    """Order stripes left to right, or top to bottom where they lie flatter than 45 degrees."""
+    if not sightings:
+        return []
+    doubled = np.stack([s.direction_px for s in sightings])
+    is_flat = float((doubled[:, 0] ** 2).mean()) > 0.5
+    return sorted(sightings, key=lambda s: float(s.middle_px[1 if is_flat else 0]))

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Generalised least squares for all sheets at once: boards and camera are uncertain, too.
+
+The residual of a point is the movement of the stripe across itself in the image. Besides the
+sheets' parameters the unknowns are the errors of the boards' poses and of the camera, with their
+covariance as prior knowledge: errors that all points of an image, or all images, have in common
+are so weighed as what they are. The camera itself stays as calibrated; its uncertainty goes into
+the weights and into the joint covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.models.light_sheet import LightSheet
+
+ITERATIONS = 12
+STEP_TOLERANCE_MM = 1e-9
+HUBER_SIGMA = 2.5
+N_SHEET = 8
+N_PLANE = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonErrors:
+    """What the boards and the camera are known to.
+
+    Parameters
+    ----------
+    pose_covariances
+        (6, 6) for each image.
+    camera_covariance
+        (9, 9); rows of parameters that are taken as exact are zero.
+    """
+
+    pose_covariances: Sequence[FloatArray]
+    camera_covariance: FloatArray
+
+    def design(self, observations: SheetObservations, dr_dpoint: FloatArray) -> FloatArray:
+        """(N, 6 M + 9) derivative of the residuals by the common errors in their own sigmas."""
+        n_images = len(self.pose_covariances)
+        columns = np.zeros((len(observations), 6 * n_images + 9))
+        for i, covariance in enumerate(self.pose_covariances):
+            own = observations.image == i
+            by_pose = np.einsum("ni,nij->nj", dr_dpoint[own], observations.by_pose[own])
+            columns[own, 6 * i : 6 * i + 6] = by_pose @ square_root(covariance)
+        by_camera = np.einsum("ni,nij->nj", dr_dpoint, observations.by_camera)
+        columns[:, 6 * n_images :] = by_camera @ square_root(self.camera_covariance)
+        return columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetSolution:
+    """Sheets at the optimum.
+
+    Parameters
+    ----------
+    sheets
+        S sheets.
+    covariance
+        (9 + 8 S, 9 + 8 S) joint with the camera's own covariance.
+    height_mm, residual_px
+        (N,) residuals with boards and camera as measured.
+    remaining_px
+        (N,) residuals after boards and camera are moved within their uncertainty.
+    common
+        (6 M + 9,) estimated common errors, in their own sigmas.
+    chi2
+        Weighted squares of ``remaining_px`` plus squares of ``common``.
+    n_parameters
+        Free parameters of all sheets.
+    """
+
+    sheets: tuple[LightSheet, ...]
+    covariance: FloatArray
+    height_mm: FloatArray
+    residual_px: FloatArray
+    remaining_px: FloatArray
+    common: FloatArray
+    chi2: float
+    n_parameters: int
+
+
+def square_root(covariance: FloatArray) -> FloatArray:
+    """(P, P) matrix L with ``L L' = covariance``, also for a covariance without full rank."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(safe, safe))
+    return np.asarray(safe[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def solve_sheets(
+    observations: SheetObservations,
+    start: Sequence[LightSheet],
+    errors: CommonErrors,
+    is_bowed: Sequence[bool],
+    *,
+    sigma_factor: float = 1.0,
+    is_robust: bool = False,
+) -> SheetSolution:
+    """Fit the sheets by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    observations
+        Points with the sheet of each.
+    start
+        Starting sheets; their axes define u and v.
+    errors
+        Covariance of the boards' poses and of the camera.
+    is_bowed
+        For each sheet, whether its bow is free; a bow that is not free is zero.
+    sigma_factor
+        Multiplies the stripes' sigmas in the weights.
+    is_robust
+        Weigh points down by Huber's function on what remains; for finding outliers.
+    """
+    sheets = [_without_bow(sheet) for sheet in start]
+    active = np.concatenate(
+        [np.arange(N_SHEET) < (N_SHEET if bowed else N_PLANE) for bowed in is_bowed]
+    )
+    sigma = observations.sigma_px * sigma_factor
+    robust = np.ones(len(observations))
+    for _ in range(ITERATIONS):
+        design, residual, height = _linearised(observations, sheets, errors, active)
+        step, information = _weighted_step(design, residual, robust / sigma**2, int(active.sum()))
+        full = np.zeros(N_SHEET * len(sheets))
+        full[active] = step[: int(active.sum())]
+        sheets = [
+            sheet.updated(full[N_SHEET * k : N_SHEET * (k + 1)]) for k, sheet in enumerate(sheets)
+        ]
+        remaining = residual + design @ step
+        if is_robust:
+            robust = _huber(remaining / sigma)
+        elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
+            break
+    n_active = int(active.sum())
+    common = step[n_active:]
+    design, residual, height = _linearised(observations, sheets, errors, active)
+    remaining = residual + design[:, n_active:] @ common
+    return SheetSolution(
+        tuple(sheets),
+        _joint_covariance(np.asarray(np.linalg.inv(information)), active, errors),
+        height,
+        residual,
+        remaining,
+        common,
+        float((robust * (remaining / sigma) ** 2).sum() + common @ common),
+        n_active,
+    )
+
+
+def _without_bow(sheet: LightSheet) -> LightSheet:
+    return LightSheet(sheet.origin_mm, sheet.axes, sheet.scale_mm, np.zeros(5))
+
+
+def _linearised(
+    observations: SheetObservations,
+    sheets: Sequence[LightSheet],
+    errors: CommonErrors,
+    active: BoolArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(N, P) design over the active sheet parameters and the common errors; residuals."""
+    height, residual, by_sheet, by_point = observations.residuals_px(sheets)
+    columns = np.zeros((len(observations), N_SHEET * len(sheets)))
+    for k in range(len(sheets)):
+        own = observations.sheet == k
+        columns[own, N_SHEET * k : N_SHEET * (k + 1)] = by_sheet[own]
+    design = np.concatenate([columns[:, active], errors.design(observations, by_point)], axis=1)
+    return design, residual, height
+
+
+def _weighted_step(
+    design: FloatArray, residual: FloatArray, weight: FloatArray, n_active: int
+) -> tuple[FloatArray, FloatArray]:
+    """Solve the normal equations; the common errors are known to be 0 +- 1."""
+    weighted = design * weight[:, None]
+    information = weighted.T @ design
+    prior = np.arange(len(information)) >= n_active
+    information[prior, prior] += 1.0
+    return np.asarray(-np.linalg.solve(information, weighted.T @ residual)), information
+
+
+def _huber(normalised: FloatArray) -> FloatArray:
+    scale = max(1.0, 1.4826 * float(np.median(np.abs(normalised))))
+    return np.asarray(HUBER_SIGMA * scale / np.maximum(np.abs(normalised), HUBER_SIGMA * scale))
+
+
+def _joint_covariance(inverse: FloatArray, active: BoolArray, errors: CommonErrors) -> FloatArray:
+    """Covariance of camera and sheets together, the camera as it was calibrated.
+
+    With the camera's error ``c = L w`` in its own sigmas, the estimate of the sheets errs by
+    ``e_s`` with ``cov(e_s, w) = -inverse[s, w]``; the calibrated camera errs by ``-L w``.
+    """
+    n_active, n_sheets = int(active.sum()), len(active)
+    camera = slice(len(inverse) - 9, len(inverse))
+    joint = np.zeros((9 + n_sheets, 9 + n_sheets))
+    joint[:9, :9] = errors.camera_covariance
+    places = 9 + np.flatnonzero(active)
+    joint[np.ix_(places, places)] = inverse[:n_active, :n_active]
+    cross = inverse[:n_active, camera] @ square_root(errors.camera_covariance).T
+    joint[np.ix_(places, np.arange(9))] = cross
+    joint[np.ix_(np.arange(9), places)] = cross.T
+    return 0.5 * (joint + joint.T)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.laser_off import subtract
 from armscan.vision.stripe.options import LaserColour
-from armscan.vision.stripe.plane import NORMAL_SCALE, StripePlane, saturated, to_units
+from armscan.vision.stripe.plane import NORMAL_SCALE, StripePlane, saturated_mask, to_units
 
 CHANNELS: tuple[LaserColour, ...] = ("red", "green", "blue")
 RIDGE_STEP_PX = 14
@@ -19,8 +19,11 @@ RIDGE_QUANTILE = 0.9995
 LEAST_COLOUR_SHARE = 0.25
 """A laser's colour shows at least this share of the grey contrast, else the line is grey."""
 SATURATED_SHARE = 0.12
-"""More clipped line pixels than this, and another channel is used."""
-LEAST_CHANNEL_SHARE = 0.2
+"""With more clipped pixels on the line than this, another channel is consulted."""
+LEAST_CORE_HEIGHT = 8.0
+"""A channel shows the core if it rises by this much above its surroundings there."""
+LINE_SHARE = 0.4
+NOWHERE = np.zeros((1, 1), np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +53,7 @@ def split_channels(exposure: Exposure, background: Exposure | None) -> ColourIma
             dark = to_units(np.ascontiguousarray(background.image[:, :, k]), background.full_scale)
             channel = subtract(channel, dark, NORMAL_SCALE)
         channels.append(channel)
-        clipped.append(saturated(raw, scale))
+        clipped.append(saturated_mask(raw, scale))
     return ColourImages(tuple(channels), tuple(clipped))
 
 
@@ -90,8 +93,10 @@ def colour_plane(
 ) -> StripePlane:
     """Choose the channel for the stripe in a colour exposure.
 
-    The laser's own channel is used unless its core is saturated; then the least saturated channel
-    that still shows the line, where only pixels with the laser's colour around them count.
+    The laser's own channel is used. Where its core is saturated, the least saturated channel that
+    still shows the core is added: it rises where the first has reached its limit, while the halo
+    and dim parts of the line stay with the laser's colour. Only ridges with the laser's colour
+    around them count.
     """
     images = split_channels(exposure, background)
     factor = exposure.full_scale / NORMAL_SCALE
@@ -100,26 +105,30 @@ def colour_plane(
     if colour == "grey":
         mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
         masks = [mask for mask in images.clipped if mask.size > 1]
-        clipped = np.maximum.reduce(masks) if masks else np.zeros((1, 1), np.uint8)
-        return StripePlane(mean, clipped, factor)
+        clipped = np.maximum.reduce(masks) if masks else NOWHERE
+        return StripePlane(mean, clipped, clipped, factor)
+    own = CHANNELS.index(colour)
     excess = colour_excess(images, colour)
-    k = _least_saturated(images, excess, CHANNELS.index(colour))
-    return StripePlane(images.channels[k], images.clipped[k], factor, excess)
+    core = _core_channel(images, excess, own)
+    if core is None:
+        return StripePlane(images.channels[own], images.clipped[own], images.clipped[own], factor, excess)
+    both = images.channels[own] + images.channels[core]
+    return StripePlane(both, images.clipped[core], images.clipped[own], factor, excess)
 
 
-def _least_saturated(images: ColourImages, excess: NDArray[np.float32], own: int) -> int:
+def _core_channel(
+    images: ColourImages, excess: NDArray[np.float32], own: int
+) -> int | None:
+    """The channel that shows a core in which the laser's own is saturated; None if none is."""
     s = RIDGE_STEP_PX
     ridge = ridge_height(excess)
-    if not ridge.size:
-        return own
-    line = ridge > 0.4 * float(np.quantile(ridge, RIDGE_QUANTILE))
-    if not line.any():
-        return own
-    shares = [
-        float(mask[s:-s, s:-s][line].mean()) if mask.size > 1 else 0.0 for mask in images.clipped
-    ]
-    if shares[own] <= SATURATED_SHARE:
-        return own
-    heights = [float(np.quantile(ridge_height(c)[line], 0.75)) for c in images.channels]
-    usable = [k for k in range(3) if heights[k] > LEAST_CHANNEL_SHARE * max(heights)]
-    return min(usable, key=lambda k: (shares[k] > SATURATED_SHARE, shares[k] > 0.0, -heights[k]))
+    if not ridge.size or images.clipped[own].size == 1:
+        return None
+    line = ridge > LINE_SHARE * float(np.quantile(ridge, RIDGE_QUANTILE))
+    core = line & (images.clipped[own][s:-s, s:-s] > 0)
+    if core.sum() <= SATURATED_SHARE * line.sum():
+        return None
+    heights = [float(np.median(ridge_height(c)[core])) for c in images.channels]
+    shares = [float(m[s:-s, s:-s][core].mean()) if m.size > 1 else 0.0 for m in images.clipped]
+    others = [k for k in range(3) if k != own and heights[k] > LEAST_CORE_HEIGHT]
+    return min(others, key=lambda k: (shares[k], -heights[k])) if others else None

@@ -23,7 +23,12 @@ from armscan.vision.stripe.level import measure_level
 from armscan.vision.stripe.options import StripeOptions
 from armscan.vision.stripe.plane import StripePlane, mono_plane
 from armscan.vision.stripe.profile_fit import ProfileFits, axis_component, fit_ridge
-from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, trace_ridges
+from armscan.vision.stripe.ridge import (
+    find_candidates,
+    find_line_sigma,
+    is_bright,
+    trace_ridges,
+)
 from armscan.vision.stripe.smoothing import smooth
 
 LEAST_SIGMA_PX = 1e-4
@@ -73,6 +78,7 @@ def extract_stripes(
     runs = find_candidates(plane.image, level)
     sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
     ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+    ridge = ridge.select(is_bright(ridge, options.faintest_share))
     if plane.gate is not None and len(ridge):
         ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma))
     if not len(ridge):
@@ -100,8 +106,8 @@ def to_profile(
     across = axis_component(fits.ridge.table)
     width = fits.values[:, SIGMA] * across
     flags = np.zeros(len(points), np.int64)
-    flags[is_saturated(fits)] |= int(StripeFlag.SATURATED)
-    flags[is_background_step(fits, options)] |= int(StripeFlag.BACKGROUND_STEP)
+    flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
+    flags[is_background_step(fits, options.background_step)] |= int(StripeFlag.BACKGROUND_STEP)
     flags[is_asymmetric(fits)] |= int(StripeFlag.ASYMMETRIC)
     near = is_near_other_line(points, chain, width, options.neighbour_sigmas)
     flags[near] |= int(StripeFlag.NEIGHBOUR)

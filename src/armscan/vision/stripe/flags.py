@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.stripe_fit import AMPLITUDE, CLIPPED, SIGMA, SKEW, SKEW_NORM
+from armscan.kernels.stripe_fit import AMPLITUDE, SKEW, SKEW_NORM
 from armscan.vision.stripe.chains import chain_lengths_px, sum_along
-from armscan.vision.stripe.options import StripeOptions
 from armscan.vision.stripe.profile_fit import ProfileFits
 
 SIGNIFICANT = 5.0
@@ -18,15 +18,21 @@ SKEW_SHIFT = 0.3
 """Third-order part of a profile, as a share of its amplitude, that counts as leaning."""
 
 
-def is_background_step(fits: ProfileFits, options: StripeOptions) -> BoolArray:
+def is_background_step(fits: ProfileFits, least_share: float) -> BoolArray:
     """(N,) True where the two sides differ enough to move the centre.
 
     A step of height d beside a line of amplitude A and sigma s moves every method by about s d / A.
+
+    Parameters
+    ----------
+    fits
+        Fitted profiles.
+    least_share
+        Smallest step that matters, as a share of the line's amplitude.
     """
     step = np.abs(fits.sides[:, 1] - fits.sides[:, 0])
-    shift = fits.values[:, SIGMA] * step / fits.values[:, AMPLITUDE]
     is_certain = step > SIGNIFICANT * fits.side_sigma
-    return np.asarray(is_certain & (shift > options.background_shift_px))
+    return np.asarray(is_certain & (step > least_share * fits.values[:, AMPLITUDE]))
 
 
 def is_asymmetric(fits: ProfileFits) -> BoolArray:
@@ -38,9 +44,17 @@ def is_asymmetric(fits: ProfileFits) -> BoolArray:
     return np.asarray((size * np.sqrt(norm) > SIGNIFICANT) & (size > SKEW_SHIFT))
 
 
-def is_saturated(fits: ProfileFits) -> BoolArray:
-    """(N,) True where the profile holds clipped pixels."""
-    return np.asarray(fits.values[:, CLIPPED] > 0)
+def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
+    """(N,) True where one of the 3 x 3 pixels around a point (N, 2) is clipped."""
+    found = np.zeros(len(points), dtype=np.bool_)
+    if saturated.size == 1:
+        return found
+    height, width = saturated.shape
+    x, y = np.rint(points).astype(np.int64).T
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
+            found |= saturated[np.clip(y + dy, 0, height - 1), np.clip(x + dx, 0, width - 1)] > 0
+    return found
 
 
 def is_near_other_line(

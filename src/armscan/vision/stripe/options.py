@@ -35,8 +35,10 @@ class StripeOptions:
         Largest half window of the smoothing along the line; 0 switches it off.
     neighbour_sigmas
         A line within this many sigmas of another is flagged.
-    background_shift_px
-        A background step that moves the centre by more than this is flagged.
+    background_step
+        A background step of more than this share of the line's amplitude is flagged.
+    faintest_share
+        Segments fainter than this share of the bright ones are taken for reflections and left out.
     """
 
     method: StripeMethod = "fit"
@@ -46,7 +48,8 @@ class StripeOptions:
     shortest_px: float = 15.0
     smoothing_px: float = 12.0
     neighbour_sigmas: float = 4.5
-    background_shift_px: float = 0.15
+    background_step: float = 0.2
+    faintest_share: float = 0.1
 
     def __post_init__(self) -> None:
         for name, choices in (("method", StripeMethod), ("laser_colour", LaserColour)):
@@ -66,7 +69,13 @@ class StripeOptions:
             raise OptionError(
                 f"threshold is {self.threshold}", remedy="give a positive count of grey levels"
             )
-        for name in ("shortest_px", "smoothing_px", "neighbour_sigmas", "background_shift_px"):
+        for name in (
+            "shortest_px",
+            "smoothing_px",
+            "neighbour_sigmas",
+            "background_step",
+            "faintest_share",
+        ):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise OptionError(
                     f"{name} is {getattr(self, name)}", remedy="give a number that is not negative"

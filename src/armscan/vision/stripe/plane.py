@@ -25,7 +25,9 @@ class StripePlane:
     image
         (H, W) float32, full scale 255 before background subtraction.
     clipped
-        (H, W) uint8, 1 where the camera saturated; (1, 1) if nowhere.
+        (H, W) uint8, 1 where ``image`` says nothing because the camera saturated; (1, 1) if nowhere.
+    saturated
+        (H, W) uint8, 1 where the laser's own channel saturated; (1, 1) if nowhere.
     grey_levels_per_unit
         Factor from ``image`` to the exposure's own grey levels.
     gate
@@ -34,11 +36,12 @@ class StripePlane:
 
     image: NDArray[np.float32]
     clipped: NDArray[np.uint8]
+    saturated: NDArray[np.uint8]
     grey_levels_per_unit: float
     gate: NDArray[np.float32] | None = None
 
 
-def saturated(channel: ImageArray, full_scale: int) -> NDArray[np.uint8]:
+def saturated_mask(channel: ImageArray, full_scale: int) -> NDArray[np.uint8]:
     """Mask (H, W) of clipped pixels, or (1, 1) zeros if there are none."""
     if int(channel.max()) < full_scale:
         return np.zeros((1, 1), np.uint8)
@@ -56,4 +59,5 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     image = to_units(exposure.image, scale)
     if background is not None:
         image = subtract(image, to_units(background.image, background.full_scale), NORMAL_SCALE)
-    return StripePlane(image, saturated(exposure.image, scale), scale / NORMAL_SCALE)
+    clipped = saturated_mask(exposure.image, scale)
+    return StripePlane(image, clipped, clipped, scale / NORMAL_SCALE)

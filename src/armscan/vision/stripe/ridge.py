@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.stripe_hessian import gaussian_taps, refine_candidates
-from armscan.kernels.stripe_links import find_neighbours, place_points, walk_chains
+from armscan.kernels.stripe_links import REACH_PX, find_neighbours, place_points, walk_chains
 from armscan.kernels.stripe_runs import find_runs
+from armscan.vision.stripe.chains import strong_median
 from armscan.vision.stripe.level import CELL_PX, ImageLevel
 
 LONGEST_RUN_PX = 90
@@ -43,8 +44,13 @@ class RidgePoints:
         return len(self.table)
 
     def select(self, keep: NDArray[np.bool_]) -> RidgePoints:
-        """Return the points where ``keep`` (N,) is True."""
-        return RidgePoints(self.table[keep], self.chain[keep])
+        """Return the points where ``keep`` (N,) is True; chains are cut where a gap opens."""
+        table, chain = self.table[keep], self.chain[keep]
+        if len(table) == 0:
+            return RidgePoints(table, chain)
+        step = np.hypot(*np.diff(table[:, :2], axis=0).T)
+        is_new = (np.diff(chain) != 0) | (step > REACH_PX)
+        return RidgePoints(table, np.concatenate([[0], np.cumsum(is_new)]).astype(np.int64))
 
 
 def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray:
@@ -153,3 +159,14 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     chain = np.zeros(n, np.int64)
     count = walk_chains(ahead, behind, order, chain)
     return RidgePoints(points[order[:count]], chain[:count])
+
+
+def is_bright(ridge: RidgePoints, least_share: float) -> NDArray[np.bool_]:
+    """(N,) False for the chains whose median curvature is below a share of the strong ones'."""
+    if not len(ridge):
+        return np.zeros(0, dtype=np.bool_)
+    bend = ridge.table[:, 4]
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(ridge.chain) != 0]))
+    sizes = np.diff(np.concatenate([starts, [len(ridge)]]))
+    medians = np.array([np.median(bend[a : a + n]) for a, n in zip(starts, sizes, strict=True)])
+    return np.asarray(np.repeat(medians, sizes) >= least_share * strong_median(bend))

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A line laser as a fan of rays: the sheet is a shallow cone, so it is bowed as real ones are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, frozen_floats
+
+RED = (1.0, 0.09, 0.05)
+"""What the three channels of a colour camera answer to a red laser."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineLaser:
+    """A source from which a fan of rays spreads.
+
+    A line lens that is not square to its beam deflects every ray of the fan by the same angle out
+    of the fan plane. The rays then lie on a cone about the fan's normal; on a wall the line is a
+    hyperbola, not straight. With ``skew_rad = 0`` the sheet is a plane through the source.
+
+    Parameters
+    ----------
+    name
+        Name of the light source.
+    source_mm
+        (3,) where the fan starts, in the frame of the scene.
+    forward, across
+        (3,) direction of the fan's middle, and the direction in which it spreads; made unit and
+        perpendicular here.
+    half_angle_rad
+        The fan ends at plus and minus this angle.
+    skew_rad
+        Angle between the rays and the fan plane: the cause of the bow.
+    waist_mm, waist_distance_mm, divergence_rad
+        Gaussian sigma of the sheet's thickness at its waist, the distance of the waist from the
+        source, and the far-field growth of sigma with distance.
+    irradiance
+        Irradiance on the fan's middle, on a surface that faces the source at the waist, as the
+        part of the camera's full scale that a white surface then shows.
+    falloff
+        Part of the brightness that is lost from the fan's middle to its ends.
+    colour
+        (3,) response of red, green and blue to this light; mono cameras see the first.
+    """
+
+    name: str
+    source_mm: FloatArray
+    forward: FloatArray
+    across: FloatArray
+    half_angle_rad: float = 0.6
+    skew_rad: float = 0.0
+    waist_mm: float = 0.25
+    waist_distance_mm: float = 300.0
+    divergence_rad: float = 6e-4
+    irradiance: float = 1.0
+    falloff: float = 0.4
+    colour: tuple[float, float, float] = RED
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source_mm", frozen_floats(self.source_mm, (3,), "source_mm"))
+        forward = np.array(frozen_floats(self.forward, (3,), "forward"))
+        forward /= np.linalg.norm(forward)
+        across = np.array(frozen_floats(self.across, (3,), "across"))
+        across -= (across @ forward) * forward
+        length = float(np.linalg.norm(across))
+        if length < 1e-9:
+            raise InputError("the laser's fan spreads along its own direction", where=self.name)
+        object.__setattr__(self, "forward", frozen_floats(forward, (3,), "forward"))
+        object.__setattr__(self, "across", frozen_floats(across / length, (3,), "across"))
+        if not (self.waist_mm > 0.0 and self.waist_distance_mm > 0.0 and self.half_angle_rad > 0.0):
+            raise InputError("a laser needs a waist and a fan of positive size", where=self.name)
+
+    @property
+    def normal(self) -> FloatArray:
+        """(3,) normal of the fan plane, the axis of the cone."""
+        return np.cross(self.forward, self.across)
+
+    def rays(self, fan_angle_rad: FloatArray) -> FloatArray:
+        """(N, 3) unit directions of the sheet's centre at fan angles (N,)."""
+        angle = np.asarray(fan_angle_rad, dtype=np.float64)[:, None]
+        flat = np.cos(angle) * self.forward + np.sin(angle) * self.across
+        return np.asarray(np.cos(self.skew_rad) * flat + np.sin(self.skew_rad) * self.normal)
+
+    def offset_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Signed distance (N,) of points (N, 3) from the centre of the sheet, along the arc."""
+        forward, across, up, distance = self._local(points_mm)
+        elevation = np.arctan2(up, np.hypot(forward, across))
+        return np.asarray(distance * (elevation - self.skew_rad))
+
+    def thickness_mm(self, distance_mm: FloatArray) -> FloatArray:
+        """Gaussian sigma of the sheet at distances (N,) from the source."""
+        growth = self.divergence_rad * (distance_mm - self.waist_distance_mm)
+        return np.asarray(np.hypot(self.waist_mm, growth))
+
+    def reach_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) from the sheet's centre, in sigmas of its thickness."""
+        distance = np.linalg.norm(points_mm - self.source_mm, axis=1)
+        return self.offset_mm(points_mm) / self.thickness_mm(distance)
+
+    def irradiance_at(self, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
+        """Irradiance (N,) on surface points (N, 3) with unit normals (N, 3); shadows not counted.
+
+        The power of the fan spreads over its width and thickness; the surface takes the cosine.
+        """
+        forward, across, up, distance = self._local(points_mm)
+        elevation = np.arctan2(up, np.hypot(forward, across))
+        sigma = self.thickness_mm(distance)
+        profile = np.exp(-0.5 * (distance * (elevation - self.skew_rad) / sigma) ** 2)
+        spread = self.waist_mm * self.waist_distance_mm / (sigma * distance)
+        fan = np.arctan2(across, forward) / self.half_angle_rad
+        along = np.where(np.abs(fan) <= 1.0, 1.0 - self.falloff * fan**2, 0.0)
+        to_source = (self.source_mm - points_mm) / distance[:, None]
+        cosine = np.maximum(np.sum(to_source * normals, axis=1), 0.0)
+        return np.asarray(self.irradiance * profile * spread * along * cosine)
+
+    def _local(self, points_mm: FloatArray) -> tuple[FloatArray, ...]:
+        """Coordinates along forward, across and normal, and the distance from the source."""
+        v = np.asarray(points_mm, dtype=np.float64) - self.source_mm
+        distance = np.linalg.norm(v, axis=1)
+        return v @ self.forward, v @ self.across, v @ self.normal, distance

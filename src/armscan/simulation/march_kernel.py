@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The renderer's own kernel: distance from a body of melted limbs, and rays that walk up to it.
+
+A limb is a row of `LIMB_COLUMNS` numbers: start (3), unit axis (3), length, radius at the start,
+radius lost per length, tangent of the taper's half angle, blend length, 1 if hollow.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, types
+from numpy.typing import NDArray
+
+LIMB_COLUMNS = 12
+MAX_STEPS = 200
+
+_INPUT = types.Array(types.float64, 2, "C", readonly=True)
+_RESULT = types.float64[::1]
+_SPAN_SIGNATURE = "UniTuple(float64, 2)(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True))"
+
+
+@njit(types.float64(types.float64, types.float64, types.float64, _INPUT), cache=True)
+def _distance(x: float, y: float, z: float, limbs: NDArray[np.float64]) -> float:
+    """Signed distance of one point from all limbs, joined in order."""
+    result = 1e30
+    for k in range(limbs.shape[0]):
+        vx, vy, vz = x - limbs[k, 0], y - limbs[k, 1], z - limbs[k, 2]
+        along = vx * limbs[k, 3] + vy * limbs[k, 4] + vz * limbs[k, 5]
+        across2 = max(vx * vx + vy * vy + vz * vz - along * along, 0.0)
+        # The nearest ball of a tapered limb lies behind the foot of the perpendicular.
+        centre = min(max(along - math.sqrt(across2) * limbs[k, 9], 0.0), limbs[k, 6])
+        radius = limbs[k, 7] - limbs[k, 8] * centre
+        other = math.sqrt(across2 + (along - centre) ** 2) - radius
+        sign = 1.0
+        if limbs[k, 11] > 0.0:
+            sign = -1.0
+        mine = sign * result
+        overlap = limbs[k, 10] - abs(mine - other)
+        joined = min(mine, other)
+        if overlap > 0.0:
+            joined -= overlap * overlap / (4.0 * limbs[k, 10])
+        result = sign * joined
+    return result
+
+
+@njit(types.void(_INPUT, _INPUT, _RESULT), cache=True)
+def distances(
+    points: NDArray[np.float64], limbs: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """Write the signed distances (N,) of points (N, 3), mm, from the body into ``result``."""
+    for i in range(points.shape[0]):
+        result[i] = _distance(points[i, 0], points[i, 1], points[i, 2], limbs)
+
+
+@njit(_SPAN_SIGNATURE, cache=True)
+def _span(ray: NDArray[np.float64], balls: NDArray[np.float64]) -> tuple[float, float]:
+    """Where a ray enters the first and leaves the last of all balls; (inf, -inf) for none."""
+    near, far = np.inf, -np.inf
+    for k in range(balls.shape[0]):
+        vx, vy, vz = balls[k, 0] - ray[0], balls[k, 1] - ray[1], balls[k, 2] - ray[2]
+        middle = vx * ray[3] + vy * ray[4] + vz * ray[5]
+        half2 = balls[k, 3] ** 2 - (vx * vx + vy * vy + vz * vz - middle * middle)
+        if half2 > 0.0:
+            half = math.sqrt(half2)
+            near, far = min(near, middle - half), max(far, middle + half)
+    return near, far
+
+
+@njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
+def march(
+    rays: NDArray[np.float64],
+    limbs: NDArray[np.float64],
+    balls: NDArray[np.float64],
+    tolerance: float,
+    travelled: NDArray[np.float64],
+) -> None:
+    """Walk along rays until the body is ``tolerance`` near.
+
+    ``rays`` (N, 6) are origins and unit directions; ``balls`` (K, 4), centre and radius, together
+    hold the body. ``travelled`` (N,) receives the distance to the hit; infinite for none.
+    """
+    for i in range(rays.shape[0]):
+        t, far = _span(rays[i], balls)
+        t = max(t, 0.0)
+        for _ in range(MAX_STEPS):
+            if t > far:
+                break
+            x = rays[i, 0] + t * rays[i, 3]
+            y = rays[i, 1] + t * rays[i, 4]
+            z = rays[i, 2] + t * rays[i, 5]
+            gap = _distance(x, y, z, limbs)
+            t += gap
+            if gap < tolerance:
+                break
+        travelled[i] = t if t <= far else np.inf

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A report as one self-contained HTML page: what it is made of, and how it is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import TypeAlias
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from armscan.report.summary import Table
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A key figure: what, how much, and what that means in a few words."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A figure.
+
+    Parameters
+    ----------
+    markup
+        Trusted HTML: an ``<img>`` with a data URI, or an ``<svg>``, from this package only.
+    caption
+        How to read it.
+    title
+        Short name; empty for none.
+    """
+
+    markup: str
+    caption: str = ""
+    title: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Gallery:
+    """Pictures side by side, each at least ``min_width_px`` wide."""
+
+    pictures: tuple[Picture, ...]
+    min_width_px: int = 420
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Labels with values."""
+
+    rows: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Legend:
+    """Names of colours: (CSS colour, text)."""
+
+    entries: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A paragraph."""
+
+    text: str
+
+
+Block: TypeAlias = Gallery | Facts | Legend | Text | Table
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A titled part of a page; a folded one opens on a click."""
+
+    title: str
+    blocks: tuple[Block, ...]
+    is_folded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A whole report.
+
+    Parameters
+    ----------
+    title, subtitle
+        What was done, and to what.
+    cards
+        Key figures.
+    warnings
+        Sentences that a person should read first.
+    sections
+        The rest, most asked for first.
+    is_simulated
+        True marks every number as coming from rendered data.
+    footer
+        One line about origin.
+    """
+
+    title: str
+    subtitle: str
+    cards: tuple[Card, ...]
+    warnings: tuple[str, ...]
+    sections: tuple[Section, ...]
+    is_simulated: bool
+    footer: str
+
+
+def render_page(page: Page) -> bytes:
+    """HTML of a page; nothing in it is loaded from elsewhere."""
+    template = _environment().get_template("page.html.j2")
+    return template.render(page=page).encode()
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("armscan.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    kinds: Mapping[str, type] = {
+        "gallery": Gallery,
+        "facts": Facts,
+        "legend": Legend,
+        "text": Text,
+        "table": Table,
+    }
+    for name, kind in kinds.items():
+        environment.tests[name] = lambda block, kind=kind: isinstance(block, kind)
+    return environment

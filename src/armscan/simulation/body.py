@@ -17,7 +17,7 @@ from armscan.geometry.frames import Part, Sensor
 from armscan.geometry.poses import Pose
 
 HIT_MM = 1e-5
-GRADIENT_STEP_MM = 2e-3
+GRADIENT_STEP_MM = 1e-4
 
 
 @dataclass(frozen=True, slots=True)

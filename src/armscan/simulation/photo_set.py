@@ -48,7 +48,7 @@ class PhotoSetOptions:
     skew_rad: float = 0.008
 
     def __post_init__(self) -> None:
-        if min(self.width_px, self.height_px) < 320:
+        if min(self.width_px, self.height_px) < 240:
             raise InputError(f"photos of {self.width_px} x {self.height_px} px are too small")
         for count, places in ((self.n_camera, CAMERA_PLACES), (self.n_laser, LASER_PLACES)):
             if not 1 <= count <= len(places):

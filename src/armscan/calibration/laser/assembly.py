@@ -119,7 +119,7 @@ def _sheet_fit(
     loose = refuse_loose_tilt(named.names[k], geometry, tilt_sigma_deg)
     if loose is not None:
         return loose
-    common = _common_plane(k, named, images)
+    common = _common_plane(k, case)
     stripes = _stripes_of(used.select(own))
     warnings = geometry_warnings(geometry, common, tilt_sigma_deg)
     return SheetFit(
@@ -147,10 +147,10 @@ def _sheet_fit(
     )
 
 
-def _common_plane(k: int, named: NamedStripes, images: Sequence[BoardImage]) -> CommonPlane | None:
+def _common_plane(k: int, case: SheetCase) -> CommonPlane | None:
     members = [
-        PosedSighting(sighting, image.data.sensor_from_board.covariance)
-        for image, sheets in zip(images, named.sheets, strict=True)
+        PosedSighting(sighting, image.data.sensor_from_board.covariance, case.camera.covariance)
+        for image, sheets in zip(case.images, case.named.sheets, strict=True)
         for sighting, sheet in zip(image.sightings, sheets, strict=True)
         if sheet == k
     ]

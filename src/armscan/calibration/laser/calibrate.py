@@ -62,14 +62,14 @@ def calibrate_sheets(
             "check that laser-on and board images belong together, the target's size, and the "
             "stripe extraction",
         )
-    named = name_stripes(images, options)
+    named = name_stripes(images, camera.covariance, options)
     if isinstance(named, FitFailure):
         return named
     for k, name in enumerate(named.names):
         failure = refuse_few_boards(name, sum(k in sheets for sheets in named.sheets))
         if failure is not None:
             return failure
-    observations = collect_observations(images, named, model)
+    observations = collect_observations(images, named)
     errors = CommonErrors(
         [board.sensor_from_board.covariance for board in boards], camera.covariance
     )

@@ -18,16 +18,28 @@ ROUNDS = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedSighting:
-    """A stripe with the (6, 6) covariance of its board's pose."""
+    """A stripe with the covariance of its board's pose (6, 6) and of the camera (9, 9)."""
 
     sighting: Sighting
     pose_covariance: FloatArray
+    camera_covariance: FloatArray
 
-    def height_covariance_mm2(self, normal: FloatArray) -> FloatArray:
-        """(2, 2) covariance of the two ends along ``normal``: board's pose and stripe noise."""
+    def own_covariance_mm2(self, normal: FloatArray) -> FloatArray:
+        """(2, 2) covariance of the ends along ``normal`` by the board's pose and stripe noise."""
         by_pose = np.einsum("i,eij->ej", normal, self.sighting.ends_by_pose)
         noise = np.diag(self.sighting.sigma_ends_mm**2)
         return np.asarray(by_pose @ self.pose_covariance @ by_pose.T + noise)
+
+    def by_camera(self, normal: FloatArray) -> FloatArray:
+        """(2, 9) derivative of the ends along ``normal`` by the camera."""
+        return np.asarray(np.einsum("i,eij->ej", normal, self.sighting.ends_by_camera))
+
+    def height_covariance_mm2(self, normal: FloatArray) -> FloatArray:
+        """(2, 2) covariance of the ends along ``normal``, the camera's error included."""
+        by_camera = self.by_camera(normal)
+        return np.asarray(
+            self.own_covariance_mm2(normal) + by_camera @ self.camera_covariance @ by_camera.T
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,10 +75,12 @@ def fit_common_plane(stripes: Sequence[PosedSighting]) -> CommonPlane | FitFailu
     for _ in range(ROUNDS):
         local = (ends - plane.point_mm) @ plane.axes.T
         design = np.stack([local[:, 0], local[:, 1], np.ones(len(ends))], axis=1)
-        covariance = np.zeros((len(ends), len(ends)))
+        # All boards share the camera's error, hence one full matrix.
+        by_camera = np.concatenate([s.by_camera(plane.normal) for s in stripes])
+        covariance = by_camera @ stripes[0].camera_covariance @ by_camera.T
         for k, stripe in enumerate(stripes):
             block = slice(2 * k, 2 * k + 2)
-            covariance[block, block] = stripe.height_covariance_mm2(plane.normal)
+            covariance[block, block] += stripe.own_covariance_mm2(plane.normal)
         weighted = np.linalg.solve(covariance, design)
         normal_matrix = design.T @ weighted
         step = np.linalg.solve(normal_matrix, weighted.T @ local[:, 2])

@@ -36,7 +36,9 @@ class NamedStripes:
     warnings: tuple[str, ...] = ()
 
 
-def name_stripes(images: Sequence[BoardImage], options: SheetOptions) -> NamedStripes | FitFailure:
+def name_stripes(
+    images: Sequence[BoardImage], camera_covariance: FloatArray, options: SheetOptions
+) -> NamedStripes | FitFailure:
     """Give every straight stripe to a sheet, without the operator where that is possible.
 
     The caller's word comes first (one laser an image). Otherwise stripes that belong together are
@@ -61,7 +63,7 @@ def name_stripes(images: Sequence[BoardImage], options: SheetOptions) -> NamedSt
             "show every line on the board in at least two placements, or switch on one laser "
             "an image and name it",
         )
-    return _by_coplanarity(images, names)
+    return _by_coplanarity(images, camera_covariance, names)
 
 
 def _count_sheets(
@@ -122,9 +124,14 @@ class _Candidate:
     degrees_of_freedom: int
 
 
-def _by_coplanarity(images: Sequence[BoardImage], names: tuple[str, ...]) -> NamedStripes:
+def _by_coplanarity(
+    images: Sequence[BoardImage], camera_covariance: FloatArray, names: tuple[str, ...]
+) -> NamedStripes:
     posed = [
-        [PosedSighting(s, image.data.sensor_from_board.covariance) for s in image.sightings]
+        [
+            PosedSighting(s, image.data.sensor_from_board.covariance, camera_covariance)
+            for s in image.sightings
+        ]
         for image in images
     ]
     n_sheets = len(names)

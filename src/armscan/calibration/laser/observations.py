@@ -9,10 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.laser.naming import NamedStripes
-from armscan.calibration.laser.ray_board import pose_by_camera
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 
 
@@ -105,9 +103,7 @@ class SheetObservations:
         )
 
 
-def collect_observations(
-    images: Sequence[BoardImage], named: NamedStripes, camera: CameraModel
-) -> SheetObservations:
+def collect_observations(images: Sequence[BoardImage], named: NamedStripes) -> SheetObservations:
     """Gather all named stripe points."""
     parts: list[tuple[int, IntArray, int]] = [
         (i, sighting.rows, sheet)
@@ -115,10 +111,6 @@ def collect_observations(
         for sighting, sheet in zip(image.sightings, sheets, strict=True)
         if sheet >= 0
     ]
-    follow = {
-        i: pose_by_camera(images[i].data.view, images[i].data.sensor_from_board.value, camera)
-        for i in {part[0] for part in parts}
-    }
     across = [
         np.einsum(
             "nij,nj->ni",
@@ -128,10 +120,7 @@ def collect_observations(
         for i, rows, _ in parts
     ]
     by_pose = [images[i].points.dpoint_dpose[rows] for i, rows, _ in parts]
-    by_camera = [
-        images[i].points.dpoint_dcamera[rows] + own @ follow[i]
-        for (i, rows, _), own in zip(parts, by_pose, strict=True)
-    ]
+    by_camera = [images[i].by_camera[rows] for i, rows, _ in parts]
     return SheetObservations(
         np.concatenate([np.full(len(rows), i) for i, rows, _ in parts]),
         np.concatenate([rows for _, rows, _ in parts]),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.ray_board import BoardPoints, meet_board
+from armscan.calibration.laser.ray_board import BoardPoints, meet_board, pose_by_camera
 from armscan.calibration.laser.result import BoardStripes, PointUse
 from armscan.calibration.laser.straight_stripes import find_straight_stripes
 from armscan.geometry.arrays import FloatArray, IntArray
@@ -27,6 +27,8 @@ class Sighting:
         (2, 3) ends of the fitted straight piece, Sensor frame.
     ends_by_pose
         (2, 3, 6) their derivative by the board's pose.
+    ends_by_camera
+        (2, 3, 9) their derivative by the camera, the board's pose following it.
     sigma_ends_mm
         (2,) standard deviation of the ends across the stripe by the stripe's noise alone.
     middle_px
@@ -38,6 +40,7 @@ class Sighting:
     rows: IntArray
     ends_mm: FloatArray
     ends_by_pose: FloatArray
+    ends_by_camera: FloatArray
     sigma_ends_mm: FloatArray
     middle_px: FloatArray
     direction_px: FloatArray
@@ -53,6 +56,8 @@ class BoardImage:
         What was given.
     points
         The points on the board.
+    by_camera
+        (N, 3, 9) their derivative by the camera, the board's pose following it.
     sigma_mm
         (N,) stripe noise across the stripe, in space.
     use
@@ -63,6 +68,7 @@ class BoardImage:
 
     data: BoardStripes
     points: BoardPoints
+    by_camera: FloatArray
     sigma_mm: FloatArray
     use: IntArray
     sightings: tuple[Sighting, ...]
@@ -72,6 +78,8 @@ def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions
     """Carry the stripe points of one image to its board and sort them into straight stripes."""
     profile, pose = data.profile, data.sensor_from_board.value
     points = meet_board(profile.points_px, pose, camera)
+    follow = pose_by_camera(data.view, pose, camera)
+    by_camera = points.dpoint_dcamera + points.dpoint_dpose @ follow
     across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
     sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
     on_board = (points.points_mm - pose.translation_mm) @ pose.rotation
@@ -95,12 +103,18 @@ def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions
     )
     for stripe in stripes:
         use[candidates[stripe.rows]] = PointUse.UNNAMED
-    sightings = [_sighting(data, points, sigma_mm, candidates[stripe.rows]) for stripe in stripes]
-    return BoardImage(data, points, sigma_mm, use, tuple(_across_image(sightings)))
+    sightings = [
+        _sighting(data, points, by_camera, sigma_mm, candidates[stripe.rows]) for stripe in stripes
+    ]
+    return BoardImage(data, points, by_camera, sigma_mm, use, tuple(_across_image(sightings)))
 
 
 def _sighting(
-    data: BoardStripes, points: BoardPoints, sigma_mm: FloatArray, rows: IntArray
+    data: BoardStripes,
+    points: BoardPoints,
+    by_camera: FloatArray,
+    sigma_mm: FloatArray,
+    rows: IntArray,
 ) -> Sighting:
     """Fit a straight line in space through the points and express it by its two ends."""
     here, weight = points.points_mm[rows], sigma_mm[rows] ** -2.0
@@ -117,6 +131,7 @@ def _sighting(
         rows,
         gain @ here,
         np.einsum("ek,kij->eij", gain, points.dpoint_dpose[rows]),
+        np.einsum("ek,kij->eij", gain, by_camera[rows]),
         np.sqrt(np.einsum("ei,ij,ej->e", at_ends, normal, at_ends)),
         0.5 * (q[0] + q[-1]),
         direction_px,

@@ -10,6 +10,7 @@ from numba import njit, types
 
 from armscan.kernels.arrays import (
     FLOATS_IN,
+    FLOATS_OUT,
     INTS_IN,
     TABLE_IN,
     TABLE_OUT,
@@ -17,24 +18,23 @@ from armscan.kernels.arrays import (
     Int64Array,
 )
 
-SHIFT, SLOPE, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(6)
+SHIFT, SLOPE, BEND, BEND_SIGMA, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 """Columns of a smoothing result."""
 LEAST_POINTS = 5
 
 
-@njit(types.UniTuple(types.float64, 3)(FLOATS_IN), cache=True, nogil=True)
-def solve_quadratic(moments: Float64Array) -> tuple[float, float, float]:
-    """Value and slope at 0 of a weighted parabola, and the variance of the value.
+@njit(types.boolean(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
+def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
+    """Fit a weighted parabola; False if it is not determined.
 
     Parameters
     ----------
     moments
         (8,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d.
 
-    Returns
-    -------
-    value, slope, variance
-        The variance is negative if the parabola is not determined.
+    solved
+        (5,) output: value, slope and second derivative at 0, then the variances of the value and of
+        the second derivative.
     """
     s0, s1, s2, s3, s4 = moments[0], moments[1], moments[2], moments[3], moments[4]
     c00 = s2 * s4 - s3 * s3
@@ -42,12 +42,18 @@ def solve_quadratic(moments: Float64Array) -> tuple[float, float, float]:
     c02 = s1 * s3 - s2 * s2
     determinant = s0 * c00 + s1 * c01 + s2 * c02
     if not determinant > 1e-9 * s0 * s2 * s4:
-        return 0.0, 0.0, -1.0
+        return False
     c11 = s0 * s4 - s2 * s2
     c12 = s1 * s2 - s0 * s3
     value = (c00 * moments[5] + c01 * moments[6] + c02 * moments[7]) / determinant
     slope = (c01 * moments[5] + c11 * moments[6] + c12 * moments[7]) / determinant
-    return value, slope, c00 / determinant
+    c22 = s0 * s2 - s1 * s1
+    solved[0] = value
+    solved[1] = slope
+    solved[2] = 2.0 * (c02 * moments[5] + c12 * moments[6] + c22 * moments[7]) / determinant
+    solved[3] = c00 / determinant
+    solved[4] = 4.0 * c22 / determinant
+    return True
 
 
 @njit(
@@ -91,13 +97,14 @@ def smooth_chains(
     confidence
         Half width of the confidence intervals in sigmas.
     result
-        (N, 6) output: shift along the normal, slope of the line against the tangent, sigma of the
-        shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
+        (N, 8) output: shift along the normal, slope of the line against the tangent, its second
+        derivative (curvature) and that one's sigma, sigma of the shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
         alone, and that prediction's sigma (0: there is none).
     """
     n = points.shape[0]
     moments = np.zeros(8)
     others = np.zeros(8)
+    solved = np.zeros(5)
     for i in range(n):
         nx = normals[i, 0]
         ny = normals[i, 1]
@@ -108,12 +115,9 @@ def smooth_chains(
         if is_used[i] != 0:
             moments[0] = own
             n_used = 1
-        result[i, SHIFT] = 0.0
-        result[i, SLOPE] = 0.0
+        for k in range(result.shape[1]):
+            result[i, k] = 0.0
         result[i, SIGMA] = sigma_px[i]
-        result[i, WINDOW] = 0.0
-        result[i, PREDICTED] = 0.0
-        result[i, PREDICTED_SIGMA] = 0.0
         lower = -1e9
         upper = 1e9
         down = i - 1
@@ -147,23 +151,24 @@ def smooth_chains(
                     up = j
             if n_used < LEAST_POINTS:
                 continue
-            value, slope, variance = solve_quadratic(moments)
-            if variance <= 0.0:
+            if not solve_quadratic(moments, solved):
                 continue
-            sigma = math.sqrt(variance * inflation[k])
+            value = solved[0]
+            sigma = math.sqrt(solved[3] * inflation[k])
             lower = max(lower, value - confidence * sigma)
             upper = min(upper, value + confidence * sigma)
             if lower > upper:
                 break
             result[i, SHIFT] = value
-            result[i, SLOPE] = slope
+            result[i, SLOPE] = solved[1]
+            result[i, BEND] = solved[2]
+            result[i, BEND_SIGMA] = math.sqrt(solved[4] * inflation[k])
             result[i, SIGMA] = sigma
             result[i, WINDOW] = reach
             for m in range(8):
                 others[m] = moments[m]
             if is_used[i] != 0:
                 others[0] -= own
-            value, _, variance = solve_quadratic(others)
-            if variance > 0.0 and n_used > LEAST_POINTS:
-                result[i, PREDICTED] = value
-                result[i, PREDICTED_SIGMA] = math.sqrt(variance * inflation[k])
+            if n_used > LEAST_POINTS and solve_quadratic(others, solved):
+                result[i, PREDICTED] = solved[0]
+                result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflation[k])

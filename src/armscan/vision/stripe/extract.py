@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.stripe_fit import AMPLITUDE, CENTRE, SIGMA, VARIANCE
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.kernels.stripe_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.vision.stripe.colour import colour_plane
@@ -25,13 +25,14 @@ from armscan.vision.stripe.plane import StripePlane, mono_plane
 from armscan.vision.stripe.profile_fit import ProfileFits, axis_component, fit_ridge
 from armscan.vision.stripe.ridge import (
     find_candidates,
-    find_line_sigma,
     is_bright,
     trace_ridges,
 )
-from armscan.vision.stripe.smoothing import smooth
+from armscan.vision.stripe.smoothing import curvature, smooth
+from armscan.vision.stripe.width import find_line_sigma
 
-LEAST_SIGMA_PX = 1e-4
+LEAST_SIGMA_PX = 0.002
+"""What pixel locking and the shape of the profile leave without any noise."""
 
 
 def extract_stripes(
@@ -113,6 +114,7 @@ def to_profile(
     flags[near] |= int(StripeFlag.NEIGHBOUR)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0
+    points = straighten(points, normals, sigma, usable, fits)
     smoothed = smooth(points, normals, sigma, chain, usable, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning
@@ -136,3 +138,28 @@ def fitted_centres(fits: ProfileFits) -> tuple[FloatArray, FloatArray, FloatArra
     points[np.arange(len(table)), 1 - axis] = fits.values[:, CENTRE]
     sigma = np.sqrt(fits.values[:, VARIANCE]) * axis_component(table)
     return points, table[:, 2:4].copy(), np.maximum(sigma, LEAST_SIGMA_PX)
+
+
+def straighten(
+    points: FloatArray,
+    normals: FloatArray,
+    sigma: FloatArray,
+    is_used: BoolArray,
+    fits: ProfileFits,
+) -> FloatArray:
+    """Take out the bias of a column or row that cuts a bent line at a slant.
+
+    With curvature k, and n and t the components of the normal and the tangent along the column, a
+    pixel d from the centre lies ``n d - k t^2 d^2 / 2`` from the line. To first order this adds the
+    term ``k t^2 s / (2 n) u^3`` to the relative profile in ``u = d / s``.
+    """
+    table = fits.ridge.table
+    rows = np.arange(len(table))
+    along = 1 - table[:, 5].astype(np.int64)
+    n = normals[rows, along]
+    spread = fits.values[:, SIGMA]
+    bend = curvature(points, normals, sigma, fits.ridge.chain, is_used)
+    cubic = bend * (1.0 - n * n) * spread / (2.0 * n)
+    corrected = points.copy()
+    corrected[rows, along] -= fits.values[:, BEND_GAIN] * spread * cubic
+    return corrected

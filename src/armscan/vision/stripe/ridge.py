@@ -16,10 +16,6 @@ from armscan.vision.stripe.chains import strong_median
 from armscan.vision.stripe.level import CELL_PX, ImageLevel
 
 LONGEST_RUN_PX = 90
-NARROW_PX, WIDE_PX = 2.0, 4.0
-"""Two scales whose responses tell a line's width."""
-WIDTH_SAMPLE = 600
-SIGMA_LIMITS_PX = (0.7, 9.0)
 HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
 
 
@@ -63,46 +59,6 @@ def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray
         if count <= capacity:
             return runs[:count]
         capacity = count
-
-
-def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
-    """Typical sigma of the lines from their second derivatives at two scales, in px.
-
-    A Gaussian line of sigma s seen at scale h has the second derivative
-    ``A s / (s^2 + h^2)^(3/2)``: the ratio at two scales gives s.
-    """
-    sample = np.ascontiguousarray(runs[:: max(len(runs) // WIDTH_SAMPLE, 1)])
-    found = []
-    for scale in (NARROW_PX, WIDE_PX):
-        points = np.zeros((len(sample), 6))
-        least = least_bend(level.rise, scale, scale)
-        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), least, points)
-        found.append(points[:n])
-    narrow, wide = found
-    if not len(narrow) or not len(wide):
-        return NARROW_PX
-    pairs = _pair(narrow, wide)
-    if not len(pairs):
-        return NARROW_PX
-    ratio = np.maximum(pairs[:, 0] / pairs[:, 1], 1.02) ** (2.0 / 3.0)
-    square = (WIDE_PX**2 - ratio * NARROW_PX**2) / (ratio - 1.0)
-    bright = pairs[:, 1] >= np.median(pairs[:, 1])
-    sigma = float(np.sqrt(max(np.median(square[bright]), 0.0)))
-    return float(np.clip(sigma, *SIGMA_LIMITS_PX))
-
-
-def _pair(narrow: FloatArray, wide: FloatArray) -> FloatArray:
-    """Second derivatives (K, 2) of the points that both scales found on the same pixel line."""
-    keys = [
-        {(int(p[5]), int(p[int(p[5])])): p for p in points} for points in (narrow, wide)
-    ]
-    both = keys[0].keys() & keys[1].keys()
-    pairs = [
-        (keys[0][k][4], keys[1][k][4])
-        for k in sorted(both)
-        if np.hypot(*(keys[0][k][:2] - keys[1][k][:2])) < WIDE_PX
-    ]
-    return np.array(pairs).reshape(-1, 2)
 
 
 def least_bend(height: float, sigma_px: float, scale_px: float) -> float:

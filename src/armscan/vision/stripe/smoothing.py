@@ -6,9 +6,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.stripe_smooth import (
+    BEND,
+    BEND_SIGMA,
     PREDICTED,
     PREDICTED_SIGMA,
     SHIFT,
@@ -20,10 +23,14 @@ from armscan.kernels.stripe_smooth import (
 SMALLEST_WINDOW_PX = 3.0
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
-LAGS = 8
+LAGS = 6
+RESULT_COLUMNS = 8
+SIGNIFICANT_CORRELATION = 2.5
+BEND_WINDOWS_PX = np.array([7.5, 12.0, 19.0, 30.0])
 LEAST_PAIRS = 200
 OUTLIER_SIGMAS = 6.0
-NO_LIMIT = 1e6
+RESIDUAL_WIDENING = 1.5
+"""A wider parabola takes less of the noise with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +89,7 @@ def smooth(
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     used = is_used.astype(np.int64)
-    rough = np.zeros((len(points), 6))
+    rough = np.zeros((len(points), RESULT_COLUMNS))
     ones = np.ones(len(half))
     smooth_chains(points, normals, sigma, used, chain, half, ones, CONFIDENCE, rough)
     spread = np.hypot(rough[:, PREDICTED_SIGMA], sigma)
@@ -94,7 +101,7 @@ def smooth(
     if largest_px <= 0.0:
         return SmoothedCentres(points, normals, sigma, is_outlier)
     inflation = np.array([_inflation(correlation, h) for h in half])
-    result = np.zeros((len(points), 6))
+    result = np.zeros((len(points), RESULT_COLUMNS))
     smooth_chains(
         points, normals, sigma, is_used.astype(np.int64), chain, half, inflation, CONFIDENCE, result
     )
@@ -108,6 +115,28 @@ def smooth(
         np.where(is_used, result[:, SIGMA], sigma),
         is_outlier,
     )
+
+
+def curvature(
+    points: FloatArray,
+    normals: FloatArray,
+    sigma: FloatArray,
+    chain: IntArray,
+    is_used: BoolArray,
+) -> FloatArray:
+    """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
+
+    Shrunk towards zero by its own noise, so that straight lines are not disturbed.
+    """
+    result = np.zeros((len(points), RESULT_COLUMNS))
+    used = is_used.astype(np.int64)
+    ones = np.ones(len(BEND_WINDOWS_PX))
+    smooth_chains(
+        points, normals, sigma, used, chain, BEND_WINDOWS_PX, ones, CONFIDENCE, result
+    )
+    square = result[:, BEND] ** 2
+    noise = result[:, BEND_SIGMA] ** 2
+    return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
 
 
 def _scale(score: FloatArray) -> float:
@@ -143,10 +172,11 @@ def noise_correlation(
 
     Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
     it, the measured covariances are a known linear mixture of the true ones, which is inverted.
+    Without a significant correlation of nearest neighbours the noise is taken as white.
     """
     white = np.zeros(LAGS)
     white[0] = 1.0
-    half = max(int(half_px), 4)
+    half = max(int(RESIDUAL_WIDENING * half_px), 4)
     residual = _filter_residuals(points, normals, sigma, chain, is_used, half)
     if residual is None:
         return white
@@ -169,7 +199,12 @@ def noise_correlation(
                 at = middle + lag - signed
                 if 0 <= at < len(spread):
                     mixture[lag, m] += spread[at]
-    solved = np.linalg.lstsq(mixture, measured, rcond=1e-3)[0]
+    scale = max(measured[0] / mixture[0, 0], 0.05)
+    surplus = measured[1:] - scale * mixture[1:, 0]
+    limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
+    if (surplus[:2] < limit).all():
+        return scale * white
+    solved, _ = nnls(mixture, measured)
     solved[0] = max(solved[0], 0.05)
     return np.asarray(solved)
 

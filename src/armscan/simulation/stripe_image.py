@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stripe images whose true centre line is known exactly, with the noise of laser and camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.records.exposure import Exposure
+from armscan.records.sensor_window import SensorWindow
+from armscan.simulation.stripe_curves import Curve
+
+REACH_SIGMAS = 6.0
+GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
+UNIT = 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedStripe:
+    """One laser line.
+
+    Parameters
+    ----------
+    curve
+        Its true centre line.
+    sigma_px
+        Sigma of the Gaussian cross-section (eq. 2.40).
+    peak
+        Grey level of the crest above the background; full scale is 255.
+    modulation, modulation_px
+        Share and period of a sinusoidal change of the peak along the line.
+    skew
+        Third-order part of the cross-section: the Gaussian is multiplied by 1 + skew (u^3 - 3 u) / 6.
+    reflectance_gradient
+        Relative change of reflectance per sigma across the line.
+    """
+
+    curve: Curve
+    sigma_px: float = 3.0
+    peak: float = 150.0
+    modulation: float = 0.0
+    modulation_px: float = 400.0
+    skew: float = 0.0
+    reflectance_gradient: float = 0.0
+
+    def profile(self, points_px: FloatArray) -> FloatArray:
+        """Irradiance (N,) at points (N, 2)."""
+        distance, along = self.curve.locate(points_px)
+        u = distance / self.sigma_px
+        peak = self.peak * (
+            1.0 + self.modulation * np.sin(2.0 * np.pi * along / self.modulation_px)
+        )
+        shape = np.exp(-0.5 * u * u) * (1.0 + self.skew * (u**3 - 3.0 * u) / 6.0)
+        lit = shape * np.maximum(1.0 + self.reflectance_gradient * u, 0.0)
+        return np.asarray(peak * np.maximum(lit, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class StripeNoise:
+    """Noise of laser and camera, for grey levels with full scale 255.
+
+    Parameters
+    ----------
+    speckle
+        Contrast of the speckle: standard deviation over mean of the stripe's own light.
+    grain_px
+        Sigma of the speckle's grains; 0 makes it independent from pixel to pixel.
+    electrons_per_level
+        Photo-electrons per grey level, for the shot noise.
+    read
+        Read noise in grey levels.
+    """
+
+    speckle: float = 0.2
+    grain_px: float = 0.0
+    electrons_per_level: float = 10.0
+    read: float = 1.0
+
+
+NO_NOISE = StripeNoise(speckle=0.0, electrons_per_level=1e12, read=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class StripeScene:
+    """A camera's view of lines on a surface.
+
+    Parameters
+    ----------
+    stripes
+        The lines.
+    width_px, height_px
+        Size of the image.
+    background
+        Grey level beside the lines, full scale 255.
+    background_step
+        Added on the positive side of the first line's centre.
+    noise
+        Noise model.
+    bits
+        Bits of the camera, 8 to 16.
+    window
+        Position of the image on the sensor; curves are in image pixels.
+    """
+
+    stripes: tuple[SimulatedStripe, ...]
+    width_px: int = 400
+    height_px: int = 300
+    background: float = 4.0
+    background_step: float = 0.0
+    noise: StripeNoise = StripeNoise()
+    bits: int = 8
+    window: SensorWindow = SensorWindow()
+
+    def __post_init__(self) -> None:
+        if not 8 <= self.bits <= 16 or min(self.width_px, self.height_px) < 1:
+            raise InputError(
+                f"a camera of {self.width_px} x {self.height_px} px and {self.bits} bits",
+                remedy="give at least one pixel and 8 to 16 bits",
+            )
+
+    def irradiance(self) -> tuple[FloatArray, FloatArray]:
+        """Noise-free light (H, W) of the lines and of the background, averaged over each pixel."""
+        y, x = np.mgrid[: self.height_px, : self.width_px]
+        centres = np.stack([x.ravel(), y.ravel()], axis=1).astype(np.float64)
+        light = np.zeros(len(centres))
+        for stripe in self.stripes:
+            distance, _ = stripe.curve.locate(centres)
+            near = np.flatnonzero(np.abs(distance) < REACH_SIGMAS * stripe.sigma_px + 1.0)
+            light[near] += _pixel_mean(stripe, centres[near])
+        base = np.full(len(centres), self.background)
+        if self.background_step and self.stripes:
+            distance, _ = self.stripes[0].curve.locate(centres)
+            base += self.background_step * np.clip(distance + 0.5, 0.0, 1.0)
+        shape = (self.height_px, self.width_px)
+        return light.reshape(shape), base.reshape(shape)
+
+    def expose(self, seed: int, source: str = "simulated") -> Exposure:
+        """Take one grey exposure with noise from ``seed``."""
+        rng = np.random.default_rng(seed)
+        light, base = self.irradiance()
+        levels = _camera(light * _speckle(light.shape, self.noise, rng) + base, self.noise, rng)
+        return Exposure(self._digitise(levels), source, bits_used=self.bits, window=self.window)
+
+    def expose_red(
+        self, seed: int, overdrive: float, halo: float = 0.15, source: str = "simulated"
+    ) -> Exposure:
+        """Take one colour exposure of a red laser.
+
+        Parameters
+        ----------
+        seed
+            Seed of the noise.
+        overdrive
+            Factor on the red channel; its core saturates where the product exceeds 255.
+        halo
+            Share of the red light that is scattered into a halo three sigmas wide.
+        source
+            Name of the exposure.
+        """
+        rng = np.random.default_rng(seed)
+        light, base = self.irradiance()
+        light = light * _speckle(light.shape, self.noise, rng)
+        spread = 3.0 * max((s.sigma_px for s in self.stripes), default=1.0)
+        red = overdrive * (light + halo * 3.0 * gaussian_filter(light, spread))
+        planes = [_camera(c + base, self.noise, rng) for c in (red, 0.35 * light, 0.5 * light)]
+        image = self._digitise(np.stack(planes, axis=2))
+        return Exposure(image, source, bits_used=self.bits, window=self.window)
+
+    def _digitise(self, levels: FloatArray) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        full = (1 << self.bits) - 1
+        counts = np.clip(np.rint(levels * (full / UNIT)), 0, full)
+        return counts.astype(np.uint8) if self.bits == 8 else counts.astype(np.uint16)
+
+    def errors(self, points_px: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Compare found points with the truth.
+
+        Parameters
+        ----------
+        points_px
+            (N, 2) full-sensor pixels.
+
+        Returns
+        -------
+        distance_px
+            (N,) signed distance to the nearest centre line.
+        stripe
+            (N,) index of that line.
+        along_px
+            (N,) position of the foot along it.
+        """
+        points = self.window.to_image(points_px)
+        found = [stripe.curve.locate(points) for stripe in self.stripes]
+        distance = np.stack([f[0] for f in found])
+        stripe = np.argmin(np.abs(distance), axis=0)
+        rows = np.arange(len(points))
+        return distance[stripe, rows], stripe, np.stack([f[1] for f in found])[stripe, rows]
+
+
+def _pixel_mean(stripe: SimulatedStripe, centres: FloatArray) -> FloatArray:
+    total = np.zeros(len(centres))
+    for u, a in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+        for v, b in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
+            total += 0.25 * a * b * stripe.profile(centres + [0.5 * u, 0.5 * v])
+    return total
+
+
+def _speckle(shape: tuple[int, ...], noise: StripeNoise, rng: np.random.Generator) -> FloatArray:
+    if noise.speckle == 0.0:
+        return np.ones(shape)
+    if noise.grain_px == 0.0:
+        share = noise.speckle**-2
+        return rng.gamma(share, 1.0 / share, shape)
+    field = gaussian_filter(rng.standard_normal(shape), noise.grain_px)
+    variance = np.log1p(noise.speckle**2)
+    return np.asarray(np.exp(field / field.std() * np.sqrt(variance) - 0.5 * variance))
+
+
+def _camera(light: FloatArray, noise: StripeNoise, rng: np.random.Generator) -> FloatArray:
+    shot = np.sqrt(np.maximum(light, 0.0) / noise.electrons_per_level)
+    total = light + shot * rng.standard_normal(light.shape)
+    return np.asarray(total + noise.read * rng.standard_normal(light.shape))

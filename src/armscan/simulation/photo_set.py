@@ -76,7 +76,7 @@ def render_photo_set(
 
     Raises
     ------
-    InputError
+    OutputError
         If the folder cannot be written.
     """
     settings = PhotoSetOptions() if options is None else options

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from armscan.errors import InputError
+from armscan.errors import OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Board, Sensor
 from armscan.geometry.poses import Pose
@@ -71,13 +71,17 @@ class PhotoSetTruth:
         """Signed distance (N,) of points (N, 3) from the object's true surface."""
         return self.body.distance_mm(np.asarray(points_sensor_mm, dtype=np.float64))
 
+    def object_normals(self, points_sensor_mm: FloatArray) -> FloatArray:
+        """(N, 3) unit normals of the object's true surface next to points (N, 3)."""
+        return self.body.normals(np.asarray(points_sensor_mm, dtype=np.float64))
+
 
 def write_truth(path: Path, truth: PhotoSetTruth) -> None:
     """Write the truth as JSON, whole or not at all.
 
     Raises
     ------
-    InputError
+    OutputError
         If the file cannot be written.
     """
     write_whole(path, json.dumps(_document(truth), indent=1).encode())
@@ -88,7 +92,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
     Raises
     ------
-    InputError
+    OutputError
         If the folder or the file cannot be written.
     """
     partial = path.with_name(path.name + ".partial")
@@ -97,7 +101,7 @@ def write_whole(path: Path, content: bytes) -> None:
         partial.write_bytes(content)
         partial.replace(path)
     except OSError as error:
-        raise InputError(
+        raise OutputError(
             f"cannot write: {error.strerror or error}",
             where=str(path),
             remedy="choose a folder that can be written",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from armscan.devices.registry import load_driver
-from armscan.errors import InputError
+from armscan.errors import InputError, OutputError
 from armscan.simulation.bench import BOARD
 from armscan.simulation.photo_set import PhotoSetOptions, render_photo_set
 from armscan.simulation.photo_truth import PhotoSetTruth
@@ -121,7 +121,7 @@ def test_a_seed_repeats_every_byte_and_another_changes_the_photos(
 def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     blocker = tmp_path / "file"
     blocker.write_text("")
-    with pytest.raises(InputError, match=r"file.*choose a folder that can be written"):
+    with pytest.raises(OutputError, match=r"file.*choose a folder that can be written"):
         render_photo_set(blocker, options=SMALL)
 
 

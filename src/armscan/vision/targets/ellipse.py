@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ellipses through edge points, many at once, with the covariance of each conic.
+
+A conic is a symmetric matrix Q with ``[u v 1] Q [u v 1]' = 0``. Each ellipse is fitted in its own
+coordinates, shifted to ``origin`` and divided by ``scale``, where the conic's last element is -1;
+this cannot fail for an ellipse, because the origin lies inside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.geometry.arrays import BoolArray, FloatArray
+
+_STEPS = 12
+_TERMS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ellipses:
+    """N fitted ellipses.
+
+    Parameters
+    ----------
+    origin_px
+        (N, 2) origin of each ellipse's own coordinates.
+    scale_px
+        (N,) unit of each ellipse's own coordinates.
+    terms
+        (N, 5) elements 11, 12, 22, 13, 23 of Q in own coordinates; element 33 is -1.
+    covariance
+        (N, 5, 5) covariance of ``terms`` for the sigmas given, not scaled by ``chi2``.
+    chi2
+        (N,) sum of squared distances over sigma.
+    degrees_of_freedom
+        (N,) edge points minus 5.
+    """
+
+    origin_px: FloatArray
+    scale_px: FloatArray
+    terms: FloatArray
+    covariance: FloatArray
+    chi2: FloatArray
+    degrees_of_freedom: FloatArray
+
+    @property
+    def matrices(self) -> FloatArray:
+        """(N, 3, 3) conics in own coordinates."""
+        return _matrices(self.terms)
+
+    @property
+    def is_ellipse(self) -> BoolArray:
+        """(N,) True where the conic is a real ellipse."""
+        q = self.terms
+        return np.asarray((q[:, 0] * q[:, 2] - q[:, 1] ** 2 > 0.0) & (q[:, 0] > 0.0))
+
+    def pole(self, lines_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the poles of lines and their covariance.
+
+        The pole of the line at infinity (0, 0, 1) is the ellipse's centre; the pole of the
+        vanishing line of a circle's plane is the image of the circle's centre.
+
+        Parameters
+        ----------
+        lines_px
+            (3,) or (N, 3) lines ``l . [u v 1] = 0``.
+
+        Returns
+        -------
+        poles_px
+            (N, 2) points ``Q^-1 l``.
+        covariance_px2
+            (N, 2, 2), the line taken as known.
+        """
+        own = self._own_lines(np.broadcast_to(lines_px, (len(self.terms), 3)))
+        inverse = np.linalg.inv(self.matrices)
+        pole = np.einsum("nij,nj->ni", inverse, own)
+        dpole = np.zeros((len(own), 3, 5))
+        for k, (i, j) in enumerate(_TERMS):
+            derivative = np.zeros((3, 3))
+            derivative[i, j] = derivative[j, i] = 1.0
+            dpole[:, :, k] = -np.einsum("nij,jk,nk->ni", inverse, derivative, pole)
+        xy = pole[:, :2] / pole[:, 2:]
+        dxy = (dpole[:, :2] - xy[:, :, None] * dpole[:, 2:]) / pole[:, 2:, None]
+        covariance = dxy @ self.covariance @ dxy.transpose(0, 2, 1)
+        scale = self.scale_px
+        return self.origin_px + scale[:, None] * xy, covariance * (scale**2)[:, None, None]
+
+    def centres(self) -> tuple[FloatArray, FloatArray]:
+        """(N, 2) centres and their (N, 2, 2) covariance, px."""
+        return self.pole(np.array([0.0, 0.0, 1.0]))
+
+    def axes(self) -> tuple[FloatArray, FloatArray]:
+        """Half axes (N, 2), px, the shorter one first, and their directions (N, 2, 2), columns."""
+        q = self.terms
+        square = np.stack([q[:, [0, 1]], q[:, [1, 2]]], axis=1)
+        linear = q[:, 3:5]
+        offset = np.einsum("ni,nij,nj->n", linear, np.linalg.inv(square), linear)
+        eigenvalues, directions = np.linalg.eigh(square)
+        half = np.sqrt((1.0 + offset)[:, None] / eigenvalues) * self.scale_px[:, None]
+        return half[:, ::-1], directions[:, :, ::-1]
+
+    def _own_lines(self, lines_px: FloatArray) -> FloatArray:
+        own = lines_px.copy()
+        own[:, 2] += (lines_px[:, :2] * self.origin_px).sum(axis=1)
+        own[:, :2] *= self.scale_px[:, None]
+        return own
+
+
+def fit_ellipses(points_px: FloatArray, weights_per_px2: FloatArray) -> Ellipses:
+    """Fit ellipses to edge points by minimising the weighted Sampson distance.
+
+    Parameters
+    ----------
+    points_px
+        (N, K, 2) edge points.
+    weights_per_px2
+        (N, K) inverse variance along the edge's normal; 0 leaves a point out.
+
+    Returns
+    -------
+    The fits. Fewer than 5 points give a covariance that is meaningless: check
+    ``degrees_of_freedom``.
+    """
+    has_weight = weights_per_px2 > 0.0
+    count = np.maximum(has_weight.sum(axis=1), 1)
+    used = np.where(has_weight[:, :, None], points_px, 0.0)
+    origin = used.sum(axis=1) / count[:, None]
+    offset = np.where(has_weight[:, :, None], points_px - origin[:, None], 0.0)
+    scale = np.sqrt(np.maximum((offset**2).sum(axis=(1, 2)) / count, 1e-12))
+    own = offset / scale[:, None, None]
+    weights = weights_per_px2 * (scale**2)[:, None]
+    terms = _algebraic(own, has_weight)
+    for _ in range(_STEPS):
+        distance, jacobian = _sampson(own, terms)
+        weighted = jacobian * weights[:, :, None]
+        normal = weighted.transpose(0, 2, 1) @ jacobian
+        rhs = np.einsum("nki,nk->ni", weighted, distance)
+        step = np.einsum("nij,nj->ni", _inverse(normal), rhs)
+        terms = terms - step
+        if float(np.abs(step).max(initial=0.0)) < 1e-10:
+            break
+    distance, jacobian = _sampson(own, terms)
+    normal = (jacobian * weights[:, :, None]).transpose(0, 2, 1) @ jacobian
+    chi2 = (weights * distance**2).sum(axis=1)
+    return Ellipses(origin, scale, terms, _inverse(normal), chi2, has_weight.sum(axis=1) - 5.0)
+
+
+def _algebraic(own: FloatArray, has_weight: BoolArray) -> FloatArray:
+    x, y = own[..., 0], own[..., 1]
+    design = np.stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y], axis=-1)
+    design *= has_weight[:, :, None]
+    normal = design.transpose(0, 2, 1) @ design
+    return np.einsum("nij,nj->ni", _inverse(normal), design.sum(axis=1))
+
+
+def _sampson(own: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Signed first-order distance (N, K) to the conic, own units, and its derivative (N, K, 5)."""
+    x, y = own[..., 0], own[..., 1]
+    a, b, c, d, e = (terms[:, k : k + 1] for k in range(5))
+    value = a * x * x + 2.0 * b * x * y + c * y * y + 2.0 * (d * x + e * y) - 1.0
+    gradient_x = a * x + b * y + d
+    gradient_y = b * x + c * y + e
+    norm = np.maximum(np.hypot(gradient_x, gradient_y), 1e-9)
+    distance = 0.5 * value / norm
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    dvalue = np.stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y], axis=-1)
+    dgx = np.stack([x, y, zero, one, zero], axis=-1)
+    dgy = np.stack([zero, x, y, zero, one], axis=-1)
+    along = gradient_x[..., None] * dgx + gradient_y[..., None] * dgy
+    jacobian = 0.5 * dvalue / norm[..., None] - (distance / norm**2)[..., None] * along
+    return distance, jacobian
+
+
+def _matrices(terms: FloatArray) -> FloatArray:
+    matrices = np.full((len(terms), 3, 3), -1.0)
+    for k, (i, j) in enumerate(_TERMS):
+        matrices[:, i, j] = matrices[:, j, i] = terms[:, k]
+    return matrices
+
+
+def _inverse(normal: FloatArray) -> FloatArray:
+    """Inverse of (N, 5, 5) matrices; a tiny ridge keeps degenerate ones finite."""
+    trace = np.trace(normal, axis1=1, axis2=2)
+    ridge = (1e-13 * trace + 1e-300)[:, None, None] * np.eye(5)
+    return np.asarray(np.linalg.inv(normal + ridge))

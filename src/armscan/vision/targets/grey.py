@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Grey images in which a target may show, the likeliest first."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.geometry.arrays import FloatArray, ImageArray
+from armscan.records.exposure import Exposure
+
+SAME_CHANNEL_LEVELS = 1.5
+"""Channels whose mean difference is below this (8-bit levels) show the same."""
+_WEIGHTS = np.array([0.299, 0.587, 0.114])
+_SAMPLES_PER_CUBE = 65_536
+
+Grey8 = NDArray[np.uint8]
+RawGrey = ImageArray | FloatArray
+
+
+def grey_channels(exposure: Exposure) -> list[RawGrey]:
+    """Return the grey images (H, W) worth a search, raw levels, without near duplicates.
+
+    A monochrome exposure has one. A colour exposure has its luminance, then red, green and blue
+    (a board lit by a red laser shows in red only), then the darkest and the brightest channel.
+    """
+    if exposure.colour == "mono":
+        return [exposure.image]
+    image = exposure.image
+    luminance: FloatArray = image @ _WEIGHTS
+    channels: list[RawGrey] = [luminance]
+    others = [image[..., 0], image[..., 1], image[..., 2], image.min(axis=2), image.max(axis=2)]
+    step = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _SAMPLES_PER_CUBE)))
+    limit = SAME_CHANNEL_LEVELS * exposure.full_scale / 255.0
+    for other in others:
+        differences = [
+            np.abs(other[::step, ::step] - known[::step, ::step].astype(np.float64)).mean()
+            for known in channels
+        ]
+        if min(differences) > limit:
+            channels.append(np.ascontiguousarray(other))
+    return channels
+
+
+def to_grey8(grey: RawGrey, full_scale: int) -> Grey8:
+    """Return an 8-bit copy for OpenCV's finders.
+
+    Up to 8 significant bits the levels are kept. Deeper images are scaled so that their brightest
+    0.1 % reach 255, because a dark board would lose its grey levels otherwise.
+    """
+    if full_scale <= 255 and grey.dtype == np.uint8:
+        return np.ascontiguousarray(grey, dtype=np.uint8)
+    if full_scale <= 255:
+        return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    top = max(float(np.percentile(grey[::4, ::4], 99.9)), full_scale / 64.0)
+    return np.clip(np.rint(grey * (255.0 / top)), 0, 255).astype(np.uint8)
+
+
+def reduced(grey8: Grey8, size_px: int) -> tuple[Grey8, float]:
+    """Reduce an image to at most ``size_px``; returns it and the factor back to full size."""
+    factor = max(grey8.shape) / size_px
+    if factor <= 1.0:
+        return grey8, 1.0
+    size = (round(grey8.shape[1] / factor), round(grey8.shape[0] / factor))
+    small = cv2.resize(grey8, size, interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8), grey8.shape[1] / size[0]
+
+
+def sample(grey: RawGrey, points_px: FloatArray) -> FloatArray:
+    """Return the levels (N,) at the pixels nearest to (N, 2) points; NaN outside the image."""
+    u = np.rint(points_px[:, 0])
+    v = np.rint(points_px[:, 1])
+    height, width = grey.shape[:2]
+    is_inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    levels = np.full(len(points_px), np.nan)
+    levels[is_inside] = grey[v[is_inside].astype(np.int64), u[is_inside].astype(np.int64)]
+    return levels

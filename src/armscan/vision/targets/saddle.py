@@ -1,0 +1,214 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chessboard corners by least squares on raw pixels, with their covariance.
+
+Near a corner the image is the product of two blurred edges that cross,
+
+``I = m + g . (q - q0) + c erf(d1 / (sqrt 2 s)) erf(d2 / (sqrt 2 s))``, ``dk = nk . (q - q0)``,
+
+so the corner q0, the two edge directions, the blur s, contrast and a linear illumination follow
+from one fit. White pixel noise then gives the covariance of q0 without further assumption.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import erf
+
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.vision.targets.grey import RawGrey
+
+WINDOW_FRACTION = 0.42
+"""Radius of the window, as a fraction of the way to the nearest other edge."""
+MAX_WINDOW_PX = 18
+MIN_WINDOW_PX = 3
+APERTURE_SIGMA_PX = 0.29
+"""Standard deviation of a pixel's own width, 1 / sqrt(12): no edge is sharper."""
+_STEPS = 15
+_OUTLIER_SIGMAS = 4.0
+_PARAMETERS = 9
+
+
+def fit_saddles(
+    grey: RawGrey, corners_px: FloatArray, step_x_px: FloatArray, step_y_px: FloatArray
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Refine chessboard corners.
+
+    Parameters
+    ----------
+    grey
+        (H, W) image, raw levels.
+    corners_px
+        (N, 2) corners to about 2 px, image pixels.
+    step_x_px, step_y_px
+        (N, 2) way to the next corner along the board's x and y.
+
+    Returns
+    -------
+    corners_px
+        (N, 2) refined corners.
+    covariance_px2
+        (N, 2, 2) covariance from the pixel noise that the fit's residuals show.
+    is_good
+        (N,) False where the fit left its window or found no crossing of two edges.
+    """
+    radius = _window_radius(step_x_px, step_y_px)
+    origin = np.rint(corners_px)
+    levels, offsets, weights = _windows(grey, origin, radius)
+    parameters = _initial(levels, offsets, weights, corners_px - origin, step_x_px, step_y_px)
+    parameters = _iterate(levels, offsets, weights, parameters)
+    weights = _without_outliers(_model(levels, offsets, parameters)[0], weights)
+    parameters = _iterate(levels, offsets, weights, parameters)
+    residuals, jacobian = _model(levels, offsets, parameters)
+    variance = _variance(residuals, weights)
+    normal = np.einsum("nki,nk,nkj->nij", jacobian, weights, jacobian)
+    covariance = _inverse(normal)[:, :2, :2] * variance[:, None, None]
+    moved = np.hypot(*(parameters[:, :2] - (corners_px - origin)).T)
+    spread = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    is_good = (moved < 0.6 * radius) & (spread < 0.25 * radius) & np.isfinite(spread)
+    is_good &= parameters[:, 4] < radius
+    is_good &= parameters[:, 6] * _initial_contrast(levels, offsets, step_x_px, step_y_px) > 0.0
+    return origin + parameters[:, :2], covariance, is_good
+
+
+def _window_radius(step_x_px: FloatArray, step_y_px: FloatArray) -> FloatArray:
+    area = np.abs(step_x_px[:, 0] * step_y_px[:, 1] - step_x_px[:, 1] * step_y_px[:, 0])
+    longest = np.maximum(np.hypot(*step_x_px.T), np.hypot(*step_y_px.T))
+    return np.clip(WINDOW_FRACTION * area / longest, MIN_WINDOW_PX, MAX_WINDOW_PX)
+
+
+def _windows(
+    grey: RawGrey, origin: FloatArray, radius: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Levels (N, K), pixel offsets (K, 2) and weights (N, K) of the discs around the origins."""
+    reach = int(np.ceil(radius.max()))
+    v, u = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    offsets = np.stack([u.ravel(), v.ravel()], axis=-1).astype(np.float64)
+    height, width = grey.shape[:2]
+    at_u = (origin[:, :1] + offsets[:, 0]).astype(np.int64)
+    at_v = (origin[:, 1:] + offsets[:, 1]).astype(np.int64)
+    is_inside = (at_u >= 0) & (at_v >= 0) & (at_u < width) & (at_v < height)
+    levels = grey[np.clip(at_v, 0, height - 1), np.clip(at_u, 0, width - 1)].astype(np.float64)
+    is_near = np.hypot(offsets[:, 0], offsets[:, 1]) <= radius[:, None]
+    return levels, offsets, (is_inside & is_near).astype(np.float64)
+
+
+def _initial(
+    levels: FloatArray,
+    offsets: FloatArray,
+    weights: FloatArray,
+    start: FloatArray,
+    step_x_px: FloatArray,
+    step_y_px: FloatArray,
+) -> FloatArray:
+    """Start (N, 9): corner, two normals' angles, blur, mean, contrast, gradient."""
+    parameters = np.zeros((len(levels), _PARAMETERS))
+    parameters[:, :2] = start
+    parameters[:, 2] = np.arctan2(step_y_px[:, 0], -step_y_px[:, 1])
+    parameters[:, 3] = np.arctan2(step_x_px[:, 0], -step_x_px[:, 1])
+    parameters[:, 4] = 1.0
+    parameters[:, 5] = (levels * weights).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)
+    edges = _edges(offsets, parameters)
+    product = edges[0] * edges[1] * weights
+    scale = np.maximum((product * product).sum(axis=1), 1e-9)
+    centred = levels - parameters[:, 5:6]
+    parameters[:, 6] = (product * centred).sum(axis=1) / scale
+    return parameters
+
+
+def _initial_contrast(
+    levels: FloatArray, offsets: FloatArray, step_x_px: FloatArray, step_y_px: FloatArray
+) -> FloatArray:
+    """Signed contrast (N,) of the quadrants between the steps' directions."""
+    normal_x = np.stack([-step_y_px[:, 1], step_y_px[:, 0]], axis=-1)
+    normal_y = np.stack([-step_x_px[:, 1], step_x_px[:, 0]], axis=-1)
+    sign = np.sign(normal_x @ offsets.T) * np.sign(normal_y @ offsets.T)
+    return np.asarray((sign * levels).sum(axis=1))
+
+
+def _edges(offsets: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    scale = np.sqrt(2.0) * parameters[:, 4:5]
+    du = offsets[:, 0] - parameters[:, :1]
+    dv = offsets[:, 1] - parameters[:, 1:2]
+    first = np.cos(parameters[:, 2:3]) * du + np.sin(parameters[:, 2:3]) * dv
+    second = np.cos(parameters[:, 3:4]) * du + np.sin(parameters[:, 3:4]) * dv
+    return np.asarray(erf(first / scale)), np.asarray(erf(second / scale))
+
+
+def _model(
+    levels: FloatArray, offsets: FloatArray, parameters: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (N, K), measured minus model, and the model's Jacobian (N, K, 9)."""
+    s, m, c = (parameters[:, k : k + 1] for k in (4, 5, 6))
+    gradient_u, gradient_v = parameters[:, 7:8], parameters[:, 8:9]
+    du = offsets[:, 0] - parameters[:, :1]
+    dv = offsets[:, 1] - parameters[:, 1:2]
+    jacobian = np.zeros((*levels.shape, _PARAMETERS))
+    edges, slopes = [], []
+    for angle in (parameters[:, 2:3], parameters[:, 3:4]):
+        d = np.cos(angle) * du + np.sin(angle) * dv
+        edges.append(erf(d / (np.sqrt(2.0) * s)))
+        slopes.append(np.sqrt(2.0 / np.pi) / s * np.exp(-0.5 * (d / s) ** 2))
+    for k, angle in enumerate((parameters[:, 2:3], parameters[:, 3:4])):
+        slope = c * slopes[k] * edges[1 - k]
+        d = np.cos(angle) * du + np.sin(angle) * dv
+        jacobian[..., 0] -= slope * np.cos(angle)
+        jacobian[..., 1] -= slope * np.sin(angle)
+        jacobian[..., 2 + k] = slope * (np.cos(angle) * dv - np.sin(angle) * du)
+        jacobian[..., 4] -= slope * d / s
+    jacobian[..., 0] -= gradient_u
+    jacobian[..., 1] -= gradient_v
+    jacobian[..., 5] = 1.0
+    jacobian[..., 6] = edges[0] * edges[1]
+    jacobian[..., 7] = du
+    jacobian[..., 8] = dv
+    model = m + c * edges[0] * edges[1] + gradient_u * du + gradient_v * dv
+    return levels - model, jacobian
+
+
+def _iterate(
+    levels: FloatArray, offsets: FloatArray, weights: FloatArray, parameters: FloatArray
+) -> FloatArray:
+    """Levenberg-Marquardt on all corners at once; each keeps its own damping."""
+    parameters = parameters.copy()
+    damping = np.full(len(levels), 1e-3)
+    residuals, jacobian = _model(levels, offsets, parameters)
+    cost = (weights * residuals**2).sum(axis=1)
+    diagonal = np.arange(_PARAMETERS)
+    for _ in range(_STEPS):
+        normal = np.einsum("nki,nk,nkj->nij", jacobian, weights, jacobian)
+        normal[:, diagonal, diagonal] *= 1.0 + damping[:, None]
+        rhs = np.einsum("nki,nk->ni", jacobian, weights * residuals)
+        step = np.einsum("nij,nj->ni", _inverse(normal), rhs)
+        trial = parameters + step
+        trial[:, 4] = np.clip(trial[:, 4], APERTURE_SIGMA_PX, 3.0 * MAX_WINDOW_PX)
+        new_residuals, new_jacobian = _model(levels, offsets, trial)
+        new_cost = (weights * new_residuals**2).sum(axis=1)
+        better = new_cost <= cost
+        parameters[better], cost[better] = trial[better], new_cost[better]
+        residuals[better], jacobian[better] = new_residuals[better], new_jacobian[better]
+        damping = np.where(better, 0.2 * damping, 10.0 * damping)
+        if float(np.abs(step[:, :2]).max(initial=0.0)) < 1e-5:
+            break
+    return parameters
+
+
+def _variance(residuals: FloatArray, weights: FloatArray) -> FloatArray:
+    freedom = np.maximum(weights.sum(axis=1) - _PARAMETERS, 1.0)
+    return np.asarray((weights * residuals**2).sum(axis=1) / freedom)
+
+
+def _without_outliers(residuals: FloatArray, weights: FloatArray) -> FloatArray:
+    """Drop pixels that a laser line or dirt put far off the model."""
+    size = np.where(weights > 0.0, np.abs(residuals), np.nan)
+    sigma = 1.4826 * np.nanmedian(size, axis=1)
+    kept = np.abs(residuals) <= _OUTLIER_SIGMAS * np.maximum(sigma, 0.3)[:, None]
+    return np.asarray(weights * kept)
+
+
+def _inverse(normal: FloatArray) -> FloatArray:
+    """Inverse of (N, P, P) matrices, ridged where they are singular."""
+    diagonal = np.einsum("nii->ni", normal)
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12))
+    scaled = normal * scale[:, :, None] * scale[:, None, :]
+    scaled = scaled + 1e-10 * np.eye(normal.shape[1])
+    return np.asarray(np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+
 from armscan.calibration.camera.board_pose import estimate_board_pose
 from armscan.calibration.laser.result import BoardStripes
 from armscan.geometry.arrays import FloatArray
@@ -189,7 +190,14 @@ def thesis_rig(bow_uu_mm: float = 0.0, bow_uv_mm: float = 0.0) -> SheetRig:
     camera = CameraModel(
         2600.0, 2602.0, 1010.0, 745.0, np.array([-0.12, 0.08, 4e-4, -3e-4, 0.02]), 2048, 1536
     )
-    tilts = ((0, 0, 134), (25, 5, 137), (-20, 15, 140), (15, -25, 131), (-25, -15, 128), (8, 28, 143))
+    tilts = (
+        (0, 0, 134),
+        (25, 5, 137),
+        (-20, 15, 140),
+        (15, -25, 131),
+        (-25, -15, 128),
+        (8, 28, 143),
+    )
     poses = tuple(placed(a, b, z, (16.0, 12.0)) for a, b, z in tilts)
     sheet = SheetTruth(THESIS_PLANE, bow_uu_mm, bow_uv_mm)
     return SheetRig((sheet,), poses, camera, np.diag(CAMERA_SIGMA**2))

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exposures with the laser on, each with its partner without laser."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import PurePath
+
+from armscan.errors import InputError
+from armscan.models.camera import CameraModel
+from armscan.records.exposure import Exposure
+
+ExposurePair = tuple[Exposure, Exposure | None]
+LISTED = 4
+
+
+def pair_exposures(
+    exposures: Sequence[Exposure], backgrounds: Sequence[Exposure]
+) -> list[ExposurePair]:
+    """Pair exposures with backgrounds: by file name where the names agree, else by order.
+
+    Parameters
+    ----------
+    exposures
+        With the laser on.
+    backgrounds
+        The same views without laser; empty for none.
+
+    Raises
+    ------
+    InputError
+        If there is no exposure, if the counts differ, or if a pair differs in size or window.
+    """
+    if not exposures:
+        raise InputError("no images with the laser on", remedy="give at least one image")
+    if not backgrounds:
+        return [(exposure, None) for exposure in exposures]
+    if len(exposures) != len(backgrounds):
+        raise InputError(
+            f"{len(exposures)} images with laser ({_listed(exposures)}) but {len(backgrounds)} "
+            f"without ({_listed(backgrounds)})",
+            remedy="give one image without laser for each image with laser, in the same order, "
+            "or none at all",
+        )
+    by_name = {PurePath(background.source).name: background for background in backgrounds}
+    names = [PurePath(exposure.source).name for exposure in exposures]
+    if len(by_name) == len(backgrounds) and set(names) == set(by_name):
+        partners = [by_name[name] for name in names]
+    else:
+        partners = list(backgrounds)
+    for exposure, partner in zip(exposures, partners, strict=True):
+        _check_pair(exposure, partner)
+    return list(zip(exposures, partners, strict=True))
+
+
+def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
+    """Raise `InputError` if an exposure is not of the camera's sensor.
+
+    A window may be anywhere on the sensor; an image without window must have its full size.
+    """
+    for exposure in exposures:
+        window = exposure.window
+        width = window.x_px + exposure.width_px * window.binning
+        height = window.y_px + exposure.height_px * window.binning
+        is_whole = window.x_px == window.y_px == 0 and window.binning == 1
+        fits = width <= camera.width_px and height <= camera.height_px
+        if not fits or (is_whole and (width, height) != (camera.width_px, camera.height_px)):
+            raise InputError(
+                f"the image reaches to {width} x {height} px, the camera was calibrated with "
+                f"{camera.width_px} x {camera.height_px} px",
+                where=exposure.source,
+                remedy="use images of the camera's full size, or state the window",
+            )
+
+
+def _check_pair(exposure: Exposure, partner: Exposure) -> None:
+    if exposure.source == partner.source:
+        raise InputError(
+            "the same image is given with and without laser",
+            where=exposure.source,
+            remedy="give the image without laser as its partner",
+        )
+    sizes = [(e.width_px, e.height_px, e.window) for e in (exposure, partner)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the image with laser has {exposure.width_px} x {exposure.height_px} px, its partner "
+            f"{partner.source} {partner.width_px} x {partner.height_px} px, or another window",
+            where=exposure.source,
+            remedy="check the order of the images: each pair must show one view",
+        )
+
+
+def _listed(exposures: Sequence[Exposure]) -> str:
+    names = [PurePath(exposure.source).name for exposure in exposures[:LISTED]]
+    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")

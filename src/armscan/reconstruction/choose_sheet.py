@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which sheet drew a stripe on an object, where no board tells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import BoolArray, IntArray
+from armscan.models.calibration import SensorCalibration, SheetCalibration
+from armscan.reconstruction.triangulate import meet_sheets
+from armscan.records.profile import Profile
+
+MIN_INSIDE = 0.9
+"""A sheet is possible for a segment if this part of its points lies in its depth range."""
+MAX_INSIDE_OTHERS = 0.1
+"""It is the only one possible if no other sheet has more than this."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthRange:
+    """Depths that a reconstruction accepts: the calibrated range of the sheet, widened.
+
+    Parameters
+    ----------
+    margin
+        Part of the calibrated range's width by which it is widened at either end.
+    """
+
+    margin: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.margin >= 0.0:
+            raise OptionError(
+                f"depth margin {self.margin}", remedy="give 0 or more, as a part of the range"
+            )
+
+    def limits_mm(self, sheet: SheetCalibration) -> tuple[float, float]:
+        """Smallest and largest Z accepted."""
+        low, high = sheet.depth_range_mm
+        slack = self.margin * (high - low)
+        return low - slack, high + slack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetChoice:
+    """(N,) sheet of each point, -1 for none, and how it was found, in words."""
+
+    sheet: IntArray
+    how: str
+
+
+def choose_sheets(
+    profile: Profile,
+    sensor: SensorCalibration,
+    depths: DepthRange,
+    *,
+    sheet_name: str = "",
+    lasers: tuple[str, ...] = (),
+) -> SheetChoice:
+    """Give every stripe point to a sheet.
+
+    In this order: the user's word; the only sheet there is; the exposure's only laser; and else,
+    segment by segment, the one sheet that puts the segment into its calibrated depth range, if
+    all others put it outside of theirs.
+
+    Parameters
+    ----------
+    profile
+        Stripe points.
+    sensor
+        Camera and sheets.
+    depths
+        Depths that count as inside.
+    sheet_name
+        The user's choice; empty for none.
+    lasers
+        The lasers that were on, as the exposure names them; empty if unknown.
+
+    Raises
+    ------
+    OptionError
+        If there is no sheet of the name given.
+    EstimationError
+        If the depth leaves more than one sheet possible.
+    """
+    names = [sheet.name for sheet in sensor.sheets]
+    whole = np.zeros(len(profile), dtype=np.int64)
+    if sheet_name:
+        if sheet_name not in names:
+            raise OptionError(
+                f"there is no sheet {sheet_name!r}",
+                where="--sheet",
+                remedy=f"give one of {', '.join(names)}",
+            )
+        return SheetChoice(whole + names.index(sheet_name), f"sheet {sheet_name}, as asked for")
+    if len(names) == 1:
+        return SheetChoice(whole, f"sheet {names[0]}, the only one calibrated")
+    known = [names.index(name) for name in lasers if name in names]
+    if len(lasers) == 1 and known:
+        return SheetChoice(whole + known[0], f"sheet {lasers[0]}, the laser that was on")
+    return _by_depth(profile, sensor, depths, known or list(range(len(names))))
+
+
+def _by_depth(
+    profile: Profile, sensor: SensorCalibration, depths: DepthRange, possible: list[int]
+) -> SheetChoice:
+    chosen = np.full(len(profile), -1)
+    inside = {k: _inside(profile, sensor, depths, k) for k in possible}
+    ambiguous: list[str] = []
+    for segment in np.unique(profile.segment[profile.is_accepted]):
+        own = profile.segment == segment
+        used = own & profile.is_accepted
+        share = {k: float(inside[k][used].mean()) for k in possible}
+        best = max(possible, key=lambda k: share[k])
+        others = max((share[k] for k in possible if k != best), default=0.0)
+        if share[best] < MIN_INSIDE:
+            continue
+        if others > MAX_INSIDE_OTHERS:
+            ambiguous.append(_shares(share, sensor))
+            continue
+        chosen[own] = best
+    if ambiguous:
+        raise EstimationError(
+            f"{len(ambiguous)} stripe segments may belong to more than one light sheet (points in "
+            f"the calibrated depth range: {ambiguous[0]})",
+            where=profile.source,
+            remedy="name the sheet with --sheet, or photograph one laser at a time",
+        )
+    used_names = [sensor.sheets[k].name for k in np.unique(chosen[chosen >= 0])]
+    how = "the only sheet that puts the stripe into its calibrated depth range: "
+    return SheetChoice(chosen, how + (", ".join(used_names) or "none"))
+
+
+def _inside(profile: Profile, sensor: SensorCalibration, depths: DepthRange, k: int) -> BoolArray:
+    points, is_met = meet_sheets(profile.points_px, np.full(len(profile), k), sensor)
+    low, high = depths.limits_mm(sensor.sheets[k])
+    return np.asarray(is_met & (points[:, 2] >= low) & (points[:, 2] <= high))
+
+
+def _shares(share: dict[int, float], sensor: SensorCalibration) -> str:
+    return ", ".join(f"{sensor.sheets[k].name} {value:.0%}" for k, value in share.items())

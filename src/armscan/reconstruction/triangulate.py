@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stripe points to Sensor points with their covariance (eqs. 2.20 and 2.21)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.models.calibration import SensorCalibration
+from armscan.records.cloud import PointCloud
+from armscan.records.profile import Profile
+
+N_CAMERA = 9
+
+
+def meet_sheets(
+    points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
+) -> tuple[FloatArray, BoolArray]:
+    """Intersect the rays of pixels with their sheets, without covariance.
+
+    Parameters
+    ----------
+    points_px
+        (N, 2) full-sensor pixels.
+    sheet_of_point
+        (N,) index into ``sensor.sheets``; -1 for none.
+    sensor
+        Camera and sheets.
+
+    Returns
+    -------
+    points_mm
+        (N, 3) in the Sensor frame; zero where there is none.
+    is_valid
+        (N,) False without sheet, without inverse of the distortion, and where the ray misses.
+    """
+    xy, is_valid = sensor.camera.camera.undistort(points_px)
+    points = np.zeros((len(points_px), 3))
+    is_met = np.zeros(len(points_px), dtype=np.bool_)
+    for k, calibrated in enumerate(sensor.sheets):
+        own = is_valid & (sheet_of_point == k)
+        points[own], is_met[own] = calibrated.sheet.intersect(xy[own])
+    return points, is_met
+
+
+def triangulate(
+    profile: Profile, sheet_of_point: IntArray, sensor: SensorCalibration
+) -> PointCloud:
+    """Turn stripe points into Sensor points.
+
+    The stripe's noise acts across the stripe; along it a point's place is a choice of where to
+    sample, not a measurement, so it has no error of its own. A point therefore errs in one
+    direction within the sheet by its own noise, and with all others by the calibration.
+
+    Parameters
+    ----------
+    profile
+        Stripe points of one exposure.
+    sheet_of_point
+        (N,) index into ``sensor.sheets``; points with -1 are left out, and so are points whose
+        ray does not meet the sheet in front of the camera.
+    sensor
+        Camera and sheets with their joint covariance.
+
+    Returns
+    -------
+    PointCloud
+        In the order of the profile; ``covariance_mm2`` is stripe noise plus calibration,
+        ``sigma_noise_mm`` the stripe noise alone.
+
+    Raises
+    ------
+    InputError
+        If ``sheet_of_point`` does not fit the profile or the sheets.
+    """
+    sheets = np.asarray(sheet_of_point)
+    if sheets.shape != (len(profile),):
+        raise InputError(
+            f"{sheets.shape} sheet numbers for {len(profile)} stripe points", where=profile.source
+        )
+    if len(sheets) and not -1 <= int(sheets.min()) <= int(sheets.max()) < len(sensor.sheets):
+        raise InputError(
+            f"sheet numbers {int(sheets.min())} to {int(sheets.max())}, but the calibration has "
+            f"{len(sensor.sheets)} sheets",
+            where=profile.source,
+        )
+    xy, has_ray, dxy_dq, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(
+        profile.points_px
+    )
+    points = np.zeros((len(profile), 3))
+    covariance = np.zeros((len(profile), 3, 3))
+    noise = np.zeros(len(profile))
+    is_met = np.zeros(len(profile), dtype=np.bool_)
+    for k, calibrated in enumerate(sensor.sheets):
+        own = np.flatnonzero(has_ray & (sheets == k))
+        points[own], is_met[own], dpoint_dxy, dpoint_dsheet = (
+            calibrated.sheet.intersect_with_jacobian(xy[own])
+        )
+        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dq[own], profile.normals_px[own])
+        across *= profile.sigma_px[own, None]
+        by_calibration = np.concatenate([dpoint_dxy @ dxy_dcamera[own], dpoint_dsheet], axis=2)
+        joint = _covariance_of(sensor, k)
+        covariance[own] = across[:, :, None] * across[:, None, :] + (
+            by_calibration @ joint @ by_calibration.transpose(0, 2, 1)
+        )
+        noise[own] = np.linalg.norm(across, axis=1)
+    kept = np.flatnonzero(is_met)
+    return PointCloud(
+        "Sensor",
+        points[kept],
+        0.5 * (covariance[kept] + covariance[kept].transpose(0, 2, 1)),
+        noise[kept],
+        sheets[kept],
+        tuple(sheet.name for sheet in sensor.sheets),
+        np.zeros(len(kept), dtype=np.int64),
+        (profile.source,),
+        profile.segment[kept],
+        profile.intensity[kept],
+    )
+
+
+def _covariance_of(sensor: SensorCalibration, k: int) -> FloatArray:
+    """(17, 17) covariance of the camera's parameters and those of sheet ``k``."""
+    own = sensor.sheet_parameter_slice(k)
+    places = np.concatenate([np.arange(N_CAMERA), np.arange(own.start, own.stop)])
+    return np.asarray(sensor.covariance[np.ix_(places, places)])

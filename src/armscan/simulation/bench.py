@@ -24,7 +24,7 @@ from armscan.simulation.scene import Lamp, Scene
 from armscan.simulation.stripe_truth import StripeTruth
 from armscan.simulation.surfaces import Floor
 
-BOARD = CirclePattern(columns=11, rows=9, pitch_mm=12.0, diameter_mm=7.2)
+BOARD = CirclePattern(columns=11, rows=9, pitch_mm=12.0, diameter_mm=6.0)
 TARGET = "circle-grid:11x9:12"
 
 Place = tuple[float, float, float, float, float, float]

@@ -18,7 +18,8 @@ from armscan.kernels.arrays import (
 
 REACH_PX = 2.9
 """One missing point on a diagonal leaves a distance of 2.83 px."""
-SAME_PX = 0.75
+SAME_PX = 1.0
+"""Column points lie at most 1.54 px apart where row points may overlap them."""
 LEAST_COSINE = 0.77
 NONE = -1
 

@@ -84,7 +84,7 @@ def extract_stripes(
         ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma))
     if not len(ridge):
         return empty_profile(exposure.source)
-    fits = fit_ridge(plane, ridge, sigma, level.noise)
+    fits = fit_ridge(plane, ridge, sigma, level.noise, options.shortest_px)
     return to_profile(exposure, plane, fits, options)
 
 
@@ -110,7 +110,7 @@ def to_profile(
     flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
     flags[is_background_step(fits, options.background_step)] |= int(StripeFlag.BACKGROUND_STEP)
     flags[is_asymmetric(fits)] |= int(StripeFlag.ASYMMETRIC)
-    near = is_near_other_line(points, chain, width, options.neighbour_sigmas)
+    near = is_near_other_line(fits.neighbour, chain, width, options.neighbour_sigmas)
     flags[near] |= int(StripeFlag.NEIGHBOUR)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0

@@ -5,16 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.stripe_fit import AMPLITUDE, SKEW, SKEW_NORM
-from armscan.vision.stripe.chains import chain_lengths_px, sum_along
+from armscan.vision.stripe.chains import chain_bounds, chain_lengths_px, sum_along
 from armscan.vision.stripe.profile_fit import ProfileFits
 
 SIGNIFICANT = 5.0
+MERGED_SIGMAS = 20.0
+"""Where two lines cross at a small angle they run as one over about this many sigmas."""
 SKEW_HALF = 4
-SKEW_SHIFT = 0.3
+SKEW_SHIFT = 0.15
 """Third-order part of a profile, as a share of its amplitude, that counts as leaning."""
 
 
@@ -58,25 +59,35 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
 
 
 def is_near_other_line(
-    points: FloatArray, chain: IntArray, width_px: FloatArray, sigmas: float
+    distance: FloatArray, chain: IntArray, width_px: FloatArray, sigmas: float
 ) -> BoolArray:
-    """(N,) True where another line, or another part of the same, is within ``sigmas`` widths.
+    """(N,) True where another line is within ``sigmas`` widths, and where two lines have merged.
 
-    Along its own chain a point may only be as near as the number of points between allows.
+    Parameters
+    ----------
+    distance
+        (N, 2) to the nearest other line on both sides.
+    chain
+        (N,) chain numbers.
+    width_px
+        (N,) sigma of the line.
+    sigmas
+        Distance that matters.
     """
-    near = np.zeros(len(points), dtype=np.bool_)
-    if len(points) < 2 or sigmas <= 0.0:
+    near = np.asarray(distance.min(axis=1) < sigmas * width_px)
+    if not near.any():
         return near
-    reach = sigmas * float(np.quantile(width_px, 0.9))
-    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
-    i, j = pairs[:, 0], pairs[:, 1]
-    own = (chain[i] == chain[j]) & (np.abs(i - j) <= 3.0 * reach + 3.0)
-    i, j = i[~own], j[~own]
-    distance = np.hypot(*(points[i] - points[j]).T)
-    close = distance < sigmas * np.maximum(width_px[i], width_px[j])
-    near[i[close]] = True
-    near[j[close]] = True
-    return near
+    return close_gaps(near, chain, MERGED_SIGMAS * width_px)
+
+
+def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray:
+    """Set also the points between two flagged ones of a chain that are within ``span`` (N,)."""
+    place = np.arange(len(flags))
+    first, stop = chain_bounds(chain)
+    before = np.maximum.accumulate(np.where(flags, place, -1))
+    after = np.minimum.accumulate(np.where(flags, place, len(flags))[::-1])[::-1]
+    is_between = (before >= first) & (after < stop)
+    return np.asarray(flags | (is_between & (after - before <= span)))
 
 
 def is_short(points: FloatArray, chain: IntArray, shortest_px: float) -> BoolArray:

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.stripe_fit import REACH_SIGMAS, VARIANCE, fit_profiles, read_sides
-from armscan.vision.stripe.chains import chain_bounds, mean_along
+from armscan.kernels.stripe_neighbours import find_other_lines
+from armscan.vision.stripe.chains import chain_bounds, chain_lengths_px, mean_along
 from armscan.vision.stripe.noise import estimate_noise, start_noise
 from armscan.vision.stripe.plane import StripePlane
 from armscan.vision.stripe.ridge import RidgePoints
@@ -19,6 +20,9 @@ NOISE_ROUNDS = 2
 SIDE_HALF = 8
 """Neighbours over which the background beside the line is averaged."""
 RESULT_COLUMNS = 8
+CLEAR_SIGMAS = 7.5
+"""Another line within this many sigmas lights up the background beside the line."""
+LEAST_REACH_PX = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,6 +39,8 @@ class ProfileFits:
         (N, 2) background on the lower and upper side, averaged along the line.
     side_sigma
         (N,) standard deviation of the difference of the two sides.
+    neighbour
+        (N, 2) distance to the nearest other line on the lower and upper side, in px.
     noise
         (3,) ``C^2``, ``1 / gain``, ``read^2``.
     """
@@ -43,6 +49,7 @@ class ProfileFits:
     values: FloatArray
     sides: FloatArray
     side_sigma: FloatArray
+    neighbour: FloatArray
     noise: FloatArray
 
 
@@ -53,15 +60,22 @@ def axis_component(table: FloatArray) -> FloatArray:
 
 
 def fit_ridge(
-    plane: StripePlane, ridge: RidgePoints, line_sigma_px: float, background_noise: float
+    plane: StripePlane,
+    ridge: RidgePoints,
+    line_sigma_px: float,
+    background_noise: float,
+    shortest_px: float,
 ) -> ProfileFits:
     """Fit a Gaussian with weights from the noise model at every ridge point.
 
-    The noise model is estimated from a sample of the points first.
+    The noise model is estimated from a sample of the points first. Chains shorter than
+    ``shortest_px`` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
     sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
-    sides, side_sigma = _sides(plane, ridge, sigma, background_noise)
+    neighbour = _neighbours(plane, ridge, line_sigma_px, shortest_px)
+    is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
+    sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     noise = start_noise(background_noise)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     for _ in range(NOISE_ROUNDS):
@@ -76,26 +90,50 @@ def fit_ridge(
         plane.image, plane.clipped, table, sigma, sides, noise, REACH_SIGMAS, values
     )
     good = values[:, VARIANCE] > 0.0
-    return ProfileFits(ridge.select(good), values[good], sides[good], side_sigma[good], noise)
+    return ProfileFits(
+        ridge.select(good), values[good], sides[good], side_sigma[good], neighbour[good], noise
+    )
+
+
+def _neighbours(
+    plane: StripePlane, ridge: RidgePoints, line_sigma_px: float, shortest_px: float
+) -> FloatArray:
+    height, width = plane.image.shape
+    length = chain_lengths_px(ridge.table[:, :2], ridge.chain)
+    distance = np.zeros((len(ridge), 2))
+    reach = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
+    is_line = (length >= shortest_px).astype(np.int64)
+    bounds = chain_bounds(ridge.chain)
+    find_other_lines(ridge.table, ridge.chain, *bounds, is_line, height, width, reach, distance)
+    return distance
 
 
 def _sides(
-    plane: StripePlane, ridge: RidgePoints, sigma: FloatArray, background_noise: float
+    plane: StripePlane,
+    ridge: RidgePoints,
+    sigma: FloatArray,
+    is_clear: BoolArray,
+    background_noise: float,
 ) -> tuple[FloatArray, FloatArray]:
+    """Background on both sides, averaged along the line, and the sigma of their difference.
+
+    A side that another line lights up takes the value of the other side.
+    """
     raw = np.zeros((len(ridge), 4))
     read_sides(plane.image, ridge.table, sigma, raw)
-    is_turned = _axis_runs(ridge)
-    lower = mean_along(raw[:, 0], raw[:, 1], is_turned, SIDE_HALF)
-    upper = mean_along(raw[:, 2], raw[:, 3], is_turned, SIDE_HALF)
-    ones = np.ones(len(ridge))
-    count = mean_along(np.minimum(raw[:, 1], raw[:, 3]), ones, is_turned, SIDE_HALF)
-    first, stop = chain_bounds(is_turned)
-    places = np.minimum(stop - first, 2 * SIDE_HALF + 1)
-    has_lower, has_upper = count > 0, count > 0
-    lower = np.where(has_lower | (lower != 0.0), lower, upper)
-    upper = np.where(has_upper | (upper != 0.0), upper, lower)
-    side_sigma = background_noise * np.sqrt(2.0 / np.maximum(count * places, 1.0))
-    return np.stack([lower, upper], axis=1), side_sigma
+    level, count = raw[:, 0::2], raw[:, 1::2] * is_clear
+    stretch = _axis_runs(ridge)
+    places = np.minimum(np.subtract(*chain_bounds(stretch)[::-1]), 2 * SIDE_HALF + 1)
+    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in count.T], 1)
+    mean = np.stack(
+        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, count.T, strict=True)], 1
+    )
+    has_own = (total > 0.0) & is_clear
+    lowest = np.where(raw[:, 1::2] > 0.0, level, np.inf).min(axis=1)
+    lowest = np.where(np.isfinite(lowest), lowest, 0.0)[:, None]
+    sides = np.where(has_own, mean, np.where(has_own[:, ::-1], mean[:, ::-1], lowest))
+    pixels = np.where(has_own.all(axis=1), count.min(axis=1), 1.0) * places
+    return sides, background_noise * np.sqrt(2.0 / np.maximum(pixels, 1.0))
 
 
 def _axis_runs(ridge: RidgePoints) -> IntArray:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import doctor, info
+from armscan.cli import calibrate_camera, calibrate_laser, doctor, info, reconstruct
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -27,6 +27,20 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+calibrate = typer.Typer(
+    help="Calibrate a camera, then its light sheets.",
+    epilog=(
+        "\b\nExample:\n"
+        "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json"
+    ),
+    context_settings=HELP_OPTIONS,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
+calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
+app.add_typer(calibrate, name="calibrate")
+app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("info", epilog=info.EXAMPLE)(info.info)
 app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
 

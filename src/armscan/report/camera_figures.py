@@ -30,7 +30,7 @@ from armscan.report.drawing import (
 )
 from armscan.report.page import Picture
 
-ARROW_SHARE = 0.035
+ARROW_SHARE = 0.06
 """Length on the picture, as a share of its longer side, of a residual of three sigma."""
 
 
@@ -49,9 +49,9 @@ def view_picture(fit: CameraFit, view: ViewFit, exposure: Exposure) -> Picture:
     arrows = np.stack([points, points + scale * view.residuals_px], axis=1).reshape(-1, 2)
     colour = "#35e0c0" if view.is_used else "#ff8a4c"
     marks = [
-        Marks(points, colour, "ring", 9.0),
-        Marks(points[:1], colour, "dot", 9.0),
-        Marks(arrows, "#ffd84a", "line", 2.6),
+        Marks(points, colour, "ring", 15.0),
+        Marks(points[:1], colour, "dot", 13.0),
+        Marks(arrows, "#ffb000", "line", 3.2),
     ]
     state = "" if view.is_used else "left out; "
     return Picture(
@@ -72,7 +72,7 @@ def residual_field(fit: CameraFit) -> Picture:
         axes = figure.add_subplot()
         axes.quiver(
             *points.T, *(scale * residuals).T, angles="xy", scale_units="xy", scale=1.0,
-            color=ACCENT, width=0.0016, headwidth=4.0, headlength=5.0,
+            color=ACCENT, width=0.0022, headwidth=3.5, headlength=4.5,
         )  # fmt: skip
         _image_axes(axes, fit)
     return Picture(
@@ -132,7 +132,7 @@ def view_bars(fit: CameraFit) -> Picture:
                 [held_out[views[k].source] for k in known], known, "|", color=ALERT,
                 markersize=9, markeredgewidth=2, label="held out",
             )  # fmt: skip
-            axes.legend(loc="lower right")
+            axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.1)
         axes.axvline(fit.rms_px, color=MUTED, linewidth=0.8, linestyle="--")
         axes.set_yticks(rows, [_short(view.source) for view in views])
         axes.invert_yaxis()
@@ -156,7 +156,7 @@ def tilt_rose(fit: CameraFit) -> Picture:
         axes.plot(directions, fit.coverage.tilts_deg, "o", color=ACCENT, markersize=5, alpha=0.85)
         axes.set_theta_direction(-1)
         axes.set_rlim(0.0, max(45.0, float(fit.coverage.tilts_deg.max(initial=0.0)) + 5.0))
-        axes.set_rticks([15, 30, 45], ["15°", "30°", "45°"])
+        axes.set_rticks([15, 30, 45], ["15°", "30°", "45°"], fontsize=7.5)
         axes.set_thetagrids([0, 90, 180, 270], ["right", "down", "left", "up"])
     return Picture(
         chart_markup(figure, "Tilts of the board"),

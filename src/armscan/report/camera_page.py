@@ -13,7 +13,7 @@ from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report import camera_figures as figures
 from armscan.report.drawing import photo_markup
-from armscan.report.numbers import with_sigma
+from armscan.report.numbers import sentence, with_sigma
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.summary import Table
@@ -76,7 +76,7 @@ def camera_page(
         subtitle=f"{fit.camera.width_px} × {fit.camera.height_px} px camera, "
         f"{fit.n_views} of {n_images} images used, {fit.n_points} target points",
         cards=_cards(fit),
-        warnings=fit.warnings,
+        warnings=tuple(sentence(warning) for warning in fit.warnings),
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),
@@ -128,11 +128,11 @@ def _camera_section(fit: CameraFit) -> Section:
     return Section(
         "The camera",
         (
-            Table(("parameter", "value ± 1 sigma", "meaning"), parameter_rows(fit)),
+            Table(("parameter", "value ± 1 sigma", "meaning"), parameter_rows(fit), "", (2,)),
             Text(
-                f"{fit.model_reason} Pixel (0, 0) is the centre of the top-left pixel. Standard "
-                f"deviations rest on the scatter of the residuals, which is {fit.noise_scale:.2f} "
-                "times what the detector expected."
+                f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
+                "Standard deviations rest on the scatter of the residuals, which is "
+                f"{fit.noise_scale:.2f} times what the detector expected."
             ),
         ),
     )
@@ -170,6 +170,7 @@ def _views_section(fit: CameraFit, exposures: Mapping[str, Exposure]) -> Section
     table = Table(
         ("image", "points", "rms, px", "held out, px", "tilt", "distance", "remark"),
         tuple(_view_row(view, held_out.get(view.source)) for view in fit.views),
+        word_columns=(6,),
     )
     pictures = tuple(
         figures.view_picture(fit, view, exposures[view.source])
@@ -178,8 +179,8 @@ def _views_section(fit: CameraFit, exposures: Mapping[str, Exposure]) -> Section
     )
     scale = figures.residual_magnification(fit)
     text = Text(
-        f"Rings are the target points found, the filled one is the board's first point. Yellow "
-        f"lines are residuals, {scale:g} times enlarged. Orange rings: the view was left out. "
+        f"Rings are the target points found, the filled one is the board's first point. Orange "
+        f"lines are residuals, {scale:g} times enlarged. Rings in orange: the view was left out. "
         "Click a picture to enlarge it."
     )
     return Section(
@@ -212,7 +213,7 @@ def _not_found_section(
         for source, reason in not_found
         if source in exposures
     )
-    table = Table(("image", "why"), tuple(not_found))
+    table = Table(("image", "why"), tuple(not_found), word_columns=(1,))
     return Section("Images without a usable target", (table, Gallery(pictures, 240)))
 
 

@@ -139,7 +139,7 @@ def _mark_path(layer: Marks, exposure: Exposure, unit: float) -> str:
             f"a{radius:g} {radius:g} 0 1 0 {-2 * radius:g} 0"
             for x, y in points
         )
-        width = 1.4 * unit
+        width = 2.4 * unit
     else:
         path = "".join(f"M{x:g} {y:g}h0" for x, y in points)
         width = layer.size * unit

@@ -29,3 +29,8 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
     if not -5 < magnitude < 6:
         return f"{value:.{digits - 1}e}{tail}"
     return f"{value:.{max(0, digits - 1 - magnitude)}f}{tail}"
+
+
+def sentence(text: str) -> str:
+    """Text with a capital at its start and a full stop at its end."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""

@@ -18,11 +18,12 @@ def origin_section(provenance: Provenance) -> Section:
             ("Rests on", ", ".join(provenance.parent_ids) or "no other document"),
         )
     )
-    options = Table(("option", "value"), provenance.options, "Options in force")
+    options = Table(("option", "value"), provenance.options, "Options in force", (1,))
     inputs = Table(
         ("file", "SHA-256"),
         tuple((item.path, item.sha256[:16] + "…") for item in provenance.inputs),
         "Files that went in",
+        (1,),
     )
     return Section("Origin", (facts, inputs, options), is_folded=True)
 

@@ -13,11 +13,22 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of ready-made texts; the first column is flush left, the others right."""
+    """A table of ready-made texts.
+
+    Parameters
+    ----------
+    columns, rows
+        Heads and cells.
+    title
+        Above the table; empty for none.
+    word_columns
+        Columns of words, flush left as the first always is; numbers stand flush right.
+    """
 
     columns: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     title: str = ""
+    word_columns: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +99,7 @@ def _table_lines(table: Table) -> list[str]:
     lines = [f"  {table.title}"] if table.title else []
     for row in rows:
         cells = [
-            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
+            f"{cell:<{width}}" if k in (0, *table.word_columns) else f"{cell:>{width}}"
             for k, (cell, width) in enumerate(zip(row, widths, strict=True))
         ]
         lines.append(("  " + "  ".join(cells)).rstrip())

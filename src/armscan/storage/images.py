@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError, OptionError
+from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
 from armscan.storage.image_format import check_complete, image_format
@@ -85,6 +85,26 @@ def read_exposures(
     names = source_names(paths)
     return tuple(
         read_exposure(path, options, source=name) for path, name in zip(paths, names, strict=True)
+    )
+
+
+def check_same_size(exposures: Sequence[Exposure]) -> None:
+    """Raise if images that one camera took differ in size.
+
+    Raises
+    ------
+    InputError
+        Naming the first image that differs from the majority.
+    """
+    sizes = Counter((exposure.width_px, exposure.height_px) for exposure in exposures)
+    if len(sizes) < 2:
+        return
+    usual = sizes.most_common(1)[0][0]
+    odd = next(item for item in exposures if (item.width_px, item.height_px) != usual)
+    raise InputError(
+        f"the image is {odd.width_px} x {odd.height_px} px, others are {usual[0]} x {usual[1]} px",
+        where=odd.source,
+        remedy="give images of one camera in its full size, none cropped, scaled or turned",
     )
 
 

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan calibrate laser``: light sheets from stripe images on a flat target."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.shared import BitsUsed, LaserColourOption, StripeMethodOption, Target
+
+EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate laser --camera camera.json --on 'on/*.png' --off 'off/*.png' \\\n"
+    "      --target chessboard:11x6:13 -o sensor.json\n\n"
+    "\b\nPut the board at several depths and tilts in the laser. If the laser outshines it,\n"
+    "take each placement twice, with and without laser; images pair by name, else by order."
+)
+
+
+def laser(
+    *,
+    camera: Annotated[
+        Path, typer.Option(help="Camera calibration, also of OpenCV or ROS.", show_default=False)
+    ],
+    on: Annotated[
+        list[str],
+        typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
+    ],
+    target: Target,
+    off: Annotated[
+        list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
+    ] = Path("sensor.json"),
+    sheets: Annotated[
+        int, typer.Option(help="Light sheets that were on together; 0 finds out.")
+    ] = 0,
+    name: Annotated[
+        list[str] | None,
+        typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
+    ] = None,
+    margin_mm: Annotated[
+        float, typer.Option(help="Use stripe points this far outside the target's points.")
+    ] = 0.0,
+    stripe_method: StripeMethodOption = "fit",
+    laser_colour: LaserColourOption = "auto",
+    bits_used: BitsUsed = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate light sheets from images of laser lines on a flat target."""
+    from armscan.calibration.laser.options import SheetOptions
+    from armscan.pipeline.laser import LaserOptions
+    from armscan.report.laser_job import LaserRequest, run_laser_calibration
+    from armscan.storage.image_options import ImageOptions
+    from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
+
+    request = LaserRequest(
+        camera=camera,
+        on=tuple(on),
+        off=tuple(off or ()),
+        target=target,
+        output=output,
+        options=LaserOptions(
+            stripes=StripeOptions(
+                method=cast(StripeMethod, stripe_method),
+                laser_colour=cast(LaserColour, laser_colour),
+            ),
+            sheets=SheetOptions(
+                margin_mm=margin_mm, n_sheets=sheets, sheet_names=tuple(name or ())
+            ),
+        ),
+        image_options=ImageOptions(bits_used=bits_used),
+        is_overwriting=force,
+        command=("armscan", *sys.argv[1:]),
+    )
+    with progress_bar() as progress:
+        summary = run_laser_calibration(request, progress)
+    show(summary, as_json=as_json)

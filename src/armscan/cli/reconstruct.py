@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan reconstruct``: points from stripe images."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.shared import BitsUsed, LaserColourOption, StripeMethodOption
+
+EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
+    "      --sheet A -o cloud.ply"
+)
+
+
+def reconstruct(
+    *,
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            help="Images with the laser on: files, folders, patterns.", show_default=False
+        ),
+    ],
+    sensor: Annotated[
+        Path,
+        typer.Option(
+            "--sensor", "--scanner", help="Calibration of camera and sheets.", show_default=False
+        ),
+    ],
+    background: Annotated[
+        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
+    ] = None,
+    sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
+    depth_margin: Annotated[
+        float, typer.Option(help="Widen the calibrated depth range by this part at either end.")
+    ] = 0.5,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
+    ] = Path("cloud.ply"),
+    stripe_method: StripeMethodOption = "fit",
+    laser_colour: LaserColourOption = "auto",
+    bits_used: BitsUsed = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure points in the Sensor frame from images of laser lines on objects."""
+    from armscan.pipeline.reconstruct import ReconstructOptions
+    from armscan.reconstruction.choose_sheet import DepthRange
+    from armscan.report.cloud_job import CloudRequest, run_reconstruction
+    from armscan.storage.image_options import ImageOptions
+    from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
+
+    request = CloudRequest(
+        sensor=sensor,
+        images=tuple(images),
+        background=tuple(background or ()),
+        output=output,
+        options=ReconstructOptions(
+            stripes=StripeOptions(
+                method=cast(StripeMethod, stripe_method),
+                laser_colour=cast(LaserColour, laser_colour),
+            ),
+            depths=DepthRange(margin=depth_margin),
+            sheet=sheet,
+        ),
+        image_options=ImageOptions(bits_used=bits_used),
+        is_overwriting=force,
+        command=("armscan", *sys.argv[1:]),
+    )
+    with progress_bar() as progress:
+        summary = run_reconstruction(request, progress)
+    show(summary, as_json=as_json)

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From stripe images and a sensor's document to a cloud and its report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.reconstruct import ReconstructOptions, reconstruct
+from armscan.reconstruction.result import Reconstruction
+from armscan.report.cloud_page import cloud_page, fate_table
+from armscan.report.numbers import sentence, significant
+from armscan.report.outputs import cloud_outputs
+from armscan.report.page import render_page
+from armscan.report.summary import Summary
+from armscan.storage.atomic import write_files
+from armscan.storage.calibration_files import read_sensor_calibration
+from armscan.storage.clouds import XYZ_LOSES, ply_bytes, xyz_bytes
+from armscan.storage.image_options import ImageOptions
+from armscan.storage.image_paths import expand_paths
+from armscan.storage.images import read_exposures
+from armscan.storage.provenance import new_provenance
+from armscan.storage.simulated import are_simulated
+
+
+@dataclass(frozen=True, slots=True)
+class CloudRequest:
+    """What to measure, and where to write.
+
+    Parameters
+    ----------
+    sensor
+        The sensor's calibration ``sensor.json``.
+    images
+        Images with the laser on: files, folders or patterns.
+    background
+        The same views without laser, one for each, or none.
+    output
+        The cloud ``NAME.ply`` or ``NAME.xyz``; ``NAME.html`` is written beside it.
+    options
+        Of stripes, depths and sheet.
+    image_options
+        How pixels are read.
+    is_overwriting
+        Replace results that exist.
+    command
+        The command line, for the record.
+    """
+
+    sensor: Path
+    images: tuple[str, ...]
+    background: tuple[str, ...]
+    output: Path
+    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    image_options: ImageOptions = field(default_factory=ImageOptions)
+    is_overwriting: bool = False
+    command: tuple[str, ...] = ()
+
+
+def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Summary:
+    """Read, measure, write the cloud and its page, and say what came out.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, an option is wrong, or nothing was measured; nothing is written
+        then.
+    """
+    files = cloud_outputs(request.output, is_overwriting=request.is_overwriting)
+    sensor = read_sensor_calibration(request.sensor)
+    images = expand_paths(request.images)
+    background = expand_paths(request.background) if request.background else ()
+    exposures = read_exposures((*images, *background), request.image_options)
+    result = reconstruct(
+        exposures[: len(images)],
+        sensor,
+        backgrounds=exposures[len(images) :],
+        options=request.options,
+        progress=progress,
+    )
+    provenance = new_provenance(
+        (*images, *background, request.sensor),
+        command=request.command,
+        options=(request.options.stripes, request.options.depths, request.image_options),
+        parent_ids=(sensor.provenance.document_id,),
+        warnings=result.warnings,
+    )
+    is_simulated = are_simulated((*images, *background))
+    by_source = {exposure.source: exposure for exposure in exposures}
+    page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
+    is_ply = request.output.suffix.lower() == ".ply"
+    cloud = ply_bytes(result.cloud) if is_ply else xyz_bytes(result.cloud)
+    write_files(
+        {files.document: cloud, files.page: render_page(page)},
+        is_overwriting=request.is_overwriting,
+    )
+    written = (files.document, files.page)
+    losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
+    return cloud_summary(result, written, losses, is_simulated=is_simulated)
+
+
+def cloud_summary(
+    result: Reconstruction,
+    written: Sequence[Path],
+    losses: Sequence[str] = (),
+    *,
+    is_simulated: bool,
+) -> Summary:
+    """What a person, and a program, wants to know of a reconstruction."""
+    cloud = result.cloud
+    median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
+    low_corner, high_corner = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
+    facts = (
+        ("points", f"{len(cloud)} in the {cloud.frame} frame"),
+        ("sigma", f"{significant(median)} mm median, 95 % below {significant(high)} mm"),
+        *(
+            (axis, f"{low:.2f} to {top:.2f} mm")
+            for axis, low, top in zip("XYZ", low_corner, high_corner, strict=True)
+        ),
+    )
+    return Summary(
+        title="Points measured" + (" on simulated images." if is_simulated else "."),
+        facts=facts,
+        tables=(fate_table(result),),
+        warnings=tuple(sentence(warning) for warning in (*result.warnings, *losses)),
+        written=tuple(written),
+        next_step=f"open {written[-1]}, and the cloud in any viewer",
+        data={
+            "kind": "reconstruction",
+            "simulated": is_simulated,
+            "frame": cloud.frame,
+            "n_points": len(cloud),
+            "sigma_median_mm": median,
+            "sigma_95_mm": high,
+            "low_corner_mm": low_corner.tolist(),
+            "high_corner_mm": high_corner.tolist(),
+            "images": [
+                {
+                    "source": image.profile.source,
+                    "n_stripe_points": len(image.profile),
+                    "n_measured": int((image.fate == 0).sum()),
+                    "naming": image.naming,
+                }
+                for image in result.images
+            ],
+        },
+    )

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a calibration of light sheets."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse, SheetFit, SheetImage
+from armscan.models.calibration import Provenance
+from armscan.records.exposure import Exposure
+from armscan.report import laser_figures as figures
+from armscan.report.drawing import photo_markup
+from armscan.report.numbers import sentence, significant
+from armscan.report.origin import footer, origin_section
+from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Section, Text
+from armscan.report.stripe_figures import stripe_legend, stripe_picture
+from armscan.report.summary import Table
+
+USE_COLOURS = {
+    PointUse.NO_RAY: "#8a6d5a",
+    PointUse.OFF_BOARD: "#b8c0ca",
+    PointUse.OFF_LINE: "#ffd23f",
+    PointUse.UNNAMED: "#ff9df0",
+    PointUse.OFF_SHEET: "#ff7a3c",
+}
+
+
+def laser_page(
+    fit: LaserFit,
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
+    *,
+    is_simulated: bool = False,
+) -> Page:
+    """Lay out the report.
+
+    Parameters
+    ----------
+    fit
+        The calibration.
+    exposures
+        The photographs by source name; those that are missing are not shown.
+    provenance
+        How the calibration came to be.
+    is_simulated
+        True if the photographs were rendered.
+    """
+    sections = [_sheets_section(fit), _images_section(fit, exposures), _residuals_section(fit)]
+    if fit.skipped:
+        sections.append(_skipped_section(fit, exposures))
+    sections += [_methods_section(fit), origin_section(provenance)]
+    warnings = list(fit.warnings)
+    for sheet in fit.sheets:
+        warnings += [f"sheet {sheet.name}: {warning}" for warning in sheet.warnings]
+    n = len(fit.sheets)
+    return Page(
+        title="Light sheet calibration" if n == 1 else "Light sheets calibration",
+        subtitle=f"{n} light sheet{'s' if n > 1 else ''} from {len(fit.images)} stripe images",
+        cards=tuple(_card(sheet) for sheet in fit.sheets),
+        warnings=tuple(sentence(warning) for warning in warnings),
+        sections=tuple(sections),
+        is_simulated=is_simulated,
+        footer=footer(provenance),
+    )
+
+
+def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
+    """Labels and values of one sheet."""
+    calibration = fit.calibration
+    a, b, c, d = fit.sheet.plane
+    low, high = calibration.depth_range_mm
+    bow = ", ".join(significant(float(value), "mm") for value in fit.sheet.bow_mm)
+    return (
+        ("Plane in Sensor", f"{a:+.6f} x {b:+.6f} y {c:+.6f} z {d:+.4f} mm = 0"),
+        (
+            "Known to",
+            f"± {significant(fit.tilt_sigma_deg)}° in direction, "
+            f"± {significant(fit.offset_sigma_mm)} mm in the middle (1 sigma)",
+        ),
+        ("Residual", f"{significant(calibration.rms_mm)} mm rms, {fit.rms_px:.3f} px rms"),
+        ("Depth covered", f"Z {low:.1f} to {high:.1f} mm"),
+        (
+            "Rests on",
+            f"{calibration.n_boards} boards, at most {fit.board_angle_deg:.0f}° apart, "
+            f"{calibration.n_points} points",
+        ),
+        (
+            "Redundant",
+            "yes" if calibration.is_redundant else "no: two stripes fix a plane, nothing checks it",
+        ),
+        (
+            "Stripes miss a common plane by",
+            f"{significant(fit.coplanarity_mm)} mm, expected "
+            f"{significant(fit.coplanarity_sigma_mm)} mm",
+        ),
+        ("Bow", bow if fit.sheet.is_bowed else "none: a plane"),
+        ("Why", sentence(fit.bow_decision)),
+        ("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
+        ("Lack of fit of the sheet", lack_of_fit_text(fit.final_test)),
+    )
+
+
+def lack_of_fit_text(test: LackOfFit) -> str:
+    """A lack-of-fit test in words."""
+    if test.degrees_of_freedom == 0 or not math.isfinite(test.p_value):
+        return "nothing is redundant, so nothing can be tested"
+    verdict = "the model does not explain the stripes" if test.p_value < 0.001 else "no objection"
+    return f"F = {test.f_ratio:.2f}, p = {test.p_value:.2g}: {verdict}"
+
+
+def _card(sheet: SheetFit) -> Card:
+    low, high = sheet.calibration.depth_range_mm
+    return Card(
+        f"Sheet {sheet.name}",
+        f"{significant(sheet.calibration.rms_mm)} mm rms",
+        f"{sheet.calibration.n_boards} boards, Z {low:.0f} to {high:.0f} mm, "
+        f"{'bowed' if sheet.sheet.is_bowed else 'plane'}",
+    )
+
+
+def _sheets_section(fit: LaserFit) -> Section:
+    blocks: list[Facts | Text | Gallery] = []
+    for sheet in fit.sheets:
+        blocks += [Text(f"Sheet {sheet.name}"), Facts(sheet_facts(sheet))]
+    blocks += [Text(sentence(fit.naming)), Gallery((figures.scene(fit),), 560)]
+    return Section("The sheets", tuple(blocks))
+
+
+def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section:
+    flags = 0
+    for image in fit.images:
+        for value in image.profile.flags[image.use == int(PointUse.FLAGGED)]:
+            flags |= int(value)
+    seen = {use for use in USE_COLOURS if any(image.count(use) for image in fit.images)}
+    fates = {int(use): (USE_COLOURS[use], use.label) for use in PointUse if use in seen}
+    pictures = tuple(
+        stripe_picture(
+            exposures[image.source],
+            image.profile,
+            image.use,
+            image.sheet,
+            {int(use): colour for use, colour in USE_COLOURS.items()},
+            outline_px=image.view.points_px,
+            caption=_caption(image),
+        )
+        for image in fit.images
+        if image.source in exposures
+    )
+    uses = [use for use in PointUse if any(image.count(use) for image in fit.images)]
+    table = Table(
+        ("image", *(use.label for use in uses), "board moved by"),
+        tuple(
+            (
+                image.source,
+                *(str(image.count(use)) for use in uses),
+                f"{image.pose_shift_sigma:.1f} sigma",
+            )
+            for image in fit.images
+        ),
+    )
+    text = Text(
+        "Every stripe point, used or not. The white outline is the region of the board's points. "
+        "Dark photographs are brightened here. Click a picture to enlarge it."
+    )
+    legend = Legend(stripe_legend(fit.sheet_names, fates, flags))
+    return Section("The stripes", (text, legend, Gallery(pictures, 420), table))
+
+
+def _caption(image: SheetImage) -> str:
+    used = image.count(PointUse.USED)
+    board = "" if image.view.source == image.source else f"; board from {image.view.source}"
+    return f"{used} of {len(image.profile)} points used{board}"
+
+
+def _residuals_section(fit: LaserFit) -> Section:
+    along = tuple(figures.residuals_along(fit, index) for index in range(len(fit.sheets)))
+    return Section(
+        "How well it fits", (Gallery(along, 560), Gallery((figures.residual_histogram(fit),), 420))
+    )
+
+
+def _skipped_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section:
+    table = Table(
+        ("image", "why"), tuple((item.source, item.reason) for item in fit.skipped), "", (1,)
+    )
+    pictures = tuple(
+        Picture(
+            photo_markup(exposures[item.source], (), f"Nothing in {item.source}", longest_px=500),
+            item.reason,
+            item.source,
+        )
+        for item in fit.skipped
+        if item.source in exposures
+    )
+    return Section("Images that gave nothing", (table, Gallery(pictures, 240)))
+
+
+def _methods_section(fit: LaserFit) -> Section:
+    rows = tuple(
+        (
+            sheet.name,
+            item.method,
+            f"{item.angle_deg:.3f}°",
+            f"{significant(item.largest_mm)} mm",
+        )
+        for sheet in fit.sheets
+        for item in sheet.comparisons
+    )
+    table = Table(("sheet", "method", "angle to ours", "largest distance"), rows, "", (1,))
+    text = Text(
+        "Planes that simpler methods give from the same points, against the sheet in use, over "
+        "the calibrated region. The algebraic one is the thesis's eq. 2.44."
+    )
+    return Section("Against simpler methods", (text, table), is_folded=True)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs with their stripe points, coloured by sheet and by what became of each point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile, StripeFlag
+from armscan.report.drawing import Marks, photo_markup
+from armscan.report.page import Picture
+
+SHEET_COLOURS = ("#2fe6c3", "#5aa9ff", "#c58bff", "#a6e22e", "#ffc2f2", "#8fd3ff")
+"""Bright colours of the sheets on photographs, in order, then repeated."""
+FLAG_COLOURS = {
+    StripeFlag.BACKGROUND_STEP: ("#ff9f1c", "flagged: background step"),
+    StripeFlag.ASYMMETRIC: ("#ff5a4f", "flagged: lopsided profile"),
+    StripeFlag.NEIGHBOUR: ("#e0559b", "flagged: neighbour line"),
+    StripeFlag.OUTLIER: ("#ffe14d", "flagged: off the line's course"),
+    StripeFlag.SHORT_SEGMENT: ("#b58863", "flagged: too short a piece"),
+}
+OUTLINE = "#ffffff"
+DOT_SIZE = 2.6
+
+
+def sheet_colour(index: int) -> str:
+    """Colour of a sheet on photographs."""
+    return SHEET_COLOURS[index % len(SHEET_COLOURS)]
+
+
+def stripe_picture(
+    exposure: Exposure,
+    profile: Profile,
+    fate: IntArray,
+    sheet: IntArray,
+    fate_colours: Mapping[int, str],
+    *,
+    outline_px: FloatArray | None = None,
+    caption: str = "",
+) -> Picture:
+    """A photograph with its stripe points.
+
+    Parameters
+    ----------
+    exposure, profile
+        The image and all its stripe points.
+    fate
+        (N,) what became of each point: 0 good, 1 flagged, other values as ``fate_colours``.
+    sheet
+        (N,) index of the sheet of good points; -1 for none.
+    fate_colours
+        Colour of each fate above 1.
+    outline_px
+        (M, 2) points of the target, whose outline is drawn; None for no target.
+    caption
+        Text below.
+    """
+    points = profile.points_px
+    marks = [] if outline_px is None else [_outline(outline_px)]
+    for value, colour in fate_colours.items():
+        marks.append(Marks(points[fate == value], colour, "dot", DOT_SIZE))
+    is_open = fate == 1
+    for flag, (colour, _) in FLAG_COLOURS.items():
+        chosen = is_open & ((profile.flags & int(flag)) != 0)
+        marks.append(Marks(points[chosen], colour, "dot", DOT_SIZE))
+        is_open &= ~chosen
+    for index in range(int(sheet.max(initial=0)) + 1):
+        chosen = (fate == 0) & (np.maximum(sheet, 0) == index)
+        marks.append(Marks(points[chosen], sheet_colour(index), "dot", DOT_SIZE))
+    markup = photo_markup(exposure, marks, f"Stripe points of {profile.source}", longest_px=1200)
+    return Picture(markup, caption, profile.source)
+
+
+def stripe_legend(
+    sheet_names: Sequence[str], fates: Mapping[int, tuple[str, str]], flags_seen: int
+) -> tuple[tuple[str, str], ...]:
+    """Colours with their meaning: sheets, then fates, then the flags that occur."""
+    sheets = [(sheet_colour(k), f"sheet {name}") for k, name in enumerate(sheet_names)]
+    flags = [entry for flag, entry in FLAG_COLOURS.items() if flags_seen & int(flag)]
+    return (*sheets, *fates.values(), *flags)
+
+
+def _outline(points_px: FloatArray) -> Marks:
+    hull = cv2.convexHull(points_px.astype(np.float32)).reshape(-1, 2).astype(np.float64)
+    ends = np.stack([hull, np.roll(hull, -1, axis=0)], axis=1).reshape(-1, 2)
+    return Marks(ends, OUTLINE, "line", 1.2)

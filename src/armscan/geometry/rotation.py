@@ -47,7 +47,7 @@ def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     if cosine > 0.0:
         return axis
     # Near half a turn the skew part vanishes; the symmetric part holds the axis.
-    outer = 0.5 * (r + np.eye(3))
+    outer = 0.25 * (r + r.T) + 0.5 * np.eye(3)
     k = int(np.argmax(np.diag(outer)))
     direction = outer[:, k] / np.sqrt(outer[k, k])
     if axis @ direction < 0.0:

@@ -140,6 +140,26 @@ class CameraModel:
         limit = fold_radius(self.distortion)
         return np.asarray(is_in_front & (radius / np.where(is_in_front, z, 1.0) >= limit))
 
+    def folded_border(self, n_steps: int = 24) -> FloatArray:
+        """(K, 2) pixels on the image's border for which the distortion has no inverse.
+
+        Parameters
+        ----------
+        n_steps
+            Pixels tested along each side.
+        """
+        right, bottom = self.width_px - 1.0, self.height_px - 1.0
+        u, v = np.linspace(0.0, right, n_steps), np.linspace(0.0, bottom, n_steps)
+        border = np.concatenate(
+            [
+                np.column_stack([u, np.zeros(n_steps)]),
+                np.column_stack([u, np.full(n_steps, bottom)]),
+                np.column_stack([np.zeros(n_steps), v]),
+                np.column_stack([np.full(n_steps, right), v]),
+            ]
+        )
+        return np.asarray(border[~self.undistort(border)[1]])
+
     def undistort_with_jacobian(
         self, q_px: FloatArray
     ) -> tuple[FloatArray, BoolArray, FloatArray, FloatArray]:

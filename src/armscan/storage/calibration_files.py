@@ -27,6 +27,7 @@ from armscan.storage.calibration_schema import (
     ObservationsBody,
     SensorDocument,
 )
+from armscan.storage.foreign_opencv import read_foreign_camera
 from armscan.storage.images import read_bytes
 from armscan.storage.json_text import json_bytes, parse_json
 
@@ -91,7 +92,7 @@ def read_camera_calibration(path: Path) -> CameraCalibration:
     data = read_bytes(path)
     is_object = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{")
     if not is_object or "schema" not in parse_json(data, str(path)):
-        return _foreign_camera(path)
+        return read_foreign_camera(path)
     return _camera(data, path)
 
 
@@ -160,10 +161,6 @@ def _validated(kind: type[D], schema: str, data: bytes, path: Path) -> D:
 
 def _stage(schema: str) -> str:
     return "camera" if schema == CAMERA_SCHEMA else "laser"
-
-
-def _foreign_camera(path: Path) -> CameraCalibration:
-    raise FileFormatError("this is not a camera calibration", where=str(path))
 
 
 def _observations_body(observations: tuple[str, bytes] | None) -> ObservationsBody | None:

@@ -6,17 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from armscan.calibration.camera.result import CameraFit
-from armscan.geometry.arrays import FloatArray
-from armscan.models.camera import CameraModel
 
 FEW_VIEWS = 8
 SMALL_TILT_DEG = 15.0
 THIN_COVERAGE = 0.6
 UNSEEN_WORSE = 1.3
-BORDER_STEPS = 24
 
 
 def advise(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> CameraFit:
@@ -67,8 +62,7 @@ def _about_coverage(fit: CameraFit) -> list[str]:
 
 def _about_model(fit: CameraFit) -> list[str]:
     warnings = []
-    folded = folded_border(fit.camera)
-    if len(folded):
+    if len(fit.camera.folded_border()):
         warnings.append(
             "the distortion has no inverse at the image's border: do not measure outside the "
             "covered part"
@@ -87,19 +81,3 @@ def _about_warp(fit: CameraFit) -> list[str]:
         return []
     bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
     return [f"the board is bowed by {bow} mm (along x, along y)"]
-
-
-def folded_border(camera: CameraModel) -> FloatArray:
-    """(K, 2) pixels on the image's border where the distortion has no inverse."""
-    u = np.linspace(0.0, camera.width_px - 1.0, BORDER_STEPS)
-    v = np.linspace(0.0, camera.height_px - 1.0, BORDER_STEPS)
-    border = np.concatenate(
-        [
-            np.column_stack([u, 0.0 * u]),
-            np.column_stack([u, 0.0 * u + camera.height_px - 1.0]),
-            np.column_stack([0.0 * v, v]),
-            np.column_stack([0.0 * v + camera.width_px - 1.0, v]),
-        ]
-    )
-    _, is_valid = camera.undistort(border)
-    return border[~is_valid]

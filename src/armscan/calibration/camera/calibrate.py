@@ -125,8 +125,12 @@ def _solve_model(
     def validate(solution: Solution) -> CrossValidation | None:
         return cross_validate(observations, solution, sources, options.n_folds)
 
+    def folds(solution: Solution) -> bool:
+        camera = solution.state.camera(observations.width_px, observations.height_px)
+        return len(camera.folded_border()) > 0
+
     if options.distortion == "auto" and options.n_folds:
-        return choose_model(solve, validate)
+        return choose_model(solve, validate, folds)
     model: DistortionModel = options.distortion
     reason = f"{model} was asked for"
     if model == "auto":

@@ -6,12 +6,13 @@ Where the views cover the image that is all five coefficients, as OpenCV: one th
 without being zero makes the covariance too small, and a free one that is near zero costs little.
 With few views, or an empty rim of the image, a large model bends to the noise and predicts unseen
 views worse: then coefficients are held at zero, k3 first, then p1 and p2, then k2. Where too few
-views are left for a hold-out test, k3 is held at zero.
+views are left for a hold-out test, k3 is held at zero. Among the models within 1 % one that folds
+over inside the image (high powers run away where no target was seen) yields to one that does not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from armscan.calibration.camera.options import DistortionModel
@@ -51,6 +52,7 @@ class ChosenModel:
 def choose_model(
     solve: Callable[[DistortionModel], Solution | FitFailure],
     validate: Callable[[Solution], CrossValidation | None],
+    folds: Callable[[Solution], bool],
 ) -> ChosenModel | FitFailure:
     """Apply the rule of this module.
 
@@ -60,6 +62,8 @@ def choose_model(
         Solves with a given model.
     validate
         Tests a solution on held-out views.
+    folds
+        Whether a solution's distortion folds over inside the image.
     """
     tried: list[ChosenModel] = []
     for model in MODELS:
@@ -75,18 +79,32 @@ def choose_model(
         chosen = tried[names.index(UNTESTED_MODEL)] if UNTESTED_MODEL in names else tried[0]
         return _with_reason(chosen, "too few views for a hold-out test: k3 is held at zero")
     best = min(rms for _, rms in tested)
-    chosen, rms = next((c, rms) for c, rms in tested if rms <= TOLERATED * best)
-    if chosen.model == MODELS[0]:
-        return _with_reason(
-            chosen,
-            "all five coefficients: no smaller model predicts unseen views better by more than 1 %",
+    good = [(chosen, rms) for chosen, rms in tested if rms <= TOLERATED * best]
+    unfolded = [(chosen, rms) for chosen, rms in good if not folds(chosen.solution)]
+    chosen, rms = (unfolded or good)[0]
+    return _with_reason(chosen, _reason(chosen.model, rms, tested, good))
+
+
+def _reason(
+    model: DistortionModel,
+    rms: float,
+    tested: Sequence[tuple[ChosenModel, float]],
+    good: Sequence[tuple[ChosenModel, float]],
+) -> str:
+    if model == MODELS[0]:
+        return (
+            "all five coefficients: no smaller model predicts unseen views better by more than 1 %"
         )
-    larger = tested[[c.model for c, _ in tested].index(chosen.model) - 1]
-    worse = 100.0 * (larger[1] / rms - 1.0)
-    return _with_reason(
-        chosen,
-        f"{larger[0].model} predicts unseen views {worse:.1f} % worse than {chosen.model}: "
-        "too few views, or too little of the image covered, for more coefficients",
+    if model != good[0][0].model:
+        return (
+            f"{good[0][0].model} folds over inside the image, and {model} predicts unseen views "
+            "as well"
+        )
+    models = [chosen.model for chosen, _ in tested]
+    larger, larger_rms = tested[models.index(model) - 1]
+    return (
+        f"{larger.model} predicts unseen views {100.0 * (larger_rms / rms - 1.0):.1f} % worse than "
+        f"{model}: too few views, or too little of the image covered, for more coefficients"
     )
 
 

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import frozen_floats, frozen_ints
+from armscan.geometry.estimate import Estimate, FitFailure
+
+
+def test_frozen_arrays_are_copies_in_row_order() -> None:
+    source = np.asfortranarray(np.arange(6.0).reshape(2, 3))
+    frozen = frozen_floats(source, (None, 3), "points")
+    source[0, 0] = 99.0
+    assert frozen[0, 0] == 0.0
+    assert frozen.flags.c_contiguous
+    assert not frozen.flags.writeable
+    assert frozen_ints([1, 2], (2,), "index").dtype == np.int64
+
+
+@pytest.mark.parametrize("shape", [(2,), (None,), (3, 2), (None, 4)])
+def test_wrong_shapes_are_named(shape: tuple[int | None, ...]) -> None:
+    with pytest.raises(InputError, match=r"points_mm has shape \(2, 3\), expected"):
+        frozen_floats(np.zeros((2, 3)), shape, "points_mm")
+
+
+def test_nan_and_infinity() -> None:
+    with pytest.raises(InputError, match="1 values that are not finite"):
+        frozen_floats([1.0, np.nan], (2,), "x")
+    assert np.isnan(frozen_floats([1.0, np.nan], (2,), "x", allow_nan=True)[1])
+    with pytest.raises(InputError, match="not finite"):
+        frozen_floats([1.0, np.inf], (2,), "x", allow_nan=True)
+
+
+def test_estimate_checks_its_covariance_and_gives_sigmas() -> None:
+    estimate = Estimate("value", ("a_mm", "b_mm"), np.diag([4.0, 9.0]), np.zeros(3), 1, 0.0)
+    assert estimate.sigma.tolist() == [2.0, 3.0]
+    with pytest.raises(InputError, match="covariance"):
+        Estimate("value", ("a_mm",), np.eye(2), np.zeros(3), 1, 0.0)
+
+
+def test_a_failure_is_false() -> None:
+    assert not FitFailure("too few points")

@@ -102,6 +102,23 @@ class Ellipses:
         half = np.sqrt((1.0 + offset)[:, None] / eigenvalues) * self.scale_px[:, None]
         return half[:, ::-1], directions[:, :, ::-1]
 
+    def distance_px(self, points_px: FloatArray) -> FloatArray:
+        """Signed first-order distance (N, K) of points (N, K, 2) to their ellipses, px."""
+        own = (points_px - self.origin_px[:, None]) / self.scale_px[:, None, None]
+        return _sampson(own, self.terms)[0] * self.scale_px[:, None]
+
+    def circles_where(self, replaced: BoolArray, origin_px: FloatArray) -> Ellipses:
+        """Return a copy with unit circles at (N, 2) origins where a fit is to be replaced."""
+        circle = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
+        return Ellipses(
+            np.where(replaced[:, None], origin_px, self.origin_px),
+            np.where(replaced, 1.0, self.scale_px),
+            np.where(replaced[:, None], circle, self.terms),
+            np.where(replaced[:, None, None], np.eye(5), self.covariance),
+            self.chi2,
+            self.degrees_of_freedom,
+        )
+
     def _own_lines(self, lines_px: FloatArray) -> FloatArray:
         own = lines_px.copy()
         own[:, 2] += (lines_px[:, :2] * self.origin_px).sum(axis=1)

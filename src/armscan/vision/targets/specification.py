@@ -108,6 +108,4 @@ def _length_mm(text: str, kind: str, name: str, field: str) -> float:
 
 
 def _wrong(text: str, kind: str, what: str) -> OptionError:
-    return OptionError(
-        what, where=f"target '{text}'", remedy=f"write for example {EXAMPLES[kind]}"
-    )
+    return OptionError(what, where=f"target '{text}'", remedy=f"write for example {EXAMPLES[kind]}")

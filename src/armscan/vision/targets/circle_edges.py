@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sub-pixel edge points of circles, starting from rough ellipses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.vision.targets.edge_profile import EdgeProfiles, fit_profiles
+from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
+from armscan.vision.targets.ellipse_band import Rims, band_pixels
+from armscan.vision.targets.grey import RawGrey
+
+SECTOR_PX = 4.0
+"""Arc length of a sector, px."""
+BAND_BLURS = 3.5
+"""Half width of the band along a rim, in standard deviations of the edge."""
+MIN_SECTORS, MAX_SECTORS = 8, 96
+_ROUNDS = 3
+_FIRST_BAND_PX = 6.0
+_MIN_CONTRAST = 0.35
+_MAX_MISFIT = 9.0
+_OUTLIER_SIGMAS = 4.5
+_MIN_EDGE_FRACTION = 0.5
+_MAX_SHAPE_CHANGE = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredCircles:
+    """Edge points of N circles in K sectors.
+
+    Parameters
+    ----------
+    points_px
+        (N, K, 2) edge points, image pixels.
+    sigma_px
+        (N, K) standard deviation along the normal; infinite where a sector was rejected.
+    is_good
+        (N,) False where too few sectors show an edge, or they lie on no ellipse.
+    ellipses
+        The fits.
+    blur_px
+        (N,) standard deviation of the edges.
+    """
+
+    points_px: FloatArray
+    sigma_px: FloatArray
+    is_good: BoolArray
+    ellipses: Ellipses
+    blur_px: FloatArray
+
+
+def measure_circles(
+    grey: RawGrey, centres_px: FloatArray, shapes_px2: FloatArray, min_contrast_levels: float
+) -> MeasuredCircles:
+    """Measure circles on raw pixels.
+
+    Parameters
+    ----------
+    grey
+        (H, W) raw levels.
+    centres_px, shapes_px2
+        (N, 2) and (N, 2, 2): ellipses to about 2 px; ``d' S^-1 d = 1`` on the rim.
+    min_contrast_levels
+        Circles with less contrast are not good.
+    """
+    rims = Rims.from_shapes(centres_px, shapes_px2)
+    perimeter = float(np.median(np.pi * rims.half_px.sum(axis=1)))
+    n_sectors = int(np.clip(round(perimeter / SECTOR_PX), MIN_SECTORS, MAX_SECTORS))
+    width = np.maximum(_FIRST_BAND_PX, 0.15 * rims.half_px[:, 0])
+    blur = np.ones(len(rims))
+    angle = (np.arange(n_sectors) + 0.5) * (2.0 * np.pi / n_sectors)
+    for _ in range(_ROUNDS):
+        width = np.minimum(width, _widest(rims))
+        pixels = band_pixels(grey, rims, width)
+        profiles = fit_profiles(pixels, len(rims), n_sectors, blur)
+        points, sigma = _edge_points(rims, angle, profiles)
+        ellipses, sigma = _robust_fit(points, sigma)
+        rims = _updated(rims, ellipses)
+        blur = profiles.blur_px
+        width = BAND_BLURS * blur + 1.0
+    contrast = np.abs(np.median(profiles.contrast, axis=1))
+    is_good = ellipses.is_ellipse & (contrast >= min_contrast_levels)
+    is_good &= np.isfinite(sigma).mean(axis=1) >= _MIN_EDGE_FRACTION
+    is_good &= np.hypot(*(rims.centres_px - centres_px).T) < 0.5 * rims.half_px[:, 0]
+    return MeasuredCircles(points, sigma, is_good, ellipses, blur)
+
+
+def _widest(rims: Rims) -> FloatArray:
+    """Half width within which the nearest rim point is unique and the middle is left out."""
+    short, long = rims.half_px.T
+    return np.asarray(np.maximum(1.5, np.minimum(0.7 * short, 0.9 * short**2 / long)))
+
+
+def _edge_points(
+    rims: Rims, angle: FloatArray, profiles: EdgeProfiles
+) -> tuple[FloatArray, FloatArray]:
+    """Edge points, and sigma with rejected sectors at infinity."""
+    points, normals, curvature = rims.points(angle)
+    # Blur moves the middle level of a convex edge inwards by half its variance times curvature.
+    shift = profiles.shift_px + 0.5 * profiles.blur_px[:, None] ** 2 * curvature
+    typical = np.median(profiles.contrast, axis=1)[:, None]
+    is_edge = profiles.contrast * np.sign(typical) > _MIN_CONTRAST * np.abs(typical)
+    is_edge &= profiles.misfit < _MAX_MISFIT
+    sigma = np.where(is_edge, profiles.sigma_px, np.inf)
+    return points + shift[..., None] * normals, sigma
+
+
+def _robust_fit(points: FloatArray, sigma: FloatArray) -> tuple[Ellipses, FloatArray]:
+    """Fit, drop sectors far off their ellipse, fit again; sigma inflated where chi2 asks for it."""
+    ellipses = fit_ellipses(points, sigma**-2.0)
+    for _ in range(2):
+        distance = ellipses.distance_px(points)
+        used = np.isfinite(sigma)
+        scaled = np.where(used, np.abs(distance) / np.where(used, sigma, 1.0), np.nan)
+        scaled[~used.any(axis=1)] = 0.0
+        typical = np.maximum(1.0, 1.4826 * np.nanmedian(scaled, axis=1))
+        sigma = np.where(scaled <= _OUTLIER_SIGMAS * typical[:, None], sigma, np.inf)
+        ellipses = fit_ellipses(points, sigma**-2.0)
+    excess = ellipses.chi2 / np.maximum(ellipses.degrees_of_freedom, 1.0)
+    sigma = sigma * np.sqrt(np.maximum(1.0, excess))[:, None]
+    return fit_ellipses(points, sigma**-2.0), sigma
+
+
+def _updated(rims: Rims, ellipses: Ellipses) -> Rims:
+    """The fitted rims; a fit that ran away leaves the rim as it was."""
+    usable = ellipses.is_ellipse & (ellipses.degrees_of_freedom > 0.0)
+    safe = ellipses.circles_where(~usable, rims.centres_px)
+    half, directions = safe.axes()
+    centres, _ = safe.centres()
+    ratio = np.abs(np.log(half / rims.half_px)).max(axis=1)
+    usable &= ratio < np.log(_MAX_SHAPE_CHANGE)
+    return Rims(
+        np.where(usable[:, None], centres, rims.centres_px),
+        np.where(usable[:, None], half, rims.half_px),
+        np.where(usable[:, None, None], directions, rims.directions),
+    )

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_camera, calibrate_laser, doctor, info, reconstruct
+from armscan.cli import calibrate_camera, calibrate_laser, demo, doctor, info, reconstruct
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -19,6 +19,7 @@ app = typer.Typer(
     epilog=(
         "\b\nFirst steps:\n"
         "  armscan doctor                                  is everything installed?\n"
+        "  armscan demo photos -o demo                     the whole chain on rendered photos\n"
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n"
         "  armscan COMMAND -h                              options, and an example that works"
     ),
@@ -41,6 +42,7 @@ calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.ca
 calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
 app.add_typer(calibrate, name="calibrate")
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
+app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
 app.command("info", epilog=info.EXAMPLE)(info.info)
 app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, Sheet
 from armscan.calibration.laser.sheet_model import SheetModel, sheet_geometry
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, SheetCalibration
 
@@ -60,34 +60,33 @@ class SheetCase:
 def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
     """Solve all sheets together and put the result into words and numbers.
 
-    Where the final lack-of-fit test of a sheet fails, the covariance of the sheets is widened by
-    its F ratio: what the model does not explain must not make the sheets look better known.
+    Where the final lack-of-fit test of a sheet fails, its stripes' sigmas have been raised: what
+    the model does not explain must not make the sheet look better known.
     """
     models, used = case.models, case.observations.select(case.kept)
     is_bowed = [model.is_bowed for model in models]
-    sigma_factor = max(model.noise.sigma_factor for model in models)
-    start = [model.sheet for model in models]
-    solution = solve_sheets(used, start, case.errors, is_bowed, sigma_factor=sigma_factor)
-    unexplained = [
-        model.final_test.f_ratio
-        for model in models
-        if model.final_test.p_value < case.options.lack_of_fit_p
-    ]
-    widening = max([1.0, *unexplained])
-    covariance = solution.covariance.copy()
-    covariance[9:, 9:] *= widening
+    factors = np.array([model.sigma_factor for model in models])
+    solution = solve_sheets(
+        used,
+        [model.sheet for model in models],
+        case.errors,
+        is_bowed,
+        sigma_factor=factors[used.sheet],
+    )
     sheets = []
     for k in range(len(models)):
-        fit = _sheet_fit(k, case, solution, covariance)
+        fit = _sheet_fit(k, case, solution)
         if isinstance(fit, FitFailure):
             return fit
         sheets.append(fit)
     warnings = list(case.named.warnings)
-    if widening > 1.0:
-        warnings.append(
-            f"the model does not explain the stripes within their noise and the boards' errors; "
-            f"the sheets' sigmas are widened {np.sqrt(widening):.1f} times"
-        )
+    for name, model in zip(case.named.names, models, strict=True):
+        raised = model.sigma_factor / model.noise.sigma_factor
+        if raised > 1.0:
+            warnings.append(
+                f"sheet {name}: its model does not explain the stripes within their noise and the "
+                f"boards' errors; the stripes' sigmas are taken {raised:.1f} times larger"
+            )
     if not case.camera.has_covariance:
         warnings.append(
             "the camera came without covariance: the sheets' sigmas leave its errors out"
@@ -96,7 +95,7 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
         tuple(sheets),
         _image_evidence(case, solution),
         case.camera,
-        covariance,
+        solution.covariance,
         max(model.noise.factor for model in models),
         max(model.noise.correlation_points for model in models),
         case.named.how,
@@ -105,14 +104,12 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
     )
 
 
-def _sheet_fit(
-    k: int, case: SheetCase, solution: SheetSolution, joint: FloatArray
-) -> SheetFit | FitFailure:
+def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | FitFailure:
     images, named, model = case.images, case.named, case.models[k]
     used = case.observations.select(case.kept)
     own = used.sheet == k
     points, sheet = used.points_mm[own], solution.sheets[k]
-    covariance = joint[9 + 8 * k : 17 + 8 * k, 9 + 8 * k : 17 + 8 * k]
+    covariance = solution.covariance[9 + 8 * k : 17 + 8 * k, 9 + 8 * k : 17 + 8 * k]
     geometry = sheet_geometry(sheet, used.select(own), images)
     tilt_variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     tilt_sigma_deg = float(np.degrees(np.sqrt(max(tilt_variance, 0.0)) / sheet.scale_mm))
@@ -148,8 +145,13 @@ def _sheet_fit(
 
 
 def _common_plane(k: int, case: SheetCase) -> CommonPlane | None:
+    factor = case.models[k].sigma_factor
     members = [
-        PosedSighting(sighting, image.data.sensor_from_board.covariance, case.camera.covariance)
+        PosedSighting(
+            replace(sighting, sigma_ends_mm=sighting.sigma_ends_mm * factor),
+            image.data.sensor_from_board.covariance,
+            case.camera.covariance,
+        )
         for image, sheets in zip(case.images, case.named.sheets, strict=True)
         for sighting, sheet in zip(image.sightings, sheets, strict=True)
         if sheet == k

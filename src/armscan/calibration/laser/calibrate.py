@@ -9,6 +9,7 @@ import numpy as np
 
 from armscan.calibration.laser.assembly import SheetCase, assemble_fit
 from armscan.calibration.laser.conditioning import refuse_few_boards
+from armscan.calibration.laser.lack_of_fit import stripe_noise
 from armscan.calibration.laser.naming import name_stripes
 from armscan.calibration.laser.observations import SheetObservations, collect_observations
 from armscan.calibration.laser.options import SheetOptions
@@ -96,11 +97,15 @@ def _without_outliers(
     """Keep the points near the plane; a bow widens the robust scale and so keeps its points."""
     keep = np.ones(len(observations), dtype=np.bool_)
     alone = observations.as_one_sheet()
+    # Stripes that scatter more than they claim must not drag the boards along.
+    noise = stripe_noise(alone, alone.residuals_px([start])[1])
     for _ in range(OUTLIER_ROUNDS):
         used = alone.select(keep)
-        solution = solve_sheets(used, [start], errors, [False], is_robust=True)
+        solution = solve_sheets(
+            used, [start], errors, [False], sigma_factor=noise.sigma_factor, is_robust=True
+        )
         normalised = np.full(len(keep), np.inf)
-        normalised[keep] = np.abs(solution.remaining_px / used.sigma_px)
+        normalised[keep] = np.abs(solution.remaining_px / used.sigma_px) / noise.factor
         scale = max(1.0, 1.4826 * float(np.median(normalised[keep])))
         before = int(keep.sum())
         keep = normalised < options.outlier_sigma * scale

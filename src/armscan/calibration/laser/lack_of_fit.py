@@ -92,9 +92,12 @@ def _correlation(rest: list[FloatArray]) -> float:
 
 
 def lack_of_fit(
-    observations: SheetObservations, solution: SheetSolution, noise: StripeNoise
+    observations: SheetObservations,
+    solution: SheetSolution,
+    noise: StripeNoise,
+    sigma_factor: float | None = None,
 ) -> LackOfFit:
-    """Test a solution that was weighted with ``noise.sigma_factor``.
+    """Test a solution that was weighted with ``noise.sigma_factor``, or with a larger one.
 
     Of each stripe the first four shape terms (offset, slope, curvature, twist) are compared with
     the model; what scatters around them is the noise. Board and camera errors are free within
@@ -104,7 +107,8 @@ def lack_of_fit(
     freedom = N_SHAPE * n_stripes - solution.n_parameters
     if freedom <= 0:
         return LackOfFit(0.0, 0, 1.0)
-    squares = max(solution.chi2 - noise.effective_freedom, 0.0)
+    share = (noise.sigma_factor / (sigma_factor or noise.sigma_factor)) ** 2
+    squares = max(solution.chi2 - noise.effective_freedom * share, 0.0)
     ratio = squares / freedom
     p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
     return LackOfFit(ratio, freedom, p_value)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from armscan.geometry.fitting import fit_plane
 from armscan.models.light_sheet import LightSheet
 
 MAX_BOW_CONDITION = 1e7
+MAX_RAISES = 10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +51,9 @@ class SheetModel:
         Lack of fit of the plane, and of the model chosen.
     decision
         Why there is a bow, or none.
+    sigma_factor
+        By which the stripes' sigmas are multiplied in the joint fit: their noise, its correlation,
+        and what the model leaves unexplained.
     """
 
     sheet: LightSheet
@@ -58,6 +62,7 @@ class SheetModel:
     plane_test: LackOfFit
     final_test: LackOfFit
     decision: str
+    sigma_factor: float
 
 
 def sheet_geometry(
@@ -105,14 +110,17 @@ def choose_model(
 ) -> SheetModel:
     """Fit the plane, test its fit, and let the sheet bow if the test asks for it."""
     alone = observations.as_one_sheet()
-    first = solve_sheets(alone, [start], errors, [False])
+    noise = stripe_noise(alone, alone.residuals_px([start])[1])
+    first = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
     noise = stripe_noise(alone, first.remaining_px)
     flat = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
     plane_test = lack_of_fit(alone, flat, noise)
     test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
 
     def plane(decision: str) -> SheetModel:
-        return SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision)
+        factor = noise.sigma_factor
+        model = SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision, factor)
+        return _with_explained_stripes(model, alone, errors, options)
 
     if plane_test.p_value >= options.lack_of_fit_p:
         return plane(f"a plane is enough ({test})")
@@ -140,7 +148,33 @@ def choose_model(
         f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
         f"(gain F {ratio:.1f}); left F {final.f_ratio:.2f}, p {final.p_value:.2g}"
     )
-    return SheetModel(bowed.sheets[0], True, noise, plane_test, final, decision)
+    factor = noise.sigma_factor
+    model = SheetModel(bowed.sheets[0], True, noise, plane_test, final, decision, factor)
+    return _with_explained_stripes(model, alone, errors, options)
+
+
+def _with_explained_stripes(
+    model: SheetModel,
+    observations: SheetObservations,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> SheetModel:
+    """Raise the stripes' sigmas until the model fits, if it did not.
+
+    What a model leaves unexplained is charged to the stripes, not to the boards: else the boards'
+    poses would be bent to follow it. The covariance of the sheet grows with it.
+    """
+    factor, test, sheet = model.sigma_factor, model.final_test, model.sheet
+    for _ in range(MAX_RAISES):
+        if test.p_value >= options.lack_of_fit_p or test.f_ratio <= 1.0:
+            break
+        factor *= float(np.sqrt(test.f_ratio))
+        solution = solve_sheets(
+            observations, [sheet], errors, [model.is_bowed], sigma_factor=factor
+        )
+        sheet = solution.sheets[0]
+        test = lack_of_fit(observations, solution, model.noise, factor)
+    return replace(model, sheet=sheet, sigma_factor=factor)
 
 
 def _bow_condition(observations: SheetObservations, flat: SheetSolution) -> float:

@@ -100,7 +100,7 @@ def solve_sheets(
     errors: CommonErrors,
     is_bowed: Sequence[bool],
     *,
-    sigma_factor: float = 1.0,
+    sigma_factor: float | FloatArray = 1.0,
     is_robust: bool = False,
 ) -> SheetSolution:
     """Fit the sheets by Gauss-Newton steps.
@@ -116,7 +116,7 @@ def solve_sheets(
     is_bowed
         For each sheet, whether its bow is free; a bow that is not free is zero.
     sigma_factor
-        Multiplies the stripes' sigmas in the weights.
+        Multiplies the stripes' sigmas in the weights; one number, or one a point.
     is_robust
         Weigh points down by Huber's function on what remains; for finding outliers.
     """

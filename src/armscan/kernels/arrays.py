@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Array types of the kernels, for Numba and for the type checker.
 
-Inputs are declared read-only, so that frozen records and writable arrays share one compiled version.
+Inputs are declared read-only, so that frozen records and writable arrays share one compiled
+version.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ Float32Array: TypeAlias = NDArray[np.float32]
 Float64Array: TypeAlias = NDArray[np.float64]
 Int64Array: TypeAlias = NDArray[np.int64]
 MaskArray: TypeAlias = NDArray[np.uint8]
+MapArray: TypeAlias = NDArray[np.int32]
 
 IMAGE_IN = types.Array(types.float32, 2, "C", readonly=True)
 MASK_IN = types.Array(types.uint8, 2, "C", readonly=True)

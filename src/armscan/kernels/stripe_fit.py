@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 from numba import njit, types
 
 from armscan.kernels.arrays import (
@@ -60,11 +59,11 @@ def read_sides(
         far = max(SIDE_FAR * sigma_px[i], near + 2.0)
         for side in range(2):
             if side == 0:
-                first = int(math.ceil(centre - far))
-                last = int(math.floor(centre - near))
+                first = math.ceil(centre - far)
+                last = math.floor(centre - near)
             else:
-                first = int(math.ceil(centre + near))
-                last = int(math.floor(centre + far))
+                first = math.ceil(centre + near)
+                last = math.floor(centre + far)
             first = max(first, 0)
             last = min(last, size - 1)
             total = 0.0
@@ -126,8 +125,8 @@ def fit_profiles(
         line = int(points[i, 0] if is_column else points[i, 1])
         size = height if is_column else width
         half = max(reach * sigma_px[i], 2.0)
-        first = max(int(math.ceil(start - half)), 0)
-        last = min(int(math.floor(start + half)), size - 1)
+        first = max(math.ceil(start - half), 0)
+        last = min(math.floor(start + half), size - 1)
         n_clipped = 0
         if has_clipped:
             for k in range(first, last + 1):

@@ -147,8 +147,8 @@ def step_to_ridge(
         (5,) output: x, y, normal x, normal y, negative second derivative along the normal.
     """
     height, width = image.shape
-    x = int(math.floor(x_px + 0.5))
-    y = int(math.floor(y_px + 0.5))
+    x = math.floor(x_px + 0.5)
+    y = math.floor(y_px + 0.5)
     for _ in range(ROUNDS):
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
@@ -176,15 +176,13 @@ def step_to_ridge(
             return True
         if abs(step) > taps.shape[1] // 2:
             return False
-        x += int(math.floor(dx + 0.5))
-        y += int(math.floor(dy + 0.5))
+        x += math.floor(dx + 0.5)
+        y += math.floor(dy + 0.5)
     return False
 
 
 @njit(
-    types.int64(
-        IMAGE_IN, TABLE_IN, types.int64, TAPS_IN, types.float64, TABLE_OUT
-    ),
+    types.int64(IMAGE_IN, TABLE_IN, types.int64, TAPS_IN, types.float64, TABLE_OUT),
     cache=True,
     nogil=True,
 )

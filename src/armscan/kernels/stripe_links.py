@@ -14,6 +14,7 @@ from armscan.kernels.arrays import (
     TABLE_IN,
     Float64Array,
     Int64Array,
+    MapArray,
 )
 
 REACH_PX = 2.9
@@ -27,7 +28,7 @@ MAP_OUT = types.Array(types.int32, 2, "C")
 
 
 @njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT), cache=True, nogil=True)
-def place_points(points: Float64Array, owner: Int64Array, is_kept: Int64Array) -> None:
+def place_points(points: Float64Array, owner: MapArray, is_kept: Int64Array) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
     Parameters
@@ -65,7 +66,7 @@ def place_points(points: Float64Array, owner: Int64Array, is_kept: Int64Array) -
 
 @njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
 def find_neighbours(
-    points: Float64Array, owner: Int64Array, ahead: Int64Array, behind: Int64Array
+    points: Float64Array, owner: MapArray, ahead: Int64Array, behind: Int64Array
 ) -> None:
     """Best continuation of each point to both sides along its tangent.
 
@@ -110,9 +111,7 @@ def find_neighbours(
 
 
 @njit(types.int64(INTS_OUT, INTS_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
-def walk_chains(
-    ahead: Int64Array, behind: Int64Array, order: Int64Array, chain: Int64Array
-) -> int:
+def walk_chains(ahead: Int64Array, behind: Int64Array, order: Int64Array, chain: Int64Array) -> int:
     """Order the points along their chains, ends first, then loops; lone points are left out.
 
     Parameters

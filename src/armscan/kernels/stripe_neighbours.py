@@ -23,7 +23,15 @@ OWN_SPAN = 3.0
 
 @njit(
     types.void(
-        TABLE_IN, INTS_IN, INTS_IN, INTS_IN, INTS_IN, types.int64, types.int64, types.float64, TABLE_OUT
+        TABLE_IN,
+        INTS_IN,
+        INTS_IN,
+        INTS_IN,
+        INTS_IN,
+        types.int64,
+        types.int64,
+        types.float64,
+        TABLE_OUT,
     ),
     cache=True,
     nogil=True,
@@ -94,9 +102,9 @@ def find_other_lines(
                     continue
                 low = first[r, c]
                 high = last[r, c]
-                if chain[low] == chain[i] and chain[high] == chain[i]:
-                    if i - low <= own and high - i <= own:
-                        continue
+                is_own = chain[low] == chain[i] and chain[high] == chain[i]
+                if is_own and i - low <= own and high - i <= own:
+                    continue
                 size = stop[i] - start[i]
                 while j >= 0:
                     apart = abs(i - j)

@@ -49,6 +49,38 @@ def interpolate_row(grid: Float32Array, cell_px: int, y: int, row: Float32Array)
         row[x] = a + (u - k) * (b - a)
 
 
+@njit(types.float64(IMAGE_IN, types.int64, types.int64, types.int64), cache=True, nogil=True)
+def level_at(image: Float32Array, axis: int, line: int, k: int) -> float:
+    """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
+    return float(image[k, line] if axis == COLUMN else image[line, k])
+
+
+@njit(
+    types.float64(
+        IMAGE_IN, types.int64, types.int64, types.int64, types.int64, types.float64, types.float64
+    ),
+    cache=True,
+    nogil=True,
+)
+def hump_centre(
+    image: Float32Array,
+    axis: int,
+    line: int,
+    first: int,
+    last: int,
+    background: float,
+    peak: float,
+) -> float:
+    """Centroid of what rises above half of the peak, so that a bright ground does not pull it."""
+    floor = background + 0.5 * peak
+    weight = moment = 0.0
+    for k in range(first, last + 1):
+        above = max(level_at(image, axis, line, k) - floor, 0.0)
+        weight += above
+        moment += above * k
+    return moment / weight if weight > 0.0 else 0.5 * (first + last)
+
+
 @njit(
     types.int64(
         IMAGE_IN,
@@ -75,7 +107,7 @@ def split_run(
     runs: Float64Array,
     count: int,
 ) -> int:
-    """Append the centroid of each hump of one run; return the new count.
+    """Append the centre of each hump of one run; return the new count.
 
     A run is split where the three-pixel mean dips below half of the peaks on both sides, so that
     two lines that share a foot become two candidates.
@@ -95,50 +127,31 @@ def split_run(
     """
     peak = 0.0
     low = np.inf
-    weight = 0.0
-    moment = 0.0
-    low_weight = 0.0
-    low_moment = 0.0
+    low_at = start = first
     for k in range(first, last + 2):
         is_end = k > last
-        value = 0.0
         smooth = 0.0
         if not is_end:
-            before = max(k - 1, first)
-            after = min(k + 1, last)
-            if axis == COLUMN:
-                value = image[k, line] - background
-                smooth = (image[before, line] + image[k, line] + image[after, line]) / 3.0
-            else:
-                value = image[line, k] - background
-                smooth = (image[line, before] + image[line, k] + image[line, after]) / 3.0
-            smooth -= background
-        is_split = not is_end and low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise
-        if is_end or is_split:
-            share = weight if is_end else low_weight
-            part = moment if is_end else low_moment
-            if share > 0.0:
-                if count < runs.shape[0]:
-                    centre = part / share
-                    runs[count, 0] = line if axis == COLUMN else centre
-                    runs[count, 1] = centre if axis == COLUMN else line
-                    runs[count, 2] = axis
-                count += 1
-            weight -= low_weight
-            moment -= low_moment
+            smooth = level_at(image, axis, line, k)
+            smooth += level_at(image, axis, line, max(k - 1, first))
+            smooth += level_at(image, axis, line, min(k + 1, last))
+            smooth = smooth / 3.0 - background
+        if is_end or (low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise):
+            if count < runs.shape[0]:
+                stop = last if is_end else low_at
+                centre = hump_centre(image, axis, line, start, stop, background, peak)
+                runs[count, 0] = line if axis == COLUMN else centre
+                runs[count, 1] = centre if axis == COLUMN else line
+                runs[count, 2] = axis
+            count += 1
+            start = low_at
+            peak = 0.0
+        if smooth >= peak:
             peak = smooth
             low = np.inf
-        if not is_end:
-            above = max(value - rise, 0.0)
-            weight += above
-            moment += above * k
-            if smooth >= peak:
-                peak = smooth
-                low = np.inf
-            if smooth < low:
-                low = smooth
-                low_weight = weight
-                low_moment = moment
+        if smooth < low:
+            low = smooth
+            low_at = k
     return count
 
 

@@ -58,7 +58,14 @@ def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
 
 @njit(
     types.void(
-        TABLE_IN, TABLE_IN, FLOATS_IN, INTS_IN, INTS_IN, FLOATS_IN, FLOATS_IN, types.float64,
+        TABLE_IN,
+        TABLE_IN,
+        FLOATS_IN,
+        INTS_IN,
+        INTS_IN,
+        FLOATS_IN,
+        FLOATS_IN,
+        types.float64,
         TABLE_OUT,
     ),
     cache=True,
@@ -98,8 +105,9 @@ def smooth_chains(
         Half width of the confidence intervals in sigmas.
     result
         (N, 8) output: shift along the normal, slope of the line against the tangent, its second
-        derivative (curvature) and that one's sigma, sigma of the shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
-        alone, and that prediction's sigma (0: there is none).
+        derivative (curvature) and that one's sigma, sigma of the shift, half window (0: not
+        smoothed), prediction of the point's shift by its neighbours alone, and that prediction's
+        sigma (0: there is none).
     """
     n = points.shape[0]
     moments = np.zeros(8)

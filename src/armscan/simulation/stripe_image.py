@@ -35,7 +35,8 @@ class SimulatedStripe:
     modulation, modulation_px
         Share and period of a sinusoidal change of the peak along the line.
     skew
-        Third-order part of the cross-section: the Gaussian is multiplied by 1 + skew (u^3 - 3 u) / 6.
+        Third-order part of the cross-section: the Gaussian is multiplied by
+        ``1 + skew (u^3 - 3 u) / 6``.
     reflectance_gradient
         Relative change of reflectance per sigma across the line.
     """
@@ -82,6 +83,7 @@ class StripeNoise:
     read: float = 1.0
 
 
+FULL_SENSOR = SensorWindow()
 NO_NOISE = StripeNoise(speckle=0.0, electrons_per_level=1e12, read=0.0)
 
 
@@ -114,7 +116,7 @@ class StripeScene:
     background_step: float = 0.0
     noise: StripeNoise = StripeNoise()
     bits: int = 8
-    window: SensorWindow = SensorWindow()
+    window: SensorWindow = FULL_SENSOR
 
     def __post_init__(self) -> None:
         if not 8 <= self.bits <= 16 or min(self.width_px, self.height_px) < 1:
@@ -205,7 +207,7 @@ def _pixel_mean(stripe: SimulatedStripe, centres: FloatArray) -> FloatArray:
     total = np.zeros(len(centres))
     for u, a in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
         for v, b in zip(GAUSS_NODES, GAUSS_WEIGHTS, strict=True):
-            total += 0.25 * a * b * stripe.profile(centres + [0.5 * u, 0.5 * v])
+            total += 0.25 * a * b * stripe.profile(centres + 0.5 * np.array([u, v]))
     return total
 
 

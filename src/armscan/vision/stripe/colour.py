@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.laser_off import subtract
 from armscan.vision.stripe.options import LaserColour
@@ -47,14 +48,21 @@ def split_channels(exposure: Exposure, background: Exposure | None) -> ColourIma
     scale = exposure.full_scale
     channels, clipped = [], []
     for k in range(3):
-        raw = np.ascontiguousarray(exposure.image[:, :, k])
+        raw = _channel(exposure, k)
         channel = to_units(raw, scale)
         if background is not None:
-            dark = to_units(np.ascontiguousarray(background.image[:, :, k]), background.full_scale)
+            dark = to_units(_channel(background, k), background.full_scale)
             channel = subtract(channel, dark, NORMAL_SCALE)
         channels.append(channel)
         clipped.append(saturated_mask(raw, scale))
     return ColourImages(tuple(channels), tuple(clipped))
+
+
+def _channel(exposure: Exposure, k: int) -> ImageArray:
+    image = exposure.image
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image[:, :, k], dtype=np.uint8)
+    return np.ascontiguousarray(image[:, :, k], dtype=np.uint16)
 
 
 def colour_excess(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
@@ -109,16 +117,24 @@ def colour_plane(
         return StripePlane(mean, clipped, clipped, factor)
     own = CHANNELS.index(colour)
     excess = colour_excess(images, colour)
+    unknown = None
+    if background is not None:
+        unknown = saturated_mask(_channel(background, own), background.full_scale)
     core = _core_channel(images, excess, own)
     if core is None:
-        return StripePlane(images.channels[own], images.clipped[own], images.clipped[own], factor, excess)
+        return StripePlane(
+            images.channels[own],
+            images.clipped[own],
+            images.clipped[own],
+            factor,
+            excess,
+            unknown,
+        )
     both = images.channels[own] + images.channels[core]
-    return StripePlane(both, images.clipped[core], images.clipped[own], factor, excess)
+    return StripePlane(both, images.clipped[core], images.clipped[own], factor, excess, unknown)
 
 
-def _core_channel(
-    images: ColourImages, excess: NDArray[np.float32], own: int
-) -> int | None:
+def _core_channel(images: ColourImages, excess: NDArray[np.float32], own: int) -> int | None:
     """The channel that shows a core in which the laser's own is saturated; None if none is."""
     s = RIDGE_STEP_PX
     ridge = ridge_height(excess)

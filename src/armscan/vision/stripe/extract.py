@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.stripe_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
+from armscan.vision.stripe.classic import THESIS_METHODS, link_centres
 from armscan.vision.stripe.colour import colour_plane
 from armscan.vision.stripe.flags import (
     is_asymmetric,
@@ -17,18 +20,19 @@ from armscan.vision.stripe.flags import (
     is_saturated,
     is_short,
 )
-from armscan.vision.stripe.gate import has_laser_colour
+from armscan.vision.stripe.gate import has_laser_colour, is_on_known_ground
 from armscan.vision.stripe.laser_off import check_background
 from armscan.vision.stripe.level import measure_level
 from armscan.vision.stripe.options import StripeOptions
 from armscan.vision.stripe.plane import StripePlane, mono_plane
 from armscan.vision.stripe.profile_fit import ProfileFits, axis_component, fit_ridge
 from armscan.vision.stripe.ridge import (
+    RidgePoints,
     find_candidates,
     is_bright,
     trace_ridges,
 )
-from armscan.vision.stripe.smoothing import curvature, smooth
+from armscan.vision.stripe.smoothing import Course, curvature, scatter, smooth
 from armscan.vision.stripe.width import find_line_sigma
 
 LEAST_SIGMA_PX = 0.002
@@ -78,14 +82,56 @@ def extract_stripes(
     level = measure_level(plane.image, threshold)
     runs = find_candidates(plane.image, level)
     sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
-    ridge = trace_ridges(plane.image, runs, sigma, level.rise)
-    ridge = ridge.select(is_bright(ridge, options.faintest_share))
-    if plane.gate is not None and len(ridge):
-        ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma))
+    if options.method == "fit":
+        ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+    else:
+        centres = THESIS_METHODS[options.method](plane.image, level, sigma)
+        ridge = link_centres(centres, plane.image)
+    ridge = _of_laser(plane, ridge, sigma, options)
     if not len(ridge):
         return empty_profile(exposure.source)
-    fits = fit_ridge(plane, ridge, sigma, level.noise, options.shortest_px)
-    return to_profile(exposure, plane, fits, options)
+    if options.method == "fit":
+        fits = fit_ridge(plane, ridge, sigma, level.noise, options.shortest_px)
+        return to_profile(exposure, plane, fits, options)
+    return thesis_profile(exposure, plane, ridge, sigma, options)
+
+
+def _of_laser(
+    plane: StripePlane, ridge: RidgePoints, sigma_px: float, options: StripeOptions
+) -> RidgePoints:
+    """Leave out faint chains, what lacks the laser's colour, and what was white without it."""
+    ridge = ridge.select(is_bright(ridge, options.faintest_share))
+    if plane.gate is not None and len(ridge):
+        ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma_px))
+    if plane.unknown is not None and len(ridge):
+        ridge = ridge.select(is_on_known_ground(plane.unknown, ridge.table, sigma_px))
+    return ridge
+
+
+def thesis_profile(
+    exposure: Exposure,
+    plane: StripePlane,
+    ridge: RidgePoints,
+    sigma_px: float,
+    options: StripeOptions,
+) -> Profile:
+    """Profile of a thesis method: not smoothed, one sigma and one width for all points."""
+    points = ridge.table[:, :2]
+    flags = np.zeros(len(points), np.int64)
+    flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
+    flags[is_short(points, ridge.chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
+    binning = exposure.window.binning
+    sigma = max(scatter(points, ridge.table[:, 2:4], ridge.chain), LEAST_SIGMA_PX)
+    return Profile(
+        exposure.source,
+        exposure.window.to_full_sensor(points),
+        ridge.table[:, 2:4],
+        np.full(len(points), sigma * binning),
+        np.full(len(points), sigma_px * binning),
+        np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
+        flags,
+        ridge.chain,
+    )
 
 
 def empty_profile(source: str) -> Profile:
@@ -114,8 +160,8 @@ def to_profile(
     flags[near] |= int(StripeFlag.NEIGHBOUR)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0
-    points = straighten(points, normals, sigma, usable, fits)
-    smoothed = smooth(points, normals, sigma, chain, usable, options.smoothing_px)
+    course = straighten(Course(points, normals, sigma, chain, usable), fits)
+    smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning
     return Profile(
@@ -140,13 +186,7 @@ def fitted_centres(fits: ProfileFits) -> tuple[FloatArray, FloatArray, FloatArra
     return points, table[:, 2:4].copy(), np.maximum(sigma, LEAST_SIGMA_PX)
 
 
-def straighten(
-    points: FloatArray,
-    normals: FloatArray,
-    sigma: FloatArray,
-    is_used: BoolArray,
-    fits: ProfileFits,
-) -> FloatArray:
+def straighten(course: Course, fits: ProfileFits) -> Course:
     """Take out the bias of a column or row that cuts a bent line at a slant.
 
     With curvature k, and n and t the components of the normal and the tangent along the column, a
@@ -156,10 +196,10 @@ def straighten(
     table = fits.ridge.table
     rows = np.arange(len(table))
     along = 1 - table[:, 5].astype(np.int64)
-    n = normals[rows, along]
+    n = course.normals[rows, along]
     spread = fits.values[:, SIGMA]
-    bend = curvature(points, normals, sigma, fits.ridge.chain, is_used)
+    bend = curvature(course)
     cubic = bend * (1.0 - n * n) * spread / (2.0 * n)
-    corrected = points.copy()
+    corrected = course.points.copy()
     corrected[rows, along] -= fits.values[:, BEND_GAIN] * spread * cubic
-    return corrected
+    return replace(course, points=corrected)

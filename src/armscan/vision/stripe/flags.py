@@ -15,7 +15,7 @@ SIGNIFICANT = 5.0
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
 SKEW_HALF = 4
-SKEW_SHIFT = 0.15
+SKEW_SHIFT = 0.25
 """Third-order part of a profile, as a share of its amplitude, that counts as leaning."""
 
 

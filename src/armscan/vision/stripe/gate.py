@@ -48,7 +48,19 @@ def has_laser_colour(
     return np.asarray(contrast > max(NOISE_FACTOR * noise, LEAST_SHARE * typical))
 
 
-def _across(gate: NDArray[np.float32], table: FloatArray, offsets: FloatArray) -> FloatArray:
+def is_on_known_ground(
+    unknown: NDArray[np.uint8], table: FloatArray, line_sigma_px: float
+) -> BoolArray:
+    """(N,) False where the view without laser was saturated within three sigmas of the ridge."""
+    if unknown.size == 1:
+        return np.ones(len(table), dtype=np.bool_)
+    core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
+    return np.asarray(_across(unknown, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1) == 0)
+
+
+def _across(
+    gate: NDArray[np.float32] | NDArray[np.uint8], table: FloatArray, offsets: FloatArray
+) -> FloatArray:
     height, width = gate.shape
     x = np.rint(table[:, :1] + table[:, 2:3] * offsets).astype(np.int64)
     y = np.rint(table[:, 1:2] + table[:, 3:4] * offsets).astype(np.int64)

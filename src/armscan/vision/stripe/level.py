@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 CELL_PX = 64
-SAMPLE_STEP_PX = 5
+SQRT2 = math.sqrt(2.0)
+SAMPLE_STEP_PX = 4
 CLUTTER_LAG_PX = 12
 BACKGROUND_QUANTILE = 0.4
 MAD_TO_SIGMA = 1.4826
@@ -66,17 +68,14 @@ def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageL
 
 def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = image.shape
-    rows = max(-(-height // CELL_PX), 1)
-    columns = max(-(-width // CELL_PX), 1)
-    grid = np.zeros((rows, columns), np.float32)
-    for i in range(rows):
-        band = image[i * CELL_PX : (i + 1) * CELL_PX : SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
-        x = np.arange(band.shape[1]) * SAMPLE_STEP_PX // CELL_PX
-        edges = np.searchsorted(x, np.arange(columns + 1))
-        for j in range(columns):
-            cell = band[:, edges[j] : edges[j + 1]]
-            grid[i, j] = np.quantile(cell, BACKGROUND_QUANTILE) if cell.size else band[0, -1]
-    return grid
+    rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
+    steps = CELL_PX // SAMPLE_STEP_PX
+    sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
+    missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
+    filled = np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge")
+    cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
+    ordered = np.sort(cells.reshape(rows, columns, steps * steps), axis=2)
+    return np.ascontiguousarray(ordered[:, :, int(BACKGROUND_QUANTILE * steps * steps)])
 
 
 def _noise(image: NDArray[np.float32], lag: int) -> float:
@@ -85,5 +84,5 @@ def _noise(image: NDArray[np.float32], lag: int) -> float:
         return LEAST_NOISE
     step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
     typical = float(np.median(step)) * MAD_TO_SIGMA
-    trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * float(np.sqrt(np.pi / 2.0))
-    return max(typical, trimmed, LEAST_NOISE * np.sqrt(2.0)) / float(np.sqrt(2.0))
+    trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * math.sqrt(math.pi / 2.0)
+    return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2

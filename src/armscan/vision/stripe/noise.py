@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.stripe_fit import AMPLITUDE, CENTRE, REACH_SIGMAS, SIDE_SPAN, SIGMA, VARIANCE
 
 START_CONTRAST2 = 0.03
@@ -86,8 +86,8 @@ def _residuals(
     start = np.where(is_column, points[:, 1], points[:, 0])
     sigma = fits[:, SIGMA]
     reach = int(np.ceil(np.quantile(sigma, 0.9) * SIDE_SPAN / 2.0))
-    k = np.rint(start).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
-    size = np.where(is_column, height, width)[:, None]
+    k: IntArray = np.rint(start).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
+    size = np.asarray(np.where(is_column, height, width)).reshape(-1, 1)
     safe = np.clip(k, 0, size - 1)
     y = np.where(is_column[:, None], safe, line[:, None])
     x = np.where(is_column[:, None], line[:, None], safe)

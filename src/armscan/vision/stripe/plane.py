@@ -25,13 +25,17 @@ class StripePlane:
     image
         (H, W) float32, full scale 255 before background subtraction.
     clipped
-        (H, W) uint8, 1 where ``image`` says nothing because the camera saturated; (1, 1) if nowhere.
+        (H, W) uint8, 1 where ``image`` says nothing because the camera saturated; (1, 1) if
+        nowhere.
     saturated
         (H, W) uint8, 1 where the laser's own channel saturated; (1, 1) if nowhere.
     grey_levels_per_unit
         Factor from ``image`` to the exposure's own grey levels.
     gate
         (H, W) float32 how much the pixel has the laser's colour, or None for grey images.
+    unknown
+        (H, W) uint8, 1 where the view without laser saturated already; (1, 1) if nowhere; None
+        without such a view.
     """
 
     image: NDArray[np.float32]
@@ -39,6 +43,7 @@ class StripePlane:
     saturated: NDArray[np.uint8]
     grey_levels_per_unit: float
     gate: NDArray[np.float32] | None = None
+    unknown: NDArray[np.uint8] | None = None
 
 
 def saturated_mask(channel: ImageArray, full_scale: int) -> NDArray[np.uint8]:
@@ -57,7 +62,9 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     """Plane of a grey exposure, less the background."""
     scale = exposure.full_scale
     image = to_units(exposure.image, scale)
+    unknown = None
     if background is not None:
+        unknown = saturated_mask(background.image, background.full_scale)
         image = subtract(image, to_units(background.image, background.full_scale), NORMAL_SCALE)
     clipped = saturated_mask(exposure.image, scale)
-    return StripePlane(image, clipped, clipped, scale / NORMAL_SCALE)
+    return StripePlane(image, clipped, clipped, scale / NORMAL_SCALE, unknown=unknown)

@@ -81,14 +81,18 @@ def fit_ridge(
     for _ in range(NOISE_ROUNDS):
         sample = np.zeros((len(pick), RESULT_COLUMNS))
         fit_profiles(
-            plane.image, plane.clipped, table[pick], sigma[pick], sides[pick], noise,
-            REACH_SIGMAS, sample,
+            plane.image,
+            plane.clipped,
+            table[pick],
+            sigma[pick],
+            sides[pick],
+            noise,
+            REACH_SIGMAS,
+            sample,
         )
         noise = estimate_noise(plane.image, table[pick], sides[pick], sample, noise)
     values = np.zeros((len(table), RESULT_COLUMNS))
-    fit_profiles(
-        plane.image, plane.clipped, table, sigma, sides, noise, REACH_SIGMAS, values
-    )
+    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, REACH_SIGMAS, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
         ridge.select(good), values[good], sides[good], side_sigma[good], neighbour[good], noise

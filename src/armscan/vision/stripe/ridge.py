@@ -63,7 +63,7 @@ def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray
 
 def least_bend(height: float, sigma_px: float, scale_px: float) -> float:
     """Second derivative at scale ``scale_px`` of a line of this height and sigma."""
-    return height * sigma_px / (sigma_px**2 + scale_px**2) ** 1.5
+    return float(height * sigma_px / (sigma_px**2 + scale_px**2) ** 1.5)
 
 
 def hessian_sigma(line_sigma_px: float) -> float:

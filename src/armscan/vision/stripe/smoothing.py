@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import nnls
@@ -25,12 +25,59 @@ WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
 RESULT_COLUMNS = 8
+SCATTER_HALF = 30
+UNKNOWN_SCATTER_PX = 0.5
+"""Assumed where chains are too short to show their scatter."""
 SIGNIFICANT_CORRELATION = 2.5
 BEND_WINDOWS_PX = np.array([7.5, 12.0, 19.0, 30.0])
 LEAST_PAIRS = 200
+LEAST_HALF = 8
 OUTLIER_SIGMAS = 6.0
 RESIDUAL_WIDENING = 1.5
 """A wider parabola takes less of the noise with it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """Centres in the order of their chains.
+
+    Parameters
+    ----------
+    points, normals
+        (N, 2) image pixels and unit normals.
+    sigma
+        (N,) standard deviation along the normal as the fit predicts it.
+    chain
+        (N,) chain numbers.
+    is_used
+        (N,) False for points that must not pull their neighbours.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    sigma: FloatArray
+    chain: IntArray
+    is_used: BoolArray
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.points)
+
+    def run(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
+        """Result (N, 8) of the smoothing kernel with these half windows."""
+        result = np.zeros((len(self), RESULT_COLUMNS))
+        smooth_chains(
+            self.points,
+            self.normals,
+            self.sigma,
+            self.is_used.astype(np.int64),
+            self.chain,
+            windows_px,
+            inflation,
+            CONFIDENCE,
+            result,
+        )
+        return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,14 +108,7 @@ def windows(largest_px: float) -> FloatArray:
     return largest_px / WINDOW_RATIO ** np.arange(steps, -1, -1, dtype=np.float64)
 
 
-def smooth(
-    points: FloatArray,
-    normals: FloatArray,
-    sigma: FloatArray,
-    chain: IntArray,
-    is_used: BoolArray,
-    largest_px: float,
-) -> SmoothedCentres:
+def smooth(course: Course, largest_px: float) -> SmoothedCentres:
     """Smooth centres along their chains and give each its standard deviation.
 
     The noise of neighbours is measured from the residuals, not assumed: its size corrects the
@@ -76,64 +116,40 @@ def smooth(
 
     Parameters
     ----------
-    points, normals
-        (N, 2) image pixels and unit normals, ordered along the chains.
-    sigma
-        (N,) standard deviation along the normal as the fit predicts it.
-    chain
-        (N,) chain numbers.
-    is_used
-        (N,) False for points that must not pull their neighbours.
+    course
+        The centres.
     largest_px
         Largest half window; 0 only measures the noise.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
-    used = is_used.astype(np.int64)
-    rough = np.zeros((len(points), RESULT_COLUMNS))
-    ones = np.ones(len(half))
-    smooth_chains(points, normals, sigma, used, chain, half, ones, CONFIDENCE, rough)
-    spread = np.hypot(rough[:, PREDICTED_SIGMA], sigma)
-    score = np.abs(rough[:, PREDICTED]) / spread
+    rough = course.run(half, np.ones(len(half)))
+    score = np.abs(rough[:, PREDICTED]) / np.hypot(rough[:, PREDICTED_SIGMA], course.sigma)
     is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * _scale(score))
-    is_used = is_used & ~is_outlier
-    correlation = noise_correlation(points, normals, sigma, chain, is_used, half[-1])
-    sigma = sigma * np.sqrt(correlation[0])
+    course = replace(course, is_used=course.is_used & ~is_outlier)
+    correlation = noise_correlation(course, half[-1])
+    course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
     if largest_px <= 0.0:
-        return SmoothedCentres(points, normals, sigma, is_outlier)
-    inflation = np.array([_inflation(correlation, h) for h in half])
-    result = np.zeros((len(points), RESULT_COLUMNS))
-    smooth_chains(
-        points, normals, sigma, is_used.astype(np.int64), chain, half, inflation, CONFIDENCE, result
-    )
-    shift = np.where(is_used, result[:, SHIFT], 0.0)
-    slope = np.where(is_used, result[:, SLOPE], 0.0)
+        return SmoothedCentres(course.points, course.normals, course.sigma, is_outlier)
+    result = course.run(half, np.array([_inflation(correlation, h) for h in half]))
+    used, normals = course.is_used, course.normals
+    shift = np.where(used, result[:, SHIFT], 0.0)
+    slope = np.where(used, result[:, SLOPE], 0.0)
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     turned = normals - slope[:, None] * tangents
     return SmoothedCentres(
-        points + shift[:, None] * normals,
+        course.points + shift[:, None] * normals,
         turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        np.where(is_used, result[:, SIGMA], sigma),
+        np.where(used, result[:, SIGMA], course.sigma),
         is_outlier,
     )
 
 
-def curvature(
-    points: FloatArray,
-    normals: FloatArray,
-    sigma: FloatArray,
-    chain: IntArray,
-    is_used: BoolArray,
-) -> FloatArray:
+def curvature(course: Course) -> FloatArray:
     """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
 
     Shrunk towards zero by its own noise, so that straight lines are not disturbed.
     """
-    result = np.zeros((len(points), RESULT_COLUMNS))
-    used = is_used.astype(np.int64)
-    ones = np.ones(len(BEND_WINDOWS_PX))
-    smooth_chains(
-        points, normals, sigma, used, chain, BEND_WINDOWS_PX, ones, CONFIDENCE, result
-    )
+    result = course.run(BEND_WINDOWS_PX, np.ones(len(BEND_WINDOWS_PX)))
     square = result[:, BEND] ** 2
     noise = result[:, BEND_SIGMA] ** 2
     return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
@@ -160,14 +176,18 @@ def _inflation(correlation: FloatArray, half_px: float) -> float:
     return max(float((factor * overlap * shape).sum() / overlap[0]), 0.3)
 
 
-def noise_correlation(
-    points: FloatArray,
-    normals: FloatArray,
-    sigma: FloatArray,
-    chain: IntArray,
-    is_used: BoolArray,
-    half_px: float,
-) -> FloatArray:
+def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
+    """Standard deviation of the points across a smooth course of their own, in px."""
+    n = len(points)
+    course = Course(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
+    residual = _filter_residuals(course, SCATTER_HALF)
+    if not np.isfinite(residual).any():
+        return UNKNOWN_SCATTER_PX
+    share = 1.0 - _weights(SCATTER_HALF)[SCATTER_HALF]
+    return float(np.sqrt(np.nanmean(residual**2) / share))
+
+
+def noise_correlation(course: Course, half_px: float) -> FloatArray:
     """Covariance (LAGS,) of normalised raw centres at distances 0, 1, ... along the chain.
 
     Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
@@ -176,18 +196,16 @@ def noise_correlation(
     """
     white = np.zeros(LAGS)
     white[0] = 1.0
-    half = max(int(RESIDUAL_WIDENING * half_px), 4)
-    residual = _filter_residuals(points, normals, sigma, chain, is_used, half)
-    if residual is None:
+    half = max(int(RESIDUAL_WIDENING * half_px), LEAST_HALF)
+    residual = _filter_residuals(course, half)
+    measured = _lag_products(residual, course.chain)
+    while measured is None and half > LEAST_HALF:
+        # A line that is often interrupted, as by the marks of a board, has no room for more.
+        half = max(int(half / WINDOW_RATIO), LEAST_HALF)
+        residual = _filter_residuals(course, half)
+        measured = _lag_products(residual, course.chain)
+    if measured is None:
         return white
-    measured = np.zeros(LAGS)
-    for lag in range(LAGS):
-        a, b = residual[: len(residual) - lag], residual[lag:]
-        same = np.isfinite(a) & np.isfinite(b) & (chain[: len(chain) - lag] == chain[lag:])
-        if same.sum() < LEAST_PAIRS:
-            return white
-        product = a[same] * b[same]
-        measured[lag] = product.mean()
     kernel = -_weights(half)
     kernel[half] += 1.0
     spread = np.correlate(kernel, kernel, "full")
@@ -203,27 +221,33 @@ def noise_correlation(
     surplus = measured[1:] - scale * mixture[1:, 0]
     limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
     if (surplus[:2] < limit).all():
-        return scale * white
+        return np.asarray(scale * white)
     solved, _ = nnls(mixture, measured)
     solved[0] = max(solved[0], 0.05)
     return np.asarray(solved)
 
 
-def _filter_residuals(
-    points: FloatArray,
-    normals: FloatArray,
-    sigma: FloatArray,
-    chain: IntArray,
-    is_used: BoolArray,
-    half: int,
-) -> FloatArray | None:
+def _lag_products(residual: FloatArray, chain: IntArray) -> FloatArray | None:
+    """Mean product (LAGS,) of residuals at each distance; None where there are too few pairs."""
+    measured = np.zeros(LAGS)
+    for lag in range(LAGS):
+        a, b = residual[: len(residual) - lag], residual[lag:]
+        same = np.isfinite(a) & np.isfinite(b) & (chain[: len(chain) - lag] == chain[lag:])
+        if same.sum() < LEAST_PAIRS:
+            return None
+        measured[lag] = (a[same] * b[same]).mean()
+    return measured
+
+
+def _filter_residuals(course: Course, half: int) -> FloatArray:
     """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
+    points, normals, chain = course.points, course.normals, course.chain
     n = len(points)
     size = 2 * half + 1
     if n < size:
-        return None
+        return np.full(n, np.nan)
     span = np.lib.stride_tricks.sliding_window_view
-    inside = (chain[: n - size + 1] == chain[size - 1 :]) & span(is_used, size).all(axis=1)
+    inside = (chain[: n - size + 1] == chain[size - 1 :]) & span(course.is_used, size).all(axis=1)
     weights = _weights(half)
     smooth_x = span(points[:, 0], size) @ weights
     smooth_y = span(points[:, 1], size) @ weights
@@ -231,7 +255,7 @@ def _filter_residuals(
     offset = (points[middle, 0] - smooth_x) * normals[middle, 0]
     offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
     residual = np.full(n, np.nan)
-    residual[middle] = np.where(inside, offset / sigma[middle], np.nan)
-    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 1e-3) if inside.any() else 0.0
+    residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
+    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
     residual[np.abs(residual) > limit * 1.4826] = np.nan
     return residual

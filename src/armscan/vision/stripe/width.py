@@ -9,16 +9,20 @@ from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import FloatArray
 from armscan.kernels.stripe_hessian import gaussian_taps, refine_candidates
+from armscan.vision.stripe.chains import strong_median
 from armscan.vision.stripe.level import ImageLevel
 
 SCALE_PX = 3.0
-SAMPLE = 400
+SAMPLE = 3000
+MEASURED = 300
+STRONG_SHARE = 0.4
 REACH_PX = 30.0
 STEP_PX = 0.5
 FWHM_PER_SIGMA = 2.3548
 SIGMA_LIMITS_PX = (0.7, 10.0)
 FALLBACK_PX = 2.0
-ALONG_PX = (-3.0, 0.0, 3.0)
+ALONG_PX = (-2.0, 0.0, 2.0)
+LOPSIDED = 1.8
 
 
 def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
@@ -39,9 +43,11 @@ def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLe
     if n == 0:
         return FALLBACK_PX
     points = points[:n]
+    points = points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
+    points = points[:: max(len(points) // MEASURED, 1)]
     profiles = _across(image, points)
     half_widths, heights = _half_widths(profiles)
-    bright = heights >= max(0.5 * float(np.quantile(heights, 0.8)), level.rise)
+    bright = heights >= max(STRONG_SHARE * strong_median(heights), level.rise)
     bright &= half_widths < REACH_PX
     if not bright.any():
         return FALLBACK_PX
@@ -63,19 +69,28 @@ def _across(image: NDArray[np.float32], points: FloatArray) -> FloatArray:
 
 
 def _half_widths(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distance (N,) from the centre to half height, mean of both sides, and height (N,)."""
+    """Mean distance (N,) from the centre to half height, and height (N,).
+
+    The height counts from the higher of the two feet, and is 0 where one side is much wider than
+    the other: an edge between two areas is no line.
+    """
     middle = profiles.shape[1] // 2
     near = profiles[:, middle - 2 : middle + 3].mean(axis=1)
-    lowest = np.minimum(profiles[:, :middle].min(axis=1), profiles[:, middle:].min(axis=1))
-    height = near - lowest
-    level = lowest + 0.5 * height
-    widths = np.zeros(len(profiles))
-    rows = np.arange(len(profiles))
-    for side in (profiles[:, middle:], profiles[:, middle::-1]):
-        below = side < level[:, None]
-        first = np.where(below.any(axis=1), np.argmax(below, axis=1), side.shape[1] - 1)
-        first = np.maximum(first, 1)
-        inner, outer = side[rows, first - 1], side[rows, first]
-        fraction = np.clip((inner - level) / np.maximum(inner - outer, 1e-6), 0.0, 1.0)
-        widths += 0.5 * (first - 1 + fraction) * STEP_PX
-    return widths, height
+    foot = np.maximum(profiles[:, :middle].min(axis=1), profiles[:, middle:].min(axis=1))
+    height = near - foot
+    level = foot + 0.5 * height
+    sides = [_first_below(side, level) for side in (profiles[:, middle:], profiles[:, middle::-1])]
+    narrow, wide = np.minimum(*sides), np.maximum(*sides)
+    is_line = wide < LOPSIDED * narrow + STEP_PX
+    return 0.5 * (narrow + wide), np.where(is_line, height, 0.0)
+
+
+def _first_below(side: FloatArray, level: FloatArray) -> FloatArray:
+    """Distance (N,) at which each profile (N, K), read outwards, first falls below its level."""
+    rows = np.arange(len(side))
+    below = side < level[:, None]
+    first = np.where(below.any(axis=1), np.argmax(below, axis=1), side.shape[1] - 1)
+    first = np.maximum(first, 1)
+    inner, outer = side[rows, first - 1], side[rows, first]
+    fraction = np.clip((inner - level) / np.maximum(inner - outer, 1e-6), 0.0, 1.0)
+    return np.asarray((first - 1 + fraction) * STEP_PX)

@@ -17,6 +17,9 @@ MIN_SPAN = 0.15
 """A stripe is at least this long, as a fraction of the board's shorter side."""
 COURSE_DEGREE = 3
 """Degree of the gentle curve that a bowed sheet may draw on a flat board."""
+COURSE_ROUNDS = 20
+HUBER = 1.0
+"""In robust sigmas: low, because what is off a stripe may be many points on one side."""
 SEED = 20
 
 
@@ -120,19 +123,18 @@ def _on_course(
     along, across = line.along(points), line.distance(points)
     reach = max(float(np.abs(along[near]).max(initial=0.0)), 1e-9)
     design = np.polynomial.legendre.legvander(along / reach, COURSE_DEGREE)
-    keep = near.copy()
-    for _ in range(10):
-        if int(keep.sum()) <= 2 * (COURSE_DEGREE + 1):
-            break
-        scaled = design[keep] / sigma_mm[keep, None]
-        course = np.linalg.lstsq(scaled, across[keep] / sigma_mm[keep], rcond=None)[0]
-        normalised = (across - design @ course) / sigma_mm
-        scale = max(1.0, 1.4826 * float(np.median(np.abs(normalised[keep]))))
-        before = keep
-        keep = near & (np.abs(normalised) < options.outlier_sigma * scale)
-        if bool((keep == before).all()):
-            break
-    return keep
+    if int(near.sum()) <= 2 * (COURSE_DEGREE + 1):
+        return near
+    scaled, target = design[near] / sigma_mm[near, None], across[near] / sigma_mm[near]
+    weight = np.ones(len(target))
+    for _ in range(COURSE_ROUNDS):
+        root = np.sqrt(weight)
+        course = np.linalg.lstsq(scaled * root[:, None], target * root, rcond=None)[0]
+        missed = np.abs(target - scaled @ course)
+        scale = max(1.0, 1.4826 * float(np.median(missed)))
+        weight = HUBER * scale / np.maximum(missed, HUBER * scale)
+    normalised = (across - design @ course) / sigma_mm
+    return np.asarray(near & (np.abs(normalised) < options.outlier_sigma * scale))
 
 
 def _is_repeat(

@@ -65,20 +65,21 @@ def _steps(
     target: Charuco, index: IntArray, rough_px: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Way (N, 2) along x and y in which nothing but the two edges of a corner is seen."""
-    board = target.points_board_mm[index, :2]
-    homography, _ = cv2.findHomography(board, rough_px, cv2.RANSAC, 3.0)
-    if homography is None:
+    board: FloatArray = target.points_board_mm[index, :2]
+    found, _ = cv2.findHomography(board, rough_px, cv2.RANSAC, 3.0)
+    if found is None:
         return None
+    homography = np.asarray(found, dtype=np.float64)
     gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
     length_mm = min(target.square_mm, _CLEARANCE * gap_mm / WINDOW_FRACTION)
     centre = _mapped(homography, board)
-    along_x = _mapped(homography, board + [length_mm, 0.0]) - centre
-    along_y = _mapped(homography, board + [0.0, length_mm]) - centre
+    along_x = _mapped(homography, board + np.array([length_mm, 0.0])) - centre
+    along_y = _mapped(homography, board + np.array([0.0, length_mm])) - centre
     return along_x, along_y
 
 
 def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
-    h = np.column_stack([points, np.ones(len(points))]) @ np.asarray(homography).T
+    h = np.column_stack([points, np.ones(len(points))]) @ homography.T
     return np.asarray(h[:, :2] / h[:, 2:])
 
 

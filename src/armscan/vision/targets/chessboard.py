@@ -108,7 +108,7 @@ def _dark_first(grey: RawGrey, grid: FloatArray) -> float:
             points = grid + along_x * step_x + along_y * step_y
             levels = sample(grey, points.reshape(-1, 2)).reshape(total.shape)
             total -= np.sign(along_x * along_y) * np.nan_to_num(levels)
-    rows, columns = total.shape
+    rows, columns = grid.shape[0], grid.shape[1]
     parity = (-1.0) ** np.add.outer(np.arange(rows), np.arange(columns))
     return float(np.median(parity * total) / 2.0)
 

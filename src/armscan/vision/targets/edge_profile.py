@@ -33,8 +33,8 @@ class EdgeProfiles:
         (N, K) outward shift of the edge from the rim.
     sigma_px
         (N, K) its standard deviation; infinite where a sector has too few pixels.
-    contrast
-        (N, K) outer minus inner level.
+    inner, outer
+        (N, K) levels of the two sides.
     misfit
         (N, K) mean squared residual of the sector over that of its circle.
     blur_px
@@ -45,10 +45,16 @@ class EdgeProfiles:
 
     shift_px: FloatArray
     sigma_px: FloatArray
-    contrast: FloatArray
+    inner: FloatArray
+    outer: FloatArray
     misfit: FloatArray
     blur_px: FloatArray
     noise: FloatArray
+
+    @property
+    def contrast(self) -> FloatArray:
+        """(N, K) outer minus inner level."""
+        return self.outer - self.inner
 
 
 def fit_profiles(
@@ -135,7 +141,8 @@ class _SectorFit:
         return EdgeProfiles(
             by_sector[..., 2],
             sigma,
-            by_sector[..., 1] - by_sector[..., 0],
+            by_sector[..., 0],
+            by_sector[..., 1],
             own / typical[:, None],
             blur,
             np.sqrt(variance),
@@ -160,4 +167,4 @@ class _SectorFit:
         return np.asarray(np.linalg.inv(normal + (1e-9 * trace + 1e-9)[:, None, None] * np.eye(3)))
 
     def _sum(self, values: FloatArray) -> FloatArray:
-        return np.bincount(self._sector, values, self._n)
+        return np.bincount(self._sector, values, self._n).astype(np.float64)

@@ -170,7 +170,7 @@ def _algebraic(own: FloatArray, has_weight: BoolArray) -> FloatArray:
     design = np.stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y], axis=-1)
     design *= has_weight[:, :, None]
     normal = design.transpose(0, 2, 1) @ design
-    return np.einsum("nij,nj->ni", _inverse(normal), design.sum(axis=1))
+    return np.asarray(np.einsum("nij,nj->ni", _inverse(normal), design.sum(axis=1)))
 
 
 def _sampson(own: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -63,8 +63,22 @@ class BandPixels:
     angle_rad: FloatArray
 
 
-def band_pixels(grey: RawGrey, rims: Rims, half_width_px: FloatArray) -> BandPixels:
-    """Collect the pixels within (N,) half widths of N rims."""
+def band_pixels(
+    grey: RawGrey, rims: Rims, half_width_px: FloatArray, gradient: FloatArray
+) -> BandPixels:
+    """Collect the pixels along the rims.
+
+    Parameters
+    ----------
+    grey
+        (H, W) raw levels.
+    rims
+        N ellipses.
+    half_width_px
+        (N,) largest distance from the rim.
+    gradient
+        (N, 2) relative slope of the illumination per px, divided out of the levels.
+    """
     parts = [_patch(grey.shape, rims, k, half_width_px[k]) for k in range(len(rims))]
     ellipse = np.repeat(np.arange(len(rims)), [len(part) for part in parts])
     pixels = np.concatenate(parts) if parts else np.zeros((0, 2), np.int64)
@@ -72,14 +86,15 @@ def band_pixels(grey: RawGrey, rims: Rims, half_width_px: FloatArray) -> BandPix
     own = np.einsum("kij,ki->kj", rims.directions[ellipse], offset)
     distance, angle = _nearest(own, rims.half_px[ellipse])
     kept = np.abs(distance) <= half_width_px[ellipse]
-    levels = grey[pixels[kept, 1], pixels[kept, 0]].astype(np.float64)
+    shade = 1.0 + (gradient[ellipse[kept]] * offset[kept]).sum(axis=1)
+    levels = grey[pixels[kept, 1], pixels[kept, 0]] / shade
     return BandPixels(levels, ellipse[kept], distance[kept], angle[kept])
 
 
 def _patch(shape: tuple[int, ...], rims: Rims, k: int, half_width_px: float) -> IntArray:
     """Pixels (K, 2), column and row, that may lie in the band of ellipse ``k``."""
     centre, half = rims.centres_px[k], rims.half_px[k]
-    reach = np.sqrt((rims.directions[k] ** 2 @ half**2)) + half_width_px + 1.0
+    reach = np.sqrt(rims.directions[k] ** 2 @ half**2) + half_width_px + 1.0
     low = np.maximum(np.floor(centre - reach), 0).astype(np.int64)
     high = np.minimum(np.ceil(centre + reach), [shape[1] - 1, shape[0] - 1]).astype(np.int64)
     v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]

@@ -54,13 +54,13 @@ def fit_saddles(
     radius = _window_radius(step_x_px, step_y_px)
     origin = np.rint(corners_px)
     levels, offsets, weights = _windows(grey, origin, radius)
-    parameters = _initial(levels, offsets, weights, corners_px - origin, step_x_px, step_y_px)
+    parameters = _initial(levels, offsets, weights, (corners_px - origin, step_x_px, step_y_px))
     parameters = _iterate(levels, offsets, weights, parameters)
     weights = _without_outliers(_model(levels, offsets, parameters)[0], weights)
     parameters = _iterate(levels, offsets, weights, parameters)
     residuals, jacobian = _model(levels, offsets, parameters)
     variance = _variance(residuals, weights)
-    normal = np.einsum("nki,nk,nkj->nij", jacobian, weights, jacobian)
+    normal = (jacobian * weights[:, :, None]).transpose(0, 2, 1) @ jacobian
     covariance = _inverse(normal)[:, :2, :2] * variance[:, None, None]
     moved = np.hypot(*(parameters[:, :2] - (corners_px - origin)).T)
     spread = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
@@ -73,7 +73,8 @@ def fit_saddles(
 def _window_radius(step_x_px: FloatArray, step_y_px: FloatArray) -> FloatArray:
     area = np.abs(step_x_px[:, 0] * step_y_px[:, 1] - step_x_px[:, 1] * step_y_px[:, 0])
     longest = np.maximum(np.hypot(*step_x_px.T), np.hypot(*step_y_px.T))
-    return np.clip(WINDOW_FRACTION * area / longest, MIN_WINDOW_PX, MAX_WINDOW_PX)
+    radius: FloatArray = WINDOW_FRACTION * area / longest
+    return np.clip(radius, MIN_WINDOW_PX, MAX_WINDOW_PX)
 
 
 def _windows(
@@ -96,11 +97,10 @@ def _initial(
     levels: FloatArray,
     offsets: FloatArray,
     weights: FloatArray,
-    start: FloatArray,
-    step_x_px: FloatArray,
-    step_y_px: FloatArray,
+    lattice: tuple[FloatArray, FloatArray, FloatArray],
 ) -> FloatArray:
     """Start (N, 9): corner, two normals' angles, blur, mean, contrast, gradient."""
+    start, step_x_px, step_y_px = lattice
     parameters = np.zeros((len(levels), _PARAMETERS))
     parameters[:, :2] = start
     parameters[:, 2] = np.arctan2(step_y_px[:, 0], -step_y_px[:, 1])
@@ -175,9 +175,10 @@ def _iterate(
     cost = (weights * residuals**2).sum(axis=1)
     diagonal = np.arange(_PARAMETERS)
     for _ in range(_STEPS):
-        normal = np.einsum("nki,nk,nkj->nij", jacobian, weights, jacobian)
+        weighted = (jacobian * weights[:, :, None]).transpose(0, 2, 1)
+        normal = weighted @ jacobian
         normal[:, diagonal, diagonal] *= 1.0 + damping[:, None]
-        rhs = np.einsum("nki,nk->ni", jacobian, weights * residuals)
+        rhs = (weighted @ residuals[:, :, None])[:, :, 0]
         step = np.einsum("nij,nj->ni", _inverse(normal), rhs)
         trial = parameters + step
         trial[:, 4] = np.clip(trial[:, 4], APERTURE_SIGMA_PX, 3.0 * MAX_WINDOW_PX)

@@ -184,7 +184,8 @@ def residual_histogram(fit: CameraFit) -> Picture:
         axes.plot(x, bell, color=INK, linewidth=1.2, label=f"Gaussian, σ = {sigma:.3f} px")
         axes.set_xlabel("residual, px")
         axes.set_ylabel("points")
-        axes.legend()
+        axes.set_ylim(top=1.3 * axes.get_ylim()[1])
+        axes.legend(loc="upper right")
     beyond = int((np.abs(residuals) > reach).any(axis=1).sum())
     tail = f" {beyond} points lie beyond the picture." if beyond else ""
     return Picture(

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from armscan.models.calibration import SensorCalibration
 from armscan.records.cloud import PointCloud
 from armscan.report.drawing import ACCENT, PALETTE, chart_markup, new_figure, raster_markup, styled
 from armscan.report.page import Picture
+from armscan.report.scene import SceneDots, ramp_colours, ramp_markup, scene_markup
 
 MAX_SHOWN = 20_000
 
@@ -18,29 +17,16 @@ MAX_SHOWN = 20_000
 def cloud_view(cloud: PointCloud) -> Picture:
     """The points in space, coloured by their standard deviation."""
     step = max(1, len(cloud) // MAX_SHOWN)
-    x, y, z = cloud.points_mm[::step].T
     sigma_um = 1000.0 * cloud.sigma_mm[::step]
-    with styled():
-        figure = new_figure(7.0, 5.4)
-        axes: Any = figure.add_subplot(projection="3d")
-        low, high = np.percentile(sigma_um, [2, 98])
-        dots = axes.scatter(
-            x, z, y, c=sigma_um, s=1.5, cmap="viridis", vmin=low, vmax=max(high, low * 1.001),
-            linewidths=0, depthshade=False,
-        )  # fmt: skip
-        axes.set_xlabel("X, mm")
-        axes.set_ylabel("Z (depth), mm")
-        axes.set_zlabel("Y (down), mm")
-        axes.invert_zaxis()
-        axes.set_aspect("equal")
-        axes.view_init(elev=22, azim=-62)
-        figure.colorbar(dots, ax=axes, shrink=0.6, label="sigma, µm", pad=0.08)
+    low, high = (float(value) for value in np.percentile(sigma_um, [2, 98]))
+    dots = SceneDots(cloud.points_mm[::step], ramp_colours(sigma_um, low, high))
+    scene = scene_markup([dots], [], [], "Measured points in space")
     shown = f" Every {step}th point is shown." if step > 1 else ""
     return Picture(
-        raster_markup(figure, "Measured points in space"),
+        ramp_markup(f"sigma {low:.0f} µm", f"{high:.0f} µm") + scene,
         title=f"Points in space ({cloud.frame} frame)",
         caption="Colour is each point's standard deviation along its worst direction, stripe "
-        "noise and calibration together." + shown,
+        "noise and calibration together. Drag to turn; click, then scroll to zoom." + shown,
     )
 
 
@@ -54,6 +40,8 @@ def profile_view(cloud: PointCloud, sensor: SensorCalibration, exposure: int) ->
             if name not in cloud.sheet_names:
                 continue
             chosen = (cloud.exposure == exposure) & (cloud.sheet == cloud.sheet_names.index(name))
+            if not chosen.any():
+                continue
             sheet = calibration.sheet
             along, depth = ((cloud.points_mm[chosen] - sheet.origin_mm) @ sheet.axes[:2].T).T
             if sheet.axes[1][2] < 0.0:

@@ -37,6 +37,7 @@ def cloud_page(
     cloud = result.cloud
     depth = cloud.points_mm[:, 2]
     n_stripe = sum(len(image.profile) for image in result.images)
+    used = [name for k, name in enumerate(cloud.sheet_names) if (cloud.sheet == k).any()]
     cards = (
         Card("Points", f"{len(cloud):,}", f"of {n_stripe:,} stripe points"),
         Card(
@@ -45,7 +46,7 @@ def cloud_page(
             f"median; 95 % below {significant(float(np.percentile(cloud.sigma_mm, 95)))} mm",
         ),
         Card("Depth", f"{depth.min():.1f} to {depth.max():.1f} mm", "Z in the Sensor frame"),
-        Card("Images", str(len(result.images)), f"sheets {', '.join(cloud.sheet_names)}"),
+        Card("Images", str(len(result.images)), f"sheets {', '.join(used)}"),
     )
     with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
     profiles = tuple(

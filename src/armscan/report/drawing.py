@@ -100,15 +100,21 @@ def raster_markup(figure: Figure, alt: str, dpi: int = 160) -> str:
 
 
 def photo_markup(
-    exposure: Exposure, marks: Iterable[Marks], alt: str, *, longest_px: int = 900
+    exposure: Exposure,
+    marks: Iterable[Marks],
+    alt: str,
+    *,
+    longest_px: int = 900,
+    is_grey: bool = False,
 ) -> str:
     """``<svg>`` of a photograph, reduced to ``longest_px``, with marks in full resolution.
 
-    Dark photographs are brightened for the eye; positions are those of the exposure's image.
+    Dark photographs are brightened for the eye; ``is_grey`` takes the colours out, so that those
+    of the marks stand out.
     """
     height, width = exposure.image.shape[:2]
     unit = max(width, height) / 1000.0
-    photo = _uri("image/jpeg", _jpeg(display_levels(exposure), longest_px))
+    photo = _uri("image/jpeg", _jpeg(display_levels(exposure, is_grey), longest_px))
     parts = [
         f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{escape(alt)}">',
         f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{photo}"/>',
@@ -117,9 +123,13 @@ def photo_markup(
     return "".join([*parts, "</svg>"])
 
 
-def display_levels(exposure: Exposure) -> np.ndarray[Any, np.dtype[np.uint8]]:
+def display_levels(
+    exposure: Exposure, is_grey: bool = False
+) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """8-bit picture for the eye: dark photographs are stretched, never the other way."""
     levels = exposure.image.astype(np.float64) / exposure.full_scale
+    if is_grey and levels.ndim == 3:
+        levels = levels.mean(axis=2)
     bright = float(np.percentile(levels, 99.5))
     scaled = levels / max(bright, 0.02) if bright < 0.7 else levels
     gamma = 0.7 if float(np.median(scaled)) < 0.2 else 1.0

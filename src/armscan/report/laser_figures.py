@@ -23,9 +23,13 @@ from armscan.report.drawing import (
     styled,
 )
 from armscan.report.page import Picture
+from armscan.report.scene import SceneLines, scene_markup, uniform_dots
 
 MAX_PANELS = 12
 BINS_ALONG = 24
+MAX_DOTS = 2000
+PAGE_WIDTH = 10.4
+"""Inches of a chart that fills the page's width."""
 
 
 def residuals_along(fit: LaserFit, index: int) -> Picture:
@@ -39,7 +43,7 @@ def residuals_along(fit: LaserFit, index: int) -> Picture:
         float(np.percentile(np.abs(image.residual_mm[_used(image, index)]), 98)) for image in images
     )
     with styled():
-        figure = new_figure(3.1 * columns + 0.4, 1.7 * rows + 0.5)
+        figure = new_figure(PAGE_WIDTH, 1.9 * rows + 0.5)
         grid: Any = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for axes, image in zip(grid.flat, images[:n], strict=False):
             chosen = _used(image, index)
@@ -93,26 +97,25 @@ def residual_histogram(fit: LaserFit) -> Picture:
 
 def scene(fit: LaserFit) -> Picture:
     """Camera, boards, stripes and sheets in space."""
-    with styled():
-        figure = new_figure(6.4, 5.2)
-        axes: Any = figure.add_subplot(projection="3d")
-        _draw_camera(axes, fit)
-        for image in fit.images:
-            _draw_board(axes, image)
-        for index, sheet in enumerate(fit.sheets):
-            colour = PALETTE[index % len(PALETTE)]
-            _draw_sheet(axes, sheet, _points_of(fit, index), colour)
-        axes.set_xlabel("X, mm")
-        axes.set_ylabel("Z (depth), mm")
-        axes.set_zlabel("Y (down), mm")
-        axes.invert_zaxis()
-        axes.set_aspect("equal")
-        axes.view_init(elev=24, azim=-58)
+    lines = [SceneLines(_camera_edges(fit), INK)]
+    lines += [SceneLines(_board_edges(image), "#b4bec8") for image in fit.images]
+    dots = []
+    labels: list[tuple[str, tuple[float, float, float]]] = [("camera", (0.0, 0.0, 0.0))]
+    for index, sheet in enumerate(fit.sheets):
+        colour = PALETTE[index % len(PALETTE)]
+        points = _points_of(fit, index)
+        shown = points[:: max(1, len(points) // MAX_DOTS)]
+        dots.append(uniform_dots(shown, colour))
+        edges = _sheet_edges(sheet, points)
+        lines.append(SceneLines(edges, colour))
+        x, y, z = edges[0].tolist()
+        labels.append((f"sheet {sheet.name}", (x, y, z)))
     return Picture(
-        raster_markup(figure, "Camera, boards and light sheets in space"),
+        scene_markup(dots, lines, labels, "Camera, boards and light sheets in space"),
         title="In space (Sensor frame)",
         caption="The pyramid is the camera and what it sees, grey outlines are the boards, dots "
-        "the stripes on them, coloured areas the calibrated part of each sheet.",
+        "the stripes on them, coloured outlines the calibrated part of each sheet. Drag to turn; "
+        "click, then scroll to zoom.",
     )
 
 
@@ -135,41 +138,37 @@ def _residual_panel(axes: Any, along: FloatArray, residual: FloatArray) -> None:
     axes.plot(middle, mean, color=ALERT, linewidth=1.2)
 
 
-def _draw_board(axes: Any, image: SheetImage) -> None:
+def _board_edges(image: SheetImage) -> FloatArray:
     board = image.view.points_board_mm
     (x0, y0, _), (x1, y1, _) = board.min(axis=0), board.max(axis=0)
-    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0], [x0, y0, 0.0]])
+    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     pose = image.sensor_from_board
-    x, y, z = (corners @ pose.rotation.T + pose.translation_mm).T
-    axes.plot(x, z, y, color=MUTED, linewidth=0.8)
+    return _closed(corners @ pose.rotation.T + pose.translation_mm)
 
 
-def _draw_sheet(axes: Any, fit: SheetFit, points: FloatArray, colour: str) -> None:
+def _sheet_edges(fit: SheetFit, points: FloatArray) -> FloatArray:
     sheet = fit.sheet
     local = (points - sheet.origin_mm) @ sheet.axes.T
     (u0, v0), (u1, v1) = local[:, :2].min(axis=0), local[:, :2].max(axis=0)
     corners = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
-    x, y, z = (sheet.origin_mm + corners @ sheet.axes[:2]).T
-    axes.plot_trisurf(
-        x, z, y, triangles=[[0, 1, 2], [0, 2, 3]], color=colour, alpha=0.18, linewidth=0
-    )
-    shown = points[:: max(1, len(points) // 1500)]
-    axes.plot(shown[:, 0], shown[:, 2], shown[:, 1], ".", color=colour, markersize=1.5)
-    axes.plot([], [], [], "s", color=colour, label=f"sheet {fit.name}")
-    axes.legend(loc="upper left")
+    return _closed(sheet.origin_mm + corners @ sheet.axes[:2])
 
 
-def _draw_camera(axes: Any, fit: LaserFit) -> None:
+def _camera_edges(fit: LaserFit) -> FloatArray:
     camera = fit.camera.camera
     depth = 0.25 * min(sheet.calibration.depth_range_mm[0] for sheet in fit.sheets)
     corners = np.array(
         [[0, 0], [camera.width_px, 0], [camera.width_px, camera.height_px], [0, camera.height_px]]
     )
     centre, focal = [camera.cx_px, camera.cy_px], [camera.fx_px, camera.fy_px]
-    xy = (corners - centre) / focal * depth
-    for k in range(4):
-        a, b = xy[k], xy[(k + 1) % 4]
-        axes.plot([0, a[0], b[0]], [0, depth, depth], [0, a[1], b[1]], color=INK, linewidth=0.9)
+    rim = np.column_stack([(corners - centre) / focal * depth, np.full(4, depth)])
+    spokes = np.stack([np.zeros((4, 3)), rim], axis=1).reshape(-1, 3)
+    return np.concatenate([_closed(rim), spokes])
+
+
+def _closed(corners: FloatArray) -> FloatArray:
+    """(2 N, 3) ends of the sides of a closed outline of N corners."""
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).reshape(-1, 3)
 
 
 def _short(source: str) -> str:

@@ -122,8 +122,8 @@ def _card(sheet: SheetFit) -> Card:
 def _sheets_section(fit: LaserFit) -> Section:
     blocks: list[Facts | Text | Gallery] = []
     for sheet in fit.sheets:
-        blocks += [Text(f"Sheet {sheet.name}"), Facts(sheet_facts(sheet))]
-    blocks += [Text(sentence(fit.naming)), Gallery((figures.scene(fit),), 560)]
+        blocks.append(Facts(sheet_facts(sheet), f"Sheet {sheet.name}"))
+    blocks += [Text(f"Named: {fit.naming}."), Gallery((figures.scene(fit),), 560)]
     return Section("The sheets", tuple(blocks))
 
 

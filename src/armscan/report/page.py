@@ -51,9 +51,10 @@ class Gallery:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Labels with values."""
+    """Labels with values, below a title if there is one."""
 
     rows: tuple[tuple[str, str], ...]
+    title: str = ""
 
 
 @dataclass(frozen=True, slots=True)

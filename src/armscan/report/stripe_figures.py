@@ -24,7 +24,7 @@ FLAG_COLOURS = {
     StripeFlag.SHORT_SEGMENT: ("#b58863", "flagged: too short a piece"),
 }
 OUTLINE = "#ffffff"
-DOT_SIZE = 2.6
+DOT_SIZE = 3.4
 
 
 def sheet_colour(index: int) -> str:
@@ -71,7 +71,9 @@ def stripe_picture(
     for index in range(int(sheet.max(initial=0)) + 1):
         chosen = (fate == 0) & (np.maximum(sheet, 0) == index)
         marks.append(Marks(points[chosen], sheet_colour(index), "dot", DOT_SIZE))
-    markup = photo_markup(exposure, marks, f"Stripe points of {profile.source}", longest_px=1200)
+    markup = photo_markup(
+        exposure, marks, f"Stripe points of {profile.source}", longest_px=1200, is_grey=True
+    )
     return Picture(markup, caption, profile.source)
 
 

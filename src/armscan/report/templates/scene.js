@@ -1,0 +1,118 @@
+// Points and lines in space, turned by dragging; orthographic, Sensor axes (x right, y down, z away).
+function drawScenes() {
+  const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+  const floats = (text) => new Float32Array(bytes(text).buffer);
+  for (const canvas of document.querySelectorAll("canvas.scene")) {
+    const data = canvas.dataset;
+    const points = floats(data.points), colours = bytes(data.colours);
+    const lines = floats(data.lines), lineColours = bytes(data.lineColours);
+    const centre = floats(data.centre);
+    const ink = "#5d6b7a", labels = JSON.parse(data.labels);
+    let yaw = Number(data.yaw), pitch = Number(data.pitch), zoom = 1, reach = null;
+
+    function turned() {
+      const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+      return (x, y, z) => [cy * x + sy * z, cp * y - sp * (cy * z - sy * x)];
+    }
+
+    function reachOf(turn) {
+      let [wide, high] = [1e-6, 1e-6];
+      for (const values of [points, lines]) for (let k = 0; k < values.length; k += 3) {
+        const [x, y] = turn(values[k] - centre[0], values[k + 1] - centre[1], values[k + 2] - centre[2]);
+        wide = Math.max(wide, Math.abs(x));
+        high = Math.max(high, Math.abs(y));
+      }
+      return [wide, high];
+    }
+
+    function draw() {
+      const ratio = window.devicePixelRatio || 1;
+      const width = (canvas.width = Math.round(canvas.clientWidth * ratio));
+      const height = (canvas.height = Math.round(canvas.clientHeight * ratio));
+      const context = canvas.getContext("2d");
+      const turn = turned();
+      reach = reach || reachOf(turn);
+      const scale = zoom * 0.44 * Math.min(width / reach[0], height / reach[1]);
+      const place = (values, k) => {
+        const [x, y] = turn(values[k] - centre[0], values[k + 1] - centre[1], values[k + 2] - centre[2]);
+        return [width / 2 + scale * x, height / 2 + scale * y];
+      };
+      context.fillStyle = "#fff";
+      context.fillRect(0, 0, width, height);
+      context.lineWidth = 1.2 * ratio;
+      for (let k = 0; k < lines.length; k += 6) {
+        const c = k / 2;
+        context.strokeStyle = `rgb(${lineColours[c]} ${lineColours[c + 1]} ${lineColours[c + 2]})`;
+        context.beginPath();
+        context.moveTo(...place(lines, k));
+        context.lineTo(...place(lines, k + 3));
+        context.stroke();
+      }
+      const image = context.getImageData(0, 0, width, height), pixels = image.data;
+      const size = Math.max(2, Math.round(1.6 * ratio));
+      for (let k = 0; k < points.length; k += 3) {
+        const [px, py] = place(points, k).map(Math.round);
+        for (let j = py; j < py + size; j++) for (let i = px; i < px + size; i++) {
+          if (i < 0 || j < 0 || i >= width || j >= height) continue;
+          const q = 4 * (j * width + i);
+          pixels[q] = colours[k]; pixels[q + 1] = colours[k + 1]; pixels[q + 2] = colours[k + 2];
+        }
+      }
+      context.putImageData(image, 0, 0);
+      context.font = `${12 * ratio}px sans-serif`;
+      context.fillStyle = ink;
+      for (const [text, ...at] of labels) context.fillText(text, ...place(at, 0));
+      drawAxes(context, turn, 46 * ratio, height - 46 * ratio, 30 * ratio, ratio);
+      drawBar(context, width, height, scale, ratio);
+    }
+
+    function drawAxes(context, turn, x0, y0, length, ratio) {
+      context.lineWidth = 1.5 * ratio;
+      context.strokeStyle = ink;
+      for (const [name, axis] of [["X", [1, 0, 0]], ["Y", [0, 1, 0]], ["Z", [0, 0, 1]]]) {
+        const [dx, dy] = turn(...axis);
+        context.beginPath();
+        context.moveTo(x0, y0);
+        context.lineTo(x0 + length * dx, y0 + length * dy);
+        context.stroke();
+        context.fillText(name, x0 + 1.25 * length * dx - 4 * ratio, y0 + 1.25 * length * dy + 4 * ratio);
+      }
+    }
+
+    function drawBar(context, width, height, scale, ratio) {
+      const wanted = (110 * ratio) / scale, power = 10 ** Math.floor(Math.log10(wanted));
+      const length = power * [5, 2, 1].find((step) => step * power <= wanted);
+      const right = width - 18 * ratio, y = height - 18 * ratio;
+      context.fillRect(right - scale * length, y, scale * length, 2 * ratio);
+      context.textAlign = "right";
+      context.fillText(`${Number(length.toPrecision(1))} mm`, right, y - 6 * ratio);
+      context.textAlign = "left";
+    }
+
+    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
+    canvas.addEventListener("pointermove", (event) => {
+      if (!event.buttons) return;
+      yaw -= event.movementX / 160;
+      pitch = Math.max(-1.57, Math.min(1.57, pitch - event.movementY / 160));
+      draw();
+    });
+    canvas.addEventListener("wheel", (event) => {
+      if (document.activeElement !== canvas) return;
+      event.preventDefault();
+      zoom = Math.max(0.3, Math.min(40, zoom * Math.exp(-event.deltaY / 500)));
+      draw();
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => {
+      const steps = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] };
+      const step = steps[event.key];
+      if (!step) return;
+      event.preventDefault();
+      yaw += step[0];
+      pitch += step[1];
+      draw();
+    });
+    window.addEventListener("resize", draw);
+    draw();
+  }
+}
+drawScenes();

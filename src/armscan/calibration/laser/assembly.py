@@ -145,7 +145,8 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
 
 
 def _common_plane(k: int, case: SheetCase) -> CommonPlane | None:
-    factor = case.models[k].sigma_factor
+    # Not the raised sigmas: they would explain away the very misfit that is to be shown.
+    factor = case.models[k].noise.sigma_factor
     members = [
         PosedSighting(
             replace(sighting, sigma_ends_mm=sighting.sigma_ends_mm * factor),

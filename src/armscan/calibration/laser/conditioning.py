@@ -113,7 +113,8 @@ def geometry_warnings(
         warnings.append(
             "two boards only: nothing is redundant but that their two stripes must lie in one "
             f"plane (they miss it by {common.largest_mm:.3f} mm, {sigmas:.1f} sigma); a wrong "
-            "depth of a board, or a bow, would not be noticed: use three boards or more"
+            "board pose that keeps the stripes in one plane, or a bow, would not be noticed: use "
+            "three boards or more"
         )
     if geometry.board_angle_deg < PARALLEL_DEG:
         warnings.append(

@@ -34,7 +34,12 @@ def advise(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> CameraFit:
 
 
 def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str]:
-    warnings = [f"{view.source}: {view.note}" for view in fit.views if view.is_misfit]
+    requested = fit.options.leave_out
+    warnings = [
+        f"{view.source}: {view.note}"
+        for view in fit.views
+        if view.note and view.source not in requested
+    ]
     warnings += [f"{view.source} cannot be used: {view.reason}" for view in fit.refused_views]
     warnings += [f"{later} repeats {earlier} and adds little" for later, earlier in repeats]
     n_outliers = sum(int(view.is_outlier.sum()) for view in fit.used_views)

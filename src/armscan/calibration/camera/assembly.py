@@ -181,7 +181,8 @@ def _left_out_fit(
     observations: Observations,
     note: str,
 ) -> ViewFit | FitFailure:
-    pose = estimate_board_pose(view, camera, bow_mm=solution.state.shared[N_CAMERA:])
+    bow = solution.state.shared[N_CAMERA:]
+    pose = estimate_board_pose(view, camera, bow_mm=bow, allow_ambiguous=True)
     if isinstance(pose, FitFailure):
         return pose
     typical = float(np.mean(np.sum(residuals_px(observations, solution.state) ** 2, axis=1)))

@@ -114,6 +114,8 @@ def estimate_board_pose(
     camera: CameraModel,
     camera_covariance: FloatArray | None = None,
     bow_mm: FloatArray | None = None,
+    *,
+    allow_ambiguous: bool = False,
 ) -> Estimate[Pose[Sensor, Board]] | FitFailure:
     """Pose of a board in one view.
 
@@ -127,6 +129,8 @@ def estimate_board_pose(
         (9, 9); if given, the camera's uncertainty is carried into the pose.
     bow_mm
         (2,) bow of the board as in `BoardWarp`; flat if None.
+    allow_ambiguous
+        Return the better of two poses even if they fit alike, instead of refusing.
 
     Returns
     -------
@@ -145,7 +149,8 @@ def estimate_board_pose(
     factor = best.chi2 / max(degrees, 1)
     if degrees < SCALED_FROM_DEGREES_OF_FREEDOM:
         factor = max(factor, 1.0)
-    if len(candidates) > 1 and candidates[1].chi2 - best.chi2 < AMBIGUOUS_CHI2 * factor:
+    rivals = () if allow_ambiguous else candidates[1:]
+    if any(rival.chi2 - best.chi2 < AMBIGUOUS_CHI2 * factor for rival in rivals):
         return FitFailure(
             "two poses of the board fit alike, mirrored at the line of sight",
             "tilt the board more, bring it nearer, or use a larger one",

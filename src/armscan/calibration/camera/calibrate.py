@@ -22,8 +22,13 @@ from armscan.calibration.camera.robust import (
     solve_robustly,
 )
 from armscan.calibration.camera.starting_values import starting_state
+from armscan.geometry.arrays import BoolArray
 from armscan.geometry.estimate import FitFailure
 from armscan.vision.targets.view import TargetView
+
+WRONG_LEVEL = 100.0
+"""A view whose residuals are ten times those of the typical view is not noisy but wrong: numbered
+wrongly, or moved during the exposure."""
 
 MIN_ANGLE_DEG = 5.0
 """Boards that differ in tilt by less than this are parallel: the focal length is not determined."""
@@ -75,8 +80,8 @@ def calibrate_camera(
     chosen = _solve_model(views, prepared, options)
     if isinstance(chosen, FitFailure):
         return chosen
-    while options.leave_out_misfits and misfits(chosen.solution).any():
-        smaller = _without_misfits(prepared, chosen.solution)
+    while (bad := _to_leave_out(chosen.solution, options)).any():
+        smaller = _without(bad, prepared, chosen.solution)
         if len(smaller.used) < max(3, len(prepared.used) // 2):
             break
         again = _solve_model(views, smaller, options)
@@ -86,15 +91,21 @@ def calibrate_camera(
     return assemble(views, prepared, chosen, misfits(chosen.solution), options)
 
 
-def misfits(solution: Solution) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def misfits(solution: Solution) -> BoolArray:
     """(V,) True for views that fit so much worse than the typical one that they should go."""
     return np.asarray(
         (solution.view_levels > MISFIT_LEVEL) | (solution.outlier_shares > MISFIT_OUTLIERS)
     )
 
 
-def _without_misfits(prepared: PreparedViews, solution: Solution) -> PreparedViews:
-    bad = misfits(solution)
+def _to_leave_out(solution: Solution, options: CameraOptions) -> BoolArray:
+    """Misfits if wanted; views that are plainly wrong in any case."""
+    if options.leave_out_misfits:
+        return misfits(solution)
+    return np.asarray(solution.view_levels > WRONG_LEVEL)
+
+
+def _without(bad: BoolArray, prepared: PreparedViews, solution: Solution) -> PreparedViews:
     left_out = dict(prepared.left_out)
     for position, index in enumerate(prepared.used):
         if bad[position]:
@@ -152,7 +163,7 @@ def _solve(
     if isinstance(start, FitFailure):
         return start
     basis, _ = free_basis(model, options, with_warp=False)
-    solution = solve_robustly(observations, start, basis)
+    solution = solve_robustly(observations, start[0], basis, start[1])
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:

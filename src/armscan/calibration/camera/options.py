@@ -40,7 +40,9 @@ class CameraOptions:
     leave_out
         Sources of views that are not used.
     leave_out_misfits
-        Leave out the views that the robust test proposes, instead of only naming them.
+        Leave out the views that the robust test proposes (residuals three times those of the
+        typical view), instead of only naming them. Views with ten times the residuals are wrong,
+        not noisy, and are left out in any case; they are named.
     n_folds
         Folds of the cross-validation over views; 0 switches it off. With fewer views than folds
         each view is a fold of its own.

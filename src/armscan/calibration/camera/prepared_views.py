@@ -80,7 +80,8 @@ def prepare_views(
     among_used = repeated_views([views[i] for i in used])
     repeats = {used[later]: used[earlier] for later, earlier in among_used.items()}
     prepared = PreparedViews(tuple(used), tuple(homographies), left_out, tuple(refused), repeats)
-    return _too_few(prepared, len(views)) or prepared
+    failure = _too_few(prepared, len(views))
+    return prepared if failure is None else failure
 
 
 def _too_few(prepared: PreparedViews, n_given: int) -> FitFailure | None:

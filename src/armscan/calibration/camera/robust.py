@@ -32,7 +32,11 @@ MISFIT_OUTLIERS = 0.25
 SUSPECT_LEVEL = 4.0
 CAUCHY_SCALE = 2.4
 ROBUST_ROUNDS = 8
+FIRST_STEPS = 15
 STEPS_PER_ROUND = 4
+NO_SAY = 1e-6
+"""Weight of points that must not pull: not zero, so that every pose stays determined."""
+
 REJECTION_ROUNDS = 3
 
 
@@ -92,43 +96,58 @@ def chi2_of_points(observations: Observations, state: State) -> FloatArray:
 
 
 def solve_robustly(
-    observations: Observations, start: State, basis: FloatArray
+    observations: Observations, start: State, basis: FloatArray, trusted: BoolArray
 ) -> Solution | FitFailure:
-    """Solve, look for outliers, and solve again without them where there are any."""
-    result = adjust(observations, start, basis)
-    if isinstance(result, FitFailure):
-        return result
-    state, equations = result
-    chi2 = chi2_of_points(observations, state)
-    levels, outlier = _judge(observations, chi2)
-    if not outlier.any() and levels.max() < SUSPECT_LEVEL:
-        return Solution(state, basis, equations, np.ones(len(chi2)), levels, 0.0 * levels)
-    state = _reweighted(observations, state, basis)
+    """Solve, look for outliers, and solve again without them where there are any.
+
+    Parameters
+    ----------
+    observations
+        The image points.
+    start, trusted
+        From `armscan.calibration.camera.starting_values.starting_state`.
+    basis
+        From `free_basis`.
+    """
+    if trusted.all():
+        result = adjust(observations, start, basis)
+        if isinstance(result, FitFailure):
+            return result
+        chi2 = chi2_of_points(observations, result[0])
+        levels, outlier = _judge(observations, chi2)
+        if not outlier.any() and levels.max() < SUSPECT_LEVEL:
+            return Solution(result[0], basis, result[1], np.ones(len(chi2)), levels, 0.0 * levels)
+    state = _reweighted(observations, start, basis, trusted)
     chi2 = chi2_of_points(observations, state)
     levels, outlier = _judge(observations, chi2)
     shares = _outlier_shares(observations, chi2)
     for _ in range(REJECTION_ROUNDS):
         weights = np.where(outlier, 0.0, 1.0)
-        result = adjust(observations, state, basis, weights)
-        if isinstance(result, FitFailure):
-            return result
-        _, again = _judge(observations, chi2_of_points(observations, result[0]))
+        kept = adjust(observations, state, basis, weights)
+        if isinstance(kept, FitFailure):
+            return kept
+        state, equations = kept
+        _, again = _judge(observations, chi2_of_points(observations, state))
         if np.array_equal(again, outlier):
             break
         outlier = again
-    return Solution(result[0], basis, result[1], weights, levels, shares)
+    return Solution(state, basis, equations, weights, levels, shares)
 
 
-def _reweighted(observations: Observations, state: State, basis: FloatArray) -> State:
+def _reweighted(
+    observations: Observations, state: State, basis: FloatArray, trusted: BoolArray
+) -> State:
     """Iterate with Cauchy weights at the level of the typical view."""
-    for _ in range(ROBUST_ROUNDS):
-        chi2 = chi2_of_points(observations, state)
-        typical = _typical(_view_levels(observations, chi2))
-        weights = 1.0 / (1.0 + chi2 / (CAUCHY_SCALE**2 * typical))
-        result = adjust(observations, state, basis, weights, STEPS_PER_ROUND)
+    weights = np.where(trusted[observations.view_of_point], 1.0, NO_SAY)
+    for round_number in range(ROBUST_ROUNDS):
+        steps = STEPS_PER_ROUND if round_number else FIRST_STEPS
+        result = adjust(observations, state, basis, weights, steps)
         if isinstance(result, FitFailure):
             return state
         state = result[0]
+        chi2 = chi2_of_points(observations, state)
+        typical = _typical(_view_levels(observations, chi2))
+        weights = np.maximum(1.0 / (1.0 + chi2 / (CAUCHY_SCALE**2 * typical)), NO_SAY)
     return state
 
 

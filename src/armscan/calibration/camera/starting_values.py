@@ -15,7 +15,7 @@ from armscan.calibration.camera.zhang import (
     linear_distortion,
     pose_from_homography,
 )
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.vision.targets.view import TargetView
@@ -69,7 +69,7 @@ def starting_state(
     homographies: Sequence[FloatArray],
     model: DistortionModel,
     options: CameraOptions,
-) -> State | FitFailure:
+) -> tuple[State, BoolArray] | FitFailure:
     """Closed-form camera and poses.
 
     Parameters
@@ -86,11 +86,15 @@ def starting_state(
     Returns
     -------
     state
-        Starting values with those parameters at rest that are not free; or why there are none.
+        Starting values with those parameters at rest that are not free.
+    trusted
+        (V,) False for views that fit a plane so badly that they had no say.
+
+    or why there are none.
     """
     width, height = observations.width_px, observations.height_px
     rms = np.array([homography_rms_px(v, h) for v, h in zip(views, homographies, strict=True)])
-    trusted = rms <= max(SUSPECT_HOMOGRAPHY * float(np.median(rms)), 1e-6)
+    trusted = np.asarray(rms <= max(SUSPECT_HOMOGRAPHY * float(np.median(rms)), 1e-6))
     chosen = [h for h, ok in zip(homographies, trusted, strict=True) if ok]
     matrix = intrinsics_from_homographies(chosen, width, height)
     if isinstance(matrix, FitFailure):
@@ -99,7 +103,7 @@ def starting_state(
     shared = np.zeros(11)
     shared[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
     state = State.from_poses(shared, [pose_from_homography(h, matrix) for h in homographies])
-    return _with_distortion(state, observations, trusted, model)
+    return _with_distortion(state, observations, trusted, model), trusted
 
 
 def _held(matrix: FloatArray, width: int, height: int, options: CameraOptions) -> FloatArray:
@@ -112,7 +116,7 @@ def _held(matrix: FloatArray, width: int, height: int, options: CameraOptions) -
 
 
 def _with_distortion(
-    state: State, observations: Observations, trusted: np.ndarray, model: DistortionModel
+    state: State, observations: Observations, trusted: BoolArray, model: DistortionModel
 ) -> State:
     """Add linear distortion (eqs. 2.36 to 2.38) where it is small enough to be believed."""
     free = [PARAMETER_NAMES.index(name) - 4 for name in DISTORTION_PARAMETERS[model]]

@@ -18,10 +18,10 @@ app = typer.Typer(
     help="Cameras and line lasers as a calibrated 3-D scanner: calibrate, then measure.",
     epilog=(
         "\b\nFirst steps:\n"
-        "  armscan doctor                                  is everything installed?\n"
-        "  armscan demo photos -o demo                     the whole chain on rendered photos\n"
+        "  armscan doctor                is everything installed?\n"
+        "  armscan demo photos -o demo   the whole chain on rendered photographs\n"
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n"
-        "  armscan COMMAND -h                              options, and an example that works"
+        "  armscan COMMAND -h            options, and an example that works"
     ),
     context_settings=HELP_OPTIONS,
     no_args_is_help=True,

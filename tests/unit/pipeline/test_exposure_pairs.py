@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images with laser find their partners without, or a sentence says why not."""
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError
+from armscan.models.camera import CameraModel
+from armscan.pipeline.exposure_pairs import check_sizes, pair_exposures
+from armscan.records.exposure import Exposure
+from armscan.records.sensor_window import SensorWindow
+
+CAMERA = CameraModel(100.0, 100.0, 20.0, 15.0, np.zeros(5), 40, 30)
+
+
+def image(source: str, shape: tuple[int, int] = (30, 40), **more: SensorWindow) -> Exposure:
+    return Exposure(np.zeros(shape, dtype=np.uint8), source, **more)
+
+
+def test_by_order_when_names_differ() -> None:
+    on, off = [image("a1.png"), image("a2.png")], [image("b1.png"), image("b2.png")]
+    assert [(e.source, b.source if b else "") for e, b in pair_exposures(on, off)] == [
+        ("a1.png", "b1.png"),
+        ("a2.png", "b2.png"),
+    ]
+
+
+def test_by_name_when_the_names_are_the_same() -> None:
+    on = [image("on/1.png"), image("on/2.png")]
+    off = [image("off/2.png"), image("off/1.png")]
+    assert [b.source if b else "" for _, b in pair_exposures(on, off)] == ["off/1.png", "off/2.png"]
+
+
+def test_no_backgrounds_is_fine_and_no_images_is_not() -> None:
+    assert pair_exposures([image("a.png")], [])[0][1] is None
+    with pytest.raises(InputError, match="no images"):
+        pair_exposures([], [])
+
+
+def test_counts_that_differ_are_refused_with_the_names() -> None:
+    with pytest.raises(InputError, match=r"2 images with laser \(a\.png, b\.png\) but 1"):
+        pair_exposures([image("a.png"), image("b.png")], [image("c.png")])
+
+
+def test_pairs_of_two_sizes_or_of_one_image_are_refused() -> None:
+    with pytest.raises(InputError, match=r"a\.png.*b\.png"):
+        pair_exposures([image("a.png")], [image("b.png", (30, 41))])
+    with pytest.raises(InputError, match="same image"):
+        pair_exposures([image("a.png")], [image("a.png")])
+
+
+def test_images_must_be_of_the_cameras_size_or_lie_on_its_sensor() -> None:
+    check_sizes([image("a.png")], CAMERA)
+    check_sizes([image("w.png", (10, 40), window=SensorWindow(0, 20))], CAMERA)
+    for wrong in (
+        image("small.png", (10, 40)),
+        image("turned.png", (40, 30)),
+        image("w.png", (10, 40), window=SensorWindow(0, 21)),
+    ):
+        with pytest.raises(InputError, match="camera was calibrated with 40 x 30"):
+            check_sizes([wrong], CAMERA)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which sheet drew a stripe on an object."""
+
+import numpy as np
+import pytest
+
+from armscan.errors import EstimationError, OptionError
+from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
+from armscan.records.profile import Profile, StripeFlag
+from sheet_rig import PROVENANCE, make_profile
+
+CAMERA = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
+RANGE_MM = (280.0, 320.0)
+
+
+def leaning(sign: float) -> LightSheet:
+    """Vertical sheet through (0, 0, 300) at 45 degrees: x = sign * (z - 300)."""
+    normal = np.array([1.0, 0.0, -sign]) / np.sqrt(2.0)
+    axes = np.stack([[0.0, 1.0, 0.0], np.cross(normal, [0.0, 1.0, 0.0]), normal])
+    return LightSheet(np.array([0.0, 0.0, 300.0]), axes, 40.0, np.zeros(5))
+
+
+def two_sheets() -> SensorCalibration:
+    box = np.array([0.0, 0.0, 1000.0, 800.0])
+    camera = CameraCalibration(CAMERA, np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, box, PROVENANCE)
+    sheets = tuple(
+        SheetCalibration(name, leaning(sign), 0.01, 4, 99, RANGE_MM, True)
+        for name, sign in (("left", 1.0), ("right", -1.0))
+    )
+    return SensorCalibration(camera, sheets, np.zeros((25, 25)), PROVENANCE)
+
+
+def stripes(*x_over_z: float) -> Profile:
+    """Vertical stripes at the columns of x / z; both sheets meet them at some depth."""
+    parts = []
+    for tangent in x_over_z:
+        q = np.stack([np.full(40, 500.0 + 1000.0 * tangent), np.linspace(300, 500, 40)], axis=1)
+        parts.append((q, np.tile([1.0, 0.0], (40, 1))))
+    return make_profile("object.png", parts, 0.1)
+
+
+FAR = -60.0 / 360.0
+"""Left meets this column at z = 257 (outside), right at z = 360 (outside)."""
+NEAR = 0.25
+"""Left meets it at z = 400, right at z = 240: outside, too."""
+
+
+def test_the_users_word_comes_first() -> None:
+    choice = choose_sheets(stripes(0.0), two_sheets(), DepthRange(), sheet_name="right")
+    assert set(choice.sheet.tolist()) == {1}
+    assert "as asked" in choice.how
+    with pytest.raises(OptionError, match="left, right"):
+        choose_sheets(stripes(0.0), two_sheets(), DepthRange(), sheet_name="middle")
+
+
+def test_the_only_laser_that_was_on() -> None:
+    choice = choose_sheets(stripes(0.0), two_sheets(), DepthRange(), lasers=("left",))
+    assert set(choice.sheet.tolist()) == {0}
+
+
+def test_depth_names_a_stripe_that_one_sheet_alone_puts_in_range() -> None:
+    """At x/z = 0.13: left z = 344.8, right z = 265.5. Range of right widened to 265 only."""
+    sensor = two_sheets()
+    wide = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (262.0, 320.0), True)
+    sensor = SensorCalibration(
+        sensor.camera, (sensor.sheets[0], wide), sensor.covariance, PROVENANCE
+    )
+    choice = choose_sheets(stripes(0.13), sensor, DepthRange(0.0))
+    assert set(choice.sheet.tolist()) == {1}
+    assert "right" in choice.how
+
+
+def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
+    with pytest.raises(EstimationError, match="--sheet"):
+        choose_sheets(stripes(0.0), two_sheets(), DepthRange())
+
+
+def test_a_stripe_in_no_range_gets_no_sheet() -> None:
+    choice = choose_sheets(stripes(FAR, NEAR), two_sheets(), DepthRange(0.0))
+    assert set(choice.sheet.tolist()) == {-1}
+
+
+def test_flagged_points_do_not_vote() -> None:
+    profile = stripes(0.0)
+    flags = np.full(len(profile), int(StripeFlag.NEIGHBOUR))
+    flagged = Profile(
+        profile.source,
+        profile.points_px,
+        profile.normals_px,
+        profile.sigma_px,
+        profile.width_px,
+        profile.intensity,
+        flags,
+        profile.segment,
+    )
+    choice = choose_sheets(flagged, two_sheets(), DepthRange())
+    assert set(choice.sheet.tolist()) == {-1}
+
+
+def test_depth_margin_by_hand() -> None:
+    assert DepthRange(0.25).limits_mm(two_sheets().sheets[0]) == (270.0, 330.0)
+    with pytest.raises(OptionError):
+        DepthRange(-0.1)

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stripe points to Sensor points: by hand, by OpenCV, by differences, by repeats."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.reconstruction.merge import merge_clouds
+from armscan.reconstruction.triangulate import meet_sheets, triangulate
+from armscan.records.profile import Profile
+from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
+
+SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+SIGMA_PX = 0.1
+PINHOLE = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
+
+
+def printed_sheet(bow_mm: FloatArray | None = None) -> LightSheet:
+    normal = THESIS_PLANE[:3] / np.linalg.norm(THESIS_PLANE[:3])
+    e_u = np.cross(normal, [0.0, 0.0, 1.0])
+    e_u = e_u / np.linalg.norm(e_u)
+    origin = np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742])
+    axes = np.stack([e_u, np.cross(normal, e_u), normal])
+    return LightSheet(origin, axes, 20.0, np.zeros(5) if bow_mm is None else bow_mm)
+
+
+def sensor(
+    camera: CameraModel, *sheets: LightSheet, covariance: FloatArray | None = None
+) -> SensorCalibration:
+    n = 9 + 8 * len(sheets)
+    joint = np.zeros((n, n)) if covariance is None else covariance
+    box = np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0])
+    calibrated = CameraCalibration(camera, joint[:9, :9], True, 0.1, 0.05, 9, 99, box, PROVENANCE)
+    entries = tuple(
+        SheetCalibration("AB"[k], sheet, 0.01, 6, 600, (120.0, 150.0), True)
+        for k, sheet in enumerate(sheets)
+    )
+    return SensorCalibration(calibrated, entries, joint, PROVENANCE)
+
+
+def profile_at(points_px: FloatArray) -> Profile:
+    normals = np.tile([0.6, 0.8], (len(points_px), 1))
+    return make_profile("stripe.png", [(points_px, normals)], SIGMA_PX)
+
+
+def test_by_hand_on_the_printed_plane() -> None:
+    """Eq. 2.21 for x_u = 0.1, y_u = -0.02 with the printed numbers."""
+    cloud = triangulate(
+        profile_at(np.array([[600.0, 380.0]])), np.array([0]), sensor(PINHOLE, printed_sheet())
+    )
+    depth = -91.78 / (-0.0042275 * 0.1 + 0.73558 * -0.02 - 0.67742)
+    np.testing.assert_allclose(cloud.points_mm, [[0.1 * depth, -0.02 * depth, depth]], rtol=1e-10)
+    assert cloud.frame == "Sensor"
+    assert cloud.sheet_names == ("A",)
+
+
+def test_points_on_boards_come_back_through_a_distorting_lens() -> None:
+    """Stripes projected by OpenCV meet the boards' points again: 0.027 mm/px by 1e-6 px."""
+    rig = replace(thesis_rig(), sigma_stripe_px=1e-6)
+    for index in range(len(rig.poses)):
+        q, _ = rig.stripe(index, rig.sheets[0], np.random.default_rng(0))
+        points, is_met = meet_sheets(
+            q, np.zeros(len(q), dtype=np.int64), sensor(rig.camera, printed_sheet())
+        )
+        assert is_met.all()
+        board = (points - rig.poses[index].translation_mm) @ rig.poses[index].rotation
+        np.testing.assert_allclose(board[:, 2], 0.0, atol=1e-6)
+
+
+def test_stripe_noise_alone_is_one_direction_by_hand() -> None:
+    """On the axis of a pinhole, noise sigma * n: dX/dq by differences of eq. 2.21."""
+    place = np.array([[500.0, 400.0]])
+    calibration = sensor(PINHOLE, printed_sheet())
+    cloud = triangulate(profile_at(place), np.array([0]), calibration)
+    step = 1e-4 * np.array([[0.6, 0.8]])
+    zero = np.array([0])
+    up, down = (meet_sheets(place + s * step, zero, calibration)[0] for s in (1, -1))
+    across = SIGMA_PX * (up - down)[0] / 2e-4
+    np.testing.assert_allclose(cloud.covariance_mm2[0], np.outer(across, across), rtol=1e-6)
+    np.testing.assert_allclose(cloud.sigma_noise_mm, np.linalg.norm(across), rtol=1e-6)
+    normal = THESIS_PLANE[:3] / np.linalg.norm(THESIS_PLANE[:3])
+    assert abs(across @ normal) < 1e-9, "noise keeps a point in the sheet"
+
+
+def test_covariance_is_that_of_repeats_with_all_errors() -> None:
+    """1000 repeats of camera, sheet and stripe errors: mean of e' C^-1 e is 3 +- 4 sigma."""
+    rig = thesis_rig()
+    free = SHEET_SIGMA_MM > 0.0
+    mixing = np.linalg.qr(np.random.default_rng(4).normal(size=(12, 12)))[0]
+    sigma = np.concatenate([CAMERA_SIGMA, SHEET_SIGMA_MM[free]])
+    correlation = mixing @ np.diag(np.linspace(0.2, 1.8, 12)) @ mixing.T
+    joint = np.zeros((17, 17))
+    joint[:12, :12] = correlation * np.outer(sigma, sigma)
+    sheet = printed_sheet()
+    place = np.array([[1400.0, 600.0]])
+    truth, _ = meet_sheets(place, np.array([0]), sensor(rig.camera, sheet))
+    cloud = triangulate(
+        profile_at(place), np.array([0]), sensor(rig.camera, sheet, covariance=joint)
+    )
+    rng = np.random.default_rng(5)
+    squares = []
+    for error in rng.multivariate_normal(np.zeros(12), joint[:12, :12], 1000):
+        camera = CameraModel.from_parameters(rig.camera.parameters + error[:9], 2048, 1536)
+        wrong = sheet.updated(np.concatenate([error[9:], np.zeros(5)]))
+        noisy = place + rng.normal(0.0, SIGMA_PX) * np.array([[0.6, 0.8]])
+        found, _ = meet_sheets(noisy, np.array([0]), sensor(camera, wrong))
+        miss = (found - truth)[0]
+        squares.append(miss @ np.linalg.solve(cloud.covariance_mm2[0], miss))
+    assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / 1000)
+
+
+def test_points_without_sheet_or_ray_are_left_out_and_order_is_kept() -> None:
+    behind = LightSheet(np.array([0.0, 0.0, -50.0]), np.eye(3), 10.0, np.zeros(5))
+    q = np.array([[400.0, 300.0], [450.0, 310.0], [500.0, 320.0], [550.0, 330.0]])
+    profile = replace(profile_at(q), segment=np.array([0, 0, 1, 1]))
+    cloud = triangulate(profile, np.array([0, -1, 1, 0]), sensor(PINHOLE, printed_sheet(), behind))
+    np.testing.assert_array_equal(cloud.segment, [0, 1])
+    np.testing.assert_allclose(
+        cloud.points_mm[:, :2] / cloud.points_mm[:, 2:], [[-0.1, -0.1], [0.05, -0.07]], atol=1e-12
+    )
+
+
+def test_wrong_sheet_numbers_are_refused() -> None:
+    profile = profile_at(np.array([[400.0, 300.0]]))
+    calibration = sensor(PINHOLE, printed_sheet())
+    for wrong in (np.array([1]), np.array([-2]), np.array([0, 0])):
+        with pytest.raises(InputError, match=r"stripe\.png"):
+            triangulate(profile, wrong, calibration)
+
+
+def test_merged_clouds_keep_order_and_exposures() -> None:
+    calibration = sensor(PINHOLE, printed_sheet())
+    clouds = [
+        triangulate(
+            replace(profile_at(np.array([[400.0 + k, 300.0]] * (k + 1))), source=f"{k}.png"),
+            np.zeros(k + 1, dtype=np.int64),
+            calibration,
+        )
+        for k in range(3)
+    ]
+    whole = merge_clouds(clouds)
+    np.testing.assert_array_equal(whole.exposure, [0, 1, 1, 2, 2, 2])
+    assert whole.exposure_sources == ("0.png", "1.png", "2.png")
+    np.testing.assert_array_equal(whole.points_mm[1], clouds[1].points_mm[0])
+    with pytest.raises(InputError):
+        merge_clouds([])
+    with pytest.raises(InputError, match="do not merge"):
+        merge_clouds([clouds[0], replace(clouds[1], frame="Base")])

@@ -82,8 +82,9 @@ class PhotoErrors:
         Measured points, and those of them on the object.
     points_rms_mm, points_median_mm
         Root mean square and median size of their distances from the object's true surface.
-    points_normalised_rms
-        Root mean square of these distances over the stated sigma along the surface's normal.
+    points_normalised_rms, points_within_2_sigma
+        Of these distances over the stated sigma along the surface's normal: root mean square, and
+        the fraction below 2.
     """
 
     focal_px: float
@@ -96,6 +97,7 @@ class PhotoErrors:
     points_rms_mm: float
     points_median_mm: float
     points_normalised_rms: float
+    points_within_2_sigma: float
 
 
 def render_photos(folder: Path, seed: int, progress: Progress = silent) -> PhotoTruth:
@@ -125,6 +127,7 @@ def compare_with_truth(
     normals = truth.object_normals(cloud.points_mm[is_on])
     variance = np.einsum("ni,nij,nj->n", normals, cloud.covariance_mm2[is_on], normals)
     on_object = distance[is_on]
+    normalised = on_object / np.sqrt(variance)
     return PhotoErrors(
         focal_px=float(error[0]),
         focal_sigma_px=float(np.sqrt(covariance[0, 0])),
@@ -139,7 +142,8 @@ def compare_with_truth(
         n_on_object=int(is_on.sum()),
         points_rms_mm=float(np.sqrt(np.mean(on_object**2))),
         points_median_mm=float(np.median(np.abs(on_object))),
-        points_normalised_rms=float(np.sqrt(np.mean(on_object**2 / variance))),
+        points_normalised_rms=float(np.sqrt(np.mean(normalised**2))),
+        points_within_2_sigma=float(np.mean(np.abs(normalised) < 2.0)),
     )
 
 

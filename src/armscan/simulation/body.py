@@ -17,6 +17,9 @@ from armscan.geometry.frames import Part, Sensor
 from armscan.geometry.poses import Pose
 
 HIT_MM = 1e-5
+BLEND_REACH = 1.5
+"""Beyond this many blends from a limb, no surface is changed by it: a blend adds a quarter of its
+length, and may meet a limb that is already melted with others."""
 GRADIENT_STEP_MM = 1e-4
 
 
@@ -62,10 +65,10 @@ class Limb:
 
     @property
     def ball(self) -> FloatArray:
-        """(4,) centre and radius of a ball that holds the limb and what its blend adds."""
+        """(4,) centre and radius of a ball that holds the limb."""
         centre = 0.5 * np.add(self.start_mm, self.end_mm)
         thickest = max(self.start_radius_mm, self.end_radius_mm)
-        return np.array([*centre, 0.5 * self._length_mm + thickest + self.blend_mm])
+        return np.array([*centre, 0.5 * self._length_mm + thickest])
 
     @property
     def _length_mm(self) -> float:
@@ -97,7 +100,9 @@ class Body:
             raise InputError("the first limb of a body must be solid")
         rows = np.array([limb.row for limb in self.limbs])
         object.__setattr__(self, "_rows", frozen_floats(rows, (None, None), "limbs"))
-        balls = np.array([limb.ball for limb in self.limbs if not limb.is_hollow])
+        balls = np.array([limb.ball for limb in self.limbs])
+        later_blends = [limb.blend_mm for limb in reversed(self.limbs)]
+        balls[:, 3] += BLEND_REACH * np.maximum.accumulate(later_blends)[::-1]
         object.__setattr__(self, "_balls", frozen_floats(balls, (None, 4), "balls"))
 
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:

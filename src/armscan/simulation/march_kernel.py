@@ -14,18 +14,27 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 LIMB_COLUMNS = 12
-MAX_STEPS = 200
+MAX_STEPS = 2000
+"""A ray that grazes the body crawls along it; after so many steps it counts as passing."""
 
 _INPUT = types.Array(types.float64, 2, "C", readonly=True)
 _RESULT = types.float64[::1]
-_SPAN_SIGNATURE = "UniTuple(float64, 2)(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True))"
+_CROSSED_SIGNATURE = (
+    "Tuple((int64, float64, float64))(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True), "
+    "Array(float64, 2, 'C', True), int64[::1])"
+)
 
 
-@njit(types.float64(types.float64, types.float64, types.float64, _INPUT), cache=True)
-def _distance(x: float, y: float, z: float, limbs: NDArray[np.float64]) -> float:
-    """Signed distance of one point from all limbs, joined in order."""
+@njit(
+    types.float64(types.float64, types.float64, types.float64, _INPUT, types.int64[::1]),
+    cache=True,
+)
+def _distance(
+    x: float, y: float, z: float, limbs: NDArray[np.float64], chosen: NDArray[np.int64]
+) -> float:
+    """Signed distance of one point from the chosen limbs, joined in order."""
     result = 1e30
-    for k in range(limbs.shape[0]):
+    for k in chosen:
         vx, vy, vz = x - limbs[k, 0], y - limbs[k, 1], z - limbs[k, 2]
         along = vx * limbs[k, 3] + vy * limbs[k, 4] + vz * limbs[k, 5]
         across2 = max(vx * vx + vy * vy + vz * vz - along * along, 0.0)
@@ -50,22 +59,31 @@ def distances(
     points: NDArray[np.float64], limbs: NDArray[np.float64], result: NDArray[np.float64]
 ) -> None:
     """Write the signed distances (N,) of points (N, 3), mm, from the body into ``result``."""
+    every = np.arange(limbs.shape[0])
     for i in range(points.shape[0]):
-        result[i] = _distance(points[i, 0], points[i, 1], points[i, 2], limbs)
+        result[i] = _distance(points[i, 0], points[i, 1], points[i, 2], limbs, every)
 
 
-@njit(_SPAN_SIGNATURE, cache=True)
-def _span(ray: NDArray[np.float64], balls: NDArray[np.float64]) -> tuple[float, float]:
-    """Where a ray enters the first and leaves the last of all balls; (inf, -inf) for none."""
-    near, far = np.inf, -np.inf
+@njit(_CROSSED_SIGNATURE, cache=True)
+def _crossed(
+    ray: NDArray[np.float64],
+    limbs: NDArray[np.float64],
+    balls: NDArray[np.float64],
+    crossed: NDArray[np.int64],
+) -> tuple[int, float, float]:
+    """Write the limbs whose balls a ray crosses; count, first entry and last exit."""
+    count, near, far = 0, np.inf, -np.inf
     for k in range(balls.shape[0]):
         vx, vy, vz = balls[k, 0] - ray[0], balls[k, 1] - ray[1], balls[k, 2] - ray[2]
         middle = vx * ray[3] + vy * ray[4] + vz * ray[5]
         half2 = balls[k, 3] ** 2 - (vx * vx + vy * vy + vz * vz - middle * middle)
         if half2 > 0.0:
-            half = math.sqrt(half2)
-            near, far = min(near, middle - half), max(far, middle + half)
-    return near, far
+            crossed[count] = k
+            count += 1
+            if limbs[k, 11] == 0.0:
+                half = math.sqrt(half2)
+                near, far = min(near, middle - half), max(far, middle + half)
+    return count, near, far
 
 
 @njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
@@ -78,20 +96,24 @@ def march(
 ) -> None:
     """Walk along rays until the body is ``tolerance`` near.
 
-    ``rays`` (N, 6) are origins and unit directions; ``balls`` (K, 4), centre and radius, together
-    hold the body. ``travelled`` (N,) receives the distance to the hit; infinite for none.
+    ``rays`` (N, 6) are origins and unit directions; ``balls`` (K, 4), centre and radius, hold
+    each limb and all that its blend reaches: a ray that misses a ball need not ask that limb.
+    ``travelled`` (N,) receives the distance to the hit; infinite for none.
     """
+    room = np.zeros(limbs.shape[0], np.int64)
     for i in range(rays.shape[0]):
-        t, far = _span(rays[i], balls)
+        count, t, far = _crossed(rays[i], limbs, balls, room)
+        crossed = room[:count]
         t = max(t, 0.0)
+        travelled[i] = np.inf
         for _ in range(MAX_STEPS):
             if t > far:
                 break
             x = rays[i, 0] + t * rays[i, 3]
             y = rays[i, 1] + t * rays[i, 4]
             z = rays[i, 2] + t * rays[i, 5]
-            gap = _distance(x, y, z, limbs)
+            gap = _distance(x, y, z, limbs, crossed)
             t += gap
             if gap < tolerance:
+                travelled[i] = t
                 break
-        travelled[i] = t if t <= far else np.inf

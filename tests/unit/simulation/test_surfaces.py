@@ -138,6 +138,21 @@ def test_the_bust_stands_on_its_table_and_is_as_tall_as_it_says() -> None:
     assert top == pytest.approx(175.0, abs=3.0)
 
 
+def test_rays_hit_the_whole_bust_and_not_a_part_of_its_limbs() -> None:
+    """The kernel asks only the limbs near a ray; the others must not matter where it stops."""
+    body = bust(POSE)
+    rng = np.random.default_rng(6)
+    aim = rng.uniform([-60, 0, -30], [60, 180, 30], (3000, 3)) @ POSE.rotation.T
+    rays = aim + POSE.translation_mm
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    distance = body.intersect(np.zeros((3000, 3)), rays)
+    hit = np.isfinite(distance)
+    assert hit.sum() > 1500
+    assert np.abs(body.distance_mm(distance[hit, None] * rays[hit])).max() < 2 * HIT_MM
+    for along in np.linspace(150.0, 550.0, 200):
+        assert body.distance_mm(along * rays[~hit]).min() > -HIT_MM
+
+
 def test_impossible_limbs_are_refused() -> None:
     with pytest.raises(InputError, match="positive radii"):
         Limb((0, 0, 0), (0, 1, 0), 0.0, 1.0)

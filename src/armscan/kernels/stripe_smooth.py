@@ -177,6 +177,6 @@ def smooth_chains(
                 others[m] = moments[m]
             if is_used[i] != 0:
                 others[0] -= own
-            if n_used > LEAST_POINTS and solve_quadratic(others, solved):
+            if solve_quadratic(others, solved):
                 result[i, PREDICTED] = solved[0]
                 result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflation[k])

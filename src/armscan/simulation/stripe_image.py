@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from armscan.records.sensor_window import SensorWindow
 from armscan.simulation.stripe_curves import Curve
 
 REACH_SIGMAS = 6.0
+HALO_SIGMAS = 3.0
 GAUSS_NODES, GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(3)
 UNIT = 255.0
 
@@ -160,15 +161,17 @@ class StripeScene:
         overdrive
             Factor on the red channel; its core saturates where the product exceeds 255.
         halo
-            Share of the red light that is scattered into a halo three sigmas wide.
+            Height of a halo as a share of the line's; its sigma is three times the line's.
         source
             Name of the exposure.
         """
         rng = np.random.default_rng(seed)
         light, base = self.irradiance()
         light = light * _speckle(light.shape, self.noise, rng)
-        spread = 3.0 * max((s.sigma_px for s in self.stripes), default=1.0)
-        red = overdrive * (light + halo * 3.0 * gaussian_filter(light, spread))
+        wide = [
+            replace(s, sigma_px=HALO_SIGMAS * s.sigma_px, peak=halo * s.peak) for s in self.stripes
+        ]
+        red = overdrive * (light + replace(self, stripes=tuple(wide)).irradiance()[0])
         planes = [_camera(c + base, self.noise, rng) for c in (red, 0.35 * light, 0.5 * light)]
         image = self._digitise(np.stack(planes, axis=2))
         return Exposure(image, source, bits_used=self.bits, window=self.window)

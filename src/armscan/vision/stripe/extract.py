@@ -155,7 +155,7 @@ def to_profile(
     flags = np.zeros(len(points), np.int64)
     flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
     flags[is_background_step(fits, options.background_step)] |= int(StripeFlag.BACKGROUND_STEP)
-    flags[is_asymmetric(fits)] |= int(StripeFlag.ASYMMETRIC)
+    flags[is_asymmetric(fits, width)] |= int(StripeFlag.ASYMMETRIC)
     near = is_near_other_line(fits.neighbour, chain, width, options.neighbour_sigmas)
     flags[near] |= int(StripeFlag.NEIGHBOUR)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)

@@ -15,8 +15,10 @@ SIGNIFICANT = 5.0
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
 SKEW_HALF = 4
-SKEW_SHIFT = 0.25
-"""Third-order part of a profile, as a share of its amplitude, that counts as leaning."""
+LEAST_SKEW = 0.1
+"""Smallest third-order part of a profile that counts as leaning."""
+SKEW_PX = 0.3
+"""The part in px that counts on narrow lines, which few pixels describe."""
 
 
 def is_background_step(fits: ProfileFits, least_share: float) -> BoolArray:
@@ -36,13 +38,25 @@ def is_background_step(fits: ProfileFits, least_share: float) -> BoolArray:
     return np.asarray(is_certain & (step > least_share * fits.values[:, AMPLITUDE]))
 
 
-def is_asymmetric(fits: ProfileFits) -> BoolArray:
-    """(N,) True where the profile's third-order part is certain and large."""
+def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
+    """(N,) True where the profile's third-order part is certain and moves the centre.
+
+    The part is ``c m (u^3 - 3 u)`` beside the Gaussian ``m``; it moves the centre by about 0.6 c
+    sigmas.
+
+    Parameters
+    ----------
+    fits
+        Fitted profiles.
+    width_px
+        (N,) sigma of the line.
+    """
     both = np.stack([fits.values[:, SKEW], fits.values[:, SKEW_NORM]], axis=1)
     total = sum_along(both, fits.ridge.chain, SKEW_HALF)
     norm = np.maximum(total[:, 1], 1e-12)
     size = np.abs(total[:, 0]) / norm
-    return np.asarray((size * np.sqrt(norm) > SIGNIFICANT) & (size > SKEW_SHIFT))
+    limit = np.maximum(LEAST_SKEW, SKEW_PX / width_px)
+    return np.asarray((size * np.sqrt(norm) > SIGNIFICANT) & (size > limit))
 
 
 def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:

@@ -20,12 +20,13 @@ from armscan.kernels.stripe_smooth import (
     smooth_chains,
 )
 
-SMALLEST_WINDOW_PX = 3.0
+SMALLEST_WINDOW_PX = 3.2
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
 RESULT_COLUMNS = 8
-SCATTER_HALF = 30
+SCATTER_HALVES = (30, 16, 8)
+"""Wide windows show slow noise too, but need long chains."""
 UNKNOWN_SCATTER_PX = 0.5
 """Assumed where chains are too short to show their scatter."""
 SIGNIFICANT_CORRELATION = 2.5
@@ -105,7 +106,7 @@ class SmoothedCentres:
 def windows(largest_px: float) -> FloatArray:
     """Half windows from small to ``largest_px``, growing by a constant ratio."""
     steps = max(round(np.log(largest_px / SMALLEST_WINDOW_PX) / np.log(WINDOW_RATIO)), 0)
-    return largest_px / WINDOW_RATIO ** np.arange(steps, -1, -1, dtype=np.float64)
+    return np.geomspace(min(SMALLEST_WINDOW_PX, largest_px), largest_px, steps + 1)
 
 
 def smooth(course: Course, largest_px: float) -> SmoothedCentres:
@@ -180,11 +181,12 @@ def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
     """Standard deviation of the points across a smooth course of their own, in px."""
     n = len(points)
     course = Course(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
-    residual = _filter_residuals(course, SCATTER_HALF)
-    if not np.isfinite(residual).any():
-        return UNKNOWN_SCATTER_PX
-    share = 1.0 - _weights(SCATTER_HALF)[SCATTER_HALF]
-    return float(np.sqrt(np.nanmean(residual**2) / share))
+    for half in SCATTER_HALVES:
+        residual = _filter_residuals(course, half)
+        if np.isfinite(residual).sum() >= LEAST_PAIRS:
+            share = 1.0 - _weights(half)[half]
+            return float(np.sqrt(np.nanmean(residual**2) / share))
+    return UNKNOWN_SCATTER_PX
 
 
 def noise_correlation(course: Course, half_px: float) -> FloatArray:

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise, bias, completeness and sigma of extracted stripes against the rendered truth."""
+
+import numpy as np
+import pytest
+
+from armscan.simulation.stripe_curves import CircleCurve, StraightCurve, WaveCurve
+from armscan.simulation.stripe_image import NO_NOISE, SimulatedStripe, StripeNoise, StripeScene
+from armscan.vision.stripe.options import StripeOptions
+from stripe_scenes import line, score
+
+NOISE_LIMIT_PX = 0.045
+BIAS_LIMIT_PX = 0.01
+LOCKING_LIMIT_PX = 0.004
+SEEDS = range(6)
+RAW = StripeOptions(smoothing_px=0.0)
+
+
+@pytest.mark.parametrize("angle_deg", [0.7, 23.0, 44.6, 66.0, 90.4, 113.0, 135.5, 158.0])
+def test_noise_bias_and_completeness_at_any_slope(angle_deg: float) -> None:
+    width, height = 320, 240
+    c, s = abs(np.cos(np.radians(angle_deg))), abs(np.sin(np.radians(angle_deg)))
+    inside = 2.0 * min(112.0 / max(s, 1e-9), 152.0 / max(c, 1e-9))
+    result = score(StripeScene((line(angle_deg),), width, height), SEEDS, length_px=inside)
+    # neighbours share their smoothing window, so the mean's own noise is that of about n / 17
+    mean_noise = 3.5 * result.rms_px / np.sqrt(len(result.error_px) / 17.0)
+    assert result.rms_px < NOISE_LIMIT_PX
+    assert abs(result.error_px.mean()) < BIAS_LIMIT_PX + mean_noise
+    assert result.false == 0
+    assert result.completeness > 0.995
+
+
+@pytest.mark.parametrize("angle_deg", [0.5, 30.0, 45.0, 88.5, 120.0, 150.0])
+def test_no_bias_and_no_pixel_locking_without_noise(angle_deg: float) -> None:
+    # 14 bits: at exactly 45 degrees every column has the same phase and the same rounding error
+    scene = StripeScene((line(angle_deg),), 320, 240, noise=NO_NOISE, bits=14)
+    result = score(scene, range(1))
+    assert abs(result.error_px.mean()) < 0.001
+    assert result.error_px.std() < LOCKING_LIMIT_PX
+
+
+@pytest.mark.parametrize("sigma_px", [0.8, 1.5, 5.0, 8.0])
+def test_width_is_found_and_sigma_is_honest(sigma_px: float) -> None:
+    result = score(StripeScene((line(12.0, sigma_px=sigma_px),), 320, 240), SEEDS)
+    widths = np.concatenate([p.width_px for p in result.profiles])
+    # a pixel is a box, of variance 1/12
+    assert np.median(widths) == pytest.approx(np.sqrt(sigma_px**2 + 1.0 / 12.0), rel=0.04)
+    assert result.normalised.std() == pytest.approx(1.0, abs=0.25)
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [StripeNoise(), StripeNoise(speckle=0.0), StripeNoise(grain_px=1.0), StripeNoise(read=3.0)],
+)
+@pytest.mark.parametrize("options", [StripeOptions(), RAW])
+def test_normalised_errors_have_unit_variance(noise: StripeNoise, options: StripeOptions) -> None:
+    stripes = tuple(
+        SimulatedStripe(StraightCurve(300.0, 40.3 + 60.0 * k, 3.0 + k)) for k in range(4)
+    )
+    result = score(StripeScene(stripes, 600, 290, noise=noise), range(4), options)
+    assert result.normalised.std() == pytest.approx(1.0, abs=0.15)
+
+
+def test_fit_reaches_the_cramer_rao_bound() -> None:
+    sigma, peak, background = 3.0, 150.0, 4.0
+    result = score(StripeScene((line(0.4),), 320, 240), range(8), RAW)
+    phases = np.linspace(-0.5, 0.5, 11)[:, None]
+    u = (np.arange(-20, 21) - phases) / sigma
+    m = peak * np.exp(-0.5 * u * u)
+    variance = (0.2 * m) ** 2 + (m + background) / 10.0 + 1.0 + 1.0 / 12.0
+    bound = 1.0 / ((m * u / sigma) ** 2 / variance).sum(axis=1).mean()
+    assert bound / result.error_px.var() > 0.85
+
+
+@pytest.mark.parametrize("radius_px", [100.0, 60.0])
+def test_circle_is_one_closed_unbiased_segment(radius_px: float) -> None:
+    stripe = SimulatedStripe(CircleCurve(120.3, 120.2, radius_px))
+    clean = score(StripeScene((stripe,), 240, 240, noise=NO_NOISE), range(1))
+    assert abs(clean.error_px.mean()) < 0.003
+    assert clean.error_px.std() < 0.012
+    noisy = score(StripeScene((stripe,), 240, 240), range(3))
+    assert noisy.rms_px < NOISE_LIMIT_PX
+    assert abs(noisy.error_px.mean()) < BIAS_LIMIT_PX
+    assert all(p.segment[p.is_accepted].max() == 0 for p in noisy.profiles)
+
+
+def test_waves_are_not_smoothed_away() -> None:
+    wave = WaveCurve(0.0, 120.0, 10.0, amplitude_px=10.0, period_px=120.0)
+    clean = score(StripeScene((SimulatedStripe(wave),), 320, 240, noise=NO_NOISE), range(1))
+    crest_bias = 3.0**2 / (2.0 * wave.crest_radius_px)
+    assert clean.rms_px < 0.1 * crest_bias
+
+
+def test_saturated_line_is_fitted_on_its_flanks() -> None:
+    result = score(StripeScene((line(20.0, peak=700.0),), 320, 240), SEEDS)
+    assert result.rms_px < NOISE_LIMIT_PX
+    assert abs(result.error_px.mean()) < BIAS_LIMIT_PX
+
+
+def test_weak_line_is_complete() -> None:
+    scene = StripeScene((line(20.0, peak=15.0),), 320, 240)
+    result = score(scene, SEEDS, length_px=300.0 / np.cos(np.radians(20.0)))
+    assert result.completeness > 0.995
+    assert result.false == 0

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colour exposures: laser colour, saturated core with halo, laser-off views."""
+
+import numpy as np
+import pytest
+
+from armscan.records.exposure import Exposure
+from armscan.simulation.stripe_image import StripeNoise, StripeScene
+from armscan.vision.stripe.colour import find_laser_colour, split_channels
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.laser_off import subtract
+from armscan.vision.stripe.options import StripeOptions
+from stripe_scenes import line
+
+SCENE = StripeScene((line(75.0),), 320, 240)
+ROLL = {"red": 0, "green": 1, "blue": 2}
+SAME_PX = 0.06
+
+
+@pytest.mark.parametrize("colour", ["red", "green", "blue"])
+def test_laser_colour_is_found(colour: str) -> None:
+    image = np.roll(SCENE.expose_red(1, overdrive=1.0).image, ROLL[colour], axis=2)
+    exposure = Exposure(image, colour)
+    assert find_laser_colour(split_channels(exposure, None)) == colour
+    profile = extract_stripes(exposure)
+    error, _, _ = SCENE.errors(profile.points_px)
+    assert profile.is_accepted.sum() > 200
+    assert np.sqrt((error**2).mean()) < SAME_PX
+
+
+def test_grey_line_in_a_colour_image() -> None:
+    grey = SCENE.expose(1).image
+    exposure = Exposure(np.stack([grey] * 3, axis=2), "grey")
+    assert find_laser_colour(split_channels(exposure, None)) == "grey"
+    assert np.abs(SCENE.errors(extract_stripes(exposure).points_px)[0]).max() < 0.3
+
+
+@pytest.mark.parametrize("overdrive", [2.0, 6.0])
+def test_saturated_core_with_halo(overdrive: float) -> None:
+    exposure = SCENE.expose_red(2, overdrive)
+    profile = extract_stripes(exposure)
+    good = profile.select(profile.is_accepted)
+    error, _, _ = SCENE.errors(good.points_px)
+    assert (exposure.image[..., 0] == 255).mean() > 0.01
+    assert len(good) > 200
+    assert np.sqrt((error**2).mean()) < 0.1
+    assert (np.abs(error) < 5.0 * good.sigma_px).all()
+
+
+def test_line_of_another_colour_is_left_out() -> None:
+    laser = SCENE.expose_red(3, overdrive=1.0).image.copy()
+    other = StripeScene((line(10.0),), 320, 240).expose(4).image
+    laser[..., 1] = np.maximum(laser[..., 1], other)
+    laser[..., 2] = np.maximum(laser[..., 2], other)
+    laser[..., 0] = np.maximum(laser[..., 0], other)
+    profile = extract_stripes(Exposure(laser, "two"), StripeOptions(laser_colour="red"))
+    good = profile.points_px[profile.is_accepted]
+    assert (np.abs(SCENE.errors(good)[0]) < 1.0).mean() > 0.98
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.08, 0.0), (0.93, 3.0)])
+def test_laser_off_view_removes_texture_even_if_the_light_changed(
+    gain: float, offset: float
+) -> None:
+    rng = np.random.default_rng(5)
+    y, x = np.mgrid[:240, :320]
+    squares = 40.0 + 70.0 * ((x // 30 + y // 30) % 2)
+    stripe = StripeScene((line(80.0),), 320, 240, background=0.0, noise=StripeNoise(read=0.0))
+    light = stripe.expose(6).image.astype(np.float64)
+    lit = squares + light + rng.normal(0, 1, squares.shape)
+    dark = (squares - offset) / gain + rng.normal(0, 1, squares.shape)
+    pair = [
+        Exposure(np.clip(v, 0, 255).astype(np.uint8), n) for v, n in ((lit, "on"), (dark, "off"))
+    ]
+    profile = extract_stripes(pair[0], background=pair[1])
+    good = profile.points_px[profile.is_accepted]
+    error, _, _ = stripe.errors(good)
+    assert len(good) > 225
+    assert (np.abs(error) < 1.0).all()
+    assert np.sqrt((error**2).mean()) < 0.06
+
+
+def test_subtraction_finds_gain_and_offset() -> None:
+    rng = np.random.default_rng(7)
+    dark = rng.uniform(10, 120, (200, 200)).astype(np.float32)
+    lit = 1.1 * dark + 4.0
+    lit[:, 95:105] += 90.0
+    rest = subtract(lit.astype(np.float32), dark, 255.0)
+    assert np.abs(rest[:, :90]).max() < 0.5
+    assert rest[:, 100].mean() == pytest.approx(90.0, abs=0.5)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every doubtful situation is flagged, and a plain line is not."""
+
+import numpy as np
+import pytest
+
+from armscan.records.profile import StripeFlag
+from armscan.simulation.stripe_curves import StraightCurve
+from armscan.simulation.stripe_image import SimulatedStripe, StripeScene
+from armscan.vision.stripe.chains import strong_median
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.flags import close_gaps
+from armscan.vision.stripe.options import StripeOptions
+from stripe_scenes import line, score
+
+
+def share(scene: StripeScene, flag: StripeFlag, seed: int = 1) -> float:
+    profile = extract_stripes(scene.expose(seed))
+    return float(((profile.flags & int(flag)) != 0).mean())
+
+
+def pair(distance_sigmas: float) -> StripeScene:
+    return StripeScene(
+        (
+            SimulatedStripe(StraightCurve(160.0, 100.0, 0.0)),
+            SimulatedStripe(StraightCurve(160.0, 100.0 + 3.0 * distance_sigmas, 0.0)),
+        ),
+        320,
+        240,
+    )
+
+
+def test_plain_line_has_no_flags() -> None:
+    profile = extract_stripes(StripeScene((line(30.0, peak=120.0),), 320, 240).expose(3))
+    rejecting = profile.flags & ~int(StripeFlag.SATURATED | StripeFlag.SHORT_SEGMENT)
+    assert not rejecting.any()
+    assert profile.is_accepted.mean() > 0.99
+
+
+def test_background_step_is_flagged() -> None:
+    scene = StripeScene((line(10.0),), 320, 240, background_step=50.0)
+    assert share(scene, StripeFlag.BACKGROUND_STEP) > 0.98
+
+
+def test_leaning_profile_is_flagged() -> None:
+    scene = StripeScene((line(10.0, skew=1.2),), 320, 240)
+    assert share(scene, StripeFlag.ASYMMETRIC) > 0.9
+
+
+def test_saturation_is_flagged_but_not_rejected() -> None:
+    profile = extract_stripes(StripeScene((line(10.0, peak=600.0),), 320, 240).expose(1))
+    assert ((profile.flags & int(StripeFlag.SATURATED)) != 0).mean() > 0.98
+    assert profile.is_accepted.mean() > 0.98
+
+
+def test_close_lines_are_flagged_and_distant_lines_are_right() -> None:
+    assert share(pair(4.2), StripeFlag.NEIGHBOUR) > 0.98
+    assert share(pair(7.0), StripeFlag.NEIGHBOUR) < 0.01
+    apart = score(pair(6.0), range(3))
+    assert apart.rms_px < 0.045
+    assert abs(apart.error_px.mean()) < 0.01
+
+
+@pytest.mark.parametrize("angle_deg", [90.0, 40.0])
+def test_crossing_spoils_only_flagged_points(angle_deg: float) -> None:
+    scene = StripeScene((line(20.0), line(20.0 + angle_deg)), 320, 240)
+    result = score(scene, range(3))
+    assert result.false == 0
+    assert result.rms_px < 0.05
+    for profile in result.profiles:
+        crossing = np.hypot(*(profile.points_px - [160.3, 120.2]).T) < 9.0
+        assert not profile.is_accepted[crossing].any()
+
+
+def test_short_segment_is_flagged() -> None:
+    scene = StripeScene((line(10.0),), 320, 240)
+    image = scene.expose(1).image.copy()
+    image[:, 40:150] = 4
+    image[:, 160:] = 4
+    profile = extract_stripes(type(scene.expose(1))(image, "cut"))
+    short = (profile.flags & int(StripeFlag.SHORT_SEGMENT)) != 0
+    inside = (profile.points_px[:, 0] > 148) & (profile.points_px[:, 0] < 162)
+    assert inside.any()
+    assert short[inside].all()
+    assert not short[profile.points_px[:, 0] < 30].any()
+
+
+def test_outlier_is_flagged() -> None:
+    exposure = StripeScene((line(0.0),), 320, 240).expose(1)
+    image = exposure.image.copy()
+    image[2:, 100] = exposure.image[:-2, 100]
+    profile = extract_stripes(type(exposure)(image, "shifted"))
+    at = np.argmin(np.abs(profile.points_px[:, 0] - 100))
+    assert profile.flags[at] & int(StripeFlag.OUTLIER)
+    assert np.median(profile.sigma_px) < 0.06
+
+
+def test_gaps_close_within_one_chain_only() -> None:
+    flags = np.array([True, False, False, True, False, False, True, False, True])
+    chain = np.array([0, 0, 0, 0, 0, 1, 1, 1, 1])
+    closed = close_gaps(flags, chain, np.full(9, 3.0))
+    assert closed.tolist() == [True, True, True, True, False, False, True, True, True]
+    assert not close_gaps(flags, chain, np.full(9, 2.0))[1]
+
+
+def test_strong_median_ignores_many_weak_values() -> None:
+    assert strong_median(np.array([1.0] * 500 + [100.0] * 5)) == 100.0
+    assert strong_median(np.zeros(0)) == 0.0
+
+
+def test_sensitivity_follows_the_threshold() -> None:
+    scene = StripeScene((line(10.0, peak=60.0),), 320, 240)
+    assert len(extract_stripes(scene.expose(1), StripeOptions(threshold=100.0))) == 0
+    assert len(extract_stripes(scene.expose(1), StripeOptions(threshold=30.0))) > 300

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The compiled kernels against readable twins in NumPy and SciPy."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import correlate
+from scipy.optimize import curve_fit
+
+from armscan.kernels.stripe_fit import (
+    AMPLITUDE,
+    CENTRE,
+    SIGMA,
+    VARIANCE,
+    fit_profiles,
+    read_sides,
+)
+from armscan.kernels.stripe_hessian import derivatives_at, gaussian_taps, refine_candidates
+from armscan.kernels.stripe_links import walk_chains
+from armscan.kernels.stripe_neighbours import find_other_lines
+from armscan.kernels.stripe_runs import find_runs, interpolate_row
+from armscan.kernels.stripe_smooth import SHIFT, smooth_chains
+from armscan.kernels.stripe_smooth import SIGMA as SMOOTH_SIGMA
+
+FLOAT32 = 3e-5
+"""Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""
+
+
+def gaussian_row(centre: float, width: int = 41, peak: float = 100.0) -> np.ndarray:
+    x = np.arange(width)
+    image = np.tile(peak * np.exp(-0.5 * ((x - centre) / 2.5) ** 2) + 5.0, (3, 1))
+    return image.astype(np.float32)
+
+
+def test_taps_differentiate_polynomials_exactly() -> None:
+    smooth, slope, bend = gaussian_taps(2.3).astype(np.float64)
+    k = np.arange(len(smooth)) - len(smooth) // 2
+    assert smooth.sum() == pytest.approx(1.0, abs=1e-6)
+    assert [slope.sum(), slope @ k] == pytest.approx([0.0, 1.0], abs=1e-6)
+    assert [bend.sum(), bend @ k, bend @ k**2] == pytest.approx([0.0, 0.0, 2.0], abs=1e-5)
+
+
+@pytest.mark.parametrize("pixel", [(20, 17), (2, 3), (37, 0)])
+def test_derivatives_match_scipy(pixel: tuple[int, int]) -> None:
+    image = np.random.default_rng(1).uniform(0, 255, (30, 40)).astype(np.float32)
+    taps = gaussian_taps(1.7)
+    result = np.zeros(5)
+    derivatives_at(image, *pixel, taps, np.zeros_like(taps), result)
+    g0, g1, g2 = taps.astype(np.float64)
+    pairs = ((g0, g1), (g1, g0), (g0, g2), (g1, g1), (g2, g0))
+    x, y = pixel
+    for k, (down, along) in enumerate(pairs):
+        full = correlate(image.astype(np.float64), np.outer(down, along), mode="nearest")
+        assert result[k] == pytest.approx(full[y, x], abs=255.0 * FLOAT32 * 3)
+
+
+def test_ridge_point_of_a_slanted_line() -> None:
+    y, x = np.mgrid[:60, :60]
+    angle = np.radians(25.0)
+    distance = np.cos(angle) * (y - 30.3) - np.sin(angle) * (x - 30.0)
+    image = (100.0 * np.exp(-0.5 * (distance / 2.5) ** 2)).astype(np.float32)
+    points = np.zeros((1, 6))
+    runs = np.array([[30.0, 30.4, 0.0]])
+    assert refine_candidates(image, runs, 1, gaussian_taps(2.5), 1.0, points) == 1
+    assert points[0, :2] == pytest.approx([30.0, 30.3], abs=0.004)
+    normal = points[0, 2:4] * np.sign(points[0, 3])
+    assert normal == pytest.approx([-np.sin(angle), np.cos(angle)], abs=4e-3)
+    assert refine_candidates(image, runs, 1, gaussian_taps(2.5), 50.0, points) == 0
+
+
+def runs_twin(image: np.ndarray, floor: float, longest: int) -> set[tuple[int, int, int]]:
+    """Twin: (axis, line, length) of the runs above ``floor``."""
+    found = set()
+    for axis, lines in ((0, image.T), (1, image)):
+        for line, values in enumerate(lines):
+            lit = np.concatenate([[0], (values > floor).astype(int), [0]])
+            starts, stops = np.flatnonzero(np.diff(lit) == 1), np.flatnonzero(np.diff(lit) == -1)
+            for a, b in zip(starts, stops, strict=True):
+                if b - a <= longest:
+                    found.add((axis, line, round(0.5 * (a + b - 1))))
+    return found
+
+
+def test_runs_match_the_twin() -> None:
+    rng = np.random.default_rng(2)
+    image = np.where(rng.uniform(size=(50, 70)) > 0.7, 100.0, 0.0).astype(np.float32)
+    runs = np.zeros((4000, 3))
+    count = find_runs(image, np.zeros((1, 2), np.float32), 64, 20.0, 6, runs)
+    rows = runs[:count]
+    axis = rows[:, 2].astype(int)
+    line = np.where(axis == 0, rows[:, 0], rows[:, 1]).astype(int)
+    centre = np.rint(np.where(axis == 0, rows[:, 1], rows[:, 0])).astype(int)
+    assert set(zip(axis.tolist(), line.tolist(), centre.tolist(), strict=True)) == runs_twin(
+        image, 20.0, 6
+    )
+
+
+def test_two_humps_on_one_foot_become_two_candidates() -> None:
+    x = np.arange(60)
+    profile = 150.0 * (np.exp(-0.5 * ((x - 22) / 3) ** 2) + np.exp(-0.5 * ((x - 37) / 3) ** 2))
+    image = np.tile(profile + 12.0, (2, 1)).astype(np.float32)
+    runs = np.zeros((200, 3))
+    count = find_runs(image, np.zeros((1, 1), np.float32), 64, 10.0, 90, runs)
+    along = runs[:count][runs[:count, 2] == 1]
+    assert along[:, 0] == pytest.approx([22.0, 37.0] * 2, abs=0.2)
+
+
+def test_capacity_is_reported() -> None:
+    image = np.zeros((20, 40), np.float32)
+    image[:, ::2] = 100.0
+    needed = find_runs(image, np.zeros((1, 1), np.float32), 64, 20.0, 90, np.zeros((5, 3)))
+    assert needed == 20 * 20 + 20
+
+
+def test_background_is_bilinear_between_cells() -> None:
+    grid = np.array([[0.0, 64.0], [128.0, 192.0]], np.float32)
+    row = np.zeros(128, np.float32)
+    interpolate_row(grid, 64, 64, row)
+    expected = 64.5 + np.interp(np.arange(128), [31.5, 95.5], [0.0, 64.0]) + 0.5
+    assert row == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("centre", [20.0, 20.37, 20.5])
+def test_profile_fit_matches_scipy(centre: float) -> None:
+    rng = np.random.default_rng(3)
+    image = gaussian_row(centre)
+    image += rng.normal(0.0, 2.0, image.shape).astype(np.float32)
+    points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
+    sides = np.full((1, 2), 5.0)
+    noise = np.array([0.0, 0.0, 4.0])
+    result = np.zeros((1, 8))
+    width = np.full(1, 2.5)
+    fit_profiles(image, np.zeros((1, 1), np.uint8), points, width, sides, noise, 2.7, result)
+    x = np.arange(41)
+    use = np.abs(x - 20.0) <= 2.7 * 2.5
+    best, covariance = curve_fit(
+        lambda t, c, a, s: a * np.exp(-0.5 * ((t - c) / s) ** 2),
+        x[use],
+        image[1, use].astype(np.float64) - 5.0,
+        p0=[20.0, 100.0, 2.5],
+        sigma=np.full(use.sum(), 2.0),
+        absolute_sigma=True,
+    )
+    assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx(best, rel=1e-4)
+    assert result[0, VARIANCE] == pytest.approx(covariance[0, 0], rel=0.05)
+
+
+def test_clipped_pixels_are_left_out() -> None:
+    image = gaussian_row(20.3, peak=400.0)
+    clipped = (image >= 255.0).astype(np.uint8)
+    points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
+    result = np.zeros((1, 8))
+    arguments = (points, np.full(1, 2.5), np.full((1, 2), 5.0), np.array([0.0, 0.1, 1.0]), 2.7)
+    fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)
+    assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx([20.3, 400.0, 2.5], rel=1e-3)
+
+
+def test_sides_are_means_beside_the_line() -> None:
+    image = np.zeros((3, 41), np.float32)
+    image[:, :20] = 10.0
+    image[:, 20:] = 30.0
+    sides = np.zeros((1, 4))
+    read_sides(image, np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]]), np.full(1, 2.0), sides)
+    assert sides[0].tolist() == [10.0, 4.0, 30.0, 4.0]
+
+
+def test_smoothing_matches_polyfit() -> None:
+    rng = np.random.default_rng(4)
+    x = np.arange(41.0)
+    y = 0.003 * (x - 20) ** 2 + 0.1 * x + rng.normal(0, 0.1, 41)
+    sigma = rng.uniform(0.08, 0.12, 41)
+    result = np.zeros((41, 8))
+    normals = np.tile([0.0, 1.0], (41, 1))
+    used, chain = np.ones(41, np.int64), np.zeros(41, np.int64)
+    points = np.stack([x, y], axis=1)
+    smooth_chains(points, normals, sigma, used, chain, np.array([9.0]), np.ones(1), 3.0, result)
+    near = np.abs(x - 20) <= 9.0
+    fit, covariance = np.polyfit(x[near] - 20, y[near], 2, w=1.0 / sigma[near], cov="unscaled")
+    assert result[20, SHIFT] == pytest.approx(fit[2] - y[20], abs=1e-9)
+    assert result[20, SMOOTH_SIGMA] == pytest.approx(np.sqrt(covariance[2, 2]), rel=1e-9)
+
+
+def test_chains_walk_ends_first_then_loops() -> None:
+    ahead = np.array([1, 2, -1, 4, 5, 3, -1])
+    behind = np.array([-1, 0, 1, 5, 3, 4, -1])
+    order, chain = np.zeros(7, np.int64), np.zeros(7, np.int64)
+    assert walk_chains(ahead, behind, order, chain) == 6
+    assert order[:6].tolist() in ([0, 1, 2, 3, 4, 5], [0, 1, 2, 3, 5, 4])
+    assert chain[:6].tolist() == [0, 0, 0, 1, 1, 1]
+
+
+def test_other_lines_match_brute_force() -> None:
+    x = np.arange(60.0)
+    lines = [np.stack([x, 20.0 + 0.0 * x], 1), np.stack([x, 5.0 + 0.5 * x], 1)]
+    points = np.zeros((120, 6))
+    points[:, :2] = np.concatenate(lines)
+    chain = np.repeat([0, 1], 60)
+    first, stop = np.repeat([0, 60], 60), np.repeat([60, 120], 60)
+    found = np.zeros((120, 2))
+    ones = np.ones(120, np.int64)
+    find_other_lines(points, chain, first, stop, ones, 60, 60, 8.0, found)
+    gap = np.hypot(*np.moveaxis(points[:, None, :2] - points[None, :, :2], 2, 0))
+    gap[chain[:, None] == chain] = np.inf
+    nearest = np.where(gap.min(axis=1) <= 8.0, gap.min(axis=1), np.inf)
+    assert found.min(axis=1).tolist() == pytest.approx(nearest.tolist())

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thesis's four methods: each does what it says, no more and no less."""
+
+import numpy as np
+import pytest
+
+from armscan.simulation.stripe_curves import CircleCurve
+from armscan.simulation.stripe_image import NO_NOISE, SimulatedStripe, StripeScene
+from armscan.vision.stripe.centres import StripeCentres
+from armscan.vision.stripe.classic import THESIS_METHODS
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.level import measure_level
+from armscan.vision.stripe.options import StripeMethod, StripeOptions
+from armscan.vision.stripe.plane import mono_plane
+from stripe_scenes import line, score
+
+METHODS: tuple[StripeMethod, ...] = ("threshold", "centroid", "template", "hessian")
+NOISE_PX = {"threshold": 0.4, "centroid": 0.2, "template": 0.45, "hessian": 0.1}
+
+
+def centres(method: str, scene: StripeScene, threshold: float = 20.0) -> StripeCentres:
+    image = mono_plane(scene.expose(1), None).image
+    return THESIS_METHODS[method](image, measure_level(image, threshold), 3.0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("angle_deg", [3.0, 86.0])
+def test_noise_is_the_methods_own_and_the_mean_is_right(
+    method: StripeMethod, angle_deg: float
+) -> None:
+    scene = StripeScene((line(angle_deg),), 320, 240)
+    result = score(scene, range(3), StripeOptions(method=method))
+    assert result.rms_px < NOISE_PX[method]
+    assert abs(result.error_px.mean()) < 0.05
+    assert result.normalised.std() < 3.0
+
+
+def test_threshold_gives_the_middle_of_the_run() -> None:
+    scene = StripeScene((line(0.0),), 40, 240, noise=NO_NOISE)
+    found = centres("threshold", scene)
+    assert len(found.points_px) == 40
+    assert np.unique(found.points_px[:, 1] * 2 % 1).tolist() == [0.0]
+    assert np.abs(found.points_px[:, 1] - 120.2).max() <= 0.5
+
+
+def test_centroid_is_exact_for_a_symmetric_noise_free_line() -> None:
+    scene = StripeScene((line(0.0),), 40, 240, background=0.0, noise=NO_NOISE, bits=16)
+    assert np.abs(centres("centroid", scene, 0.5).points_px[:, 1] - 120.2).max() < 0.02
+
+
+def test_template_gives_whole_pixels_and_the_nearest_direction() -> None:
+    found = centres("template", StripeScene((line(45.0),), 320, 240, noise=NO_NOISE))
+    assert (found.points_px == np.rint(found.points_px)).all()
+    direction = np.median(np.abs(found.normals), axis=0)
+    assert direction == pytest.approx([np.sqrt(0.5), np.sqrt(0.5)])
+
+
+def test_hessian_has_the_known_bias_on_a_circle() -> None:
+    radius, sigma = 80.0, 3.0
+    stripe = SimulatedStripe(CircleCurve(120.0, 120.0, radius), sigma_px=sigma)
+    scene = StripeScene((stripe,), 240, 240, noise=NO_NOISE)
+    error, _, _ = scene.errors(centres("hessian", scene).points_px)
+    assert error.mean() == pytest.approx(-(sigma**2) / (2.0 * radius), rel=0.15)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_profiles_are_linked_and_flagged_alike(method: StripeMethod) -> None:
+    scene = StripeScene((line(12.0, peak=600.0),), 320, 240)
+    profile = extract_stripes(scene.expose(1), StripeOptions(method=method))
+    step = np.hypot(*np.diff(profile.points_px, axis=0).T)
+    assert step[np.diff(profile.segment) == 0].max() < 4.0
+    assert (profile.flags & 1).mean() > 0.9
+    assert len(np.unique(profile.sigma_px)) == 1

@@ -212,6 +212,7 @@ def test_repeated_names_are_told_apart(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "2.png"), noise((4, 4)))
     paths = [tmp_path / "left/1.png", tmp_path / "right/1.png", tmp_path / "2.png"]
     names = source_names(paths)
-    assert len(set(names)) == 3
-    assert names[2] == "2.png"
+    assert names == ("left/1.png", "right/1.png", "2.png")
+    deep = [Path("a/x/1.png"), Path("b/x/1.png"), Path("y/1.png"), Path("1.png")]
+    assert source_names(deep) == ("a/x/1.png", "b/x/1.png", "y/1.png", "1.png")
     assert tuple(exposure.source for exposure in read_exposures(paths)) == names

@@ -28,6 +28,7 @@ from armscan.report.drawing import (
     raster_markup,
     styled,
 )
+from armscan.report.numbers import significant
 from armscan.report.page import Picture
 
 ARROW_SHARE = 0.06
@@ -57,7 +58,7 @@ def view_picture(fit: CameraFit, view: ViewFit, exposure: Exposure) -> Picture:
     return Picture(
         photo_markup(exposure, marks, f"Target points found in {view.source}"),
         title=view.source,
-        caption=f"{state}{len(view.view)} points, rms {view.rms_px:.3f} px, tilt "
+        caption=f"{state}{len(view.view)} points, rms {significant(view.rms_px)} px, tilt "
         f"{view.tilt_deg:.0f}°, {view.distance_mm:.0f} mm away",
     )
 
@@ -150,7 +151,7 @@ def view_bars(fit: CameraFit) -> Picture:
 def tilt_rose(fit: CameraFit) -> Picture:
     """How far, and which way, the board was tilted."""
     with styled():
-        figure = new_figure(3.6, 3.4)
+        figure = new_figure(5.4, 4.0)
         axes: Any = figure.add_subplot(projection="polar")
         directions = np.deg2rad(fit.coverage.tilt_directions_deg)
         axes.plot(directions, fit.coverage.tilts_deg, "o", color=ACCENT, markersize=5, alpha=0.85)
@@ -181,13 +182,13 @@ def residual_histogram(fit: CameraFit) -> Picture:
         axes = figure.add_subplot()
         axes.hist(residuals[:, 0], edges, color=ACCENT, alpha=0.75, label="x")
         axes.hist(residuals[:, 1], edges, color=ACCENT_LIGHT, alpha=0.75, label="y")
-        axes.plot(x, bell, color=INK, linewidth=1.2, label=f"Gaussian, σ = {sigma:.3f} px")
+        axes.plot(x, bell, color=INK, linewidth=1.2, label=f"Gaussian, σ = {significant(sigma)} px")
         axes.set_xlabel("residual, px")
         axes.set_ylabel("points")
         axes.set_ylim(top=1.3 * axes.get_ylim()[1])
         axes.legend(loc="upper right")
     beyond = int((np.abs(residuals) > reach).any(axis=1).sum())
-    tail = f" {beyond} points lie beyond the picture." if beyond else ""
+    tail = f" Beyond the picture: {beyond}." if beyond else ""
     return Picture(
         chart_markup(figure, "Histogram of residuals"),
         title="Distribution of residuals",

@@ -15,7 +15,7 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.camera_page import camera_page, parameter_rows
-from armscan.report.numbers import sentence
+from armscan.report.numbers import sentence, significant
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
 from armscan.report.summary import Summary, Table
@@ -130,15 +130,17 @@ def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: boo
     facts = [
         ("images", f"{fit.n_views} used of {len(fit.views) + len(run.not_found)}"),
         ("points", str(fit.n_points)),
-        ("rms", f"{fit.rms_px:.4f} px (length of the residual, x and y together)"),
+        ("rms", f"{significant(fit.rms_px)} px (length of the residual, x and y together)"),
     ]
     if held_out is not None:
-        facts.append(("hold-out rms", f"{held_out.rms_px:.4f} px on views not used to solve"))
+        facts.append(
+            ("hold-out rms", f"{significant(held_out.rms_px)} px on views not used to solve")
+        )
     facts += [(name, value) for name, value, _ in parameter_rows(fit)]
     views = Table(
         ("image", "rms px", "tilt", "remark"),
         tuple(
-            (view.source, f"{view.rms_px:.3f}", f"{view.tilt_deg:.0f}°", view.note)
+            (view.source, significant(view.rms_px), f"{view.tilt_deg:.0f}°", view.note)
             for view in fit.views
             if view.note
         )

@@ -13,7 +13,7 @@ from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report import camera_figures as figures
 from armscan.report.drawing import photo_markup
-from armscan.report.numbers import sentence, with_sigma
+from armscan.report.numbers import sentence, significant, with_sigma
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.summary import Table
@@ -108,8 +108,8 @@ def _cards(fit: CameraFit) -> tuple[Card, ...]:
         ),
         Card(
             "Reprojection residual",
-            f"{fit.rms_px:.3f} px rms",
-            f"{fit.sigma_point_px:.3f} px per axis",
+            f"{significant(fit.rms_px)} px rms",
+            f"{significant(fit.sigma_point_px)} px per axis",
         ),
     ]
     if fit.cross_validation is not None:
@@ -117,8 +117,8 @@ def _cards(fit: CameraFit) -> tuple[Card, ...]:
         cards.append(
             Card(
                 "On images it has not seen",
-                f"{held_out.rms_px:.3f} px rms",
-                f"{held_out.n_folds}-fold hold-out; {held_out.rms_in_sample_px:.3f} px in sample",
+                f"{significant(held_out.rms_px)} px rms",
+                f"{held_out.n_folds}-fold hold-out; {significant(held_out.rms_in_sample_px)} px in sample",
             )
         )
     return tuple(cards)
@@ -193,8 +193,8 @@ def _view_row(view: ViewFit, held_out: float | None) -> tuple[str, ...]:
     return (
         view.source,
         str(len(view.view)),
-        f"{view.rms_px:.3f}",
-        "" if held_out is None else f"{held_out:.3f}",
+        significant(view.rms_px),
+        "" if held_out is None else significant(held_out),
         f"{view.tilt_deg:.0f}°",
         f"{view.distance_mm:.0f} mm",
         remark,

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 
 from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse, SheetFit, SheetImage
 from armscan.models.calibration import Provenance
+from armscan.models.light_sheet import BOW_TERMS
 from armscan.records.exposure import Exposure
 from armscan.report import laser_figures as figures
 from armscan.report.drawing import photo_markup
@@ -70,7 +71,10 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
     calibration = fit.calibration
     a, b, c, d = fit.sheet.plane
     low, high = calibration.depth_range_mm
-    bow = ", ".join(significant(float(value), "mm") for value in fit.sheet.bow_mm)
+    bow = ", ".join(
+        f"{significant(float(value), 'mm')} {_term(i, j)}"
+        for value, (i, j) in zip(fit.sheet.bow_mm, BOW_TERMS, strict=True)
+    )
     return (
         ("Plane in Sensor", f"{a:+.6f} x {b:+.6f} y {c:+.6f} z {d:+.4f} mm = 0"),
         (
@@ -78,7 +82,7 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"± {significant(fit.tilt_sigma_deg)}° in direction, "
             f"± {significant(fit.offset_sigma_mm)} mm in the middle (1 sigma)",
         ),
-        ("Residual", f"{significant(calibration.rms_mm)} mm rms, {fit.rms_px:.3f} px rms"),
+        ("Residual", f"{significant(calibration.rms_mm)} mm rms, {significant(fit.rms_px)} px rms"),
         ("Depth covered", f"Z {low:.1f} to {high:.1f} mm"),
         (
             "Rests on",
@@ -94,11 +98,17 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"{significant(fit.coplanarity_mm)} mm, expected "
             f"{significant(fit.coplanarity_sigma_mm)} mm",
         ),
-        ("Bow", bow if fit.sheet.is_bowed else "none: a plane"),
+        ("Bow (u along the stripe, v in depth)", bow if fit.sheet.is_bowed else "none: a plane"),
         ("Why", sentence(fit.bow_decision)),
         ("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
         ("Lack of fit of the sheet", lack_of_fit_text(fit.final_test)),
     )
+
+
+def _term(i: int, j: int) -> str:
+    """Powers of a bow term: ``u²v``."""
+    powers = ("", "{}", "{}²", "{}³")
+    return powers[i].format("u") + powers[j].format("v")
 
 
 def lack_of_fit_text(test: LackOfFit) -> str:

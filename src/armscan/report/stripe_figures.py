@@ -23,8 +23,8 @@ FLAG_COLOURS = {
     StripeFlag.OUTLIER: ("#ffe14d", "flagged: off the line's course"),
     StripeFlag.SHORT_SEGMENT: ("#b58863", "flagged: too short a piece"),
 }
-OUTLINE = "#ffffff"
-DOT_SIZE = 3.4
+OUTLINE, OUTLINE_EDGE = "#ffffff", "#1d2733"
+DOT_SIZE = 4.2
 
 
 def sheet_colour(index: int) -> str:
@@ -60,7 +60,7 @@ def stripe_picture(
         Text below.
     """
     points = profile.points_px
-    marks = [] if outline_px is None else [_outline(outline_px)]
+    marks = [] if outline_px is None else _outline(outline_px)
     for value, colour in fate_colours.items():
         marks.append(Marks(points[fate == value], colour, "dot", DOT_SIZE))
     is_open = fate == 1
@@ -86,7 +86,8 @@ def stripe_legend(
     return (*sheets, *fates.values(), *flags)
 
 
-def _outline(points_px: FloatArray) -> Marks:
+def _outline(points_px: FloatArray) -> list[Marks]:
+    """A white line on a dark one, seen on bright and dark boards."""
     hull = cv2.convexHull(points_px.astype(np.float32)).reshape(-1, 2).astype(np.float64)
     ends = np.stack([hull, np.roll(hull, -1, axis=0)], axis=1).reshape(-1, 2)
-    return Marks(ends, OUTLINE, "line", 1.2)
+    return [Marks(ends, OUTLINE_EDGE, "line", 3.2), Marks(ends, OUTLINE, "line", 1.4)]

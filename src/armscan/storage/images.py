@@ -81,7 +81,7 @@ def read_exposures(
     paths: Sequence[Path],
     options: ImageOptions = DEFAULT_OPTIONS,
 ) -> tuple[Exposure, ...]:
-    """Read image files; each is named by its file name, or by its path where names repeat."""
+    """Read image files; each is named as `source_names` says."""
     names = source_names(paths)
     return tuple(
         read_exposure(path, options, source=name) for path, name in zip(paths, names, strict=True)
@@ -109,9 +109,16 @@ def check_same_size(exposures: Sequence[Exposure]) -> None:
 
 
 def source_names(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Names of files for messages: the file name, or the whole path where file names repeat."""
-    counts = Counter(path.name for path in paths)
-    return tuple(path.name if counts[path.name] == 1 else path.as_posix() for path in paths)
+    """Names of files for messages: the file name, with folders where file names repeat."""
+    tails = [list(reversed(path.as_posix().split("/"))) for path in paths]
+    names = [tail[0] for tail in tails]
+    for depth in range(2, max(map(len, tails), default=0) + 1):
+        repeated = {name for name, count in Counter(names).items() if count > 1}
+        names = [
+            "/".join(reversed(tail[:depth])) if name in repeated else name
+            for name, tail in zip(names, tails, strict=True)
+        ]
+    return tuple(names)
 
 
 def read_bytes(path: Path) -> bytes:

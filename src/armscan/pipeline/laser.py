@@ -17,6 +17,7 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.targets.circle_centres import correct_centres
 from armscan.vision.targets.definition import Target
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.options import TargetOptions
@@ -103,6 +104,8 @@ def find_board_stripes(
         view = view if isinstance(retried, FitFailure) else retried
     if isinstance(view, FitFailure):
         return view
+    if view.edges is not None:
+        view = correct_centres(view, camera.camera)
     pose = estimate_board_pose(view, camera.camera)
     if isinstance(pose, FitFailure):
         return pose

@@ -88,7 +88,7 @@ def reconstruct(
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
         raise EstimationError(_nothing_measured(images), remedy=_REMEDY)
-    return Reconstruction(cloud, tuple(images), _warnings(images, sensor))
+    return Reconstruction(cloud, tuple(images), _warnings(images, cloud, sensor))
 
 
 def measure_exposure(
@@ -130,21 +130,26 @@ def _nothing_measured(images: Sequence[ReconstructedImage]) -> str:
     return f"none of {n_points} stripe points could be measured: {counts}"
 
 
-def _warnings(images: Sequence[ReconstructedImage], sensor: SensorCalibration) -> tuple[str, ...]:
+def _warnings(
+    images: Sequence[ReconstructedImage], cloud: PointCloud, sensor: SensorCalibration
+) -> tuple[str, ...]:
     warnings = []
     empty = [image.profile.source for image in images if image.count(PointFate.MEASURED) == 0]
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:4])}")
     n_outside = sum(image.count(PointFate.OUT_OF_DEPTH) for image in images)
     if n_outside:
-        ranges = "; ".join(
-            f"{s.name} {s.depth_range_mm[0]:.1f} to {s.depth_range_mm[1]:.1f} mm"
-            for s in sensor.sheets
-        )
-        warnings.append(
-            f"{n_outside} points lie outside the calibrated depth range ({ranges}) and its margin"
-        )
-    weak = [sheet.name for sheet in sensor.sheets if not sheet.is_redundant]
-    if weak:
-        warnings.append(f"sheets from two boards only, unchecked: {', '.join(weak)}")
+        warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
+    for k, sheet in enumerate(sensor.sheets):
+        low, high = sheet.depth_range_mm
+        depth = cloud.points_mm[cloud.sheet == k, 2]
+        beyond = np.maximum(low - depth, depth - high)
+        if (beyond > 0.0).any():
+            warnings.append(
+                f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
+                f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
+                f"{high:.1f} mm: there the sheet is extrapolated, and only as good as its sigma says"
+            )
+        if len(depth) and not sheet.is_redundant:
+            warnings.append(f"sheet {sheet.name} rests on two boards only, which nothing checks")
     return tuple(warnings)

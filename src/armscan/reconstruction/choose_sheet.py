@@ -26,10 +26,12 @@ class DepthRange:
     Parameters
     ----------
     margin
-        Part of the calibrated range's width by which it is widened at either end.
+        Part of the calibrated range's width by which it is widened at either end. Between the
+        calibrated range and this limit points are extrapolated: their covariance grows, and a
+        warning counts them.
     """
 
-    margin: float = 0.5
+    margin: float = 3.0
 
     def __post_init__(self) -> None:
         if not self.margin >= 0.0:

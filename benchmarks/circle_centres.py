@@ -67,7 +67,9 @@ def measured(
     view = detect_target(Exposure(image, "rendered"), TARGET)
     if not isinstance(view, TargetView):
         return {}
-    truth = rendered.marks_px[view.point_index]
+    # The grid looks the same after half a turn: take the numbering that was meant.
+    either = (rendered.marks_px[view.point_index], rendered.marks_px[::-1][view.point_index])
+    truth = min(either, key=lambda marks: float(np.abs(marks - view.points_px).sum()))
     shapes = ellipse_shapes(view)
     circles = measure_circles(image, view.points_px, shapes, 5.0)
     ideal = correct_centres(view, camera)

@@ -34,14 +34,17 @@ def detect_chessboard(
     -------
     The view, with the corners that the fit on raw pixels accepted; or why there is none.
     """
+    why: FitFailure | None = None
     size = (target.columns, target.rows)
-    why = FitFailure("")
     for grey, rough_px in rough_corners(exposure, *size, options.search_size_px):
         view = _measure(exposure, target, options, grey, rough_px)
         if isinstance(view, TargetView):
             return view
-        why = why if why.reason else view
-    return why if why.reason else _not_found(exposure, target, options)
+        why = view if why is None else why
+    seen = seen_size(exposure, options.search_size_px)
+    if why is not None and (seen is None or sorted(seen) == sorted(size)):
+        return why
+    return _not_found(exposure, target, seen)
 
 
 def is_symmetric(target: Chessboard) -> bool:
@@ -63,9 +66,9 @@ def _measure(
             f"{exposure.full_scale} grey levels",
             "expose longer or light the board",
         )
-    columns, rows = true_size(grey, grid)
-    if (columns, rows) != (target.columns, target.rows):
-        return _wrong_size(exposure, target, columns, rows)
+    size = true_size(grey, grid)
+    if size != (target.columns, target.rows):
+        return _not_found(exposure, target, (max(size), min(size)))
     step_x, step_y = lattice_steps(grid)
     flat = grid.reshape(-1, 2)
     corners, covariance, is_good = fit_saddles(
@@ -113,16 +116,7 @@ def _dark_first(grey: RawGrey, grid: FloatArray) -> float:
     return float(np.median(parity * total) / 2.0)
 
 
-def _wrong_size(exposure: Exposure, target: Chessboard, columns: int, rows: int) -> FitFailure:
-    return FitFailure(
-        f"{exposure.source}: the chessboard has {columns} x {rows} inner corners, not "
-        f"{target.columns} x {target.rows}",
-        f"give chessboard:{columns}x{rows}:{target.square_mm:g}",
-    )
-
-
-def _not_found(exposure: Exposure, target: Chessboard, options: TargetOptions) -> FitFailure:
-    seen = seen_size(exposure, options.search_size_px)
+def _not_found(exposure: Exposure, target: Chessboard, seen: tuple[int, int] | None) -> FitFailure:
     wanted = f"{target.columns} x {target.rows}"
     if seen is None:
         return FitFailure(

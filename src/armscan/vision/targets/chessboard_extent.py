@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does the chessboard go on beyond the corners that were found?
+"""How many corners does the chessboard really have?
 
-OpenCV's finders also accept a part of a larger board. Beyond the last inner corners a real board
-shows a light rim: there the four quadrants of a lattice point hold half the contrast of an inner
-corner, so that a row of points with (nearly) full contrast is one more row of corners.
+OpenCV's finders also accept a part of a larger board, or take the outer corners of the border
+squares for inner ones. Around an inner corner the four quadrants alternate; around an outer corner
+three of them are light or lie on the light rim. The alternating sum, divided by the range of the
+four, is 2 there and 1 here, whatever the light. Border lines of outer corners are taken off, lines
+of inner corners beyond the border are added.
 """
 
 from __future__ import annotations
@@ -13,9 +15,12 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.vision.targets.grey import RawGrey, sample
 
-_FULL_CONTRAST = 0.75
-_PROBE = 0.3
+_INNER_CORNER = 1.5
+"""Alternating sum over range: 2 at an inner, 1 at an outer corner, about 0 where there is none."""
+_PROBES = (0.2, 0.3, 0.4)
+_QUADRANTS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 _MAX_GROWTH = 30
+_SMALLEST = 3
 
 
 def true_size(grey: RawGrey, grid_px: FloatArray) -> tuple[int, int]:
@@ -28,40 +33,62 @@ def true_size(grey: RawGrey, grid_px: FloatArray) -> tuple[int, int]:
     grid_px
         (rows, columns, 2) inner corners, image pixels.
     """
-    rows, columns = grid_px.shape[:2]
-    grown = [
-        _rows_beyond(grey, grid)
-        for grid in (
-            grid_px,
-            grid_px[::-1],
-            grid_px.transpose(1, 0, 2),
-            grid_px[:, ::-1].transpose(1, 0, 2),
-        )
-    ]
-    return columns + grown[2] + grown[3], rows + grown[0] + grown[1]
+    grid = grid_px
+    for _ in range(4):
+        grid = np.rot90(_without_weak_border(grey, grid))
+    grown = []
+    for _ in range(4):
+        grown.append(_rows_beyond(grey, grid))
+        grid = np.rot90(grid)
+    rows, columns = grid.shape[:2]
+    return columns + grown[1] + grown[3], rows + grown[0] + grown[2]
+
+
+def _without_weak_border(grey: RawGrey, grid: FloatArray) -> FloatArray:
+    """The lattice without those last rows that are no rows of inner corners."""
+    while len(grid) > _SMALLEST and not _is_inner(
+        grey, grid[-1], grid[-1] - grid[-2], if_out_of_view=True
+    ):
+        grid = grid[:-1]
+    return grid
 
 
 def _rows_beyond(grey: RawGrey, grid: FloatArray) -> int:
-    """Rows of corners past the last row of ``grid``."""
-    inner = np.median(np.abs(_contrast(grey, grid[-2], grid[-2] - grid[-3])))
+    """Rows of inner corners past the last row of ``grid``."""
     last, step = grid[-1], grid[-1] - grid[-2]
-    shrink = np.linalg.norm(step, axis=1) / np.linalg.norm(grid[-2] - grid[-3], axis=1)
-    ratio = float(np.median(shrink))
+    before = np.linalg.norm(grid[-2] - grid[-3], axis=1)
+    ratio = float(np.median(np.linalg.norm(step, axis=1) / before))
     for count in range(_MAX_GROWTH):
         step = step * ratio
         last = last + step
-        contrast = _contrast(grey, last, step)
-        sign = (-1.0) ** np.arange(len(contrast))
-        if not np.abs(np.median(sign * contrast)) > _FULL_CONTRAST * inner:
+        if not _is_inner(grey, last, step, if_out_of_view=False):
             return count
     return _MAX_GROWTH
 
 
-def _contrast(grey: RawGrey, row_px: FloatArray, step_px: FloatArray) -> FloatArray:
-    """Signed contrast (N,) of the four quadrants around the points of a row; NaN outside."""
+def _is_inner(
+    grey: RawGrey, row_px: FloatArray, step_px: FloatArray, *, if_out_of_view: bool
+) -> bool:
+    """Tell whether most points of a row are corners where four squares meet."""
     along = np.gradient(row_px, axis=0)
-    total = np.zeros(len(row_px))
-    for a in (-_PROBE, _PROBE):
-        for b in (-_PROBE, _PROBE):
-            total += np.sign(a * b) * sample(grey, row_px + a * along + b * step_px)
-    return total
+    quadrants = np.stack([_quadrant(grey, row_px, a * along, b * step_px) for a, b in _QUADRANTS])
+    spread = np.maximum(np.ptp(quadrants, axis=0), 1e-9)
+    alternating = (quadrants[0] - quadrants[1] + quadrants[2] - quadrants[3]) / spread
+    signed = (-1.0) ** np.arange(len(alternating)) * alternating
+    known = signed[np.isfinite(signed)]
+    if not len(known):
+        return if_out_of_view
+    return bool(np.abs(np.median(known)) > _INNER_CORNER)
+
+
+def _quadrant(
+    grey: RawGrey, corners_px: FloatArray, along_px: FloatArray, across_px: FloatArray
+) -> FloatArray:
+    """Mean level (N,) of the probes in one quadrant of each corner; NaN if none is in view."""
+    levels = np.stack(
+        [sample(grey, corners_px + p * along_px + q * across_px) for p in _PROBES for q in _PROBES]
+    )
+    seen = np.isfinite(levels)
+    count = seen.sum(axis=0)
+    total = np.where(seen, levels, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small camera and small targets for the tests of detection."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray
+from armscan.models.camera import CameraModel
+from armscan.records.exposure import Exposure
+from armscan.records.sensor_window import SensorWindow
+from armscan.simulation.flat_pattern import FlatPattern
+from armscan.simulation.flat_target import Lighting, RenderedTarget, render_flat_target
+from armscan.simulation.optics import RenderCamera, add_noise
+
+NOISE = 2.0
+DISTORTION = (-0.1, 0.05, 1e-3, -5e-4, 0.0)
+
+
+def camera(blur_sigma_px: float = 1.0, distorted: bool = False) -> RenderCamera:
+    k = DISTORTION if distorted else (0.0,) * 5
+    return RenderCamera(2000.0, 2000.0, 600.4, 449.7, *k, 1200, 900, blur_sigma_px)
+
+
+def model(distorted: bool = False) -> CameraModel:
+    k = DISTORTION if distorted else (0.0,) * 5
+    return CameraModel(2000.0, 2000.0, 600.4, 449.7, np.array(k), 1200, 900)
+
+
+def render(
+    pattern: FlatPattern,
+    distance_mm: float,
+    *,
+    tilt_deg: float = 0.0,
+    azimuth_deg: float = 0.0,
+    roll_deg: float = 0.0,
+    render_camera: RenderCamera | None = None,
+    lighting: Lighting | None = None,
+) -> RenderedTarget:
+    azimuth = np.deg2rad(azimuth_deg)
+    axis = np.deg2rad(tilt_deg) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    tilt = cv2.Rodrigues(axis)[0]
+    roll = cv2.Rodrigues(np.array([0.0, 0.0, np.deg2rad(roll_deg)]))[0]
+    rotation = tilt @ roll
+    x_min, y_min, x_max, y_max = pattern.extent_board_mm
+    middle = np.array([0.5 * (x_min + x_max), 0.5 * (y_min + y_max), 0.0])
+    translation = np.array([0.0, 0.0, distance_mm]) - rotation @ middle
+    chosen = camera() if render_camera is None else render_camera
+    return render_flat_target(chosen, pattern, rotation, translation, lighting)
+
+
+def exposure(
+    image: FloatArray, seed: int = 0, bits: int = 8, window: SensorWindow | None = None
+) -> Exposure:
+    noisy = add_noise(image, np.random.default_rng(seed), sigma=NOISE, bits=bits)
+    place = SensorWindow() if window is None else window
+    return Exposure(noisy, "rendered", bits_used=bits, window=place)
+
+
+def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Normalised error squared, mean 2 for an honest covariance of two coordinates."""
+    return np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)

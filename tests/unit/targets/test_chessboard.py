@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from armscan.geometry.estimate import FitFailure
+from armscan.records.exposure import Exposure
+from armscan.simulation.flat_pattern import CharucoPattern, ChessboardPattern
+from armscan.simulation.flat_target import Lighting, RenderedTarget
+from armscan.vision.targets.definition import Charuco, Chessboard
+from armscan.vision.targets.detect import detect_target
+from armscan.vision.targets.saddle import fit_saddles
+from armscan.vision.targets.view import TargetView
+from target_scenes import exposure, nees, render
+
+BOARD = Chessboard(7, 4, 3.0)
+PATTERN = ChessboardPattern(7, 4, 3.0)
+
+
+@pytest.fixture(scope="module")
+def tilted() -> RenderedTarget:
+    return render(PATTERN, 75.0, tilt_deg=30.0, azimuth_deg=50.0, roll_deg=20.0)
+
+
+def test_corners_and_covariance_against_the_truth(tilted: RenderedTarget) -> None:
+    errors, covariances = [], []
+    rough = tilted.marks_px.reshape(4, 7, 2)
+    step_x, step_y = (np.gradient(rough, axis=k).reshape(-1, 2) for k in (1, 0))
+    for seed in range(20):
+        image = exposure(tilted.image, seed).image
+        start = tilted.marks_px + 0.7 * np.random.default_rng(seed).uniform(-1, 1, (28, 2))
+        points, covariance, is_good = fit_saddles(image, start, step_x, step_y)
+        assert is_good.all()
+        errors.append(points - tilted.marks_px)
+        covariances.append(covariance)
+    error = np.concatenate(errors)
+    n = len(error)
+    assert np.sqrt((error**2).mean()) < 0.02
+    mean = nees(error, np.concatenate(covariances)).mean() / 2.0
+    assert mean == pytest.approx(1.0, abs=5.0 / np.sqrt(n))
+
+
+def test_detection_numbers_the_corners_from_the_dark_square(tilted: RenderedTarget) -> None:
+    view = detect_target(exposure(tilted.image), BOARD)
+    assert isinstance(view, TargetView)
+    assert len(view) == 28
+    assert not view.is_ambiguous
+    sigma = np.sqrt(np.trace(view.covariance_px2, axis1=1, axis2=2))
+    error = np.linalg.norm(view.points_px - tilted.marks_px[view.point_index], axis=1)
+    assert (error < 5.0 * sigma).all()
+    np.testing.assert_allclose(view.points_board_mm, BOARD.points_board_mm)
+
+
+@pytest.mark.parametrize("roll_deg", [95.0, 175.0, 260.0])
+def test_any_roll_gives_the_same_numbers(roll_deg: float) -> None:
+    rendered = render(PATTERN, 75.0, tilt_deg=20.0, azimuth_deg=10.0, roll_deg=roll_deg)
+    view = detect_target(exposure(rendered.image), BOARD)
+    assert isinstance(view, TargetView)
+    np.testing.assert_allclose(view.points_px, rendered.marks_px[view.point_index], atol=0.1)
+
+
+def test_half_turn_symmetric_board_is_flagged_and_numbered_to_the_right() -> None:
+    rendered = render(ChessboardPattern(6, 4, 3.0), 75.0, tilt_deg=20.0, roll_deg=170.0)
+    view = detect_target(exposure(rendered.image), Chessboard(6, 4, 3.0))
+    assert isinstance(view, TargetView)
+    assert view.is_ambiguous
+    np.testing.assert_allclose(view.points_px, rendered.marks_px[::-1], atol=0.1)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(6, 4), (7, 3), (5, 3), (8, 4), (9, 6)], ids=str)
+def test_a_wrong_count_fails_and_says_what_was_seen(
+    tilted: RenderedTarget, columns: int, rows: int
+) -> None:
+    failure = detect_target(exposure(tilted.image), Chessboard(columns, rows, 3.0))
+    assert isinstance(failure, FitFailure)
+    assert "7 x 4" in failure.reason
+    assert f"{columns} x {rows}" in failure.reason
+
+
+def test_a_dark_board_in_the_red_channel_only(tilted: RenderedTarget) -> None:
+    image = np.zeros((*tilted.image.shape, 3))
+    image[..., 0] = 0.12 * tilted.image
+    image[700:, :, 0] = 255.0
+    image[..., 2] = 3.0
+    noisy = exposure(image)
+    view = detect_target(noisy, BOARD)
+    assert isinstance(view, TargetView)
+    assert len(view) >= 26
+    np.testing.assert_allclose(view.points_px, tilted.marks_px[view.point_index], atol=0.6)
+
+
+def test_a_board_partly_out_of_view_fails(tilted: RenderedTarget) -> None:
+    left = int(tilted.marks_px[:, 0].min()) + 60
+    failure = detect_target(exposure(tilted.image[:, left:]), BOARD)
+    assert isinstance(failure, FitFailure)
+    assert failure.remedy
+
+
+def test_a_faint_board_fails_for_its_contrast(tilted: RenderedTarget) -> None:
+    faint = 100.0 + 0.02 * tilted.image
+    image = np.clip(np.rint(faint), 0, 255).astype(np.uint8)
+    failure = detect_target(Exposure(image, "faint"), BOARD)
+    assert isinstance(failure, FitFailure)
+
+
+@pytest.mark.parametrize("kind", [BOARD, Charuco(8, 5, 3.0, 2.2, "DICT_4X4_50")])
+def test_blank_and_tiny_images_fail(kind: Chessboard | Charuco) -> None:
+    for shape in ((300, 400), (20, 20), (33, 32, 3)):
+        failure = detect_target(Exposure(np.full(shape, 90, np.uint8), "blank"), kind)
+        assert isinstance(failure, FitFailure)
+        assert "blank" in failure.reason
+
+
+def test_charuco_corners_whole_and_in_part() -> None:
+    target = Charuco(8, 5, 3.0, 2.2, "DICT_4X4_50")
+    pattern = CharucoPattern(8, 5, 3.0, 2.2, "DICT_4X4_50")
+    light = Lighting(gradient=0.4)
+    rendered = render(
+        pattern, 75.0, tilt_deg=30.0, azimuth_deg=70.0, roll_deg=200.0, lighting=light
+    )
+    view = detect_target(exposure(rendered.image), target)
+    assert isinstance(view, TargetView)
+    assert len(view) == 28
+    assert not view.is_ambiguous
+    error = view.points_px - rendered.marks_px[view.point_index]
+    assert np.abs(error).max() < 0.06
+    assert nees(error, view.covariance_px2).mean() / 2.0 == pytest.approx(1.0, abs=1.0)
+    part = detect_target(exposure(rendered.image[:, :680]), target)
+    assert isinstance(part, TargetView)
+    assert 6 <= len(part) < 28
+    np.testing.assert_allclose(part.points_px, rendered.marks_px[part.point_index], atol=0.1)
+
+
+def test_charuco_of_another_dictionary_fails_by_its_name() -> None:
+    pattern = CharucoPattern(8, 5, 3.0, 2.2, "DICT_4X4_50")
+    rendered = render(pattern, 75.0)
+    failure = detect_target(exposure(rendered.image), Charuco(8, 5, 3.0, 2.2, "DICT_6X6_50"))
+    assert isinstance(failure, FitFailure)
+    assert "DICT_6X6_50" in failure.reason
+
+
+def test_saddle_fit_reports_a_corner_that_is_none() -> None:
+    image = np.full((200, 200), 80, np.uint8)
+    cv2.rectangle(image, (100, 0), (199, 199), 180, -1)
+    step = np.array([[40.0, 0.0]])
+    _, _, is_good = fit_saddles(image, np.array([[100.0, 100.0]]), step, step[:, ::-1])
+    assert not is_good.any()

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import pytest
+
+from armscan.errors import OptionError
+from armscan.vision.targets.definition import Charuco, Chessboard, CircleGrid
+from armscan.vision.targets.options import TargetOptions
+from armscan.vision.targets.specification import EXAMPLES, parse_target
+
+
+@pytest.mark.parametrize(
+    ("text", "target"),
+    [
+        ("circle-grid:11x9:3.75", CircleGrid(11, 9, 3.75)),
+        ("asymmetric-circle-grid:4x11:5", CircleGrid(4, 11, 5.0, is_asymmetric=True)),
+        ("chessboard:11x6:13", Chessboard(11, 6, 13.0)),
+        (" chessboard:11X6:13mm ", Chessboard(11, 6, 13.0)),
+        ("charuco:10x7:4:3:DICT_4X4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
+        ("charuco:10x7:4:3:4x4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
+    ],
+)
+def test_right_spellings(text: str, target: object) -> None:
+    assert parse_target(text) == target
+
+
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_every_example_is_right(kind: str) -> None:
+    assert EXAMPLES[kind].startswith(kind)
+    parse_target(EXAMPLES[kind])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no kind of target"),
+        ("checkerboard:11x6:13", "no kind of target"),
+        ("chessboard", "needs 2 fields"),
+        ("chessboard:11x6", "needs 2 fields"),
+        ("chessboard:11x6:13:2", "needs 2 fields"),
+        ("chessboard:11*6:13", "COLUMNSxROWS"),
+        ("chessboard:11x-6:13", "COLUMNSxROWS"),
+        ("chessboard:2x6:13", "too few"),
+        ("chessboard:11x6:0", "no square in mm"),
+        ("chessboard:11x6:-1", "no square in mm"),
+        ("chessboard:11x6:nan", "no square in mm"),
+        ("chessboard:11x6:1e999", "no square in mm"),
+        ("chessboard:11x6:13cm", "no square in mm"),
+        ("circle-grid:11x9:ten", "no pitch in mm"),
+        ("charuco:10x7:4:3", "needs 4 fields"),
+        ("charuco:10x7:3:4:DICT_4X4_50", "does not fit"),
+        ("charuco:10x7:4:3:DICT_9X9_50", "no ArUco dictionary"),
+        ("charuco:20x17:4:3:DICT_4X4_50", "needs 170 markers"),
+    ],
+)
+def test_every_wrong_spelling_shows_a_right_example(text: str, words: str) -> None:
+    with pytest.raises(OptionError, match=words) as caught:
+        parse_target(text)
+    kind = text.split(":", maxsplit=1)[0]
+    assert EXAMPLES.get(kind, EXAMPLES["chessboard"]) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"search_size_px": 10},
+        {"min_circle_px": 2.0},
+        {"min_circle_px": 500.0},
+        {"min_contrast": 0.0},
+        {"min_circles_fraction": 0.1},
+    ],
+)
+def test_options_are_checked(bad: dict[str, float]) -> None:
+    with pytest.raises(OptionError):
+        TargetOptions(**bad)  # type: ignore[arg-type]

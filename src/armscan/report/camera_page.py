@@ -118,7 +118,8 @@ def _cards(fit: CameraFit) -> tuple[Card, ...]:
             Card(
                 "On images it has not seen",
                 f"{significant(held_out.rms_px)} px rms",
-                f"{held_out.n_folds}-fold hold-out; {significant(held_out.rms_in_sample_px)} px in sample",
+                f"{held_out.n_folds}-fold hold-out; "
+                f"{significant(held_out.rms_in_sample_px)} px in sample",
             )
         )
     return tuple(cards)

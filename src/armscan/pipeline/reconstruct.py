@@ -148,7 +148,7 @@ def _warnings(
             warnings.append(
                 f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
                 f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
-                f"{high:.1f} mm: there the sheet is extrapolated, and only as good as its sigma says"
+                f"{high:.1f} mm: there the sheet is extrapolated; trust its sigma"
             )
         if len(depth) and not sheet.is_redundant:
             warnings.append(f"sheet {sheet.name} rests on two boards only, which nothing checks")

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Both light sheets of a desktop scanner from real photographs, and the stripe on a bust."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.errors import EstimationError
+from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
+from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.pipeline.laser import calibrate_sheets_from_exposures
+from armscan.pipeline.reconstruct import ReconstructOptions, reconstruct
+from armscan.reconstruction.choose_sheet import DepthRange
+from armscan.reconstruction.result import PointFate
+from armscan.storage.images import read_exposure
+from armscan.vision.targets.definition import Chessboard
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data")) / "ciclop"
+pytestmark = pytest.mark.skipif(
+    not DATA.is_dir(),
+    reason="test data not found: set ARMSCAN_DATA to the folder that holds ciclop",
+)
+BOARD = Chessboard(11, 6, 13.0)
+PLACEMENTS = ("0-255-255-8", "0-255-255-8-x")
+NO_PROVENANCE = Provenance("test", "2026-01-01T00:00:00Z", "0", ("test",), ())
+STRIPE_PX = 0.7
+"""The lines are 3 px wide on paper squares, with speckle, through a webcam's JPEG."""
+
+
+@pytest.fixture(scope="module")
+def laser() -> LaserFit:
+    photos = [read_exposure(DATA / "camera" / f"frame{k}.jpg") for k in range(16)]
+    run = calibrate_camera_from_exposures(photos, BOARD)
+    assert isinstance(run, CameraRun), run
+    fit = run.fit
+    camera = CameraCalibration(
+        fit.camera,
+        fit.covariance,
+        True,
+        fit.rms_px,
+        fit.sigma_point_px,
+        fit.n_views,
+        fit.n_points,
+        fit.coverage.covered_px,
+        NO_PROVENANCE,
+    )
+    folder = DATA / "laser_pattern"
+    found = calibrate_sheets_from_exposures(
+        [read_exposure(folder / f"laser-{name}.png") for name in PLACEMENTS],
+        BOARD,
+        camera,
+        backgrounds=[read_exposure(folder / f"laser-background-{name}.png") for name in PLACEMENTS],
+    )
+    assert isinstance(found, LaserFit), found
+    return found
+
+
+@pytest.fixture(scope="module")
+def sensor(laser: LaserFit) -> SensorCalibration:
+    return laser.to_calibration(NO_PROVENANCE)
+
+
+def test_both_sheets_fit_their_two_boards(laser: LaserFit) -> None:
+    assert laser.sheet_names == ("A", "B")
+    for sheet in laser.sheets:
+        assert sheet.calibration.n_boards == 2
+        assert sheet.calibration.n_points > 300
+        assert sheet.rms_px < STRIPE_PX
+        assert sheet.coplanarity_mm < 3.0 * sheet.coplanarity_sigma_mm
+        assert 15.0 < sheet.board_angle_deg < 30.0
+        assert not sheet.calibration.is_redundant
+        assert any("two boards only" in warning for warning in sheet.warnings)
+        assert sheet.tilt_sigma_deg < 1.5
+    for image in laser.images:
+        assert image.pose_shift_sigma < 4.0
+        assert image.count(PointUse.OFF_LINE) < 0.1 * len(image.profile)
+
+
+def test_the_sheets_lie_as_the_scanner_is_built(laser: LaserFit) -> None:
+    """Upright line lasers at about 30 degrees left and right, crossing near the turntable's axis.
+
+    Neither fact went into the fit; two placements alone could not check the planes.
+    """
+    left, right = (sheet.sheet.plane for sheet in laser.sheets)
+    for plane in (left, right):
+        turn = np.degrees(np.arctan2(abs(plane[2]), abs(plane[0])))
+        assert 25.0 < turn < 37.0
+    crossing = np.cross(left[:3], right[:3])
+    upright = np.degrees(np.arccos(abs(crossing[1]) / np.linalg.norm(crossing)))
+    assert upright < 3.0
+    at_axis = np.linalg.solve(
+        np.stack([left[:3], right[:3], [0.0, 1.0, 0.0]]), [-left[3], -right[3], 0.0]
+    )
+    assert 285.0 < at_axis[2] < 335.0
+    assert abs(at_axis[0]) < 25.0
+
+
+def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
+    sensor: SensorCalibration,
+) -> None:
+    """Only sheet B puts it there; A would put it 60 mm behind the axis, inside the bust's back."""
+    folder = DATA / "laser_object"
+    on, off = read_exposure(folder / "laser.png"), read_exposure(folder / "laser_background.png")
+    result = reconstruct([on], sensor, backgrounds=[off])
+    cloud = result.cloud
+    assert "B" in result.images[0].naming
+    assert set(cloud.sheet.tolist()) == {1}
+    assert result.images[0].count(PointFate.MEASURED) == len(cloud) > 700
+    assert 215.0 < cloud.points_mm[:, 2].min() < cloud.points_mm[:, 2].max() < 300.0
+    assert 190.0 < np.ptp(cloud.points_mm[:, 1]) < 225.0, "a bust of about 20 cm"
+    assert any("outside its calibrated depth range" in warning for warning in result.warnings)
+    asked = reconstruct([on], sensor, backgrounds=[off], options=ReconstructOptions(sheet="B"))
+    np.testing.assert_array_equal(asked.cloud.points_mm, cloud.points_mm)
+
+
+def test_an_ambiguous_stripe_is_asked_for_not_guessed(sensor: SensorCalibration) -> None:
+    on = read_exposure(DATA / "laser_object" / "laser.png")
+    off = read_exposure(DATA / "laser_object" / "laser_background.png")
+    wide = ReconstructOptions(depths=DepthRange(margin=30.0))
+    with pytest.raises(EstimationError, match="--sheet"):
+        reconstruct([on], sensor, backgrounds=[off], options=wide)

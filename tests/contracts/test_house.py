@@ -33,7 +33,7 @@ def lines_of(path: Path) -> int:
 
 
 def function_lines() -> list[tuple[int, str]]:
-    """Lines of each function without its docstring, signature included; a kernel is one function."""
+    """Lines of each function without its docstring; a kernel is one function by necessity."""
     found = []
     for path in SOURCES:
         if path.parent.name == "kernels" or path.stem.endswith("_kernel"):

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers and summaries as people and programs read them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from armscan.report.numbers import sentence, significant, with_sigma
+from armscan.report.summary import Summary, Table, summary_json, summary_text
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "text"),
+    [
+        (1431.2749, 0.8512, "1431.27 ± 0.85 px"),
+        (0.0305123, 0.0033, "0.0305 ± 0.0033 px"),
+        (-7.0, 12.3, "-7 ± 12 px"),
+        (0.1, 0.0999, "0.100 ± 0.100 px"),
+        (12345.6, 0.0, "12345.6 px"),
+        (1.5, math.nan, "1.5 px"),
+    ],
+)
+def test_a_value_is_shown_to_two_digits_of_its_sigma(value: float, sigma: float, text: str) -> None:
+    assert with_sigma(value, sigma, "px") == text
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0 mm"),
+        (0.0748123, "0.0748 mm"),
+        (1234.5, "1234 mm"),
+        (-3.14159, "-3.14 mm"),
+        (1.23456e-7, "1.23e-07 mm"),
+        (math.nan, "not known"),
+    ],
+)
+def test_a_few_digits(value: float, text: str) -> None:
+    assert significant(value, "mm") == text
+
+
+def test_sentences() -> None:
+    assert sentence("all is well") == "All is well."
+    assert sentence("Done.") == "Done."
+    assert sentence("") == ""
+
+
+def summary() -> Summary:
+    return Summary(
+        title="Done.",
+        facts=(("points", "12"), ("path", "a\nb")),
+        tables=(
+            Table(("name", "rms", "why"), (("a", "1.0", "x"), ("long", "12.0", "")), "T", (2,)),
+        ),
+        warnings=("Careful.",),
+        written=(Path("out") / "c.json",),
+        next_step="look",
+        data={"rms": math.nan, "list": (1, 2.5, math.inf), "nested": {"path": "ü"}},
+    )
+
+
+def test_text_is_aligned() -> None:
+    assert summary_text(summary()).splitlines() == [
+        "Done.",
+        "  points  12",
+        "  path    a",
+        "          b",
+        "",
+        "  T",
+        "  name   rms  why",
+        "  a      1.0  x",
+        "  long  12.0",
+        "",
+        "warning: Careful.",
+        "",
+        f"wrote {Path('out') / 'c.json'}",
+        "next: look",
+    ]
+
+
+def test_json_is_strict_and_says_null_for_what_is_not_known() -> None:
+    text = summary_json(summary())
+    assert json.loads(text, parse_constant=pytest.fail) == {
+        "rms": None,
+        "list": [1, 2.5, None],
+        "nested": {"path": "ü"},
+        "warnings": ["Careful."],
+        "written": ["out/c.json"],
+    }

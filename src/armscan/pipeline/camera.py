@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Iterable, Iterator, Sequence, Sized
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -96,10 +96,10 @@ def calibrate_camera_from_exposures(
     missing = _too_few(views, not_found)
     if missing is not None:
         return missing
-    solved = _solve(views, options, progress)
-    if isinstance(solved, FitFailure):
-        return FitFailure(solved.reason + _listed(not_found), solved.remedy)
-    return CameraRun(solved[0], tuple(not_found), solved[1])
+    run = calibrate_camera_from_views(views, options, progress=progress)
+    if isinstance(run, FitFailure):
+        return FitFailure(run.reason + _listed(not_found), run.remedy)
+    return CameraRun(run.fit, tuple(not_found), run.centre_rounds)
 
 
 def _detected(
@@ -117,27 +117,38 @@ def _detected(
             yield source, future.result()
 
 
-def _solve(
-    views: list[TargetView], options: CameraOptions, progress: Progress
-) -> tuple[CameraFit, int] | FitFailure:
-    """Calibrate; for circles, correct the centres with the camera and calibrate again."""
-    fit = calibrate_camera(views, options)
+def calibrate_camera_from_views(
+    views: Sequence[TargetView],
+    options: CameraOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> CameraRun | FitFailure:
+    """Calibrate; for circles, correct the centres with the camera and calibrate again.
+
+    Parameters, errors and result as `calibrate_camera_from_exposures`, with the target found.
+    """
+    options = options or CameraOptions()
     has_circles = any(view.edges is not None for view in views)
     total = CENTRE_ROUNDS if has_circles else 1
+    fit = calibrate_camera(views, options)
     progress(ProgressEvent("solve", 1, total))
-    if not has_circles or isinstance(fit, FitFailure):
-        return fit if isinstance(fit, FitFailure) else (fit, 0)
-    for done in range(1, CENTRE_ROUNDS):
-        views = [correct_centres(view, fit.camera) for view in views]
+    if isinstance(fit, FitFailure):
+        return fit
+    rounds, is_stable = 0, False
+    while rounds < total - 1 and not is_stable:
+        views = [_corrected(view, fit) for view in views]
         again = calibrate_camera(views, options)
         if isinstance(again, FitFailure):
             return again
+        rounds += 1
         is_stable = _moved_sigmas(fit, again) < CENTRES_STABLE
         fit = again
-        progress(ProgressEvent("solve", total if is_stable else done + 1, total))
-        if is_stable:
-            break
-    return fit, done
+        progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
+    return CameraRun(fit, (), rounds)
+
+
+def _corrected(view: TargetView, fit: CameraFit) -> TargetView:
+    return view if view.edges is None else correct_centres(view, fit.camera)
 
 
 def _moved_sigmas(before: CameraFit, after: CameraFit) -> float:

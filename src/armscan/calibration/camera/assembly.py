@@ -13,11 +13,12 @@ from armscan.calibration.camera.covariance import joint_covariance
 from armscan.calibration.camera.coverage import measure_coverage
 from armscan.calibration.camera.cross_validation import cross_validate, rms
 from armscan.calibration.camera.model_choice import ChosenModel
-from armscan.calibration.camera.observations import Observations, free_basis, gather
+from armscan.calibration.camera.noise import claimed_covariances
+from armscan.calibration.camera.observations import free_basis, gather
 from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.camera.prepared_views import PreparedViews
 from armscan.calibration.camera.result import CameraFit, RefusedView, ViewFit
-from armscan.calibration.camera.robust import Solution, residuals_px
+from armscan.calibration.camera.robust import Solution, chi2_of_points, residuals_px
 from armscan.calibration.camera.warp import judge_warp, with_warp
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -39,15 +40,15 @@ def assemble(
 ) -> CameraFit | FitFailure:
     """Put the result together, or refuse a solution that the views do not determine."""
     used = [views[index] for index in prepared.used]
-    observations = gather(used)
     solution, validation = chosen.solution, chosen.cross_validation
     if options.solve_warp:
-        bowed = with_warp(observations, solution)
+        bowed = with_warp(solution)
         if isinstance(bowed, FitFailure):
             return bowed
         solution = bowed
         sources = tuple(view.source for view in used)
-        validation = cross_validate(observations, solution, sources, options.n_folds)
+        validation = cross_validate(solution, sources, options.n_folds)
+    observations = solution.observations
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
         return determined
@@ -76,8 +77,8 @@ def assemble(
         views=fits,
         refused_views=prepared.refused + refused,
         rms_px=rms(residuals_px(observations, solution.state)[kept]),
-        sigma_point_px=_sigma_point_px(used, kept, solution),
-        noise_scale=float(np.sqrt(solution.variance_factor)),
+        sigma_point_px=_sigma_point_px(solution),
+        noise_scale=_noise_scale(used, solution),
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=condition,
         coverage=coverage,
@@ -102,10 +103,17 @@ def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | N
     )
 
 
-def _sigma_point_px(used: Sequence[TargetView], kept: BoolArray, solution: Solution) -> float:
-    covariances = np.concatenate([view.covariance_px2 for view in used])[kept]
+def _sigma_point_px(solution: Solution) -> float:
+    kept = solution.weights > 0.0
+    covariances = claimed_covariances(solution.observations)[kept]
     mean_variance = 0.5 * float(np.mean(np.trace(covariances, axis1=1, axis2=2)))
     return float(np.sqrt(mean_variance * solution.variance_factor))
+
+
+def _noise_scale(used: Sequence[TargetView], solution: Solution) -> float:
+    kept = solution.weights > 0.0
+    chi2 = float(chi2_of_points(gather(used), solution.state)[kept].sum())
+    return float(np.sqrt(chi2 / max(solution.degrees_of_freedom, 1)))
 
 
 def _view_fits(
@@ -118,7 +126,7 @@ def _view_fits(
     camera: CameraModel,
 ) -> tuple[tuple[ViewFit, ...], tuple[RefusedView, ...]]:
     """Evidence of each view with a pose, in the order given."""
-    observations = gather([views[index] for index in prepared.used])
+    observations = solution.observations
     residuals = residuals_px(observations, solution.state)
     fits: dict[int, ViewFit] = {}
     refused: list[RefusedView] = []
@@ -135,7 +143,7 @@ def _view_fits(
             is_misfit=bool(is_misfit[position]),
         )
     for index, note in prepared.left_out.items():
-        left = _left_out_fit(views[index], camera, solution, observations, note)
+        left = _left_out_fit(views[index], camera, solution, note)
         if isinstance(left, FitFailure):
             refused.append(RefusedView(views[index].source, f"{note}; {left.reason}"))
         else:
@@ -178,14 +186,15 @@ def _left_out_fit(
     view: TargetView,
     camera: CameraModel,
     solution: Solution,
-    observations: Observations,
     note: str,
 ) -> ViewFit | FitFailure:
     bow = solution.state.shared[N_CAMERA:]
     pose = estimate_board_pose(view, camera, bow_mm=bow, allow_ambiguous=True)
     if isinstance(pose, FitFailure):
         return pose
-    typical = float(np.mean(np.sum(residuals_px(observations, solution.state) ** 2, axis=1)))
+    typical = float(
+        np.mean(np.sum(residuals_px(solution.observations, solution.state) ** 2, axis=1))
+    )
     level = float(np.mean(np.sum(pose.residuals**2, axis=1))) / max(typical, 1e-300)
     return _view_fit(
         view,

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armscan.calibration.camera.adjustment import NormalEquations, adjust, linearise
 from armscan.calibration.camera.covariance import condition_number
 from armscan.calibration.camera.homography import estimate_homography
+from armscan.calibration.camera.noise import excess_variance_px2
 from armscan.calibration.camera.observations import Observations, State, gather
 from armscan.calibration.camera.robust import residuals_px
 from armscan.calibration.camera.zhang import pose_from_homography
@@ -85,7 +86,7 @@ def board_pose_candidates(
     if isinstance(homography, FitFailure):
         return homography
     observations = gather([view])
-    shared = np.append(camera.parameters, np.zeros(2) if bow_mm is None else bow_mm)
+    shared = _shared(camera, bow_mm)
     centre = view.points_board_mm.mean(axis=0)
     first = _refined(observations, shared, pose_from_homography(homography, np.eye(3)))
     if isinstance(first, FitFailure):
@@ -136,16 +137,20 @@ def estimate_board_pose(
     -------
     estimate
         ``sensor_from_board``; covariance (6, 6) of (rotation-vector increment in rad in the Sensor
-        frame, applied on the left; translation in mm); residuals (M, 2) in px. The detector's
-        covariances give the weights, the residuals the level: the covariance is scaled by chi2
+        frame, applied on the left; translation in mm); residuals (M, 2) in px. The points'
+        covariances give the weights (see `armscan.calibration.camera.noise`), the residuals the
+        level: the covariance is scaled by chi2
         over the degrees of freedom (with fewer than ten of them never below 1). Or why there is
         no pose: too few points, points on a line, or two poses that fit alike.
     """
+    degrees = 2 * len(view) - 6
     candidates = board_pose_candidates(view, camera, bow_mm)
+    if not isinstance(candidates, FitFailure):
+        view = _with_excess(view, camera, candidates[0], bow_mm)
+        candidates = board_pose_candidates(view, camera, bow_mm)
     if isinstance(candidates, FitFailure):
         return candidates
     best = candidates[0]
-    degrees = 2 * len(view) - 6
     factor = best.chi2 / max(degrees, 1)
     if degrees < SCALED_FROM_DEGREES_OF_FREEDOM:
         factor = max(factor, 1.0)
@@ -156,8 +161,7 @@ def estimate_board_pose(
             "tilt the board more, bring it nearer, or use a larger one",
         )
     observations = gather([view])
-    shared = np.append(camera.parameters, np.zeros(2) if bow_mm is None else bow_mm)
-    state = State.from_poses(shared, [best.sensor_from_board])
+    state = State.from_poses(_shared(camera, bow_mm), [best.sensor_from_board])
     equations = linearise(observations, state, _CAMERA, np.ones(len(view)))
     if equations is None or not condition_number(equations.pose[0]) < 1e13:
         return FitFailure("the points do not determine a pose", "show more of the board")
@@ -169,6 +173,22 @@ def estimate_board_pose(
         degrees,
         best.chi2,
     )
+
+
+def _shared(camera: CameraModel, bow_mm: FloatArray | None) -> FloatArray:
+    return np.append(camera.parameters, np.zeros(2) if bow_mm is None else bow_mm)
+
+
+def _with_excess(
+    view: TargetView, camera: CameraModel, best: PoseCandidate, bow_mm: FloatArray | None
+) -> TargetView:
+    """The view with the variance that explains its residuals, see `calibration.camera.noise`."""
+    state = State.from_poses(_shared(camera, bow_mm), [best.sensor_from_board])
+    residuals = residuals_px(gather([view]), state)
+    excess = excess_variance_px2(residuals, view.covariance_px2, best.chi2, 2 * len(view) - 6)
+    if excess <= 0.0:
+        return view
+    return replace(view, covariance_px2=view.covariance_px2 + excess * np.eye(2))
 
 
 def _pose_covariance(

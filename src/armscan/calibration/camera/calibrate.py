@@ -11,6 +11,11 @@ from armscan.calibration.camera.assembly import assemble
 from armscan.calibration.camera.coverage import largest_angle_deg
 from armscan.calibration.camera.cross_validation import cross_validate
 from armscan.calibration.camera.model_choice import ChosenModel, choose_model
+from armscan.calibration.camera.noise import (
+    claimed_covariances,
+    excess_variance_px2,
+    with_excess,
+)
 from armscan.calibration.camera.observations import Observations, free_basis, gather
 from armscan.calibration.camera.options import CameraOptions, DistortionModel
 from armscan.calibration.camera.prepared_views import PreparedViews, prepare_views
@@ -19,6 +24,8 @@ from armscan.calibration.camera.robust import (
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
     Solution,
+    chi2_of_points,
+    residuals_px,
     solve_robustly,
 )
 from armscan.calibration.camera.starting_values import starting_state
@@ -29,6 +36,8 @@ from armscan.vision.targets.view import TargetView
 WRONG_LEVEL = 100.0
 """A view whose residuals are ten times those of the typical view is not noisy but wrong: numbered
 wrongly, or moved during the exposure."""
+
+EXCESS_ROUNDS = 2
 
 MIN_ANGLE_DEG = 5.0
 """Boards that differ in tilt by less than this are parallel: the focal length is not determined."""
@@ -47,9 +56,9 @@ def calibrate_camera(
 
     Homographies and Zhang's closed form (eqs. 2.27 to 2.35) and linear distortion (2.36 to 2.38)
     start a Levenberg-Marquardt solution over intrinsics, distortion and all poses (2.39), each
-    point weighted by its covariance. The covariance is that of the normal equations, scaled by
-    sigma0 squared = chi2 / degrees of freedom: the detector's covariances give the weights, the
-    residuals give the level.
+    point weighted by its covariance (see `armscan.calibration.camera.noise` for what is added to
+    the detector's). The covariance is that of the normal equations, scaled by sigma0 squared =
+    chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
 
     A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
     as it is. A numbering that starts at the opposite corner of a symmetric target is harmless.
@@ -134,7 +143,7 @@ def _solve_model(
         return _solve(used, observations, prepared, model, options)
 
     def validate(solution: Solution) -> CrossValidation | None:
-        return cross_validate(observations, solution, sources, options.n_folds)
+        return cross_validate(solution, sources, options.n_folds)
 
     def folds(solution: Solution) -> bool:
         camera = solution.state.camera(observations.width_px, observations.height_px)
@@ -164,8 +173,27 @@ def _solve(
         return start
     basis, _ = free_basis(model, options, with_warp=False)
     solution = solve_robustly(observations, start[0], basis, start[1])
+    for _ in range(EXCESS_ROUNDS):
+        if isinstance(solution, FitFailure):
+            return solution
+        excess = _excess_variance_px2(observations, solution)
+        if excess <= 0.0:
+            break
+        noisier = with_excess(observations, excess)
+        solution = solve_robustly(noisier, solution.state, basis, start[1])
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:
         return PARALLEL
     return solution
+
+
+def _excess_variance_px2(observations: Observations, solution: Solution) -> float:
+    """Variance to add to the detector's covariances, by the rule of `calibration.camera.noise`."""
+    kept = solution.weights > 0.0
+    return excess_variance_px2(
+        residuals_px(observations, solution.state)[kept],
+        claimed_covariances(observations)[kept],
+        float(chi2_of_points(observations, solution.state)[kept].sum()),
+        solution.degrees_of_freedom,
+    )

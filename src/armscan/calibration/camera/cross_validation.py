@@ -17,7 +17,7 @@ NO_SHARED = np.zeros((11, 0))
 
 
 def cross_validate(
-    observations: Observations, solution: Solution, sources: tuple[str, ...], n_folds: int
+    solution: Solution, sources: tuple[str, ...], n_folds: int
 ) -> CrossValidation | None:
     """Hold out views fold by fold (see `CrossValidation`).
 
@@ -26,8 +26,8 @@ def cross_validate(
 
     Parameters
     ----------
-    observations, solution
-        All used views and their solution, which also is the folds' starting value.
+    solution
+        Of all used views; it also is the folds' starting value.
     sources
         Names of the views.
     n_folds
@@ -38,6 +38,7 @@ def cross_validate(
     result
         None if fewer than three views would be left to solve from, or if a fold has no solution.
     """
+    observations = solution.observations
     n_views = observations.n_views
     folds = min(n_folds, n_views)
     if folds < 2 or n_views - int(np.ceil(n_views / folds)) < MIN_VIEWS:

@@ -6,8 +6,9 @@ Where the views cover the image that is all five coefficients, as OpenCV: one th
 without being zero makes the covariance too small, and a free one that is near zero costs little.
 With few views, or an empty rim of the image, a large model bends to the noise and predicts unseen
 views worse: then coefficients are held at zero, k3 first, then p1 and p2, then k2. Where too few
-views are left for a hold-out test, k3 is held at zero. Among the models within 1 % one that folds
-over inside the image (high powers run away where no target was seen) yields to one that does not.
+views are left for a hold-out test, only k1 and k2 are free. Among the models within 1 %, one that
+folds over inside the image (high powers run away where no target was seen) yields to one that does
+not.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ TOLERATED = 1.01
 MODELS: tuple[DistortionModel, ...] = ("k1k2p1p2k3", "k1k2p1p2", "k1k2", "k1")
 """Largest first."""
 
-UNTESTED_MODEL: DistortionModel = "k1k2p1p2"
+UNTESTED_MODEL: DistortionModel = "k1k2"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +78,7 @@ def choose_model(
     if not tested:
         names = [chosen.model for chosen in tried]
         chosen = tried[names.index(UNTESTED_MODEL)] if UNTESTED_MODEL in names else tried[0]
-        return _with_reason(chosen, "too few views for a hold-out test: k3 is held at zero")
+        return _with_reason(chosen, "too few views for a hold-out test: only k1 and k2 are free")
     best = min(rms for _, rms in tested)
     good = [(chosen, rms) for chosen, rms in tested if rms <= TOLERATED * best]
     unfolded = [(chosen, rms) for chosen, rms in good if not folds(chosen.solution)]

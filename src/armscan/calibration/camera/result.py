@@ -224,9 +224,9 @@ class CameraFit:
     sigma_point_px
         Estimated standard deviation of one detected coordinate, per axis.
     noise_scale
-        sigma0: by how much the points scatter more than their detector's covariances say. All
-        covariances here are scaled by its square: the detector gives weights, the residuals give
-        the level.
+        By how much the points scatter more than their detector's covariances say: root of chi2
+        over the degrees of freedom with these covariances alone. What is done about it:
+        `armscan.calibration.camera.noise`.
     degrees_of_freedom
         Count of observed coordinates minus count of unknowns.
     condition

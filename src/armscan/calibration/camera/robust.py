@@ -46,6 +46,8 @@ class Solution:
 
     Parameters
     ----------
+    observations
+        What was adjusted, with the weights that were in force.
     state
         The unknowns.
     basis
@@ -60,6 +62,7 @@ class Solution:
         (V,) share of each view's points that lie too far out for the typical view's noise.
     """
 
+    observations: Observations
     state: State
     basis: FloatArray
     equations: NormalEquations
@@ -116,7 +119,9 @@ def solve_robustly(
         chi2 = chi2_of_points(observations, result[0])
         levels, outlier = _judge(observations, chi2)
         if not outlier.any() and levels.max() < SUSPECT_LEVEL:
-            return Solution(result[0], basis, result[1], np.ones(len(chi2)), levels, 0.0 * levels)
+            state, equations = result
+            every = np.ones(len(chi2))
+            return Solution(observations, state, basis, equations, every, levels, 0.0 * levels)
     state = _reweighted(observations, start, basis, trusted)
     chi2 = chi2_of_points(observations, state)
     levels, outlier = _judge(observations, chi2)
@@ -131,7 +136,7 @@ def solve_robustly(
         if np.array_equal(again, outlier):
             break
         outlier = again
-    return Solution(state, basis, equations, weights, levels, shares)
+    return Solution(observations, state, basis, equations, weights, levels, shares)
 
 
 def _reweighted(

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import stats
 
 from armscan.calibration.camera.adjustment import adjust
-from armscan.calibration.camera.observations import SHARED_NAMES, WARP_NAMES, Observations
+from armscan.calibration.camera.observations import SHARED_NAMES, WARP_NAMES
 from armscan.calibration.camera.result import BoardWarp
 from armscan.calibration.camera.robust import Solution
 from armscan.geometry.arrays import FloatArray
@@ -17,17 +19,15 @@ _FIRST = SHARED_NAMES.index(WARP_NAMES[0])
 WARP_ROWS = slice(_FIRST, _FIRST + len(WARP_NAMES))
 
 
-def with_warp(observations: Observations, flat: Solution) -> Solution | FitFailure:
+def with_warp(flat: Solution) -> Solution | FitFailure:
     """Free the two bow parameters, starting from the flat solution and over the same points."""
     columns = np.zeros((len(SHARED_NAMES), len(WARP_NAMES)))
     columns[WARP_ROWS] = np.eye(len(WARP_NAMES))
     basis = np.concatenate([flat.basis, columns], axis=1)
-    result = adjust(observations, flat.state, basis, flat.weights)
+    result = adjust(flat.observations, flat.state, basis, flat.weights)
     if isinstance(result, FitFailure):
         return result
-    return Solution(
-        result[0], basis, result[1], flat.weights, flat.view_levels, flat.outlier_shares
-    )
+    return replace(flat, state=result[0], basis=basis, equations=result[1])
 
 
 def judge_warp(flat: Solution, bowed: Solution, covariance: FloatArray) -> BoardWarp:

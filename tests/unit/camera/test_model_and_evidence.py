@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.camera.board_pose import estimate_board_pose
+from armscan.calibration.camera.calibrate import calibrate_camera
+from armscan.calibration.camera.coverage import largest_angle_deg, measure_coverage
+from armscan.calibration.camera.noise import excess_variance_px2
+from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.camera.result import CameraFit
+from armscan.geometry.estimate import Estimate
+from armscan.models.camera import CameraModel
+from armscan.vision.targets.view import TargetView
+from camera_scene import CAMERA, Scene, make_views
+
+ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
+
+
+def solved(views: list[TargetView], options: CameraOptions | None = None) -> CameraFit:
+    fit = calibrate_camera(views, options)
+    assert isinstance(fit, CameraFit), fit
+    return fit
+
+
+def test_good_coverage_frees_all_five() -> None:
+    fit = solved(make_views(Scene(), 1)[0])
+    assert fit.free_parameters[4:] == ("k1", "k2", "p1", "p2", "k3")
+    assert "all five" in fit.model_reason
+    held_out = fit.cross_validation
+    assert held_out is not None
+    assert held_out.n_folds == 5
+    # Unseen points scatter by their noise and by the camera's uncertainty, which is small here.
+    assert held_out.rms_in_sample_px == pytest.approx(fit.rms_px)
+    assert held_out.rms_in_sample_px < held_out.rms_px < 1.05 * held_out.rms_in_sample_px
+    assert held_out.sources == tuple(view.source for view in fit.used_views)
+
+
+def test_few_central_views_free_fewer() -> None:
+    scene = Scene(n_views=4, noise_px=0.3, distance_mm=900.0, reach=0.05, max_tilt_deg=50.0)
+    chosen = [solved(make_views(scene, seed)[0]) for seed in range(6)]
+    assert any("k3" not in fit.free_parameters for fit in chosen)
+    for fit in chosen:
+        if "k3" not in fit.free_parameters:
+            assert "worse" in fit.model_reason or "folds" in fit.model_reason
+            assert fit.camera.distortion[4] == 0.0
+
+
+def test_three_views_free_only_k1_and_k2() -> None:
+    fit = solved(make_views(Scene(n_views=3), 2)[0])
+    assert fit.free_parameters[4:] == ("k1", "k2")
+    assert fit.cross_validation is None
+    assert any("only 3 views" in warning for warning in fit.warnings)
+
+
+def test_hold_out_by_hand() -> None:
+    views, _ = make_views(Scene(n_views=6), 3)
+    options = replace(ALL_FIVE, n_folds=3)
+    held_out = solved(views, options).cross_validation
+    assert held_out is not None
+    fold = solved([view for index, view in enumerate(views) if index % 3 != 1], ALL_FIVE)
+    for index in (1, 4):
+        pose = estimate_board_pose(views[index], fold.camera)
+        assert isinstance(pose, Estimate)
+        rms = np.sqrt(np.mean(np.sum(pose.residuals**2, axis=1)))
+        assert held_out.view_rms_px[index] == pytest.approx(rms, rel=1e-4)
+
+
+def test_bow_of_the_board_is_found_and_judged() -> None:
+    bowed = Scene(bow_mm=(0.4, -0.25))
+    options = replace(ALL_FIVE, solve_warp=True)
+    errors = []
+    for seed in range(20):
+        fit = solved(make_views(bowed, seed)[0], options)
+        assert fit.warp is not None
+        assert fit.warp.is_significant
+        error = fit.warp.bow_mm - bowed.bow_mm
+        errors.append(error @ np.linalg.solve(fit.warp.covariance_mm2, error))
+    assert abs(np.mean(errors) - 2.0) < 3.0 * np.sqrt(4.0 / 20.0)
+    assert any("bowed" in warning for warning in fit.warnings)
+    with_bow, without = fit, solved(make_views(bowed, 19)[0], ALL_FIVE)
+    assert without.rms_px > 1.5 * with_bow.rms_px
+    assert abs(with_bow.camera.fx_px - CAMERA.fx_px) < 4.0 * with_bow.sigma[0]
+
+
+def test_flat_board_is_rarely_called_bowed() -> None:
+    options = replace(ALL_FIVE, solve_warp=True)
+    p_values = []
+    for seed in range(40):
+        warp = solved(make_views(Scene(n_views=6), seed)[0], options).warp
+        assert warp is not None
+        p_values.append(warp.p_value)
+    # Uniform on a flat board: mean 1/2 with sigma 1 / sqrt(12 n).
+    assert abs(np.mean(p_values) - 0.5) < 3.0 / np.sqrt(12.0 * 40.0)
+
+
+def test_excess_scatter_is_added_only_where_it_shows() -> None:
+    rng = np.random.default_rng(4)
+    n = 2000
+    claimed = np.tile(0.01**2 * np.eye(2), (n, 1, 1))
+    quiet = 0.01 * rng.normal(size=(n, 2))
+    loud = np.hypot(0.01, 0.15) * rng.normal(size=(n, 2))
+    for residuals, expected in ((quiet, 0.0), (loud, 0.15), (0.5 * quiet, 0.0)):
+        chi2 = float(np.sum(residuals**2)) / 0.01**2
+        variance = excess_variance_px2(residuals, claimed, chi2, 2 * n)
+        assert np.sqrt(variance) == pytest.approx(expected, rel=4.0 / np.sqrt(4.0 * n), abs=1e-9)
+
+
+def test_common_scatter_levels_the_weights() -> None:
+    """A detector that claims 0.01 px for some points and 0.1 px for others, truth 0.2 px."""
+    views, _ = make_views(Scene(noise_px=0.2), 5)
+    rng = np.random.default_rng(5)
+    uneven = []
+    for view in views:
+        sigma = np.where(rng.random(len(view)) < 0.3, 0.01, 0.1)
+        covariance = sigma[:, None, None] ** 2 * np.eye(2)
+        uneven.append(replace(view, covariance_px2=covariance))
+    fit, equal = solved(uneven, ALL_FIVE), solved(views, ALL_FIVE)
+    assert fit.noise_scale > 3.0
+    assert fit.sigma_point_px == pytest.approx(0.2, rel=0.1)
+    assert fit.sigma == pytest.approx(equal.sigma, rel=0.15)
+
+
+def test_coverage_by_hand() -> None:
+    points = np.array([[5.0, 5.0], [5.0, 5.2], [95.0, 45.0], [55.0, 25.0]])
+    tilt = np.deg2rad(30.0)
+    normals = np.array([[0.0, 0.0, 1.0], [0.0, np.sin(tilt), np.cos(tilt)]])
+    coverage = measure_coverage(points, normals, 100, 50)
+    assert coverage.counts.shape == (5, 10)
+    assert coverage.counts.sum() == 4
+    assert coverage.counts[0, 0] == 2
+    assert coverage.fraction == pytest.approx(3 / 50)
+    assert coverage.covered_px.tolist() == [5.0, 5.0, 95.0, 45.0]
+    assert set(coverage.empty) == {
+        "top centre",
+        "top right",
+        "middle left",
+        "middle right",
+        "bottom left",
+        "bottom centre",
+    }
+    assert coverage.tilts_deg == pytest.approx([0.0, 30.0])
+    assert coverage.tilt_directions_deg[1] == pytest.approx(90.0)
+    assert largest_angle_deg(normals) == pytest.approx(30.0)
+
+
+def test_empty_parts_and_small_tilts_are_warned_of() -> None:
+    scene = Scene(n_views=8, distance_mm=700.0, reach=0.03, max_tilt_deg=14.0)
+    warnings = " ".join(solved(make_views(scene, 6)[0], ALL_FIVE).warnings)
+    assert "no target points in the" in warnings
+    assert "tilt it by 20 to 45" in warnings
+
+
+def test_folding_model_yields_to_one_that_does_not_fold() -> None:
+    # Strong barrel distortion seen only in the middle: k3 runs away at the corners.
+    lens = CameraModel(520.0, 520.0, 319.5, 239.5, np.array([-0.3, 0.11, 0, 0, 0]), 640, 480)
+    scene = Scene(camera=lens, n_views=8, noise_px=0.2, distance_mm=450.0, reach=0.1)
+    for seed in range(4):
+        fit = solved(make_views(scene, seed)[0])
+        if len(fit.camera.folded_border()):
+            assert any("no inverse" in warning for warning in fit.warnings)
+        elif "folds over" in fit.model_reason:
+            assert "k3" not in fit.free_parameters

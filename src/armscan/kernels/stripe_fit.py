@@ -75,9 +75,7 @@ def read_sides(
 
 
 @njit(
-    types.void(
-        IMAGE_IN, MASK_IN, TABLE_IN, FLOATS_IN, TABLE_IN, FLOATS_IN, types.float64, TABLE_OUT
-    ),
+    types.void(IMAGE_IN, MASK_IN, TABLE_IN, FLOATS_IN, TABLE_IN, FLOATS_IN, FLOATS_IN, TABLE_OUT),
     cache=True,
     nogil=True,
     error_model="numpy",
@@ -89,7 +87,7 @@ def fit_profiles(
     sigma_px: Float64Array,
     sides: Float64Array,
     noise: Float64Array,
-    reach: float,
+    reach: Float64Array,
     result: Float64Array,
 ) -> None:
     """Fit centre, amplitude and width by Gauss-Newton steps with weights from the noise model.
@@ -111,7 +109,7 @@ def fit_profiles(
     noise
         (3,) ``C^2``, ``1 / gain``, ``read^2``.
     reach
-        Half width of the fitted window in sigmas.
+        (N,) half width of the fitted window in sigmas.
     result
         (N, 8) output: centre, amplitude, sigma, variance of the centre (0: the fit failed), skew
         score, its norm, count of clipped pixels, and by how much a term ``u^3`` in the profile's
@@ -124,7 +122,7 @@ def fit_profiles(
         start = points[i, 1] if is_column else points[i, 0]
         line = int(points[i, 0] if is_column else points[i, 1])
         size = height if is_column else width
-        half = max(reach * sigma_px[i], 2.0)
+        half = max(reach[i] * sigma_px[i], 2.0)
         first = max(math.ceil(start - half), 0)
         last = min(math.floor(start + half), size - 1)
         n_clipped = 0
@@ -158,17 +156,24 @@ def fit_profiles(
             h00 = h01 = h02 = h11 = h12 = h22 = 0.0
             b0 = b1 = b2 = 0.0
             q_residual = q_norm = q_centre = cubic = 0.0
+            # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
+            step = 1.0 / sigma
+            u = (first - 1 - centre) * step
+            m = amplitude * math.exp(-0.5 * u * u)
+            ratio = math.exp(-(u + 0.5 * step) * step)
+            change = math.exp(-step * step)
             for k in range(first, last + 1):
+                u += step
+                m *= ratio
+                ratio *= change
                 if has_clipped and (clipped[k, line] if is_column else clipped[line, k]):
                     continue
-                u = (k - centre) / sigma
-                m = amplitude * math.exp(-0.5 * u * u)
                 value = image[k, line] if is_column else image[line, k]
                 background = middle + ramp * (k - start)
                 variance = noise[0] * m * m + noise[1] * max(m + background, 0.0) + noise[2]
                 w = 1.0 / variance
                 r = value - background - m
-                j0 = m * u / sigma
+                j0 = m * u * step
                 j2 = m * u * u
                 q = m * u * (u * u - 3.0)
                 h00 += w * j0 * j0

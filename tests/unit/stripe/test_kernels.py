@@ -129,7 +129,9 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     noise = np.array([0.0, 0.0, 4.0])
     result = np.zeros((1, 8))
     width = np.full(1, 2.5)
-    fit_profiles(image, np.zeros((1, 1), np.uint8), points, width, sides, noise, 2.7, result)
+    fit_profiles(
+        image, np.zeros((1, 1), np.uint8), points, width, sides, noise, np.full(1, 2.7), result
+    )
     x = np.arange(41)
     use = np.abs(x - 20.0) <= 2.7 * 2.5
     best, covariance = curve_fit(
@@ -149,7 +151,13 @@ def test_clipped_pixels_are_left_out() -> None:
     clipped = (image >= 255.0).astype(np.uint8)
     points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
     result = np.zeros((1, 8))
-    arguments = (points, np.full(1, 2.5), np.full((1, 2), 5.0), np.array([0.0, 0.1, 1.0]), 2.7)
+    arguments = (
+        points,
+        np.full(1, 2.5),
+        np.full((1, 2), 5.0),
+        np.array([0.0, 0.1, 1.0]),
+        np.full(1, 2.7),
+    )
     fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)
     assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx([20.3, 400.0, 2.5], rel=1e-3)
 

@@ -160,7 +160,9 @@ def to_profile(
     flags[near] |= int(StripeFlag.NEIGHBOUR)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0
-    course = straighten(Course(points, normals, sigma, chain, usable), fits)
+    # beyond a crossing a chain may follow the other line: nothing is averaged across it
+    stretch = np.concatenate([[0], np.cumsum((np.diff(chain) != 0) | (np.diff(near) != 0))])
+    course = straighten(Course(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning

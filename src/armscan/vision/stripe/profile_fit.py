@@ -20,9 +20,12 @@ NOISE_ROUNDS = 2
 SIDE_HALF = 8
 """Neighbours over which the background beside the line is averaged."""
 RESULT_COLUMNS = 8
-CLEAR_SIGMAS = 7.5
-"""Another line within this many sigmas lights up the background beside the line."""
+CLEAR_SIGMAS = 11.0
+"""Another line within this many sigmas may light up the background beside a slanted line."""
 LEAST_REACH_PX = 6.0
+FOOT_SIGMAS = 3.2
+LEAST_REACH_SIGMAS = 1.4
+"""The window shrinks beside another line, so that its foot stays outside."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +77,8 @@ def fit_ridge(
     table = ridge.table
     sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
     neighbour = _neighbours(plane, ridge, line_sigma_px, shortest_px)
+    room = neighbour.min(axis=1) / line_sigma_px - FOOT_SIGMAS
+    reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     noise = start_noise(background_noise)
@@ -87,12 +92,12 @@ def fit_ridge(
             sigma[pick],
             sides[pick],
             noise,
-            REACH_SIGMAS,
+            reach[pick],
             sample,
         )
         noise = estimate_noise(plane.image, table[pick], sides[pick], sample, noise)
     values = np.zeros((len(table), RESULT_COLUMNS))
-    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, REACH_SIGMAS, values)
+    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, reach, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
         ridge.select(good), values[good], sides[good], side_sigma[good], neighbour[good], noise

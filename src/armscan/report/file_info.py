@@ -143,6 +143,14 @@ def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:
     return {
         "what": f"{what}, {camera.width_px} x {camera.height_px} px",
         **values,
+        **_evidence(calibration),
+    }
+
+
+def _evidence(calibration: CameraCalibration) -> dict[str, Any]:
+    if not calibration.has_covariance:
+        return {"uncertainty": "none given"}
+    return {
         "rms_px": calibration.rms_px,
         "views": calibration.n_views,
         "points": calibration.n_points,

@@ -11,7 +11,7 @@ from armscan.models.calibration import Provenance
 from armscan.models.light_sheet import BOW_TERMS
 from armscan.records.exposure import Exposure
 from armscan.report import laser_figures as figures
-from armscan.report.drawing import photo_markup
+from armscan.report.drawing import Marks, photo_markup
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Section, Text
@@ -25,6 +25,7 @@ USE_COLOURS = {
     PointUse.UNNAMED: "#ff9df0",
     PointUse.OFF_SHEET: "#ff7a3c",
 }
+BOARD_COLOUR = "#35e0c0"
 
 
 def laser_page(
@@ -48,6 +49,7 @@ def laser_page(
         True if the photographs were rendered.
     """
     sections = [_sheets_section(fit), _images_section(fit, exposures), _residuals_section(fit)]
+    sections.append(_boards_section(fit, exposures))
     if fit.skipped:
         sections.append(_skipped_section(fit, exposures))
     sections += [_methods_section(fit), origin_section(provenance)]
@@ -175,6 +177,28 @@ def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section
     )
     legend = Legend(stripe_legend(fit.sheet_names, fates, flags))
     return Section("The stripes", (text, legend, Gallery(pictures, 420), table))
+
+
+def _boards_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section:
+    pictures = tuple(
+        Picture(
+            photo_markup(
+                exposures[image.view.source],
+                (
+                    Marks(image.view.points_px, BOARD_COLOUR, "ring", 12.0),
+                    Marks(image.view.points_px[:1], BOARD_COLOUR, "dot", 11.0),
+                ),
+                f"Target points in {image.view.source}",
+                longest_px=700,
+                is_grey=True,
+            ),
+            title=image.view.source,
+            caption=f"{len(image.view)} target points; the filled ring is the board's first point",
+        )
+        for image in fit.images
+        if image.view.source in exposures
+    )
+    return Section("The boards", (Gallery(pictures, 300),), is_folded=True)
 
 
 def _caption(image: SheetImage) -> str:

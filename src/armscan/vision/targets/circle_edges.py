@@ -75,10 +75,11 @@ def measure_circles(
     gradient = np.zeros((len(rims), 2))
     blur = np.ones(len(rims))
     angle = np.asarray((np.arange(n_sectors) + 0.5) * (2.0 * np.pi / n_sectors), np.float64)
+    before: EdgeProfiles | None = None
     for _ in range(_ROUNDS):
         width = np.minimum(width, _widest(rims))
         pixels = band_pixels(grey, rims, width, gradient)
-        profiles = fit_profiles(pixels, len(rims), n_sectors, blur)
+        before = profiles = fit_profiles(pixels, n_sectors, blur, before)
         points, sigma = _edge_points(rims, angle, profiles)
         ellipses, sigma = _robust_fit(points, sigma)
         gradient = gradient + _remaining_gradient(rims, points, profiles)

@@ -27,8 +27,8 @@ from armscan.vision.targets.view import CircleEdges, TargetView
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Search:
-    """What one channel showed: the grid, or the largest lattice that is another one."""
+class _Candidate:
+    """A lattice of blobs; ``grid`` is None if it is not the target's."""
 
     blobs: Blobs
     grid: NumberedGrid | None
@@ -47,40 +47,39 @@ def detect_circle_grid(
     """
     best_seen = (0, (0, 0))
     for grey in grey_channels(exposure):
-        search = _search(grey, exposure, target, options)
-        if search.grid is None:
-            best_seen = max(best_seen, (search.n_seen, search.size_seen))
-            continue
-        index = search.grid.blob_index
-        circles = measure_circles(
-            grey,
-            search.blobs.centres_px[index],
-            search.blobs.shapes_px2[index],
-            options.min_contrast * exposure.full_scale,
-        )
-        if circles.is_good.mean() < options.min_circles_fraction:
-            best_seen = max(best_seen, (int(circles.is_good.sum()), search.size_seen))
-            continue
-        return correct_centres(_view(exposure, target, search.grid, circles))
+        for candidate in _candidates(grey, exposure, target, options):
+            best_seen = max(best_seen, (candidate.n_seen, candidate.size_seen))
+            if candidate.grid is None:
+                continue
+            index = candidate.grid.blob_index
+            circles = measure_circles(
+                grey,
+                candidate.blobs.centres_px[index],
+                candidate.blobs.shapes_px2[index],
+                options.min_contrast * exposure.full_scale,
+            )
+            if circles.is_good.mean() >= options.min_circles_fraction:
+                return correct_centres(_view(exposure, target, candidate.grid, circles))
     return _failure(exposure, target, *best_seen)
 
 
-def _search(
+def _candidates(
     grey: RawGrey, exposure: Exposure, target: CircleGrid, options: TargetOptions
-) -> _Search:
-    """Number the grid among the dark or the light blobs, whichever shows more of it."""
+) -> list[_Candidate]:
+    """Lattices among the dark and among the light blobs, the target's own and the largest first.
+
+    The thresholds also outline the ground between circles: such a lattice fits as well, but its
+    rims show no edge, so that measuring it tells.
+    """
     blobs = find_blobs(to_grey8(grey, exposure.full_scale), options)
-    best = _Search(blobs, None, 0, (0, 0))
+    found = []
     for is_light in (False, True):
         alike = blobs.subset(blobs.is_light == is_light)
         for lattice in grow_lattices(alike):
             grid = number_grid(lattice, alike.centres_px, target, options.min_circles_fraction)
-            n_seen = len(lattice)
-            is_better = (grid is not None, n_seen) > (best.grid is not None, best.n_seen)
-            if is_better:
-                size = lattice_size(lattice, target.is_asymmetric)
-                best = _Search(alike, grid, n_seen, size)
-    return best
+            size = lattice_size(lattice, target.is_asymmetric)
+            found.append(_Candidate(alike, grid, len(lattice), size))
+    return sorted(found, key=lambda c: (c.grid is None, -c.n_seen))
 
 
 def _view(

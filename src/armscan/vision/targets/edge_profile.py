@@ -19,6 +19,8 @@ from armscan.vision.targets.ellipse_band import BandPixels
 
 APERTURE_SIGMA_PX = 0.29
 """Standard deviation of a pixel's own width, 1 / sqrt(12): no edge is sharper."""
+LEVEL_SCATTER = 0.03
+"""Scatter of the levels along a rim, as a fraction of the contrast."""
 _STEPS = 5
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -58,7 +60,10 @@ class EdgeProfiles:
 
 
 def fit_profiles(
-    pixels: BandPixels, n_circles: int, n_sectors: int, blur_px: FloatArray
+    pixels: BandPixels,
+    n_sectors: int,
+    blur_px: FloatArray,
+    before: EdgeProfiles | None = None,
 ) -> EdgeProfiles:
     """Fit all sectors of all circles by Gauss-Newton steps.
 
@@ -66,16 +71,23 @@ def fit_profiles(
     ----------
     pixels
         The bands' pixels.
-    n_circles, n_sectors
-        N and K.
+    n_sectors
+        K.
     blur_px
         (N,) blur to start from.
+    before
+        An earlier fit: the levels of a circle's sectors are then taken to scatter by
+        `LEVEL_SCATTER` of the contrast around their medians. A sector of a small circle has too
+        few pixels to tell its levels from its shift; in a large one this changes nothing.
     """
+    n_circles = len(blur_px)
     turn = np.mod(pixels.angle_rad / (2.0 * np.pi), 1.0)
     sector = pixels.ellipse * n_sectors + np.minimum(
         (turn * n_sectors).astype(np.int64), n_sectors - 1
     )
     fit = _SectorFit(pixels, sector, n_circles, n_sectors)
+    if before is not None:
+        fit.expect(before)
     parameters, blur = fit.start(blur_px)
     for _ in range(_STEPS):
         parameters, blur = fit.step(parameters, blur)
@@ -96,6 +108,19 @@ class _SectorFit:
         width = np.zeros(n_circles)
         np.maximum.at(width, pixels.ellipse, np.abs(pixels.distance_px))
         self._width = width
+        self._expected = np.zeros((self._n, 2))
+        self._expectation_weight = np.zeros(self._n)
+
+    def expect(self, before: EdgeProfiles) -> None:
+        """Expect the levels of an earlier fit, with the weight of that many pixels."""
+        n_sectors = self._shape[1]
+        levels = np.stack(
+            [np.median(before.inner, axis=1), np.median(before.outer, axis=1)], axis=-1
+        )
+        contrast = np.maximum(np.abs(levels[:, 1] - levels[:, 0]), 1e-6)
+        weight = (before.noise / (LEVEL_SCATTER * contrast)) ** 2
+        self._expected = np.repeat(levels, n_sectors, axis=0)
+        self._expectation_weight = np.repeat(weight, n_sectors)
 
     def start(self, blur_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Levels from the two halves of each sector, no shift."""
@@ -111,6 +136,7 @@ class _SectorFit:
         residual, columns, by_blur = self._linearise(parameters, blur)
         inverse = self._inverse(columns)
         rhs = np.stack([self._sum(c * residual) for c in columns], axis=-1)
+        rhs[:, :2] += self._expectation_weight[:, None] * (self._expected - parameters[:, :2])
         border = np.stack([self._sum(c * by_blur) for c in columns], axis=-1)
         eliminated = np.einsum("nij,nj->ni", inverse, border)
         stiffness = self._sum(by_blur * by_blur) - (border * eliminated).sum(axis=1)
@@ -163,6 +189,8 @@ class _SectorFit:
         normal = np.zeros((self._n, 3, 3))
         for i, j in _PAIRS:
             normal[:, i, j] = normal[:, j, i] = self._sum(columns[i] * columns[j])
+        normal[:, 0, 0] += self._expectation_weight
+        normal[:, 1, 1] += self._expectation_weight
         trace = np.trace(normal, axis1=1, axis2=2)
         return np.asarray(np.linalg.inv(normal + (1e-9 * trace + 1e-9)[:, None, None] * np.eye(3)))
 

@@ -6,12 +6,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import PurePath
 
+import numpy as np
+
 from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 
 ExposurePair = tuple[Exposure, Exposure | None]
 LISTED = 4
+REDUCED_PX = 120
+CLIPPED_SHARE = 0.99
+SAME_VIEW = 0.3
+MISORDERED = 0.6
+"""An exposure is taken to belong to another partner if its own explains less than this part of what
+that one does, and that one correlates by more than `SAME_VIEW`."""
 
 
 def pair_exposures(
@@ -29,7 +38,8 @@ def pair_exposures(
     Raises
     ------
     InputError
-        If there is no exposure, if the counts differ, or if a pair differs in size or window.
+        If there is no exposure, if the counts differ, if a pair differs in size or window, or if
+        an exposure plainly shows the view of another one's partner.
     """
     if not exposures:
         raise InputError("no images with the laser on", remedy="give at least one image")
@@ -50,6 +60,7 @@ def pair_exposures(
         partners = list(backgrounds)
     for exposure, partner in zip(exposures, partners, strict=True):
         _check_pair(exposure, partner)
+    _check_order(exposures, partners)
     return list(zip(exposures, partners, strict=True))
 
 
@@ -88,6 +99,39 @@ def _check_pair(exposure: Exposure, partner: Exposure) -> None:
             where=exposure.source,
             remedy="check the order of the images: each pair must show one view",
         )
+
+
+def _check_order(exposures: Sequence[Exposure], partners: Sequence[Exposure]) -> None:
+    """Raise `InputError` where an exposure shows another background's view and not its own."""
+    if len({(e.width_px, e.height_px, e.window) for e in partners}) > 1:
+        return
+    lit = np.stack([_structure(exposure) for exposure in exposures])
+    dark = np.stack([_structure(partner) for partner in partners])
+    likeness = lit @ dark.T
+    for k, exposure in enumerate(exposures):
+        best = int(np.argmax(likeness[k]))
+        own, other = float(likeness[k, k]), float(likeness[k, best])
+        if other > SAME_VIEW and own < MISORDERED * other:
+            raise InputError(
+                f"the image looks like {partners[best].source} (correlation {other:.2f}), not like "
+                f"its partner {partners[k].source} ({own:.2f})",
+                where=exposure.source,
+                remedy="check the order of the images with and without laser",
+            )
+
+
+def _structure(exposure: Exposure) -> FloatArray:
+    """Edges of a reduced image, bright lines clipped, as a vector of length 1."""
+    grey = exposure.image if exposure.colour == "mono" else exposure.image.mean(axis=2)
+    step = max(1, min(exposure.width_px, exposure.height_px) // REDUCED_PX)
+    rows, columns = (size // step * step for size in grey.shape)
+    blocks = grey[:rows, :columns].reshape(rows // step, step, columns // step, step)
+    small = np.sqrt(blocks.mean(axis=(1, 3)))
+    edges = np.concatenate([np.diff(small, axis=0).ravel(), np.diff(small, axis=1).ravel()])
+    limit = float(np.quantile(np.abs(edges), CLIPPED_SHARE))
+    edges = np.clip(edges, -limit, limit)
+    length = float(np.linalg.norm(edges))
+    return np.asarray(edges / length if length > 0.0 else edges)
 
 
 def _listed(exposures: Sequence[Exposure]) -> str:

@@ -59,3 +59,31 @@ def test_images_must_be_of_the_cameras_size_or_lie_on_its_sensor() -> None:
     ):
         with pytest.raises(InputError, match="camera was calibrated with 40 x 30"):
             check_sizes([wrong], CAMERA)
+
+
+def scene(seed: int, has_line: bool) -> np.ndarray:
+    """Squares at random places with noise; a bright line where the laser is on."""
+    rng = np.random.default_rng(seed)
+    picture = np.full((300, 400), 30.0)
+    for x, y in rng.integers(0, (380, 280), (30, 2)):
+        picture[y : y + 20, x : x + 20] = 50.0
+    picture += np.random.default_rng(seed + 100 * has_line).normal(0.0, 2.0, picture.shape)
+    if has_line:
+        picture[:, 200:204] += 150.0
+    return np.clip(picture, 0, 255).astype(np.uint8)
+
+
+def test_pairs_in_the_wrong_order_are_refused_by_what_they_show() -> None:
+    on = [Exposure(scene(k, True), f"on-{k}.png") for k in range(3)]
+    off = [Exposure(scene(k, False), f"off-{k}.png") for k in range(3)]
+    assert [b for _, b in pair_exposures(on, off)] == off
+    with pytest.raises(InputError, match=r"on-0\.png.*looks like off-0\.png.*off-1\.png"):
+        pair_exposures(on, [off[1], off[0], off[2]])
+
+
+def test_views_without_structure_are_taken_by_order() -> None:
+    rng = np.random.default_rng(1)
+    noise = [rng.normal(30.0, 2.0, (300, 400)).astype(np.uint8) for _ in range(4)]
+    on = [Exposure(noise[0], "1.png"), Exposure(noise[1], "2.png")]
+    off = [Exposure(noise[2], "3.png"), Exposure(noise[3], "4.png")]
+    assert [b for _, b in pair_exposures(on, off)] == off

@@ -13,6 +13,8 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Line, fit_line
 
 TRIALS = 600
+MAX_SCORED = 1500
+"""Points that vote on a trial line; more are thinned out evenly."""
 MIN_SPAN = 0.15
 """A stripe is at least this long, as a fraction of the board's shorter side."""
 COURSE_DEGREE = 3
@@ -89,9 +91,11 @@ def _best_line(
     n = len(points)
     first = generator.integers(n, size=TRIALS)
     second = generator.integers(n, size=TRIALS)
-    for k in range(0, TRIALS, 2):
-        same = np.flatnonzero(segment == segment[first[k]])
-        second[k] = same[generator.integers(len(same))]
+    _, own, counts = np.unique(segment, return_inverse=True, return_counts=True)
+    by_segment = np.argsort(own, kind="stable")
+    starts = np.cumsum(counts) - counts
+    half = own[first[::2]]
+    second[::2] = by_segment[starts[half] + generator.integers(counts[half])]
     step = points[second] - points[first]
     length = np.linalg.norm(step, axis=1)
     usable = length > 2.0 * options.line_tolerance_mm
@@ -99,7 +103,8 @@ def _best_line(
         return None
     first, step, length = first[usable], step[usable], length[usable]
     direction = step / length[:, None]
-    offset = points[None, :, :] - points[first][:, None, :]
+    scored = points[:: max(1, n // MAX_SCORED)]
+    offset = scored[None, :, :] - points[first][:, None, :]
     distance = np.abs(
         direction[:, None, 0] * offset[:, :, 1] - direction[:, None, 1] * offset[:, :, 0]
     )

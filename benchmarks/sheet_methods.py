@@ -62,6 +62,9 @@ def scenes() -> dict[str, SheetRig]:
         "camera exact, one board at 62 deg, corners 0.2 px": replace(
             sharp, poses=oblique, sigma_corner_px=0.2
         ),
+        "camera exact, stripe noise 0.3 px, correlated over 9 of 240 points": replace(
+            sharp, sigma_stripe_px=0.3, points_per_stripe=240, correlated_points=9
+        ),
         "two boards": replace(plain, poses=(plain.poses[1], plain.poses[4])),
         "bowed by 0.10 mm": thesis_rig(bow_uu_mm=0.10, bow_uv_mm=-0.03),
     }

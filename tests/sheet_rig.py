@@ -61,6 +61,7 @@ class SheetRig:
     rows: int = 7
     pitch_mm: float = 4.0
     points_per_stripe: int = 120
+    correlated_points: int = 1
 
     def calibration(self, camera: CameraModel) -> CameraCalibration:
         """A camera calibration that claims the rig's covariance."""
@@ -100,8 +101,10 @@ class SheetRig:
         tangent = np.gradient(q, axis=0)
         normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
         normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True))[step]
-        noise = rng.normal(0.0, self.sigma_stripe_px, (len(step), 1))
-        return q[step] + noise * normal, normal
+        k = self.correlated_points
+        white = rng.normal(0.0, self.sigma_stripe_px, len(step) + k - 1)
+        noise = np.convolve(white, np.full(k, 1.0 / np.sqrt(k)), "valid")
+        return q[step] + noise[:, None] * normal, normal
 
     def boards(
         self,

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The stripes' own scatter: level and correlation, whatever the smooth misfit."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from armscan.calibration.laser.lack_of_fit import stripe_noise
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.geometry.arrays import FloatArray
+
+N_STRIPES, N_POINTS = 8, 300
+SIGMA_PX = 0.05
+
+
+def straight_observations() -> SheetObservations:
+    n = N_STRIPES * N_POINTS
+    stripe: NDArray[np.int64] = np.repeat(np.arange(N_STRIPES), N_POINTS)
+    points = np.zeros((n, 3))
+    points[:, 0] = np.tile(np.linspace(-20.0, 20.0, N_POINTS), N_STRIPES)
+    points[:, 2] = 130.0 + stripe
+    return SheetObservations(
+        stripe,
+        np.tile(np.arange(N_POINTS), N_STRIPES),
+        np.zeros(n, dtype=np.int64),
+        stripe,
+        points,
+        np.tile([0.0, 0.03, 0.0], (n, 1)),
+        np.full(n, SIGMA_PX),
+        np.zeros((n, 3, 6)),
+        np.zeros((n, 3, 9)),
+    )
+
+
+def moving_average(length: int, sigma: float, seed: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    rows = [
+        np.convolve(rng.normal(0.0, sigma, N_POINTS + length - 1), np.ones(length), "valid")
+        for _ in range(N_STRIPES)
+    ]
+    return np.concatenate(rows) / np.sqrt(length)
+
+
+@pytest.mark.parametrize("true_factor", [0.5, 1.0, 3.0])
+def test_level_of_white_noise(true_factor: float) -> None:
+    """2400 points: the level is known to 1 / sqrt(2 * 2400) = 1.4 %; four sigma allowed."""
+    noise = stripe_noise(straight_observations(), moving_average(1, true_factor * SIGMA_PX, 1))
+    assert abs(noise.factor / true_factor - 1.0) < 4.0 / np.sqrt(2 * 2368)
+    assert noise.correlation_points < 1.15
+    assert noise.degrees_of_freedom == N_STRIPES * (N_POINTS - 4)
+
+
+@pytest.mark.parametrize("length", [3, 9])
+def test_a_moving_average_counts_as_its_length(length: int) -> None:
+    """For a moving average 1 + 2 sum of the correlations is its length, by hand."""
+    noise = stripe_noise(straight_observations(), moving_average(length, SIGMA_PX, 2))
+    assert 0.8 * length < noise.correlation_points < 1.15 * length
+    np.testing.assert_allclose(
+        noise.sigma_factor, noise.factor * np.sqrt(noise.correlation_points), rtol=1e-12
+    )
+
+
+def test_a_cubic_misfit_is_no_noise() -> None:
+    """Each stripe bent by its own cubic of 100 sigma: the noise stays what it is."""
+    observations = straight_observations()
+    white = moving_average(1, SIGMA_PX, 3)
+    t = observations.points_mm[:, 0] / 20.0
+    bend = (1.0 + observations.stripe) * (t**3 - 2.0 * t**2 + 0.5)
+    plain, bent = (stripe_noise(observations, white + extra) for extra in (0.0, bend))
+    np.testing.assert_allclose(bent.factor, plain.factor, rtol=1e-9)

@@ -71,6 +71,10 @@ def test_help_is_quick() -> None:
         (["nonsense"], "No such command 'nonsense'"),
         (["info"], "Missing argument"),
         (["info", "--nonsense", "x"], "No such option"),
+        (
+            ["calibrate", "laser", "--camera=c", "--target=t", "--on", "a.png", "b.png"],
+            "Put quotes around patterns",
+        ),
         (["info", "absent.png"], "absent.png: there is no such file"),
     ],
 )

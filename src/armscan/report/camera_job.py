@@ -81,7 +81,7 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
     provenance = new_provenance(
         paths,
         command=request.command,
-        options=(run.fit.options, request.image_options),
+        options=(target, run.fit.options, request.image_options),
         warnings=run.fit.warnings,
     )
     page = camera_page(

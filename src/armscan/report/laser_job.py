@@ -96,7 +96,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     provenance = new_provenance(
         (*on, *off, request.camera),
         command=request.command,
-        options=(options.target, options.stripes, fit.options, request.image_options),
+        options=(target, options.target, options.stripes, fit.options, request.image_options),
         parent_ids=(camera.provenance.document_id,),
         warnings=all_warnings(fit),
     )

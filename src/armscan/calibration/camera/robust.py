@@ -34,6 +34,7 @@ CAUCHY_SCALE = 2.4
 ROBUST_ROUNDS = 8
 FIRST_STEPS = 15
 STEPS_PER_ROUND = 4
+WEIGHTS_STABLE = 0.02
 NO_SAY = 1e-6
 """Weight of points that must not pull: not zero, so that every pose stays determined."""
 
@@ -152,7 +153,10 @@ def _reweighted(
         state = result[0]
         chi2 = chi2_of_points(observations, state)
         typical = _typical(_view_levels(observations, chi2))
+        before = weights
         weights = np.maximum(1.0 / (1.0 + chi2 / (CAUCHY_SCALE**2 * typical)), NO_SAY)
+        if float(np.abs(weights - before).max()) < WEIGHTS_STABLE:
+            break
     return state
 
 

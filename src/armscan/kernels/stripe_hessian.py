@@ -78,34 +78,37 @@ def derivatives_at(
     radius = m // 2
     left = x - radius
     is_inside = left >= 0 and left + m <= width
-    for i in range(m):
-        columns[0, i] = np.float32(0.0)
-        columns[1, i] = np.float32(0.0)
-        columns[2, i] = np.float32(0.0)
+    # views, because an index that might be negative keeps the loops from being vectorised
+    down0, down1, down2 = columns[0], columns[1], columns[2]
+    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
+    down0[:] = np.float32(0.0)
+    down1[:] = np.float32(0.0)
+    down2[:] = np.float32(0.0)
     for j in range(m):
         row = min(max(y + j - radius, 0), height - 1)
-        smooth = taps[0, j]
-        slope = taps[1, j]
-        bend = taps[2, j]
+        smooth = taps0[j]
+        slope = taps1[j]
+        bend = taps2[j]
         if is_inside:
+            pixels = image[row, left : left + m]
             for i in range(m):
-                value = image[row, left + i]
-                columns[0, i] += smooth * value
-                columns[1, i] += slope * value
-                columns[2, i] += bend * value
+                value = pixels[i]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
         else:
             for i in range(m):
                 value = image[row, min(max(left + i, 0), width - 1)]
-                columns[0, i] += smooth * value
-                columns[1, i] += slope * value
-                columns[2, i] += bend * value
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
     gx = gy = gxx = gxy = gyy = np.float32(0.0)
     for i in range(m):
-        gx += taps[1, i] * columns[0, i]
-        gxx += taps[2, i] * columns[0, i]
-        gxy += taps[1, i] * columns[1, i]
-        gy += taps[0, i] * columns[1, i]
-        gyy += taps[0, i] * columns[2, i]
+        gx += taps1[i] * down0[i]
+        gxx += taps2[i] * down0[i]
+        gxy += taps1[i] * down1[i]
+        gy += taps0[i] * down1[i]
+        gyy += taps0[i] * down2[i]
     result[0] = gx
     result[1] = gy
     result[2] = gxx

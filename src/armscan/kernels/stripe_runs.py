@@ -21,32 +21,14 @@ VALLEY_RATIO = 0.5
 
 
 @njit(types.void(IMAGE_IN, types.int64, types.int64, ROW_OUT), cache=True, nogil=True)
-def interpolate_row(grid: Float32Array, cell_px: int, y: int, row: Float32Array) -> None:
-    """Write row ``y`` of the bilinear surface through the centres of square cells.
-
-    Parameters
-    ----------
-    grid
-        (rows, columns) value per cell of ``cell_px`` pixels.
-    cell_px
-        Side of a cell.
-    y
-        Image row.
-    row
-        (W,) output.
-    """
-    rows, columns = grid.shape
-    v = min(max((y + 0.5) / cell_px - 0.5, 0.0), rows - 1.0)
-    i = min(int(v), max(rows - 2, 0))
-    j = min(i + 1, rows - 1)
-    fraction = v - i
+def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Array) -> None:
+    """Write row ``i`` of the grid, interpolated linearly between cell centres, to ``row`` (W,)."""
+    columns = grid.shape[1]
     for x in range(row.shape[0]):
         u = min(max((x + 0.5) / cell_px - 0.5, 0.0), columns - 1.0)
         k = min(int(u), max(columns - 2, 0))
         m = min(k + 1, columns - 1)
-        a = grid[i, k] + fraction * (grid[j, k] - grid[i, k])
-        b = grid[i, m] + fraction * (grid[j, m] - grid[i, m])
-        row[x] = a + (u - k) * (b - a)
+        row[x] = grid[i, k] + (u - k) * (grid[i, m] - grid[i, k])
 
 
 @njit(types.float64(IMAGE_IN, types.int64, types.int64, types.int64), cache=True, nogil=True)
@@ -192,15 +174,28 @@ def find_runs(
         Count of candidates; more than the capacity if the output was too short.
     """
     height, width = image.shape
-    level = np.zeros(width, np.float32)
+    floor = np.zeros(width, np.float32)
+    upper = np.zeros(width, np.float32)
+    lower = np.zeros(width, np.float32)
+    above = -1
     start = np.full(width, -1, np.int64)
     count = 0
+    lift = np.float32(rise)
     for y in range(height + 1):
         row_start = -1
         if y < height:
-            interpolate_row(background, cell_px, y, level)
+            v = min(max((y + 0.5) / cell_px - 0.5, 0.0), background.shape[0] - 1.0)
+            cell = int(v)
+            if cell != above:
+                interpolate_columns(background, cell_px, cell, upper)
+                following = min(cell + 1, background.shape[0] - 1)
+                interpolate_columns(background, cell_px, following, lower)
+                above = cell
+            fraction = np.float32(v - cell)
+            for x in range(width):
+                floor[x] = upper[x] + fraction * (lower[x] - upper[x]) + lift
         for x in range(width):
-            if y < height and image[y, x] > level[x] + rise:
+            if y < height and image[y, x] > floor[x]:
                 if start[x] < 0:
                     start[x] = y
                 if row_start < 0:
@@ -211,7 +206,7 @@ def find_runs(
             else:
                 if start[x] >= 0:
                     if y - start[x] <= longest_px:
-                        base = float(level[x])
+                        base = float(floor[x]) - rise
                         count = split_run(
                             image, COLUMN, x, start[x], y - 1, base, rise, runs, count
                         )
@@ -219,7 +214,7 @@ def find_runs(
                 stop = x - 1
             if row_start >= 0:
                 if stop - row_start < longest_px:
-                    base = float(level[x])
+                    base = float(floor[x]) - rise
                     count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
                 row_start = -1
     return count

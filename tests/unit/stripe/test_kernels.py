@@ -17,7 +17,7 @@ from armscan.kernels.stripe_fit import (
 from armscan.kernels.stripe_hessian import derivatives_at, gaussian_taps, refine_candidates
 from armscan.kernels.stripe_links import walk_chains
 from armscan.kernels.stripe_neighbours import find_other_lines
-from armscan.kernels.stripe_runs import find_runs, interpolate_row
+from armscan.kernels.stripe_runs import find_runs, interpolate_columns
 from armscan.kernels.stripe_smooth import SHIFT, smooth_chains
 from armscan.kernels.stripe_smooth import SIGMA as SMOOTH_SIGMA
 
@@ -111,12 +111,24 @@ def test_capacity_is_reported() -> None:
     assert needed == 20 * 20 + 20
 
 
-def test_background_is_bilinear_between_cells() -> None:
+def test_background_is_linear_between_cells() -> None:
     grid = np.array([[0.0, 64.0], [128.0, 192.0]], np.float32)
     row = np.zeros(128, np.float32)
-    interpolate_row(grid, 64, 64, row)
-    expected = 64.5 + np.interp(np.arange(128), [31.5, 95.5], [0.0, 64.0]) + 0.5
+    interpolate_columns(grid, 64, 1, row)
+    expected = 128.0 + np.interp(np.arange(128), [31.5, 95.5], [0.0, 64.0])
     assert row == pytest.approx(expected, abs=0.01)
+
+
+def test_runs_follow_a_sloping_background() -> None:
+    y, x = np.mgrid[:128, :128]
+    ground = 0.5 * np.clip(x, 31.5, 95.5) + 0.3 * np.clip(y, 31.5, 95.5)
+    centres = np.array([31.5, 95.5])
+    grid = (0.5 * centres[None, :] + 0.3 * centres[:, None]).astype(np.float32)
+    image = ground.astype(np.float32)
+    runs = np.zeros((100, 3))
+    assert find_runs(image, grid, 64, 0.1, 90, runs) == 0
+    image[100, 40] += 5.0
+    assert find_runs(image, grid, 64, 0.1, 90, runs) == 2
 
 
 @pytest.mark.parametrize("centre", [20.0, 20.37, 20.5])

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
-from armscan.kernels.stripe_runs import interpolate_row
 from armscan.vision.stripe.level import CELL_PX, ImageLevel
 
 LONGEST_RUN_PX = 90
@@ -72,10 +72,13 @@ class Runs:
 
 def above_background(image: NDArray[np.float32], level: ImageLevel) -> NDArray[np.float32]:
     """Image (H, W) less its interpolated background."""
-    surface = np.zeros_like(image)
-    for y in range(len(image)):
-        interpolate_row(level.background, CELL_PX, y, surface[y])
-    return np.asarray(image - surface)
+    rows, columns = (
+        np.clip((np.arange(n) + 0.5) / CELL_PX - 0.5, 0.0, cells - 1.0)
+        for n, cells in zip(image.shape, level.background.shape, strict=True)
+    )
+    grid = np.stack(np.meshgrid(rows, columns, indexing="ij"))
+    surface = map_coordinates(level.background, grid, order=1, mode="nearest")
+    return np.asarray(image - surface, dtype=np.float32)
 
 
 def find_thesis_runs(image: NDArray[np.float32], level: ImageLevel) -> Runs:

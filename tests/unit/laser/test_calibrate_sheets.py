@@ -157,6 +157,22 @@ def test_three_boards_cannot_tell_a_bow_and_say_so() -> None:
     assert sheet.offset_sigma_mm > flat.offset_sigma_mm
 
 
+def test_one_wrong_board_is_named() -> None:
+    """A board taken to be 1 mm too far: the other five agree without it."""
+    rig = thesis_rig()
+    boards = rig.boards(rig.camera, np.random.default_rng(7))
+    pose = boards[3].sensor_from_board
+    moved = Pose(pose.value.rotation, pose.value.translation_mm + np.array([0.0, 0.0, 1.0]))
+    boards[3] = replace(boards[3], sensor_from_board=replace(pose, value=moved))
+    fit = calibrate_sheets(boards, rig.calibration(rig.camera))
+    assert isinstance(fit, LaserFit)
+    named = [warning for warning in fit.sheets[0].warnings if "all boards but" in warning]
+    assert len(named) == 1
+    assert "laser-3.png" in named[0]
+    bowed = fitted(thesis_rig(bow_uu_mm=0.15))
+    assert not any("all boards but" in warning for warning in bowed.sheets[0].warnings)
+
+
 def test_points_are_rejected_for_the_reason_that_holds() -> None:
     rig = thesis_rig()
     rng = np.random.default_rng(5)

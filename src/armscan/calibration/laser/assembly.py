@@ -10,6 +10,7 @@ import numpy as np
 
 from armscan.calibration.laser.conditioning import geometry_warnings, refuse_loose_tilt
 from armscan.calibration.laser.coplanarity import CommonPlane, PosedSighting, fit_common_plane
+from armscan.calibration.laser.misfit import find_misfit_image
 from armscan.calibration.laser.naming import NamedStripes
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.options import SheetOptions
@@ -119,6 +120,10 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
     common = _common_plane(k, case)
     stripes = _stripes_of(used.select(own))
     warnings = geometry_warnings(geometry, common, tilt_sigma_deg)
+    if model.plane_test.p_value < case.options.lack_of_fit_p:
+        misfit = find_misfit_image(used.select(own), sheet, case.errors, case.options)
+        if misfit is not None:
+            warnings = (*warnings, _misfit_warning(images[misfit].data.profile.source))
     return SheetFit(
         SheetCalibration(
             named.names[k],
@@ -141,6 +146,13 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
         geometry.board_angle_deg,
         compare_planes(sheet, points, images, stripes, case.camera.camera),
         warnings,
+    )
+
+
+def _misfit_warning(source: str) -> str:
+    return (
+        f"a plane explains all boards but the one in {source}: check that its images belong "
+        "together and that the board was found rightly, or leave it out"
     )
 
 

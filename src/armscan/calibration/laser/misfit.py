@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which single image keeps a sheet from being a plane."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armscan.calibration.laser.lack_of_fit import lack_of_fit, stripe_noise
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.solve import CommonErrors, solve_sheets
+from armscan.models.light_sheet import LightSheet
+
+MIN_BOARDS = 4
+"""With fewer, two boards are left of which each explains the other."""
+
+
+def find_misfit_image(
+    observations: SheetObservations,
+    sheet: LightSheet,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> int | None:
+    """Number of the image without which a plane explains all others, or None.
+
+    Parameters
+    ----------
+    observations
+        Points of one sheet that a plane does not explain.
+    sheet
+        Where the fits start.
+    errors
+        Covariance of boards and camera.
+    options
+        For the limit of the lack-of-fit test.
+    """
+    alone = observations.as_one_sheet()
+    images = np.unique(alone.image)
+    if len(images) < MIN_BOARDS:
+        return None
+    p_values = []
+    for image in images:
+        rest = alone.select(alone.image != image)
+        noise = stripe_noise(rest, rest.residuals_px([sheet])[1])
+        solution = solve_sheets(rest, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
+        p_values.append(lack_of_fit(rest, solution, noise).p_value)
+    best = int(np.argmax(p_values))
+    return int(images[best]) if p_values[best] >= options.lack_of_fit_p else None

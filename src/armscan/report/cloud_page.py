@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TypeVar
 
 import numpy as np
 
@@ -15,13 +14,10 @@ from armscan.report import cloud_figures as figures
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Gallery, Legend, Page, Section, Text
-from armscan.report.stripe_figures import stripe_legend, stripe_picture
+from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
 from armscan.report.summary import Table
 
 FATE_COLOURS = {PointFate.NO_RAY: "#8a6d5a", PointFate.OUT_OF_DEPTH: "#ff7a3c"}
-T = TypeVar("T")
-
-MAX_PICTURES = 24
 MAX_PROFILES = 6
 
 
@@ -50,7 +46,7 @@ def cloud_page(
     )
     with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
     profiles = tuple(
-        figures.profile_view(cloud, sensor, k) for k in _spread(with_points, MAX_PROFILES)
+        figures.profile_view(cloud, sensor, k) for k in evenly_chosen(with_points, MAX_PROFILES)
     )
     return Page(
         title="Measured points",
@@ -88,7 +84,7 @@ def _images_section(result: Reconstruction, exposures: Mapping[str, Exposure]) -
             flags |= int(value)
     seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in result.images)}
     fates = {int(fate): (FATE_COLOURS[fate], fate.label) for fate in PointFate if fate in seen}
-    shown = _spread([image for image in result.images if image.profile.source in exposures])
+    shown = evenly_chosen([image for image in result.images if image.profile.source in exposures])
     pictures = tuple(
         stripe_picture(
             exposures[image.profile.source],
@@ -105,10 +101,3 @@ def _images_section(result: Reconstruction, exposures: Mapping[str, Exposure]) -
         text += f" {len(shown)} of {len(result.images)} images are shown, evenly chosen."
     legend = Legend(stripe_legend(result.cloud.sheet_names, fates, flags))
     return Section("The stripes", (Text(text), legend, Gallery(pictures, 420), fate_table(result)))
-
-
-def _spread(items: list[T], most: int = MAX_PICTURES) -> list[T]:
-    """At most ``most`` of the items, evenly chosen."""
-    if len(items) <= most:
-        return items
-    return [items[k] for k in np.linspace(0, len(items) - 1, most).astype(int)]

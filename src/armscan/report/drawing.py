@@ -14,6 +14,7 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
@@ -114,7 +115,8 @@ def photo_markup(
     """
     height, width = exposure.image.shape[:2]
     unit = max(width, height) / 1000.0
-    photo = _uri("image/jpeg", _jpeg(display_levels(exposure, is_grey), longest_px))
+    levels = display_levels(exposure, longest_px=longest_px, is_grey=is_grey)
+    photo = _uri("image/jpeg", _jpeg(levels))
     parts = [
         f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{escape(alt)}">',
         f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{photo}"/>',
@@ -124,10 +126,25 @@ def photo_markup(
 
 
 def display_levels(
-    exposure: Exposure, is_grey: bool = False
+    exposure: Exposure, *, longest_px: int | None = None, is_grey: bool = False
 ) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """8-bit picture for the eye: dark photographs are stretched, never the other way."""
-    levels = exposure.image.astype(np.float64) / exposure.full_scale
+    """8-bit picture for the eye: dark photographs are stretched, never the other way.
+
+    Parameters
+    ----------
+    exposure
+        The photograph.
+    longest_px
+        Reduce it so that its longer side has this many pixels; None keeps its size.
+    is_grey
+        Take the colours out.
+    """
+    image: NDArray[Any] = exposure.image
+    scale = 1.0 if longest_px is None else min(1.0, longest_px / max(image.shape[:2]))
+    if scale < 1.0:
+        size = (round(image.shape[1] * scale), round(image.shape[0] * scale))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    levels = image.astype(np.float64) / exposure.full_scale
     if is_grey and levels.ndim == 3:
         levels = levels.mean(axis=2)
     bright = float(np.percentile(levels, 99.5))
@@ -159,11 +176,7 @@ def _mark_path(layer: Marks, exposure: Exposure, unit: float) -> str:
     )
 
 
-def _jpeg(picture: np.ndarray[Any, np.dtype[np.uint8]], longest_px: int) -> bytes:
-    scale = min(1.0, longest_px / max(picture.shape[:2]))
-    if scale < 1.0:
-        size = (round(picture.shape[1] * scale), round(picture.shape[0] * scale))
-        picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+def _jpeg(picture: np.ndarray[Any, np.dtype[np.uint8]]) -> bytes:
     ordered = picture if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, ::-1])
     _, data = cv2.imencode(".jpg", ordered, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return bytes(data)

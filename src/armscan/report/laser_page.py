@@ -15,7 +15,7 @@ from armscan.report.drawing import Marks, photo_markup
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Section, Text
-from armscan.report.stripe_figures import stripe_legend, stripe_picture
+from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
 from armscan.report.summary import Table
 
 USE_COLOURS = {
@@ -146,6 +146,7 @@ def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section
             flags |= int(value)
     seen = {use for use in USE_COLOURS if any(image.count(use) for image in fit.images)}
     fates = {int(use): (USE_COLOURS[use], use.label) for use in PointUse if use in seen}
+    shown = evenly_chosen([image for image in fit.images if image.source in exposures])
     pictures = tuple(
         stripe_picture(
             exposures[image.source],
@@ -156,8 +157,7 @@ def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section
             outline_px=image.view.points_px,
             caption=_caption(image),
         )
-        for image in fit.images
-        if image.source in exposures
+        for image in shown
     )
     uses = [use for use in PointUse if any(image.count(use) for image in fit.images)]
     table = Table(
@@ -173,7 +173,8 @@ def _images_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section
     )
     text = Text(
         "Every stripe point, used or not. The white outline is the region of the board's points. "
-        "Dark photographs are brightened here. Click a picture to enlarge it."
+        "Dark photographs are brightened here. Click a picture to enlarge it. "
+        f"{len(shown)} of {len(fit.images)} images are shown."
     )
     legend = Legend(stripe_legend(fit.sheet_names, fates, flags))
     return Section("The stripes", (text, legend, Gallery(pictures, 420), table))
@@ -195,8 +196,7 @@ def _boards_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section
             title=image.view.source,
             caption=f"{len(image.view)} target points; the filled ring is the board's first point",
         )
-        for image in fit.images
-        if image.view.source in exposures
+        for image in evenly_chosen([i for i in fit.images if i.view.source in exposures])
     )
     return Section("The boards", (Gallery(pictures, 300),), is_folded=True)
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -14,6 +15,9 @@ from armscan.records.profile import Profile, StripeFlag
 from armscan.report.drawing import Marks, photo_markup
 from armscan.report.page import Picture
 
+T = TypeVar("T")
+
+MAX_PICTURES = 24
 SHEET_COLOURS = ("#2fe6c3", "#5aa9ff", "#c58bff", "#a6e22e", "#ffc2f2", "#8fd3ff")
 """Bright colours of the sheets on photographs, in order, then repeated."""
 FLAG_COLOURS = {
@@ -75,6 +79,13 @@ def stripe_picture(
         exposure, marks, f"Stripe points of {profile.source}", longest_px=1200, is_grey=True
     )
     return Picture(markup, caption, profile.source)
+
+
+def evenly_chosen(items: Sequence[T], most: int = MAX_PICTURES) -> list[T]:
+    """At most ``most`` of the items, evenly chosen."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, most).astype(int)]
 
 
 def stripe_legend(

@@ -12,7 +12,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Line, fit_line
 
-TRIALS = 600
+TRIALS = 300
 MAX_SCORED = 1500
 """Points that vote on a trial line; more are thinned out evenly."""
 MIN_SPAN = 0.15

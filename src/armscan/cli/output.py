@@ -31,7 +31,12 @@ def progress_bar() -> Iterator[Progress]:
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bars
 
+    from armscan.pipeline.progress import silent
+
     console = Console(stderr=True)
+    if not console.is_terminal:
+        yield silent
+        return
     bars = Bars(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -40,7 +45,6 @@ def progress_bar() -> Iterator[Progress]:
         TextColumn("{task.fields[item]}"),
         console=console,
         transient=True,
-        disable=not console.is_terminal,
     )
     tasks: dict[str, int] = {}
 

@@ -54,7 +54,7 @@ class Plane:
     @property
     def normal(self) -> FloatArray:
         """(3,) unit normal."""
-        return self.axes[2]
+        return np.asarray(self.axes[2])
 
     @property
     def coefficients(self) -> FloatArray:

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
     FLOATS_IN,
+    FLOATS_OUT,
     IMAGE_IN,
     MASK_IN,
     TABLE_IN,
@@ -74,6 +76,100 @@ def read_sides(
             sides[i, 2 * side + 1] = n
 
 
+@njit(types.float64(TABLE_IN, types.int64, types.float64, types.float64), cache=True, nogil=True)
+def start_amplitude(profile: Float64Array, n: int, offset: float, sigma: float) -> float:
+    """Unweighted height of a Gaussian ``offset`` pixels from the profile's first pixel."""
+    top = norm = 0.0
+    for k in range(n):
+        u = (k - offset) / sigma
+        g = math.exp(-0.5 * u * u) * profile[2, k]
+        top += g * profile[0, k]
+        norm += g * g
+    return top / norm if norm > 0.0 else 0.0
+
+
+@njit(
+    types.void(TABLE_IN, types.int64, FLOATS_IN, FLOATS_IN, FLOATS_OUT),
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def accumulate(
+    profile: Float64Array,
+    n: int,
+    state: Float64Array,
+    noise: Float64Array,
+    sums: Float64Array,
+) -> None:
+    """Weighted sums of one Gauss-Newton step.
+
+    Parameters
+    ----------
+    profile
+        (3, >= n) grey level less background, background, and 1 where the pixel counts.
+    n
+        Pixels of the profile.
+    state
+        (3,) centre from the first pixel, amplitude, sigma.
+    noise
+        (3,) ``C^2``, ``1 / gain``, ``read^2``.
+    sums
+        (13,) output: normal matrix of (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its
+        right-hand side, then the residual against the skew term, the skew term's norm, its product
+        with the centre's derivative, and the same product for a term ``u^3``.
+    """
+    sums[:] = 0.0
+    # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
+    step = 1.0 / state[2]
+    u = (-1.0 - state[0]) * step
+    m = state[1] * math.exp(-0.5 * u * u)
+    ratio = math.exp(-(u + 0.5 * step) * step)
+    change = math.exp(-step * step)
+    for k in range(n):
+        u += step
+        m *= ratio
+        ratio *= change
+        variance = noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2]
+        w = profile[2, k] / variance
+        r = profile[0, k] - m
+        j0 = m * u * step
+        j2 = m * u * u
+        q = m * u * (u * u - 3.0)
+        sums[0] += w * j0 * j0
+        sums[1] += w * j0 * m
+        sums[2] += w * j0 * j2
+        sums[3] += w * m * m
+        sums[4] += w * m * j2
+        sums[5] += w * j2 * j2
+        sums[6] += w * r * j0
+        sums[7] += w * r * m
+        sums[8] += w * r * j2
+        sums[9] += w * r * q
+        sums[10] += w * q * q
+        sums[11] += w * q * j0
+        sums[12] += w * j0 * m * u * u * u
+
+
+@njit(types.float64(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
+def solve_step(sums: Float64Array, steps: Float64Array) -> float:
+    """Solve the normal equations into ``steps`` (3,); return the centre's variance, or 0."""
+    h00, h01, h02, h11, h12, h22 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    b0, b1, b2 = sums[6], sums[7], sums[8]
+    c00 = h11 * h22 - h12 * h12
+    c01 = h02 * h12 - h01 * h22
+    c02 = h01 * h12 - h02 * h11
+    determinant = h00 * c00 + h01 * c01 + h02 * c02
+    if not determinant > 0.0:
+        return 0.0
+    c11 = h00 * h22 - h02 * h02
+    c12 = h01 * h02 - h00 * h12
+    c22 = h00 * h11 - h01 * h01
+    steps[0] = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
+    steps[1] = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
+    steps[2] = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
+    return float(c00 / determinant)
+
+
 @njit(
     types.void(IMAGE_IN, MASK_IN, TABLE_IN, FLOATS_IN, TABLE_IN, FLOATS_IN, FLOATS_IN, TABLE_OUT),
     cache=True,
@@ -116,6 +212,10 @@ def fit_profiles(
         exponent moves the centre, in sigmas (for the correction on bent lines).
     """
     height, width = image.shape
+    profile = np.zeros((3, max(height, width)))
+    state = np.zeros(3)
+    steps = np.zeros(3)
+    sums = np.zeros(13)
     has_clipped = clipped.shape[0] == height and clipped.shape[1] == width
     for i in range(points.shape[0]):
         is_column = int(points[i, 5]) == COLUMN
@@ -134,87 +234,42 @@ def fit_profiles(
             last = min(last + grow, size - 1)
         middle = 0.5 * (sides[i, 0] + sides[i, 1])
         ramp = (sides[i, 1] - sides[i, 0]) / (SIDE_SPAN * sigma_px[i])
-        centre = start
-        sigma = sigma_px[i]
-        top = 0.0
-        norm = 0.0
-        for k in range(first, last + 1):
-            if has_clipped and (clipped[k, line] if is_column else clipped[line, k]):
-                continue
-            u = (k - centre) / sigma
-            g = math.exp(-0.5 * u * u)
-            value = image[k, line] if is_column else image[line, k]
-            top += g * (value - middle - ramp * (k - start))
-            norm += g * g
-        amplitude = top / norm if norm > 0.0 else 0.0
+        n = last - first + 1
+        for k in range(n):
+            at = first + k
+            value = image[at, line] if is_column else image[line, at]
+            profile[1, k] = middle + ramp * (at - start)
+            profile[0, k] = value - profile[1, k]
+            profile[2, k] = 1.0
+            if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
+                profile[2, k] = 0.0
+        state[0] = start - first
+        state[1] = start_amplitude(profile, n, state[0], sigma_px[i])
+        state[2] = sigma_px[i]
         result[i, VARIANCE] = 0.0
         result[i, CLIPPED] = n_clipped
-        if amplitude <= 0.0 or last - first + 1 - n_clipped < LEAST_PIXELS:
+        if state[1] <= 0.0 or n - n_clipped < LEAST_PIXELS:
             continue
         is_done = False
         for round_ in range(ITERATIONS):
-            h00 = h01 = h02 = h11 = h12 = h22 = 0.0
-            b0 = b1 = b2 = 0.0
-            q_residual = q_norm = q_centre = cubic = 0.0
-            # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
-            step = 1.0 / sigma
-            u = (first - 1 - centre) * step
-            m = amplitude * math.exp(-0.5 * u * u)
-            ratio = math.exp(-(u + 0.5 * step) * step)
-            change = math.exp(-step * step)
-            for k in range(first, last + 1):
-                u += step
-                m *= ratio
-                ratio *= change
-                if has_clipped and (clipped[k, line] if is_column else clipped[line, k]):
-                    continue
-                value = image[k, line] if is_column else image[line, k]
-                background = middle + ramp * (k - start)
-                variance = noise[0] * m * m + noise[1] * max(m + background, 0.0) + noise[2]
-                w = 1.0 / variance
-                r = value - background - m
-                j0 = m * u * step
-                j2 = m * u * u
-                q = m * u * (u * u - 3.0)
-                h00 += w * j0 * j0
-                h01 += w * j0 * m
-                h02 += w * j0 * j2
-                h11 += w * m * m
-                h12 += w * m * j2
-                h22 += w * j2 * j2
-                b0 += w * r * j0
-                b1 += w * r * m
-                b2 += w * r * j2
-                q_residual += w * r * q
-                q_norm += w * q * q
-                q_centre += w * q * j0
-                cubic += w * j0 * m * u * u * u
-            c00 = h11 * h22 - h12 * h12
-            c01 = h02 * h12 - h01 * h22
-            c02 = h01 * h12 - h02 * h11
-            determinant = h00 * c00 + h01 * c01 + h02 * c02
-            if not determinant > 0.0:
+            accumulate(profile, n, state, noise, sums)
+            variance = solve_step(sums, steps)
+            if variance <= 0.0:
                 break
-            c11 = h00 * h22 - h02 * h02
-            c12 = h01 * h02 - h00 * h12
-            c22 = h00 * h11 - h01 * h01
             if is_done or round_ == ITERATIONS - 1:
-                result[i, CENTRE] = centre
-                result[i, AMPLITUDE] = amplitude
-                result[i, SIGMA] = sigma
-                result[i, VARIANCE] = c00 / determinant
-                result[i, SKEW] = q_residual - q_centre / h00 * b0
-                result[i, SKEW_NORM] = max(q_norm - q_centre * q_centre / h00, 0.0)
-                result[i, BEND_GAIN] = cubic / (h00 * sigma)
+                result[i, CENTRE] = first + state[0]
+                result[i, AMPLITUDE] = state[1]
+                result[i, SIGMA] = state[2]
+                result[i, VARIANCE] = variance
+                result[i, SKEW] = sums[9] - sums[11] / sums[0] * sums[6]
+                result[i, SKEW_NORM] = max(sums[10] - sums[11] * sums[11] / sums[0], 0.0)
+                result[i, BEND_GAIN] = sums[12] / (sums[0] * state[2])
                 break
-            d0 = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
-            d1 = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
-            d2 = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
-            centre += min(max(d0, -0.5 * sigma), 0.5 * sigma)
-            amplitude *= math.exp(min(max(d1, -0.5), 0.5))
-            sigma *= math.exp(min(max(d2, -0.25), 0.25))
-            if not (abs(centre - start) < 2.0 * sigma_px[i] + 1.0) or not (
-                0.4 * sigma_px[i] < sigma < 2.5 * sigma_px[i] + 0.5
-            ):
+            is_done = abs(steps[0]) < 2e-3 * state[2] and abs(steps[2]) < 0.02
+            state[0] += min(max(steps[0], -0.5 * state[2]), 0.5 * state[2])
+            state[1] *= math.exp(min(max(steps[1], -0.5), 0.5))
+            state[2] *= math.exp(min(max(steps[2], -0.25), 0.25))
+            drift = abs(first + state[0] - start)
+            is_near = drift < 2.0 * sigma_px[i] + 1.0
+            if not is_near or not 0.4 < state[2] / sigma_px[i] < 2.5 + 0.5 / sigma_px[i]:
                 break
-            is_done = abs(d0) < 2e-3 * sigma and abs(d2) < 0.02

@@ -49,6 +49,9 @@ def test_solution_is_that_of_mrcal() -> None:
         "intrinsics": start[None].copy(),
         cameras: np.zeros((0, 6)),
         boards: frames.copy(),
+        "points": None,
+        "observations_point": None,
+        "indices_point_camintrinsics_camextrinsics": None,
         "observations_board": observations,
         "indices_frame_camintrinsics_camextrinsics": np.array(
             [[index, 0, -1] for index in range(len(views))], dtype=np.int32

@@ -21,6 +21,9 @@ from armscan.kernels.arrays import (
 SHIFT, SLOPE, BEND, BEND_SIGMA, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 """Columns of a smoothing result."""
 LEAST_POINTS = 5
+LEAST_COSINE = 0.6
+COUNT = 8
+"""Place of the count of points among the moments."""
 
 
 @njit(types.boolean(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
@@ -30,7 +33,7 @@ def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
     Parameters
     ----------
     moments
-        (8,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d.
+        (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of points.
 
     solved
         (5,) output: value, slope and second derivative at 0, then the variances of the value and of
@@ -54,6 +57,63 @@ def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
     solved[3] = c00 / determinant
     solved[4] = 4.0 * c22 / determinant
     return True
+
+
+@njit(
+    types.int64(
+        TABLE_IN,
+        TABLE_IN,
+        FLOATS_IN,
+        INTS_IN,
+        INTS_IN,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.float64,
+        FLOATS_OUT,
+    ),
+    cache=True,
+    nogil=True,
+)
+def gather(
+    points: Float64Array,
+    normals: Float64Array,
+    sigma_px: Float64Array,
+    is_used: Int64Array,
+    chain: Int64Array,
+    i: int,
+    j: int,
+    direction: int,
+    reach: float,
+    moments: Float64Array,
+) -> int:
+    """Add the neighbours of point ``i`` from place ``j`` on to the moments; return where it ended.
+
+    Neighbours are taken in the tangent frame of point ``i`` while they lie on its chain, within
+    ``reach`` along the tangent and not turned by more than about 50 degrees.
+    """
+    nx = normals[i, 0]
+    ny = normals[i, 1]
+    while 0 <= j < points.shape[0] and chain[j] == chain[i]:
+        dx = points[j, 0] - points[i, 0]
+        dy = points[j, 1] - points[i, 1]
+        s = dy * nx - dx * ny
+        if abs(s) > reach or abs(normals[j, 0] * nx + normals[j, 1] * ny) < LEAST_COSINE:
+            break
+        if is_used[j] != 0:
+            d = dx * nx + dy * ny
+            w = 1.0 / (sigma_px[j] * sigma_px[j])
+            moments[0] += w
+            moments[1] += w * s
+            moments[2] += w * s * s
+            moments[3] += w * s * s * s
+            moments[4] += w * s * s * s * s
+            moments[5] += w * d
+            moments[6] += w * s * d
+            moments[7] += w * s * s * d
+            moments[COUNT] += 1.0
+        j += direction
+    return j
 
 
 @njit(
@@ -110,19 +170,15 @@ def smooth_chains(
         sigma (0: there is none).
     """
     n = points.shape[0]
-    moments = np.zeros(8)
-    others = np.zeros(8)
+    moments = np.zeros(9)
+    others = np.zeros(9)
     solved = np.zeros(5)
     for i in range(n):
-        nx = normals[i, 0]
-        ny = normals[i, 1]
-        for k in range(8):
-            moments[k] = 0.0
+        moments[:] = 0.0
         own = 1.0 / (sigma_px[i] * sigma_px[i])
-        n_used = 0
         if is_used[i] != 0:
             moments[0] = own
-            n_used = 1
+            moments[COUNT] = 1.0
         for k in range(result.shape[1]):
             result[i, k] = 0.0
         result[i, SIGMA] = sigma_px[i]
@@ -132,32 +188,9 @@ def smooth_chains(
         up = i + 1
         for k in range(windows_px.shape[0]):
             reach = windows_px[k]
-            for side in range(2):
-                j = down if side == 0 else up
-                while 0 <= j < n and chain[j] == chain[i]:
-                    dx = points[j, 0] - points[i, 0]
-                    dy = points[j, 1] - points[i, 1]
-                    s = dy * nx - dx * ny
-                    if abs(s) > reach or abs(normals[j, 0] * nx + normals[j, 1] * ny) < 0.6:
-                        break
-                    if is_used[j] != 0:
-                        d = dx * nx + dy * ny
-                        w = 1.0 / (sigma_px[j] * sigma_px[j])
-                        moments[0] += w
-                        moments[1] += w * s
-                        moments[2] += w * s * s
-                        moments[3] += w * s * s * s
-                        moments[4] += w * s * s * s * s
-                        moments[5] += w * d
-                        moments[6] += w * s * d
-                        moments[7] += w * s * s * d
-                        n_used += 1
-                    j += 1 if side == 1 else -1
-                if side == 0:
-                    down = j
-                else:
-                    up = j
-            if n_used < LEAST_POINTS:
+            down = gather(points, normals, sigma_px, is_used, chain, i, down, -1, reach, moments)
+            up = gather(points, normals, sigma_px, is_used, chain, i, up, 1, reach, moments)
+            if moments[COUNT] < LEAST_POINTS:
                 continue
             if not solve_quadratic(moments, solved):
                 continue
@@ -173,8 +206,7 @@ def smooth_chains(
             result[i, BEND_SIGMA] = math.sqrt(solved[4] * inflation[k])
             result[i, SIGMA] = sigma
             result[i, WINDOW] = reach
-            for m in range(8):
-                others[m] = moments[m]
+            others[:] = moments
             if is_used[i] != 0:
                 others[0] -= own
             if solve_quadratic(others, solved):

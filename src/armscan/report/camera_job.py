@@ -15,7 +15,7 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.camera_page import camera_page, parameter_rows
-from armscan.report.numbers import sentence, significant
+from armscan.report.numbers import sentence, significant, without_source
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
 from armscan.report.summary import Summary, Table
@@ -144,7 +144,9 @@ def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: boo
             for view in fit.views
             if view.note
         )
-        + tuple((source, "", "", reason) for source, reason in run.not_found),
+        + tuple(
+            (source, "", "", without_source(source, reason)) for source, reason in run.not_found
+        ),
         "Images to look at",
         (3,),
     )

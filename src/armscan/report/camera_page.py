@@ -13,7 +13,7 @@ from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report import camera_figures as figures
 from armscan.report.drawing import photo_markup
-from armscan.report.numbers import sentence, significant, with_sigma
+from armscan.report.numbers import sentence, significant, with_sigma, without_source
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.summary import Table
@@ -209,12 +209,13 @@ def _not_found_section(
         Picture(
             photo_markup(exposures[source], (), f"No target in {source}", longest_px=500),
             title=source,
-            caption=reason,
+            caption=without_source(source, reason),
         )
         for source, reason in not_found
         if source in exposures
     )
-    table = Table(("image", "why"), tuple(not_found), word_columns=(1,))
+    rows = tuple((source, without_source(source, reason)) for source, reason in not_found)
+    table = Table(("image", "why"), rows, word_columns=(1,))
     return Section("Images without a usable target", (table, Gallery(pictures, 240)))
 
 

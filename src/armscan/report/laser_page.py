@@ -12,7 +12,7 @@ from armscan.models.light_sheet import BOW_TERMS
 from armscan.records.exposure import Exposure
 from armscan.report import laser_figures as figures
 from armscan.report.drawing import Marks, photo_markup
-from armscan.report.numbers import sentence, significant
+from armscan.report.numbers import sentence, significant, without_source
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Section, Text
 from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
@@ -215,13 +215,12 @@ def _residuals_section(fit: LaserFit) -> Section:
 
 
 def _skipped_section(fit: LaserFit, exposures: Mapping[str, Exposure]) -> Section:
-    table = Table(
-        ("image", "why"), tuple((item.source, item.reason) for item in fit.skipped), "", (1,)
-    )
+    rows = tuple((item.source, without_source(item.source, item.reason)) for item in fit.skipped)
+    table = Table(("image", "why"), rows, "", (1,))
     pictures = tuple(
         Picture(
             photo_markup(exposures[item.source], (), f"Nothing in {item.source}", longest_px=500),
-            item.reason,
+            without_source(item.source, item.reason),
             item.source,
         )
         for item in fit.skipped

@@ -34,3 +34,8 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
 def sentence(text: str) -> str:
     """Text with a capital at its start and a full stop at its end."""
     return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
+def without_source(source: str, reason: str) -> str:
+    """A reason without the image's name in front, for places that show the name beside it."""
+    return reason.removeprefix(f"{source}: ")

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reports say what the results hold: numbers with sigma, views left out and why, all points."""
+
+from __future__ import annotations
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.calibration.camera.calibrate import calibrate_camera
+from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.result import LaserFit
+from armscan.records.exposure import Exposure
+from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
+from armscan.report.camera_job import camera_calibration
+from armscan.report.camera_page import camera_page
+from armscan.report.laser_job import laser_summary
+from armscan.report.laser_page import laser_page
+from armscan.report.numbers import with_sigma
+from armscan.report.page import render_page
+from camera_scene import Scene, make_views
+from sheet_rig import PROVENANCE, thesis_rig
+
+
+@cache
+def camera_fit() -> CameraFit:
+    views, _ = make_views(Scene(n_views=8), seed=3)
+    options = CameraOptions(leave_out=(views[2].source,), solve_warp=True)
+    fit = calibrate_camera(views, options)
+    assert isinstance(fit, CameraFit)
+    return fit
+
+
+@cache
+def laser_fit() -> LaserFit:
+    rig = thesis_rig(bow_uu_mm=0.1)
+    boards = rig.boards(rig.camera, np.random.default_rng(5))
+    fit = calibrate_sheets(boards, rig.calibration(rig.camera))
+    assert isinstance(fit, LaserFit)
+    return fit
+
+
+def blank(fit_source: str, width: int, height: int) -> Exposure:
+    return Exposure(np.full((height, width), 90, np.uint8), fit_source)
+
+
+def text_of(page: bytes) -> str:
+    """What a reader sees: no pictures, no markup."""
+    text = re.sub(r"<(style|script|svg)[^>]*>.*?</\1>", " ", page.decode(), flags=re.DOTALL)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", text))
+
+
+def test_camera_page_shows_numbers_views_and_reasons() -> None:
+    fit = camera_fit()
+    sources = [view.source for view in fit.views]
+    exposures = {name: blank(name, 2048, 1536) for name in sources[:3]}
+    not_found = (("dark.png", "dark.png: no grid of 11 x 9 circles in view"),)
+    page = render_page(camera_page(fit, not_found, exposures, PROVENANCE))
+    text = text_of(page)
+    assert with_sigma(fit.camera.fx_px, fit.sigma[0], "px") in text
+    assert all(source in text for source in sources)
+    assert "left out by request" in text
+    assert "dark.png no grid of 11 x 9 circles in view" in text
+    assert "Bow along x" in text
+    assert page.count(b"<svg") == 3
+    assert f"{fit.n_views} of {len(sources) + 1} images used" in text
+
+
+def test_residual_arrows_are_enlarged_by_a_round_number() -> None:
+    fit = camera_fit()
+    scale = residual_magnification(fit)
+    assert f"{scale:.0e}"[0] in "125"
+    three_sigma = 3.0 * fit.rms_px * scale / fit.camera.width_px
+    assert ARROW_SHARE / 2.5 <= three_sigma <= ARROW_SHARE
+
+
+def test_document_of_a_camera_is_the_fit() -> None:
+    fit = camera_fit()
+    document = camera_calibration(fit, PROVENANCE)
+    assert document.n_views == 7
+    np.testing.assert_array_equal(document.covariance, fit.covariance)
+    np.testing.assert_array_equal(document.camera.parameters, fit.camera.parameters)
+
+
+def test_laser_page_shows_every_point_and_the_bow() -> None:
+    fit = laser_fit()
+    exposures = {
+        name: blank(name, fit.camera.camera.width_px, fit.camera.camera.height_px)
+        for image in fit.images
+        for name in (image.source, image.view.source)
+    }
+    page = render_page(laser_page(fit, exposures, PROVENANCE))
+    text = text_of(page)
+    assert "bowed" in text
+    assert "lack of fit" in text.lower()
+    assert all(image.source in text for image in fit.images)
+    dots = sum(len(re.findall(r"M[-\d.e ]+h0", part)) for part in page.decode().split("<svg")[1:])
+    assert dots >= sum(len(image.profile) for image in fit.images)
+
+
+def test_laser_summary_has_the_sheet_with_its_sigmas() -> None:
+    fit = laser_fit()
+    written = (Path("s.json"), Path("s.npz"), Path("s.html"))
+    summary = laser_summary(fit, written, is_simulated=True)
+    (sheet,) = summary.data["sheets"]
+    assert sheet["plane_sensor_a_b_c_d_mm"] == fit.sheets[0].sheet.plane.tolist()
+    sigmas = np.sqrt(np.diag(fit.sheets[0].covariance))[:3]
+    np.testing.assert_array_equal(list(sheet["plane_sigma_mm"].values()), sigmas)
+    assert "simulated" in summary.title
+    assert "s.json" in summary.next_step
+
+
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_pages_say_where_the_data_come_from(is_simulated: bool) -> None:
+    page = camera_page(camera_fit(), (), {}, PROVENANCE, is_simulated=is_simulated)
+    assert ("simulated data" in text_of(render_page(page))) == is_simulated

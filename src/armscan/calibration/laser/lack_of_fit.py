@@ -16,6 +16,9 @@ from armscan.geometry.arrays import FloatArray
 SHAPE_DEGREE = 3
 N_SHAPE = SHAPE_DEGREE + 1
 MAX_LAG = 100
+CORRELATION_ROUNDS = 20
+MAX_TAKEN = 0.5
+"""Largest share of the noise that the cubic is believed to take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,12 +32,13 @@ class StripeNoise:
     correlation_points
         Variance of a mean over that of independent points: 1 + 2 sum of the correlations.
     degrees_of_freedom
-        Of ``factor``, counted in points.
+        Of ``factor``, counted in points: each shape term of a stripe takes the noise of as many
+        points as count as one.
     """
 
     factor: float
     correlation_points: float
-    degrees_of_freedom: int
+    degrees_of_freedom: float
 
     @property
     def sigma_factor(self) -> float:
@@ -57,7 +61,7 @@ def stripe_noise(observations: SheetObservations, residual_px: FloatArray) -> St
     residual_px
         (N,) residuals from the sheets; a smooth misfit does not matter.
     """
-    rest, squares, freedom = [], 0.0, 0
+    rest, squares = [], 0.0
     for stripe in np.unique(observations.stripe):
         own = observations.stripe == stripe
         points = observations.points_mm[own]
@@ -69,16 +73,30 @@ def stripe_noise(observations: SheetObservations, residual_px: FloatArray) -> St
         left = normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0]
         rest.append(left)
         squares += float(left @ left)
-        freedom += len(left) - N_SHAPE
-    factor = float(np.sqrt(squares / max(freedom, 1)))
-    return StripeNoise(factor, _correlation(rest), freedom)
+    correlation = _correlation(rest)
+    count = sum(len(left) for left in rest)
+    freedom = max(count - N_SHAPE * len(rest) * correlation, 1.0)
+    return StripeNoise(float(np.sqrt(squares / freedom)), correlation, freedom)
 
 
 def _correlation(rest: list[FloatArray]) -> float:
-    """Sum the correlations over the lags until they drown in their own noise."""
-    total = sum(len(left) for left in rest)
-    power = sum(float(left @ left) for left in rest) / total
+    """Sum the correlations over the lags until they drown in their own noise.
+
+    The cubic takes a share of the noise with it, which lowers every correlation by about that
+    share; it depends on the sum itself, hence the rounds.
+    """
+    count = sum(len(left) for left in rest)
+    lags = _lag_correlations(rest)
     correlation = 1.0
+    for _ in range(CORRELATION_ROUNDS if len(lags) else 0):
+        taken = min(N_SHAPE * len(rest) * correlation / count, MAX_TAKEN)
+        correlation = 1.0 + 2.0 * float((lags * (1.0 - taken) + taken).sum())
+    return min(correlation, MAX_TAKEN * count / (N_SHAPE * len(rest)))
+
+
+def _lag_correlations(rest: list[FloatArray]) -> FloatArray:
+    power = sum(float(left @ left) for left in rest) / sum(len(left) for left in rest)
+    found: list[float] = []
     for lag in range(1, MAX_LAG + 1):
         pairs = [(left[:-lag], left[lag:]) for left in rest if len(left) > 4 * lag]
         count = sum(len(a) for a, _ in pairs)
@@ -87,8 +105,8 @@ def _correlation(rest: list[FloatArray]) -> float:
         rho = sum(float(a @ b) for a, b in pairs) / count / power
         if rho < 2.5 / np.sqrt(count):
             break
-        correlation += 2.0 * rho
-    return correlation
+        found.append(rho)
+    return np.array(found)
 
 
 def lack_of_fit(

@@ -244,6 +244,8 @@ def test_folder_that_may_not_be_written(bench: Bench, fails: Fails, tmp_path: Pa
         ("--distortion", "fisheye", "distortion model"),
         ("--bits-used", "77", "bits used is 77"),
         ("--bits-used", "12", "8 bits a pixel"),
+        ("--bits-align", "middle", "choose low or high"),
+        ("--bits-align", "high", "count of bits used"),
         ("--leave-out", "absent.png", "absent.png"),
     ],
 )

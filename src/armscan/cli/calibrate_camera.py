@@ -10,7 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.shared import BitsUsed, Target
+from armscan.cli.shared import BitsAlign, BitsUsed, Target
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -46,6 +46,7 @@ def camera(
         bool, typer.Option("--board-warp", help="Also solve a bow of the board.")
     ] = False,
     bits_used: BitsUsed = None,
+    bits_align: BitsAlign = "low",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -53,7 +54,7 @@ def camera(
     from armscan.calibration.camera.options import CameraOptions, DistortionModel
     from armscan.errors import OptionError
     from armscan.report.camera_job import CameraRequest, run_camera_calibration
-    from armscan.storage.image_options import ImageOptions
+    from armscan.storage.image_options import Alignment, ImageOptions
 
     held = set(fix or ())
     if unknown := sorted(held - {"aspect", "centre"}):
@@ -70,7 +71,7 @@ def camera(
             leave_out=tuple(leave_out or ()),
             leave_out_misfits=auto_leave_out,
         ),
-        image_options=ImageOptions(bits_used=bits_used),
+        image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
     )

@@ -10,7 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.shared import BitsUsed, LaserColourOption, StripeMethodOption, Target
+from armscan.cli.shared import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption, Target
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -50,6 +50,7 @@ def laser(
     stripe_method: StripeMethodOption = "fit",
     laser_colour: LaserColourOption = "auto",
     bits_used: BitsUsed = None,
+    bits_align: BitsAlign = "low",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -57,7 +58,7 @@ def laser(
     from armscan.calibration.laser.options import SheetOptions
     from armscan.pipeline.laser import LaserOptions
     from armscan.report.laser_job import LaserRequest, run_laser_calibration
-    from armscan.storage.image_options import ImageOptions
+    from armscan.storage.image_options import Alignment, ImageOptions
     from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
 
     request = LaserRequest(
@@ -75,7 +76,7 @@ def laser(
                 margin_mm=margin_mm, n_sheets=sheets, sheet_names=tuple(name or ())
             ),
         ),
-        image_options=ImageOptions(bits_used=bits_used),
+        image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
     )

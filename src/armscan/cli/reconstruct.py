@@ -10,7 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.shared import BitsUsed, LaserColourOption, StripeMethodOption
+from armscan.cli.shared import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -46,6 +46,7 @@ def reconstruct(
     stripe_method: StripeMethodOption = "fit",
     laser_colour: LaserColourOption = "auto",
     bits_used: BitsUsed = None,
+    bits_align: BitsAlign = "low",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -53,7 +54,7 @@ def reconstruct(
     from armscan.pipeline.reconstruct import ReconstructOptions
     from armscan.reconstruction.choose_sheet import DepthRange
     from armscan.report.cloud_job import CloudRequest, run_reconstruction
-    from armscan.storage.image_options import ImageOptions
+    from armscan.storage.image_options import Alignment, ImageOptions
     from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
 
     request = CloudRequest(
@@ -69,7 +70,7 @@ def reconstruct(
             depths=DepthRange(margin=depth_margin),
             sheet=sheet,
         ),
-        image_options=ImageOptions(bits_used=bits_used),
+        image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
     )

@@ -20,6 +20,9 @@ BitsUsed = Annotated[
     int | None,
     typer.Option("--bits-used", help="Significant bits of 16-bit images, such as 10 or 12."),
 ]
+BitsAlign = Annotated[
+    str, typer.Option("--bits-align", help="Where they lie in 16 bits: low, or high.")
+]
 StripeMethodOption = Annotated[
     str,
     typer.Option(

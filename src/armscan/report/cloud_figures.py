@@ -49,7 +49,7 @@ def profile_view(cloud: PointCloud, sensor: SensorCalibration, exposure: int) ->
             colour = PALETTE[k % len(PALETTE)]
             axes.plot(along, depth, ".", markersize=1.8, color=colour, label=f"sheet {name}")
         axes.set_xlabel("along the stripe, mm")
-        axes.set_ylabel("in the sheet, away from the camera, mm")
+        axes.set_ylabel("depth in the sheet, mm")
         axes.set_aspect("equal", adjustable="datalim")
         axes.invert_yaxis()
         axes.grid()
@@ -57,7 +57,6 @@ def profile_view(cloud: PointCloud, sensor: SensorCalibration, exposure: int) ->
     return Picture(
         raster_markup(figure, "Profile in the sheet"),
         title=cloud.exposure_sources[exposure],
-        caption="The measured profile, seen square on to the light sheet; the camera is above.",
     )
 
 

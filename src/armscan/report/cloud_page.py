@@ -19,6 +19,7 @@ from armscan.report.summary import Table
 
 FATE_COLOURS = {PointFate.NO_RAY: "#8a6d5a", PointFate.OUT_OF_DEPTH: "#ff7a3c"}
 MAX_PROFILES = 6
+PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
 
 
 def cloud_page(
@@ -42,7 +43,11 @@ def cloud_page(
             f"median; 95 % below {significant(float(np.percentile(cloud.sigma_mm, 95)))} mm",
         ),
         Card("Depth", f"{depth.min():.1f} to {depth.max():.1f} mm", "Z in the Sensor frame"),
-        Card("Images", str(len(result.images)), f"sheets {', '.join(used)}"),
+        Card(
+            "Images",
+            str(len(result.images)),
+            f"sheet{'s' if len(used) > 1 else ''} {', '.join(used)}",
+        ),
     )
     with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
     profiles = tuple(
@@ -56,7 +61,7 @@ def cloud_page(
         warnings=tuple(sentence(warning) for warning in result.warnings),
         sections=(
             Section("The points", (Gallery((figures.cloud_view(cloud),), 560),)),
-            Section("Profiles", (Gallery(profiles, 420),)),
+            Section("Profiles", (Text(PROFILE_TEXT), Gallery(profiles, 420))),
             _images_section(result, exposures),
             Section("How far to trust them", (Gallery((figures.sigma_histogram(cloud),), 420),)),
             origin_section(provenance),

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import subprocess
 import sys
 import time
@@ -169,3 +170,21 @@ def test_completion_is_offered() -> None:
         check=False,
     )
     assert "doctor" in result.stdout
+
+
+def test_a_terminal_without_our_signs_is_served() -> None:
+    golden = Path(__file__).parents[1] / "golden" / "camera_v1.json"
+    words = f"['info', {str(golden)!r}]"
+    result = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            f"import sys; from armscan.cli import main; sys.exit(main({words}))",
+        ],
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "fx px: 477." in result.stdout

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -32,6 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from armscan.cli.app import command
 
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # a terminal that has no sign for ± or ° shows a question mark instead of failing
+        sys.stdout.reconfigure(errors="replace")
     try:
         result = command()(
             args=None if arguments is None else list(arguments),

@@ -63,13 +63,13 @@ class Summary:
 
 
 def summary_json(summary: Summary) -> str:
-    """JSON text of a summary; what is not known is ``null``."""
+    """JSON text of a summary in ASCII; what is not known is ``null``."""
     content = {
         **summary.data,
         "warnings": list(summary.warnings),
         "written": [path.as_posix() for path in summary.written],
     }
-    return json.dumps(_plain(content), indent=2, allow_nan=False, ensure_ascii=False)
+    return json.dumps(_plain(content), indent=2, allow_nan=False)
 
 
 def summary_text(summary: Summary) -> str:

@@ -76,6 +76,26 @@ def test_observations_let_the_camera_be_solved_again(calibrated: Bench) -> None:
     )
 
 
+def test_observations_let_the_sheet_be_solved_again(calibrated: Bench) -> None:
+    from armscan.calibration.camera.board_pose import estimate_board_pose
+    from armscan.calibration.laser.calibrate import calibrate_sheets
+    from armscan.calibration.laser.result import BoardStripes
+
+    found = read_observations(calibrated.sensor.with_suffix(".npz"))
+    document = read_sensor_calibration(calibrated.sensor)
+    boards = []
+    for view, profile in zip(found.views, found.profiles, strict=True):
+        pose = estimate_board_pose(view, document.camera.camera)
+        assert pose
+        boards.append(BoardStripes(profile, view, pose))
+    again = calibrate_sheets(boards, document.camera)
+    assert again
+    np.testing.assert_allclose(
+        again.sheets[0].sheet.plane, document.sheets[0].sheet.plane, atol=1e-9, rtol=1e-9
+    )
+    np.testing.assert_allclose(again.covariance, document.covariance, atol=1e-15, rtol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["camera.html", "sensor.html"])
 def test_pages_are_self_contained(calibrated: Bench, name: str) -> None:
     page = (calibrated.folder / name).read_text("utf-8")

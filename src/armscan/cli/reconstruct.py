@@ -38,8 +38,13 @@ def reconstruct(
     ] = None,
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
     depth_margin: Annotated[
-        float, typer.Option(help="Widen the calibrated depth range by this part at either end.")
-    ] = 0.5,
+        float | None,
+        typer.Option(
+            help="Widen the calibrated depth range by this part of its width at either end; "
+            "points beyond are left out. Without it 3; 0 refuses every extrapolation.",
+            show_default=False,
+        ),
+    ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
     ] = Path("cloud.ply"),
@@ -67,7 +72,7 @@ def reconstruct(
                 method=cast(StripeMethod, stripe_method),
                 laser_colour=cast(LaserColour, laser_colour),
             ),
-            depths=DepthRange(margin=depth_margin),
+            depths=DepthRange() if depth_margin is None else DepthRange(depth_margin),
             sheet=sheet,
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),

@@ -113,8 +113,8 @@ def measure_exposure(
 
 
 _REMEDY = (
-    "check that the images show a laser line, that the calibration is the camera's, and widen the "
-    "depth range if the object lies outside of it"
+    "check that the images show a laser line, that camera and sheet are the right ones, and give a "
+    "larger --depth-margin if the object stood outside the calibrated depth range"
 )
 
 

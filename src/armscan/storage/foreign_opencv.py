@@ -95,13 +95,19 @@ def _read_tree(data: bytes, where: str) -> Mapping[str, Any]:
     )
     mode = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     try:
-        storage = cv2.FileStorage(data.decode("utf-8"), mode)
+        storage = cv2.FileStorage(_with_yaml_header(data.decode("utf-8")), mode)
         tree = _plain(storage.root()) if storage.isOpened() else None
     except (cv2.error, SystemError, UnicodeDecodeError) as error:
         raise unreadable from error
     if not isinstance(tree, Mapping):
         raise unreadable
     return tree
+
+
+def _with_yaml_header(text: str) -> str:
+    """OpenCV 4 takes a text for YAML by its first line only, which ROS does not write."""
+    start = text.lstrip("\ufeff \t\r\n").removeprefix("---\n")
+    return text if start.startswith(("%YAML", "<?xml", "<opencv")) else f"%YAML:1.0\n---\n{start}"
 
 
 def _plain(node: cv2.FileNode) -> Any:

@@ -9,7 +9,15 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_camera, calibrate_laser, demo, doctor, info, reconstruct
+from armscan.cli import (
+    calibrate_camera,
+    calibrate_laser,
+    convert,
+    demo,
+    doctor,
+    info,
+    reconstruct,
+)
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -43,6 +51,7 @@ calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser
 app.add_typer(calibrate, name="calibrate")
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
+app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
 app.command("info", epilog=info.EXAMPLE)(info.info)
 app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
 

@@ -115,6 +115,38 @@ def test_covariance_is_that_of_repeats_with_all_errors() -> None:
     assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / 1000)
 
 
+def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
+    """Each point takes the camera and its own sheet, with their signed correlation.
+
+    Compared term by term: camera and sheet errors that cancel in truth must cancel here.
+    """
+    camera = thesis_rig().camera
+    sheets = (printed_sheet(), printed_sheet().updated(np.array([1.0, -2.0, 3.0, 0, 0, 0, 0, 0])))
+    sigma = np.concatenate([CAMERA_SIGMA, SHEET_SIGMA_MM, 3.0 * SHEET_SIGMA_MM])
+    mixing = np.linalg.qr(np.random.default_rng(8).normal(size=(25, 25)))[0]
+    correlation = mixing @ np.diag(np.linspace(0.05, 1.95, 25)) @ mixing.T
+    joint = correlation * np.outer(sigma, sigma)
+    place = np.array([[1400.0, 600.0], [1400.0, 600.0]])
+    cloud = triangulate(
+        profile_at(place), np.array([0, 1]), sensor(camera, *sheets, covariance=joint)
+    )
+
+    def moved(step: FloatArray, sign: float) -> FloatArray:
+        step = sign * step
+        other = CameraModel.from_parameters(camera.parameters + step[:9], 2048, 1536)
+        turned = (sheets[0].updated(step[9:17]), sheets[1].updated(step[17:]))
+        return meet_sheets(place, np.array([0, 1]), sensor(other, *turned))[0]
+
+    steps = np.diag(1e-3 * np.where(sigma > 0.0, sigma, 0.0))
+    by = np.stack([moved(step, 1.0) - moved(step, -1.0) for step in steps], axis=2)
+    by = by / np.where(sigma > 0.0, 2e-3 * sigma, 1.0)
+    calibration = by @ joint @ by.transpose(0, 2, 1)
+    noise = triangulate(profile_at(place), np.array([0, 1]), sensor(camera, *sheets))
+    expected = calibration + noise.covariance_mm2
+    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(cloud.covariance_mm2 / size, expected / size, atol=1e-5)
+
+
 def test_points_without_sheet_or_ray_are_left_out_and_order_is_kept() -> None:
     behind = LightSheet(np.array([0.0, 0.0, -50.0]), np.eye(3), 10.0, np.zeros(5))
     q = np.array([[400.0, 300.0], [450.0, 310.0], [500.0, 320.0], [550.0, 330.0]])

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint fit against generalised least squares with one full covariance matrix, by hand."""
+
+import numpy as np
+
+from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.laser.solve import CommonErrors, solve_sheets, square_root
+from armscan.geometry.arrays import FloatArray
+from armscan.models.light_sheet import LightSheet
+
+N_IMAGES, N_STRIPE = 4, 15
+SIGMA_PX = 0.1
+FLAT = LightSheet(
+    np.array([1.0, -2.0, 100.0]), np.eye(3)[[0, 2, 1]] * [1, 1, -1], 20.0, np.zeros(5)
+)
+
+
+def correlated(rng: np.random.Generator, sigma: FloatArray) -> FloatArray:
+    """A covariance with strong correlations, as that of a real camera."""
+    mixing = np.linalg.qr(rng.normal(size=(len(sigma), len(sigma))))[0]
+    return sigma[:, None] * (mixing @ np.diag(np.geomspace(0.01, 3, len(sigma))) @ mixing.T) * sigma
+
+
+def observations(rng: np.random.Generator) -> SheetObservations:
+    """Points within 1e-5 mm of the plane, so that the fit is linear to 1e-9."""
+    n = N_IMAGES * N_STRIPE
+    image = np.repeat(np.arange(N_IMAGES), N_STRIPE)
+    local = np.column_stack([rng.uniform(-20, 20, (n, 2)), rng.normal(0.0, 1e-5, n)])
+    return SheetObservations(
+        image,
+        np.arange(n),
+        np.zeros(n, dtype=np.int64),
+        image,
+        FLAT.origin_mm + local @ FLAT.axes,
+        np.tile(0.03 * FLAT.axes[2] + 0.01 * FLAT.axes[0], (n, 1)),
+        np.full(n, 1e-4 * SIGMA_PX),
+        1e-4 * rng.normal(size=(n, 3, 6)),
+        1e-4 * smooth(local, rng),
+    )
+
+
+def smooth(local: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(N, 3, 9) camera derivatives that shift, tilt and bend: the sheet follows most of them."""
+    u, v = local[:, 0] / 20.0, local[:, 1] / 20.0
+    shapes = np.stack([np.ones_like(u), u, v, u * v], axis=1)
+    return np.einsum("ns,sij->nij", shapes, rng.normal(size=(4, 3, 9)))
+
+
+def test_fit_and_joint_covariance_are_those_of_the_full_matrix() -> None:
+    """With V of stripes, boards and camera: G = (A'V^-1 A)^-1 A'V^-1, step -G r, cov(s, c) -G B C.
+
+    A camera that errs by e moves the residuals by B e and so the sheet by -G B e.
+    """
+    rng = np.random.default_rng(3)
+    points = observations(rng)
+    pose = [correlated(rng, np.full(6, 0.01)) for _ in range(N_IMAGES)]
+    camera = correlated(rng, np.geomspace(0.001, 0.1, 9))
+    solution = solve_sheets(points, [FLAT], CommonErrors(pose, camera), [False])
+
+    _, residual, by_sheet, by_point = points.residuals_px([FLAT])
+    by_camera = np.einsum("ni,nij->nj", by_point, points.by_camera)
+    by_pose = np.einsum("ni,nij->nj", by_point, points.by_pose)
+    full = np.diag(points.sigma_px**2) + by_camera @ camera @ by_camera.T
+    for i in range(N_IMAGES):
+        own = np.ix_(points.image == i, points.image == i)
+        full[own] += by_pose[points.image == i] @ pose[i] @ by_pose[points.image == i].T
+    design = by_sheet[:, :3]
+    sheet_covariance = np.linalg.inv(design.T @ np.linalg.solve(full, design))
+    gain = sheet_covariance @ np.linalg.solve(full, design).T
+    remaining = residual - design @ (gain @ residual)
+
+    found = solution.covariance
+    np.testing.assert_allclose(found[:9, :9], camera, rtol=1e-12)
+    sigma = np.sqrt(np.diag(sheet_covariance))
+    np.testing.assert_allclose(
+        found[9:12, 9:12] / np.outer(sigma, sigma),
+        sheet_covariance / np.outer(sigma, sigma),
+        atol=1e-5,
+    )
+    scale = np.outer(sigma, np.sqrt(np.diag(camera)))
+    cross = -gain @ by_camera @ camera
+    assert np.abs(cross / scale).max() > 0.1, "the case must have something to find"
+    np.testing.assert_allclose(found[9:12, :9] / scale, cross / scale, atol=1e-5)
+    np.testing.assert_array_equal(found[12:], 0.0)
+    expected = remaining @ np.linalg.solve(full, remaining)
+    np.testing.assert_allclose(solution.chi2, expected, rtol=1e-5)
+    assert solution.common @ solution.common > 0.01 * expected, "boards and camera must have moved"
+
+
+def test_square_root_of_a_covariance_without_full_rank() -> None:
+    sigma = np.array([600.0, 0.0, 1e-5])
+    covariance = np.outer(sigma, sigma)
+    root = square_root(covariance)
+    np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-9)

@@ -14,7 +14,9 @@ BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1)
 """Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth."""
 
 PLANE_PARAMETER_NAMES = ("tilt_u_mm", "tilt_v_mm", "offset_mm")
-NEWTON_STEPS = 8
+NEWTON_STEPS = 12
+NEWTON_TOLERANCE_MM = 1e-6
+"""A last step larger than this means that the ray does not meet the bowed sheet."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,9 +84,9 @@ class LightSheet:
         dheight_dpoint
             (N, 3).
         dheight_dparameters
-            (N, 3 + 5) by tilt about the u axis and the v axis (per unit of u and v, in mm: a
-            tilt parameter t adds ``t * u``, ``t * v``), the offset and the bow coefficients;
-            see `updated`.
+            (N, 3 + 5) by the slopes along u and v (in mm per unit of u and v: a parameter t adds
+            ``t * u``, ``t * v`` to the surface), the offset and the bow coefficients; see
+            `updated`.
         """
         local = (points_mm - self.origin_mm) @ self.axes.T
         u, v = local[:, 0] / self.scale_mm, local[:, 1] / self.scale_mm
@@ -114,20 +116,22 @@ class LightSheet:
             (N, 3) in the Sensor frame (eq. 2.21, then Newton steps along the ray for the bow);
             zero where there is none.
         is_valid
-            (N,) False where the ray is parallel to the sheet or meets it behind the camera.
+            (N,) False where the ray is parallel to the sheet, meets it behind the camera, or passes
+            by its bow without meeting it.
         """
         rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
         plane = self.plane
         slope = rays @ plane[:3]
         is_valid = np.abs(slope) > 1e-9 * np.linalg.norm(rays, axis=1)
         depth = -plane[3] / np.where(is_valid, slope, 1.0)
-        steps = NEWTON_STEPS if self.is_bowed else 0
-        for _ in range(steps):
+        step = np.zeros_like(depth)
+        for _ in range(NEWTON_STEPS if self.is_bowed else 0):
             height, gradient, _ = self.height_with_jacobian(rays * depth[:, None])
             along = np.einsum("ni,ni->n", gradient, rays)
             is_valid &= np.abs(along) > 1e-9
-            depth = depth - height / np.where(is_valid, along, 1.0)
-        is_valid &= np.isfinite(depth) & (depth > 0.0)
+            step = np.where(is_valid, height / np.where(is_valid, along, 1.0), 0.0)
+            depth = depth - step
+        is_valid &= np.isfinite(depth) & (depth > 0.0) & (np.abs(step) < NEWTON_TOLERANCE_MM)
         depth = np.where(is_valid, depth, 0.0)
         return rays * depth[:, None], is_valid
 

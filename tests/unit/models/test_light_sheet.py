@@ -63,7 +63,7 @@ def test_height_derivatives_by_differences() -> None:
         d = STEP * np.eye(8)[k]
         up, down = (sheet.updated(s * d).height_with_jacobian(points)[0] for s in (1, -1))
         # A tilt also turns the bow's own axes: of the order bow / scale, 0.02, times the height.
-        tolerance = DIFFERENCE if k > 2 else 0.05
+        tolerance = DIFFERENCE if k > 1 else 0.05
         np.testing.assert_allclose(by_parameters[:, k], (up - down) / (2 * STEP), atol=tolerance)
 
 
@@ -100,7 +100,7 @@ def test_intersection_derivatives_by_differences() -> None:
         d = STEP * np.eye(8)[k]
         up, down = (sheet.updated(s * d).intersect(xy)[0] for s in (1, -1))
         np.testing.assert_allclose(
-            by_parameters[:, :, k], (up - down) / (2 * STEP), rtol=0.05, atol=0.02
+            by_parameters[:, :, k], (up - down) / (2 * STEP), rtol=1e-6, atol=1e-6
         )
     flat = bowed_sheet(np.zeros(5))
     _, _, _, by_parameters = flat.intersect_with_jacobian(xy)
@@ -123,6 +123,21 @@ def test_rays_along_or_away_from_the_sheet_are_invalid() -> None:
     assert is_met.tolist() == [False, False, True]
     np.testing.assert_allclose(points[0], 0.0)
     np.testing.assert_allclose(points[2], [0.0, 10.0, 100.0], rtol=1e-12)
+
+
+def test_a_ray_that_passes_by_a_strong_bow_is_invalid() -> None:
+    """By hand: y = 10 - 0.03 (z - 100)^2 meets y = z s where 0.03 d^2 + s d + 100 s - 10 = 0.
+
+    Its discriminant s^2 - 0.12 (100 s - 10) is negative from s = 0.1008 to 11.9; at s = 0.1 the
+    middle of the sheet is met.
+    """
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    sheet = LightSheet(np.array([0.0, 10.0, 100.0]), axes, 10.0, np.array([0.0, 0, 3.0, 0, 0]))
+    slopes = np.array([0.1, 0.05, 0.15, 0.2, 0.25, 0.3])
+    points, is_met = sheet.intersect(np.column_stack([0.0 * slopes, slopes]))
+    assert is_met.tolist() == [True, True, False, False, False, False]
+    np.testing.assert_allclose(points[0], [0.0, 10.0, 100.0], atol=1e-9)
+    np.testing.assert_allclose(sheet.height_with_jacobian(points)[0][:2], 0.0, atol=1e-9)
 
 
 def test_update_keeps_the_triad_orthonormal_for_large_steps() -> None:

@@ -46,13 +46,5 @@ class OptionError(ArmscanError):
     """A command-line option or a target specification is wrong."""
 
 
-class DetectionError(ArmscanError):
-    """Nothing usable was found in an image or in a set of images."""
-
-
 class EstimationError(ArmscanError):
     """The data do not determine what was asked for."""
-
-
-class MissingDependencyError(ArmscanError):
-    """An optional package is needed and not installed."""

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
-from armscan.models.distortion import distort, distorted_xy, fold_radius, undistort
+from armscan.models.distortion import distort, distorted_xy, undistort
 
 PARAMETER_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 """Order of the camera's parameters in every covariance and Jacobian."""
@@ -127,18 +127,6 @@ class CameraModel:
         q = np.asarray(q_px, dtype=np.float64)
         distorted = (q - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         return undistort(distorted, self.distortion)
-
-    def folds_over(self, points_sensor_mm: FloatArray) -> BoolArray:
-        """(N,) True for points in front of the camera whose projection means nothing.
-
-        Their direction lies beyond the radius at which the distortion model folds over, so that
-        the pixel that `project` returns belongs to another direction.
-        """
-        z = points_sensor_mm[:, 2]
-        radius = np.hypot(points_sensor_mm[:, 0], points_sensor_mm[:, 1])
-        is_in_front = z > 0.0
-        limit = fold_radius(self.distortion)
-        return np.asarray(is_in_front & (radius / np.where(is_in_front, z, 1.0) >= limit))
 
     def folded_border(self, n_steps: int = 24) -> FloatArray:
         """(K, 2) pixels on the image's border for which the distortion has no inverse.

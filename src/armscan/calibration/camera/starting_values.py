@@ -120,7 +120,7 @@ def _with_distortion(
 ) -> State:
     """Add linear distortion (eqs. 2.36 to 2.38) where it is small enough to be believed."""
     free = [PARAMETER_NAMES.index(name) - 4 for name in DISTORTION_PARAMETERS[model]]
-    # k2 and k3 follow from k1 only poorly before the poses are refined.
+    # k3 is told from k1 and k2 only poorly before the poses are refined.
     free = [index for index in free if index != 4]
     points = np.concatenate(
         [

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A command without options does what the library does without options.
+
+Help texts show a default, so the command line repeats it; here the two are held together.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.laser.options import SheetOptions
+from armscan.cli.app import command
+from armscan.pipeline.reconstruct import ReconstructOptions
+from armscan.reconstruction.choose_sheet import DepthRange
+from armscan.storage.image_options import ImageOptions
+from armscan.vision.stripe.options import StripeOptions
+
+STRIPES = {
+    "stripe_method": StripeOptions().method,
+    "laser_colour": StripeOptions().laser_colour,
+}
+IMAGES = {"bits_used": ImageOptions().bits_used, "bits_align": ImageOptions().align}
+EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
+    ("calibrate", "camera"): {
+        "distortion": CameraOptions().distortion,
+        "auto_leave_out": CameraOptions().leave_out_misfits,
+        "board_warp": CameraOptions().solve_warp,
+        **IMAGES,
+    },
+    ("calibrate", "laser"): {
+        "sheets": SheetOptions().n_sheets,
+        "margin_mm": SheetOptions().margin_mm,
+        **STRIPES,
+        **IMAGES,
+    },
+    ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
+}
+
+
+def parameters(path: tuple[str, ...]) -> dict[str, Any]:
+    node: Any = command()
+    for word in path:
+        node = node.commands[word]
+    return {parameter.name: parameter for parameter in node.params}
+
+
+@pytest.mark.parametrize("path", EXPECTED, ids=" ".join)
+def test_defaults_of_a_command_are_those_of_its_options(path: tuple[str, ...]) -> None:
+    found = parameters(path)
+    assert {name: found[name].default for name in EXPECTED[path]} == EXPECTED[path]
+
+
+def test_the_depth_margin_that_texts_name_is_the_default() -> None:
+    text = f"{DepthRange().margin:g}"
+    option = parameters(("reconstruct",))["depth_margin"]
+    assert option.default is None
+    assert f"Without it {text};" in option.help
+    page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
+    assert f"`--depth-margin` times its width at either end ({text}\n" in page.read_text()

@@ -283,5 +283,5 @@ def test_interrupt_leaves_nothing(
     monkeypatch.setattr(os, "fsync", interrupt)
     words = camera_words(bench.camera_images, tmp_path / "c.json")
     assert main([str(word) for word in words]) == 130
-    assert "interrupted, nothing was written" in capsys.readouterr().err
+    assert "interrupted; no file is left half-written" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -93,7 +93,7 @@ def test_a_wrong_line_gets_one_sentence(
 @pytest.mark.parametrize(
     ("failure", "code", "message"),
     [
-        (KeyboardInterrupt(), 130, "interrupted, nothing was written"),
+        (KeyboardInterrupt(), 130, "interrupted; no file is left half-written"),
         (OSError(errno.ENOSPC, "No space left on device", "x.json"), 2, "x.json: No space left"),
         (PermissionError(errno.EACCES, "Permission denied", "x.json"), 2, "Permission denied"),
         (MemoryError(), 2, "not enough memory"),

@@ -45,6 +45,23 @@ def test_a_full_disk_or_an_interrupt_leaves_nothing(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"old"}
 
 
+def test_a_refused_rename_says_what_was_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first file is in place, the second is held open by somebody: no temporary remains."""
+    rename = Path.replace
+
+    def refuse_b(path: Path, target: Path) -> Path:
+        if target.name == "b":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", refuse_b)
+    with pytest.raises(OutputError, match=r"only a was written \(Permission denied\)"):
+        write_files({tmp_path / "a": b"1", tmp_path / "b": b"2"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1"}
+
+
 def test_places_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="no such folder"):
         check_outputs([tmp_path / "absent" / "a"])

@@ -72,7 +72,7 @@ def _sentence(error: BaseException) -> str:
 
 
 def _interrupted() -> int:
-    return _fail("interrupted, nothing was written", EXIT_INTERRUPTED, prefix="")
+    return _fail("interrupted; no file is left half-written", EXIT_INTERRUPTED, prefix="")
 
 
 def _fail(sentence: str, code: int, prefix: str = "error: ") -> int:

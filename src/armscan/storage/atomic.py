@@ -46,26 +46,31 @@ def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> Non
 
 
 def write_files(contents: Mapping[Path, bytes], *, is_overwriting: bool = False) -> None:
-    """Write files that belong together: all of them, complete, or none.
+    """Write files that belong together, each of them complete.
 
-    Each is written under a temporary name in its folder and renamed at the end, so that a full
-    disk or an interrupt leaves what was there before.
+    Each is written under a temporary name in its folder and all are renamed at the end, so that a
+    full disk or an interrupt leaves what was there before.
 
     Raises
     ------
     OutputError
-        As `check_outputs`, or if the disk is full or refuses.
+        As `check_outputs`, or if the disk is full or refuses; if it refuses one of the renames,
+        the message names the files that were renamed before.
     """
     check_outputs(contents, is_overwriting=is_overwriting)
     written: dict[Path, Path] = {}
+    done: list[str] = []
     try:
         for path, content in contents.items():
             written[path] = _write_temporary(path, content)
         for path in list(written):
-            written.pop(path).replace(path)
+            written[path].replace(path)
+            del written[path]
+            done.append(path.name)
     except OSError as error:
+        what = f"only {', '.join(done)}" if done else "nothing"
         raise OutputError(
-            f"nothing was written ({error.strerror})",
+            f"{what} was written ({error.strerror})",
             where=", ".join(str(path) for path in contents),
             remedy="free some space or choose another folder",
         ) from error

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.calibration.camera.board_pose import (
+    AMBIGUOUS_CHI2,
     board_pose_candidates,
     estimate_board_pose,
     mirrored_pose,
@@ -93,6 +94,19 @@ def test_mirrored_pose_mirrors_the_normal_at_the_line_of_sight() -> None:
     assert np.abs(turned - (2.0 * (normal @ sight) * sight - normal)).max() < 1e-9
     back = mirrored_pose(other, centre)
     assert np.abs(back.rotation - pose.rotation).max() < 1e-9
+
+
+def test_the_second_pose_is_judged_by_the_noise_that_is_there() -> None:
+    """A detector that claims too much noise must not make a clear view ambiguous."""
+    rng = np.random.default_rng(4)
+    scene = Scene(camera=TELE, target=SMALL, noise_px=0.02)
+    view = view_of(scene, tilted(25.0, 400.0), rng, "a")
+    candidates = board_pose_candidates(view, TELE)
+    assert isinstance(candidates, tuple)
+    gap = candidates[1].chi2 - candidates[0].chi2
+    assert gap > 2.0 * AMBIGUOUS_CHI2
+    timid = replace(view, covariance_px2=gap / (0.5 * AMBIGUOUS_CHI2) * view.covariance_px2)
+    assert isinstance(estimate_board_pose(timid, TELE), Estimate)
 
 
 def test_both_poses_of_a_distant_board_are_found() -> None:

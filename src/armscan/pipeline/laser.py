@@ -10,6 +10,7 @@ from armscan.calibration.camera.board_pose import estimate_board_pose
 from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit, SkippedImage
+from armscan.calibration.laser.target_edges import find_target_edges
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes, pair_exposures
@@ -112,4 +113,5 @@ def find_board_stripes(
     profile = extract_stripes(exposure, options.stripes, background)
     if not bool(profile.is_accepted.any()):
         return FitFailure("no stripe was found", "check the laser and the exposure")
-    return BoardStripes(profile, view, pose, exposure.lasers)
+    edges = find_target_edges(view, target, pose.value, camera.camera)
+    return BoardStripes(profile, view, pose, exposure.lasers, edges)

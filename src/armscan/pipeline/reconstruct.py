@@ -114,7 +114,7 @@ def measure_exposure(
 
 _REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
-    "larger --depth-margin if the object stood outside the calibrated depth range"
+    "larger --depth-margin if the object stood further outside the calibrated depths"
 )
 
 

@@ -14,7 +14,7 @@ from armscan.reconstruction.triangulate import meet_sheets
 from armscan.records.profile import Profile
 
 MIN_INSIDE = 0.9
-"""A sheet is possible for a segment if this part of its points lies in its depth range."""
+"""A sheet is possible for a segment if this part of its points lies within its reach."""
 MAX_INSIDE_OTHERS = 0.1
 """It is the only one possible if no other sheet has more than this."""
 
@@ -65,8 +65,8 @@ def choose_sheets(
     """Give every stripe point to a sheet.
 
     In this order: the user's word; the only sheet there is; the exposure's only laser; and else,
-    segment by segment, the one sheet that puts the segment into its calibrated depth range, if
-    all others put it outside of theirs.
+    segment by segment, the one sheet that puts the segment within reach of its calibrated depth
+    range (`DepthRange.limits_mm`), if no other sheet does so for its own.
 
     Parameters
     ----------
@@ -126,20 +126,28 @@ def _by_depth(
         chosen[own] = best
     if ambiguous:
         raise EstimationError(
-            f"{len(ambiguous)} stripe segments may belong to more than one light sheet (points in "
-            f"the calibrated depth range: {ambiguous[0]})",
+            f"{len(ambiguous)} stripe segments may belong to more than one light sheet (points "
+            f"within reach of its calibrated depth range: {ambiguous[0]})",
             where=profile.source,
             remedy="name the sheet with --sheet, or photograph one laser at a time",
         )
-    used_names = [sensor.sheets[k].name for k in np.unique(chosen[chosen >= 0])]
-    how = "the only sheet that puts the stripe into its calibrated depth range: "
-    return SheetChoice(chosen, how + (", ".join(used_names) or "none"))
+    used = [int(k) for k in np.unique(chosen[chosen >= 0])]
+    if not used:
+        return SheetChoice(chosen, "no sheet puts a stripe within reach of its calibrated depths")
+    how = "the only sheet that puts the stripe within reach of its calibrated depths: "
+    return SheetChoice(chosen, how + ", ".join(_reach(sensor.sheets[k], depths) for k in used))
 
 
 def _inside(profile: Profile, sensor: SensorCalibration, depths: DepthRange, k: int) -> BoolArray:
     points, is_met = meet_sheets(profile.points_px, np.full(len(profile), k), sensor)
     low, high = depths.limits_mm(sensor.sheets[k])
     return np.asarray(is_met & (points[:, 2] >= low) & (points[:, 2] <= high))
+
+
+def _reach(sheet: SheetCalibration, depths: DepthRange) -> str:
+    (low, high), (least, most) = sheet.depth_range_mm, depths.limits_mm(sheet)
+    calibrated = f"{sheet.name} (calibrated Z {low:.0f} to {high:.0f} mm"
+    return f"{calibrated}, accepted {least:.0f} to {most:.0f} mm)"
 
 
 def _shares(share: dict[int, float], sensor: SensorCalibration) -> str:

@@ -20,7 +20,7 @@ class PointFate(IntEnum):
     NO_RAY = 2
     """The lens model has no inverse there, or the ray misses the sheet."""
     OUT_OF_DEPTH = 3
-    """Meets the sheet outside the depth range in which it was calibrated."""
+    """Meets the sheet outside the depths accepted: those in which it was calibrated, widened."""
 
     @property
     def label(self) -> str:
@@ -32,7 +32,7 @@ _FATE_LABELS = {
     PointFate.MEASURED: "measured",
     PointFate.FLAGGED: "flagged by the stripe extraction",
     PointFate.NO_RAY: "no ray meets the sheet",
-    PointFate.OUT_OF_DEPTH: "outside the calibrated depth range",
+    PointFate.OUT_OF_DEPTH: "too far outside the calibrated depths",
 }
 
 

@@ -24,6 +24,7 @@ USE_COLOURS = {
     PointUse.OFF_LINE: "#ffd23f",
     PointUse.UNNAMED: "#ff9df0",
     PointUse.OFF_SHEET: "#ff7a3c",
+    PointUse.ON_EDGE: "#8d7bff",
 }
 BOARD_COLOUR = "#35e0c0"
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armscan.calibration.laser.lack_of_fit import stripe_noise
+from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.geometry.arrays import FloatArray
 
@@ -70,3 +70,12 @@ def test_a_cubic_misfit_is_no_noise() -> None:
     bend = (1.0 + observations.stripe) * (t**3 - 2.0 * t**2 + 0.5)
     plain, bent = (stripe_noise(observations, white + extra) for extra in (0.0, bend))
     np.testing.assert_allclose(bent.factor, plain.factor, rtol=1e-9)
+
+
+def test_scatter_of_each_stripe_over_its_claim() -> None:
+    """A median over 300 points knows the scatter to 1.17 / sqrt(600) = 4.8 %; four sigma."""
+    true = np.repeat(np.linspace(0.3, 4.0, N_STRIPES), N_POINTS)
+    residual = true * moving_average(1, SIGMA_PX, 4)
+    found = scatter_by_stripe(straight_observations(), residual)
+    np.testing.assert_allclose(found, true, rtol=4.0 * 0.048)
+    assert len(np.unique(found)) == N_STRIPES

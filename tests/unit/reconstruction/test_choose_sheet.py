@@ -73,6 +73,14 @@ def test_depth_names_a_stripe_that_one_sheet_alone_puts_in_range() -> None:
     assert "right" in choice.how
 
 
+def test_the_words_tell_the_calibrated_depths_from_those_accepted() -> None:
+    """At x/z = -0.25: left z = 240, 40 mm before its range, and right z = 400, 80 mm behind."""
+    choice = choose_sheets(stripes(-0.25), two_sheets(), DepthRange(1.5))
+    assert set(choice.sheet.tolist()) == {0}
+    assert "left (calibrated Z 280 to 320 mm, accepted 220 to 380 mm)" in choice.how
+    assert "within reach" in choice.how
+
+
 def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
     with pytest.raises(EstimationError, match="--sheet"):
         choose_sheets(stripes(0.0), two_sheets(), DepthRange())
@@ -81,6 +89,7 @@ def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
 def test_a_stripe_in_no_range_gets_no_sheet() -> None:
     choice = choose_sheets(stripes(FAR, NEAR), two_sheets(), DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {-1}
+    assert choice.how.startswith("no sheet")
 
 
 def test_flagged_points_do_not_vote() -> None:

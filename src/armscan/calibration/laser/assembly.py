@@ -19,7 +19,7 @@ from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, Sheet
 from armscan.calibration.laser.sheet_model import SheetModel, sheet_geometry
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
-from armscan.geometry.arrays import BoolArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, SheetCalibration
 
@@ -35,7 +35,9 @@ class SheetCase:
     named
         The sheet of each straight stripe.
     observations
-        All named points.
+        All named points, their sigmas raised or lowered to their stripe's own scatter.
+    scatter
+        (N,) factor by which they were.
     kept
         (N,) False for points that are too far from their sheet.
     models
@@ -51,6 +53,7 @@ class SheetCase:
     images: Sequence[BoardImage]
     named: NamedStripes
     observations: SheetObservations
+    scatter: FloatArray
     kept: BoolArray
     models: Sequence[SheetModel]
     errors: CommonErrors
@@ -97,7 +100,7 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
         _image_evidence(case, solution),
         case.camera,
         solution.covariance,
-        max(model.noise.factor for model in models),
+        max(_noise_factor(k, case) for k in range(len(models))),
         max(model.noise.correlation_points for model in models),
         case.named.how,
         case.options,
@@ -149,6 +152,12 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
     )
 
 
+def _noise_factor(k: int, case: SheetCase) -> float:
+    """Scatter of one sheet's points over what the stripe extraction claimed."""
+    own = case.kept & (case.observations.sheet == k)
+    return case.models[k].noise.factor * float(np.sqrt((case.scatter[own] ** 2).mean()))
+
+
 def _misfit_warning(source: str) -> str:
     return (
         f"a plane explains all boards but the one in {source}: check that its images belong "
@@ -159,16 +168,20 @@ def _misfit_warning(source: str) -> str:
 def _common_plane(k: int, case: SheetCase) -> CommonPlane | None:
     # Not the raised sigmas: they would explain away the very misfit that is to be shown.
     factor = case.models[k].noise.sigma_factor
-    members = [
-        PosedSighting(
-            replace(sighting, sigma_ends_mm=sighting.sigma_ends_mm * factor),
-            image.data.sensor_from_board.covariance,
-            case.camera.covariance,
-        )
-        for image, sheets in zip(case.images, case.named.sheets, strict=True)
-        for sighting, sheet in zip(image.sightings, sheets, strict=True)
-        if sheet == k
-    ]
+    members = []
+    for i, (image, sheets) in enumerate(zip(case.images, case.named.sheets, strict=True)):
+        for sighting, sheet in zip(image.sightings, sheets, strict=True):
+            if sheet != k:
+                continue
+            first = (case.observations.image == i) & (case.observations.row == sighting.rows[0])
+            level = factor * float(case.scatter[first][0])
+            members.append(
+                PosedSighting(
+                    replace(sighting, noise_ends_mm2=sighting.noise_ends_mm2 * level**2),
+                    image.data.sensor_from_board.covariance,
+                    case.camera.covariance,
+                )
+            )
     common = fit_common_plane(members)
     return None if isinstance(common, FitFailure) else common
 

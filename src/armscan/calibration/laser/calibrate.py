@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from armscan.calibration.laser.assembly import SheetCase, assemble_fit
 from armscan.calibration.laser.conditioning import refuse_few_boards
-from armscan.calibration.laser.lack_of_fit import stripe_noise
+from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
 from armscan.calibration.laser.naming import name_stripes
 from armscan.calibration.laser.observations import SheetObservations, collect_observations
 from armscan.calibration.laser.options import SheetOptions
@@ -74,17 +75,22 @@ def calibrate_sheets(
     errors = CommonErrors(
         [board.sensor_from_board.covariance for board in boards], camera.covariance
     )
-    models: list[SheetModel] = []
-    kept = np.ones(len(observations), dtype=np.bool_)
+    starts: list[LightSheet] = []
     for k, name in enumerate(named.names):
-        own = observations.sheet == k
-        start = start_sheet(name, observations.select(own), images)
+        start = start_sheet(name, observations.select(observations.sheet == k), images)
         if isinstance(start, FitFailure):
             return start
+        starts.append(start)
+    scatter = scatter_by_stripe(observations, observations.residuals_px(starts)[1])
+    observations = replace(observations, sigma_px=observations.sigma_px * scatter)
+    models: list[SheetModel] = []
+    kept = np.ones(len(observations), dtype=np.bool_)
+    for k, start in enumerate(starts):
+        own = observations.sheet == k
         kept[own] = _without_outliers(observations.select(own), start, errors, options)
         models.append(choose_model(observations.select(own & kept), start, errors, options))
     return assemble_fit(
-        SheetCase(images, named, observations, kept, models, errors, camera, options)
+        SheetCase(images, named, observations, scatter, kept, models, errors, camera, options)
     )
 
 

@@ -27,7 +27,7 @@ class PosedSighting:
     def own_covariance_mm2(self, normal: FloatArray) -> FloatArray:
         """(2, 2) covariance of the ends along ``normal`` by the board's pose and stripe noise."""
         by_pose = np.einsum("i,eij->ej", normal, self.sighting.ends_by_pose)
-        noise = np.diag(self.sighting.sigma_ends_mm**2)
+        noise = self.sighting.noise_ends_mm2 * float(self.sighting.across @ normal) ** 2
         return np.asarray(by_pose @ self.pose_covariance @ by_pose.T + noise)
 
     def by_camera(self, normal: FloatArray) -> FloatArray:

@@ -61,22 +61,40 @@ def stripe_noise(observations: SheetObservations, residual_px: FloatArray) -> St
     residual_px
         (N,) residuals from the sheets; a smooth misfit does not matter.
     """
-    rest, squares = [], 0.0
-    for stripe in np.unique(observations.stripe):
-        own = observations.stripe == stripe
-        points = observations.points_mm[own]
-        along = (points - points[0]) @ (points[-1] - points[0])
-        t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
-        sigma = observations.sigma_px[own]
-        design = np.polynomial.legendre.legvander(t, SHAPE_DEGREE) / sigma[:, None]
-        normalised = residual_px[own] / sigma
-        left = normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0]
-        rest.append(left)
-        squares += float(left @ left)
+    rest = [
+        _off_course(observations.select(own), residual_px[own])
+        for own in (observations.stripe == stripe for stripe in np.unique(observations.stripe))
+    ]
+    squares = sum(float(left @ left) for left in rest)
     correlation = _correlation(rest)
     count = sum(len(left) for left in rest)
     freedom = max(count - N_SHAPE * len(rest) * correlation, 1.0)
     return StripeNoise(float(np.sqrt(squares / freedom)), correlation, freedom)
+
+
+def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) -> FloatArray:
+    """(N,) scatter of each point's stripe over what its sigmas claim, by the median.
+
+    The stripes of one calibration lie on boards of different brightness and slant, and their
+    claims may be wrong by different factors. A stripe that claims too little would outweigh all
+    others.
+    """
+    factor = np.ones(len(observations))
+    for stripe in np.unique(observations.stripe):
+        own = observations.stripe == stripe
+        left = _off_course(observations.select(own), residual_px[own])
+        factor[own] = 1.4826 * float(np.median(np.abs(left)))
+    return np.where(factor > 0.0, factor, 1.0)
+
+
+def _off_course(stripe: SheetObservations, residual_px: FloatArray) -> FloatArray:
+    """What one stripe's residuals leave of a cubic course, in the points' own sigmas."""
+    along = (stripe.points_mm - stripe.points_mm[0]) @ (stripe.points_mm[-1] - stripe.points_mm[0])
+    t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
+    design = np.polynomial.legendre.legvander(t, SHAPE_DEGREE) / stripe.sigma_px[:, None]
+    normalised = residual_px / stripe.sigma_px
+    left = normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0]
+    return np.asarray(left)
 
 
 def _correlation(rest: list[FloatArray]) -> float:

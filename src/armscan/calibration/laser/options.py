@@ -22,6 +22,13 @@ class SheetOptions:
     sheet_names
         Names to give, in the order of the stripes across the first image (left to right, or top
         to bottom where stripes lie flatter than 45 degrees); empty gives A, B, C, ...
+    edge_widths
+        A stripe point is left out if an edge of the target's marks that runs along the stripe is
+        nearer than this many of the stripe's widths (sigma of its cross-section); 0 leaves none
+        out.
+    edge_angle_deg
+        Largest angle between stripe and edge for this; edges that are turned further cross the
+        stripe and pull it to neither side.
     line_tolerance_mm
         Half width of the band on the board in which points belong to one straight stripe, before
         robust statistics tighten it.
@@ -38,6 +45,8 @@ class SheetOptions:
     margin_mm: float = 0.0
     n_sheets: int = 0
     sheet_names: tuple[str, ...] = ()
+    edge_widths: float = 3.0
+    edge_angle_deg: float = 75.0
     line_tolerance_mm: float = 1.0
     outlier_sigma: float = 4.0
     min_points: int = 20
@@ -46,6 +55,16 @@ class SheetOptions:
 
     def __post_init__(self) -> None:
         _require(0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32")
+        _require(
+            self.edge_widths >= 0.0,
+            f"edges within {self.edge_widths} widths",
+            "give 0 (use every point) or more",
+        )
+        _require(
+            0.0 < self.edge_angle_deg <= 90.0,
+            f"edges within {self.edge_angle_deg} deg of the stripe",
+            "give an angle between 0 and 90",
+        )
         _require(
             self.line_tolerance_mm > 0.0,
             f"line tolerance of {self.line_tolerance_mm} mm",

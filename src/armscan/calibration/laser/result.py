@@ -8,6 +8,7 @@ from enum import IntEnum
 from typing import Literal, TypeAlias
 
 from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.target_edges import TargetEdges
 from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
 from armscan.geometry.estimate import Estimate
 from armscan.geometry.frames import Board, Sensor
@@ -39,6 +40,8 @@ class PointUse(IntEnum):
     """On a straight stripe that could not be given to a sheet."""
     OFF_SHEET = 6
     """Given to a sheet and too far from it."""
+    ON_EDGE = 7
+    """Next to a reflectance edge of the target that runs along the stripe and pulls its centre."""
 
     @property
     def label(self) -> str:
@@ -54,6 +57,7 @@ _USE_LABELS = {
     PointUse.OFF_LINE: "off the straight stripe on the flat board",
     PointUse.UNNAMED: "stripe not given to a sheet",
     PointUse.OFF_SHEET: "off the sheet",
+    PointUse.ON_EDGE: "along an edge of the target's marks",
 }
 
 
@@ -72,12 +76,16 @@ class BoardStripes:
         multiplied from the left), then translation (mm), the camera being held fixed.
     lasers
         Names of the sheets that were on; empty when not known.
+    edges
+        Edges of the target's marks; None if they are not known, and then no point is left out for
+        them.
     """
 
     profile: Profile
     view: TargetView
     sensor_from_board: Estimate[Pose[Sensor, Board]]
     lasers: tuple[str, ...] = ()
+    edges: TargetEdges | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.ray_board import BoardPoints, meet_board, pose_by_camera
 from armscan.calibration.laser.result import BoardStripes, PointUse
 from armscan.calibration.laser.straight_stripes import find_straight_stripes
+from armscan.calibration.laser.target_edges import runs_along_edge
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.camera import CameraModel
 
@@ -29,8 +30,11 @@ class Sighting:
         (2, 3, 6) their derivative by the board's pose.
     ends_by_camera
         (2, 3, 9) their derivative by the camera, the board's pose following it.
-    sigma_ends_mm
-        (2,) standard deviation of the ends across the stripe by the stripe's noise alone.
+    noise_ends_mm2
+        (2, 2) covariance of the ends across the stripe by the stripe's noise alone: one end goes
+        up where the other goes down.
+    across
+        (3,) unit vector on the board across the stripe, in which this noise acts.
     middle_px
         (2,) middle of the stripe in the image.
     direction_px
@@ -41,7 +45,8 @@ class Sighting:
     ends_mm: FloatArray
     ends_by_pose: FloatArray
     ends_by_camera: FloatArray
-    sigma_ends_mm: FloatArray
+    noise_ends_mm2: FloatArray
+    across: FloatArray
     middle_px: FloatArray
     direction_px: FloatArray
 
@@ -90,6 +95,9 @@ def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions
             on_board[:, :2] <= high + options.margin_mm
         )
     use = np.full(len(profile), int(PointUse.OFF_LINE))
+    if data.edges is not None:
+        pulled = runs_along_edge(profile, data.edges, options.edge_widths, options.edge_angle_deg)
+        use[pulled] = PointUse.ON_EDGE
     use[~known.all(axis=1)] = PointUse.OFF_BOARD
     use[~points.is_valid] = PointUse.NO_RAY
     use[~profile.is_accepted] = PointUse.FLAGGED
@@ -132,7 +140,8 @@ def _sighting(
         gain @ here,
         np.einsum("ek,kij->eij", gain, points.dpoint_dpose[rows]),
         np.einsum("ek,kij->eij", gain, by_camera[rows]),
-        np.sqrt(np.einsum("ei,ij,ej->e", at_ends, normal, at_ends)),
+        at_ends @ normal @ at_ends.T,
+        np.cross(data.sensor_from_board.value.rotation[:, 2], direction),
         0.5 * (q[0] + q[-1]),
         direction_px,
     )

@@ -78,7 +78,8 @@ def choose_model(
     if not tested:
         names = [chosen.model for chosen in tried]
         chosen = tried[names.index(UNTESTED_MODEL)] if UNTESTED_MODEL in names else tried[0]
-        return _with_reason(chosen, "too few views for a hold-out test: only k1 and k2 are free")
+        reason = f"too few views for a hold-out test: {chosen.model} without one"
+        return _with_reason(chosen, reason)
     best = min(rms for _, rms in tested)
     good = [(chosen, rms) for chosen, rms in tested if rms <= TOLERATED * best]
     unfolded = [(chosen, rms) for chosen, rms in good if not folds(chosen.solution)]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -14,13 +15,14 @@ from armscan.calibration.camera.calibrate import calibrate_camera
 from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.camera.result import CameraFit
 from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LaserFit
+from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.calibration.laser.target_edges import TargetEdges
 from armscan.records.exposure import Exposure
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
 from armscan.report.camera_job import camera_calibration
 from armscan.report.camera_page import camera_page
 from armscan.report.laser_job import laser_summary
-from armscan.report.laser_page import laser_page
+from armscan.report.laser_page import USE_COLOURS, laser_page
 from armscan.report.numbers import with_sigma
 from armscan.report.page import render_page
 from camera_scene import Scene, make_views
@@ -101,6 +103,23 @@ def test_laser_page_shows_every_point_and_the_bow() -> None:
     assert all(image.source in text for image in fit.images)
     dots = sum(len(re.findall(r"M[-\d.e ]+h0", part)) for part in page.decode().split("<svg")[1:])
     assert dots >= sum(len(image.profile) for image in fit.images)
+
+
+def test_laser_page_names_the_points_along_an_edge_and_gives_every_fate_a_colour() -> None:
+    """The first half of one stripe runs on an edge of the target."""
+    rig = thesis_rig()
+    boards = rig.boards(rig.camera, np.random.default_rng(5))
+    profile = boards[0].profile
+    half = profile.select(np.arange(len(profile)) < len(profile) // 2)
+    along = np.stack([-half.normals_px[:, 1], half.normals_px[:, 0]], axis=1)
+    boards[0] = replace(boards[0], edges=TargetEdges(half.points_px, along))
+    fit = calibrate_sheets(boards, rig.calibration(rig.camera))
+    assert isinstance(fit, LaserFit)
+    page = render_page(laser_page(fit, {}, PROVENANCE))
+    assert PointUse.ON_EDGE.label in text_of(page)
+    assert USE_COLOURS[PointUse.ON_EDGE].encode() in page
+    assert len(set(USE_COLOURS.values())) == len(USE_COLOURS)
+    assert set(USE_COLOURS) == set(PointUse) - {PointUse.USED, PointUse.FLAGGED}
 
 
 def test_laser_summary_has_the_sheet_with_its_sigmas() -> None:

@@ -57,7 +57,7 @@ _USE_LABELS = {
     PointUse.OFF_LINE: "off the straight stripe on the flat board",
     PointUse.UNNAMED: "stripe not given to a sheet",
     PointUse.OFF_SHEET: "off the sheet",
-    PointUse.ON_EDGE: "along an edge of the target's marks",
+    PointUse.ON_EDGE: "along an edge of the target",
 }
 
 

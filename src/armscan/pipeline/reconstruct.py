@@ -140,6 +140,10 @@ def _warnings(
     n_outside = sum(image.count(PointFate.OUT_OF_DEPTH) for image in images)
     if n_outside:
         warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
+    if not sensor.camera.has_covariance:
+        warnings.append(
+            "the camera came without covariance: the points' sigmas leave its errors out"
+        )
     for k, sheet in enumerate(sensor.sheets):
         low, high = sheet.depth_range_mm
         depth = cloud.points_mm[cloud.sheet == k, 2]

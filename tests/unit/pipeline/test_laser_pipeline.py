@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pipelines tell what is wrong with images that hold nothing, and report their progress."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,7 +24,7 @@ CAMERA = CameraModel(400.0, 400.0, 159.5, 119.5, np.zeros(5), WIDTH, HEIGHT)
 CALIBRATION = CameraCalibration(
     CAMERA,
     np.zeros((9, 9)),
-    False,
+    True,
     0.1,
     0.05,
     9,
@@ -92,7 +94,7 @@ def test_a_line_becomes_points_at_the_depth_by_hand() -> None:
 
 
 def test_a_line_far_outside_the_depths_and_no_line_are_told_apart() -> None:
-    with pytest.raises(EstimationError, match="outside the calibrated depth range"):
+    with pytest.raises(EstimationError, match="too far outside the calibrated depths"):
         reconstruct([picture("far.png", 310.0)], sensor())
     with pytest.raises(EstimationError, match="no stripe was found in 1 images"):
         reconstruct([picture("none.png")], sensor())
@@ -104,3 +106,10 @@ def test_extrapolated_points_and_empty_images_are_counted() -> None:
     assert set(result.cloud.exposure.tolist()) == {0}
     assert any("bb.png" in warning for warning in result.warnings)
     assert any("outside its calibrated depth range" in warning for warning in result.warnings)
+
+
+def test_sigmas_without_the_cameras_part_are_told() -> None:
+    known = sensor()
+    foreign = replace(known, camera=replace(known.camera, has_covariance=False))
+    result = reconstruct([picture("a.png", CAMERA.cx_px)], foreign)
+    assert any("came without covariance" in warning for warning in result.warnings)

@@ -28,6 +28,8 @@ class StripeFlag(IntFlag):
     """Off the smooth course of its own segment."""
     SHORT_SEGMENT = 32
     """Belongs to a segment that is too short to be a stripe."""
+    TARGET_EDGE = 64
+    """Along an edge of a calibration target's marks: set by the calibration, not the extraction."""
 
 
 REJECTING = (
@@ -36,6 +38,7 @@ REJECTING = (
     | StripeFlag.NEIGHBOUR
     | StripeFlag.OUTLIER
     | StripeFlag.SHORT_SEGMENT
+    | StripeFlag.TARGET_EDGE
 )
 
 

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from armscan.calibration.laser.result import LaserFit, SheetFit
+import numpy as np
+
+from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
 from armscan.errors import EstimationError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
 from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_exposures
 from armscan.pipeline.progress import Progress, silent
+from armscan.records.profile import Profile, StripeFlag
 from armscan.report.laser_page import laser_page, sheet_facts
 from armscan.report.numbers import sentence
 from armscan.report.outputs import calibration_outputs
@@ -105,7 +108,9 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     page = laser_page(fit, by_source, provenance, is_simulated=is_simulated)
     hashes = dict(zip(by_source, (item.sha256 for item in provenance.inputs), strict=False))
     observations = pack_observations(
-        [image.view for image in fit.images], [image.profile for image in fit.images], hashes
+        [image.view for image in fit.images],
+        [_with_edge_flags(image) for image in fit.images],
+        hashes,
     )
     document = sensor_document(
         fit.to_calibration(provenance), (files.observations.name, observations)
@@ -116,6 +121,16 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     )
     written = (files.document, files.observations, files.page)
     return laser_summary(fit, written, is_simulated=is_simulated)
+
+
+def _with_edge_flags(image: SheetImage) -> Profile:
+    """The stripe points with those flagged that lay along an edge of the target.
+
+    The edges themselves are not kept, and without them the sheet could not be solved again.
+    """
+    is_on_edge = image.use == int(PointUse.ON_EDGE)
+    flags = image.profile.flags | np.where(is_on_edge, int(StripeFlag.TARGET_EDGE), 0)
+    return replace(image.profile, flags=flags)
 
 
 def all_warnings(fit: LaserFit) -> tuple[str, ...]:

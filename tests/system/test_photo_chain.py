@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from armscan.calibration.laser.result import PointUse
 from armscan.cli import main
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.photo_demo import PhotoErrors, SheetErrors
@@ -72,6 +73,7 @@ def test_every_photo_is_used_and_every_file_written(measured: Measured) -> None:
     assert {path.name for path in measured.folder.iterdir()} == demo_job.OWN_NAMES
     for page in ("camera.html", "sensor.html", "cloud.html"):
         assert "simulated" in (measured.folder / page).read_text().lower()
+    assert PointUse.ON_EDGE.label in (measured.folder / "sensor.html").read_text()
 
 
 def test_camera_errors_are_what_its_covariance_says(measured: Measured) -> None:

@@ -165,7 +165,7 @@ def _too_few(views: list[TargetView], not_found: list[tuple[str, str]]) -> FitFa
         return None
     if n_images < MIN_VIEWS:
         return FitFailure(
-            f"{n_images} images were given, a camera needs at least {MIN_VIEWS}",
+            f"{n_images} {'image was' if n_images == 1 else 'images were'} given, a camera needs at least {MIN_VIEWS}",
             "take 10 to 20 images with the board tilted by 20 to 45 degrees in all directions",
         )
     return FitFailure(

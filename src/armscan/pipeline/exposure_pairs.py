@@ -16,6 +16,14 @@ from armscan.records.exposure import Exposure
 ExposurePair = tuple[Exposure, Exposure | None]
 LISTED = 4
 REDUCED_PX = 120
+OTHER_VIEW = 0.15
+LEAST_CONTRAST = 0.02
+"""A pair shows two scenes if the correlation of their structure is below `OTHER_VIEW`, given that
+both have a contrast of more than this part of full scale: a dark room shows no structure."""
+THIN_SHARE = 0.001
+SWAPPED_RATIO = 3.0
+"""The pair is swapped if the partner's brightest `THIN_SHARE` of the pixels stands this many times
+further above the image than the image's above the partner."""
 CLIPPED_SHARE = 0.99
 SAME_VIEW = 0.3
 MISORDERED = 0.6
@@ -61,6 +69,9 @@ def pair_exposures(
     for exposure, partner in zip(exposures, partners, strict=True):
         _check_pair(exposure, partner)
     _check_order(exposures, partners)
+    for exposure, partner in zip(exposures, partners, strict=True):
+        _check_scene(exposure, partner)
+        _check_laser_side(exposure, partner)
     return list(zip(exposures, partners, strict=True))
 
 
@@ -80,7 +91,7 @@ def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
                 f"the image reaches to {width} x {height} px, the camera was calibrated with "
                 f"{camera.width_px} x {camera.height_px} px",
                 where=exposure.source,
-                remedy="use images of the camera's full size, or state the window",
+                remedy="use images of the camera's full size",
             )
 
 
@@ -120,13 +131,52 @@ def _check_order(exposures: Sequence[Exposure], partners: Sequence[Exposure]) ->
             )
 
 
-def _structure(exposure: Exposure) -> FloatArray:
-    """Edges of a reduced image, bright lines clipped, as a vector of length 1."""
+def _check_scene(exposure: Exposure, partner: Exposure) -> None:
+    """Raise `InputError` if the two images of a pair show different scenes."""
+    contrast = min(float(_reduced(image).std()) / image.full_scale for image in (exposure, partner))
+    likeness = float(_structure(exposure) @ _structure(partner))
+    if contrast > LEAST_CONTRAST and likeness < OTHER_VIEW:
+        raise InputError(
+            f"the image does not show the scene of its partner {partner.source} (correlation "
+            f"{likeness:.2f})",
+            where=exposure.source,
+            remedy="give the same view without laser, or no image without laser",
+        )
+
+
+def _check_laser_side(exposure: Exposure, partner: Exposure) -> None:
+    """Raise `InputError` if thin bright parts are in the image that should be without laser.
+
+    The brightness of the two is matched first: the partner may be exposed longer.
+    """
+    lit, dark = (image.image.astype(np.float64).ravel() for image in (exposure, partner))
+    usual = dark <= np.quantile(dark, 1.0 - 10.0 * THIN_SHARE)
+    (_, shared), (_, variance) = np.cov(lit[usual], dark[usual])
+    gain = max(shared, 0.0) / variance if variance > 0.0 else 0.0
+    difference = lit - gain * dark
+    difference -= np.median(difference)
+    below, above = np.quantile(difference, [THIN_SHARE, 1.0 - THIN_SHARE])
+    if -below > SWAPPED_RATIO * max(float(above), LEAST_CONTRAST * exposure.full_scale):
+        raise InputError(
+            f"its partner {partner.source} is the one with thin bright parts: the laser seems to "
+            "be on in the wrong image",
+            where=exposure.source,
+            remedy="swap the images with and without laser",
+        )
+
+
+def _reduced(exposure: Exposure) -> FloatArray:
+    """Mean grey levels of square blocks, about `REDUCED_PX` of them along the shorter side."""
     grey = exposure.image if exposure.colour == "mono" else exposure.image.mean(axis=2)
     step = max(1, min(exposure.width_px, exposure.height_px) // REDUCED_PX)
     rows, columns = (size // step * step for size in grey.shape)
     blocks = grey[:rows, :columns].reshape(rows // step, step, columns // step, step)
-    small = np.sqrt(blocks.mean(axis=(1, 3)))
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _structure(exposure: Exposure) -> FloatArray:
+    """Edges of a reduced image, bright lines clipped, as a vector of length 1."""
+    small = np.sqrt(_reduced(exposure))
     edges = np.concatenate([np.diff(small, axis=0).ravel(), np.diff(small, axis=1).ravel()])
     limit = float(np.quantile(np.abs(edges), CLIPPED_SHARE))
     edges = np.clip(edges, -limit, limit)

@@ -22,6 +22,8 @@ from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
 
 STAGE = "reconstruct"
+CLEAN_SHARE = 0.5
+"""An image of which less than this share of the stripe points is measured is pointed out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,6 +139,16 @@ def _warnings(
     empty = [image.profile.source for image in images if image.count(PointFate.MEASURED) == 0]
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:4])}")
+    doubtful = [
+        image.profile.source
+        for image in images
+        if 0 < image.count(PointFate.MEASURED) < CLEAN_SHARE * len(image.profile)
+    ]
+    if doubtful:
+        warnings.append(
+            f"less than half of what looked like a stripe could be measured in "
+            f"{', '.join(doubtful[:4])}: see in the pictures whether it is a laser line"
+        )
     n_outside = sum(image.count(PointFate.OUT_OF_DEPTH) for image in images)
     if n_outside:
         warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
@@ -152,8 +164,11 @@ def _warnings(
             warnings.append(
                 f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
                 f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
-                f"{high:.1f} mm: there the sheet is extrapolated; trust its sigma"
+                f"{high:.1f} mm: their sigma supposes that the sheet goes on as it was calibrated"
             )
         if len(depth) and not sheet.is_redundant:
-            warnings.append(f"sheet {sheet.name} rests on two boards only, which nothing checks")
+            warnings.append(
+                f"sheet {sheet.name} rests on two boards only: nothing but the coplanarity of two "
+                "stripes checks it"
+            )
     return tuple(warnings)

@@ -87,3 +87,26 @@ def test_views_without_structure_are_taken_by_order() -> None:
     on = [Exposure(noise[0], "1.png"), Exposure(noise[1], "2.png")]
     off = [Exposure(noise[2], "3.png"), Exposure(noise[3], "4.png")]
     assert [b for _, b in pair_exposures(on, off)] == off
+
+
+def test_a_swapped_pair_is_noticed_also_when_it_is_the_only_one() -> None:
+    lit, dark = Exposure(scene(1, True), "lit.png"), Exposure(scene(1, False), "dark.png")
+    assert pair_exposures([lit], [dark]) == [(lit, dark)]
+    with pytest.raises(InputError, match=r"dark\.png.*wrong image.*swap"):
+        pair_exposures([dark], [lit])
+
+
+@pytest.mark.parametrize("gain", [0.5, 2.0, 4.0])
+def test_the_partner_may_be_exposed_longer_or_shorter(gain: float) -> None:
+    lit = Exposure(scene(1, True), "lit.png")
+    dark = Exposure((scene(1, False) * gain).astype(np.uint8), "dark.png")
+    assert pair_exposures([lit], [dark]) == [(lit, dark)]
+
+
+def test_a_pair_of_two_scenes_is_refused_and_a_dark_room_is_not() -> None:
+    lit, other = Exposure(scene(1, True), "lit.png"), Exposure(scene(2, False), "other.png")
+    with pytest.raises(InputError, match=r"lit\.png.*scene of its partner other\.png"):
+        pair_exposures([lit], [other])
+    night = np.random.default_rng(5).normal(3.0, 1.0, (300, 400)).clip(0, 255).astype(np.uint8)
+    dark = Exposure(night, "night.png")
+    assert pair_exposures([lit], [dark]) == [(lit, dark)]

@@ -113,3 +113,13 @@ def test_sigmas_without_the_cameras_part_are_told() -> None:
     foreign = replace(known, camera=replace(known.camera, has_covariance=False))
     result = reconstruct([picture("a.png", CAMERA.cx_px)], foreign)
     assert any("came without covariance" in warning for warning in result.warnings)
+
+
+def test_an_image_with_little_clean_line_is_pointed_out() -> None:
+    """Fifteen rows of a line measure; the rest is torn into pieces too short to be one."""
+    image = picture("torn.png", CAMERA.cx_px + 8.0).image.copy()
+    rows = np.arange(HEIGHT)
+    image[(rows > 25) & (rows % 14 > 9)] = 20
+    result = reconstruct([Exposure(image, "torn.png")], sensor())
+    assert 0 < len(result.cloud) < 0.5 * len(result.images[0].profile)
+    assert any("torn.png" in warning and "half" in warning for warning in result.warnings)

@@ -12,7 +12,7 @@ from armscan.records.exposure import Exposure
 SAMPLE_STEP_PX = 4
 ROUNDS = 4
 TRIM_SIGMAS = 2.5
-GAIN_LIMITS = (0.5, 2.0)
+GAIN_LIMITS = (0.05, 20.0)
 
 
 def check_background(exposure: Exposure, background: Exposure) -> None:

@@ -164,8 +164,9 @@ def _too_few(views: list[TargetView], not_found: list[tuple[str, str]]) -> FitFa
     if len(views) >= MIN_VIEWS:
         return None
     if n_images < MIN_VIEWS:
+        given = "1 image was" if n_images == 1 else f"{n_images} images were"
         return FitFailure(
-            f"{n_images} {'image was' if n_images == 1 else 'images were'} given, a camera needs at least {MIN_VIEWS}",
+            f"{given} given, a camera needs at least {MIN_VIEWS}",
             "take 10 to 20 images with the board tilted by 20 to 45 degrees in all directions",
         )
     return FitFailure(

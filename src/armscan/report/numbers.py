@@ -32,8 +32,16 @@ def significant(value: float, unit: str = "", digits: int = 3) -> str:
 
 
 def sentence(text: str) -> str:
-    """Text with a capital at its start and a full stop at its end."""
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
+    """Text with a capital at its start and a full stop at its end.
+
+    A first word with a dot, digit or the like inside is a name, of a file or a coefficient, and
+    stays as it is.
+    """
+    if not text:
+        return ""
+    first = text.split(maxsplit=1)[0].rstrip(".,:;").replace("-", "").replace("'", "")
+    start = text[:1].upper() if first.isalpha() else text[:1]
+    return f"{start}{text[1:].rstrip('.')}."
 
 
 def without_source(source: str, reason: str) -> str:

@@ -113,7 +113,7 @@ def test_weights_leave_points_out_exactly() -> None:
     spoiled_fit = adjust(other, start, BASIS, weights)
     assert not isinstance(with_zeros, FitFailure)
     assert not isinstance(spoiled_fit, FitFailure)
-    assert np.array_equal(with_zeros[0].shared, spoiled_fit[0].shared)
+    assert np.array_equal(with_zeros.state.shared, spoiled_fit.state.shared)
 
 
 def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
@@ -125,9 +125,9 @@ def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
     result = adjust(observations, State.from_poses(poor, poses), basis)
     assert not isinstance(result, FitFailure)
     assert names == SHARED_NAMES[:9]
-    assert np.abs(result[0].shared[:4] - CAMERA.parameters[:4]).max() < 1e-5
-    assert np.abs(result[0].shared[4:9] - CAMERA.distortion).max() < 1e-5
-    for found, truth in zip(result[0].rotations, poses, strict=True):
+    assert np.abs(result.state.shared[:4] - CAMERA.parameters[:4]).max() < 1e-5
+    assert np.abs(result.state.shared[4:9] - CAMERA.distortion).max() < 1e-5
+    for found, truth in zip(result.state.rotations, poses, strict=True):
         assert np.abs(found - truth.rotation).max() < 1e-8
 
 

@@ -74,7 +74,8 @@ def test_wrong_columns_are_noticed_and_blank_images_named() -> None:
 
 def test_too_few_images_are_refused() -> None:
     blank = Exposure(np.full((64, 64), 90, dtype=np.uint8), "blank.png")
-    for exposures in ([], [blank], [blank, blank]):
+    counts = ("0 images were", "1 image was", "2 images were")
+    for exposures, count in zip(([], [blank], [blank, blank]), counts, strict=True):
         failure = calibrate_camera_from_exposures(exposures, Chessboard(9, 6, 25.0))
         assert isinstance(failure, FitFailure)
-        assert f"{len(exposures)} images were given" in failure.reason
+        assert f"{count} given" in failure.reason

@@ -47,6 +47,13 @@ def test_sentences() -> None:
     assert sentence("all is well") == "All is well."
     assert sentence("Done.") == "Done."
     assert sentence("") == ""
+    assert sentence("well-known") == "Well-known."
+
+
+def test_names_at_the_start_of_a_sentence_stay_as_they_are() -> None:
+    assert sentence("left03copy.png repeats left03.png") == "left03copy.png repeats left03.png."
+    assert sentence("left.png: residuals are large") == "left.png: residuals are large."
+    assert sentence("k1k2 without hold-out") == "k1k2 without hold-out."
 
 
 def summary() -> Summary:

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.calibration.camera.observations import Observations, State
+from armscan.calibration.camera.options import MAX_STEPS
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotation import rotation_from_vector, skew
 from armscan.models.camera import CameraModel
 
-MAX_STEPS = 60
 CONVERGED = 1e-12
 """Relative decrease of chi2 at which the iteration ends."""
 
@@ -40,6 +40,25 @@ class NormalEquations:
     pose: FloatArray
     shared_gradient: FloatArray
     pose_gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjustment:
+    """Where an adjustment ended.
+
+    Parameters
+    ----------
+    state
+        The unknowns.
+    equations
+        The normal equations there.
+    is_converged
+        False if the last step allowed still lowered chi2: a lower minimum is near.
+    """
+
+    state: State
+    equations: NormalEquations
+    is_converged: bool
 
 
 def predict(
@@ -168,7 +187,7 @@ def adjust(
     basis: FloatArray,
     weights: FloatArray | None = None,
     max_steps: int = MAX_STEPS,
-) -> tuple[State, NormalEquations] | FitFailure:
+) -> Adjustment | FitFailure:
     """Minimise eq. 2.39, weighted by each point's covariance.
 
     Parameters
@@ -186,8 +205,8 @@ def adjust(
 
     Returns
     -------
-    state, equations
-        The minimum and the normal equations there, or why there is none.
+    adjustment
+        The minimum, or what was reached by the last step; or why there is none.
     """
     if weights is None:
         weights = np.ones(len(observations.points_px))
@@ -201,14 +220,14 @@ def adjust(
         proposed = linearise(observations, trial, basis, weights) if trial is not None else None
         if trial is None or proposed is None or not proposed.chi2 <= equations.chi2:
             if damping > MAX_DAMPING or (step is not None and _is_tiny(equations, step)):
-                break
+                return Adjustment(state, equations, is_converged=True)
             damping *= 10.0
             continue
         decrease = equations.chi2 - proposed.chi2
         state, equations, damping = trial, proposed, max(0.1 * damping, 1e-14)
         if decrease <= CONVERGED * equations.chi2:
-            break
-    return state, equations
+            return Adjustment(state, equations, is_converged=True)
+    return Adjustment(state, equations, is_converged=False)
 
 
 def _is_tiny(equations: NormalEquations, step: tuple[FloatArray, FloatArray]) -> bool:

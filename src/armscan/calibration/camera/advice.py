@@ -12,9 +12,13 @@ FEW_VIEWS = 8
 SMALL_TILT_DEG = 15.0
 THIN_COVERAGE = 0.6
 UNSEEN_WORSE = 1.3
+UNSEEN_BETTER = 0.9
+"""Least squares fits the views that it used at least about as well as those that it did not."""
 
 
-def advise(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> CameraFit:
+def advise(
+    fit: CameraFit, repeats: Sequence[tuple[str, str]], *, is_converged: bool = True
+) -> CameraFit:
     """Add warnings to a result.
 
     Parameters
@@ -23,14 +27,31 @@ def advise(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> CameraFit:
         The result.
     repeats
         Pairs (later, earlier) of views that show the board in the same place.
+    is_converged
+        Whether the adjustment reached its minimum.
     """
     warnings = [
+        *_about_convergence(fit, is_converged=is_converged),
         *_about_views(fit, repeats),
         *_about_coverage(fit),
         *_about_model(fit),
         *_about_warp(fit),
     ]
     return replace(fit, warnings=tuple(warnings))
+
+
+def _about_convergence(fit: CameraFit, *, is_converged: bool) -> list[str]:
+    remedy = "do not rely on it: check the views with the largest residuals, and add views"
+    if not is_converged:
+        return [f"the solution was stopped before it reached the best fit; {remedy}"]
+    validation = fit.cross_validation
+    if validation is None or validation.rms_px >= UNSEEN_BETTER * validation.rms_in_sample_px:
+        return []
+    return [
+        f"the solution did not converge to the best fit: views that it used fit worse "
+        f"({validation.rms_in_sample_px:.3f} px) than the same views when they are held out "
+        f"({validation.rms_px:.3f} px); {remedy}"
+    ]
 
 
 def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str]:

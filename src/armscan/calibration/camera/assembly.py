@@ -42,7 +42,7 @@ def assemble(
     used = [views[index] for index in prepared.used]
     solution, validation = chosen.solution, chosen.cross_validation
     if options.solve_warp:
-        bowed = with_warp(solution)
+        bowed = with_warp(solution, options.max_steps)
         if isinstance(bowed, FitFailure):
             return bowed
         solution = bowed
@@ -89,7 +89,7 @@ def assemble(
         options=options,
     )
     repeats = [(views[a].source, views[b].source) for a, b in prepared.repeats.items()]
-    return advise(fit, repeats)
+    return advise(fit, repeats, is_converged=solution.is_converged)
 
 
 def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:

@@ -209,7 +209,7 @@ def _refined(
     result = adjust(observations, State.from_poses(shared, [start]), _POSE_ONLY)
     if isinstance(result, FitFailure):
         return result
-    return PoseCandidate(result[0].pose(0), result[1].chi2)
+    return PoseCandidate(result.state.pose(0), result.equations.chi2)
 
 
 def _is_same(a: PoseCandidate, b: PoseCandidate) -> bool:

@@ -172,7 +172,7 @@ def _solve(
     if isinstance(start, FitFailure):
         return start
     basis, _ = free_basis(model, options, with_warp=False)
-    solution = solve_robustly(observations, start[0], basis, start[1])
+    solution = solve_robustly(observations, start[0], basis, start[1], options.max_steps)
     for _ in range(EXCESS_ROUNDS):
         if isinstance(solution, FitFailure):
             return solution
@@ -180,7 +180,7 @@ def _solve(
         if excess <= 0.0:
             break
         noisier = with_excess(observations, excess)
-        solution = solve_robustly(noisier, solution.state, basis, start[1])
+        solution = solve_robustly(noisier, solution.state, basis, start[1], options.max_steps)
     if isinstance(solution, FitFailure):
         return solution
     if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:

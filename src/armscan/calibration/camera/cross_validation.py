@@ -53,12 +53,12 @@ def cross_validate(
             return None
         part, weights = subset(observations, solution.weights, test)
         start = _of_views(solution.state, test)
-        start = State(trained[0].shared, start.rotations, start.translations_mm)
+        start = State(trained.state.shared, start.rotations, start.translations_mm)
         posed = adjust(part, start, NO_SHARED, weights)
         if isinstance(posed, FitFailure):
             return None
         rows = np.isin(observations.view_of_point, test)
-        held_out[rows] = residuals_px(part, posed[0])
+        held_out[rows] = residuals_px(part, posed.state)
     in_sample = residuals_px(observations, solution.state)
     kept = solution.weights > 0.0
     per_view = []

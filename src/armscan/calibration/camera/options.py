@@ -20,6 +20,8 @@ DISTORTION_PARAMETERS: dict[DistortionModel, tuple[str, ...]] = {
 """Free coefficients of each distortion model; those not named are zero."""
 
 MIN_VIEWS = 3
+MAX_STEPS = 200
+"""A wide lens whose distortion nearly folds over needs more than 60."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,8 @@ class CameraOptions:
         each view is a fold of its own.
     min_points
         Fewest points with which a view is used.
+    max_steps
+        Most iterations of one adjustment; a solution that needs more is returned with a warning.
     """
 
     distortion: DistortionModel = "auto"
@@ -58,6 +62,7 @@ class CameraOptions:
     leave_out_misfits: bool = False
     n_folds: int = 5
     min_points: int = 6
+    max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
         if self.distortion != "auto" and self.distortion not in DISTORTION_PARAMETERS:
@@ -71,3 +76,5 @@ class CameraOptions:
             raise OptionError(
                 f"min_points is {self.min_points}", remedy="a pose needs at least 4 points"
             )
+        if self.max_steps < 1:
+            raise OptionError(f"max_steps is {self.max_steps}", remedy="give at least 1")

@@ -61,6 +61,8 @@ class Solution:
         (V,) robust chi2 per coordinate of each view over that of the typical view.
     outlier_shares
         (V,) share of each view's points that lie too far out for the typical view's noise.
+    is_converged
+        False if the adjustment was stopped before the minimum.
     """
 
     observations: Observations
@@ -70,6 +72,7 @@ class Solution:
     weights: FloatArray
     view_levels: FloatArray
     outlier_shares: FloatArray
+    is_converged: bool
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -100,7 +103,11 @@ def chi2_of_points(observations: Observations, state: State) -> FloatArray:
 
 
 def solve_robustly(
-    observations: Observations, start: State, basis: FloatArray, trusted: BoolArray
+    observations: Observations,
+    start: State,
+    basis: FloatArray,
+    trusted: BoolArray,
+    max_steps: int,
 ) -> Solution | FitFailure:
     """Solve, look for outliers, and solve again without them where there are any.
 
@@ -112,32 +119,41 @@ def solve_robustly(
         From `armscan.calibration.camera.starting_values.starting_state`.
     basis
         From `free_basis`.
+    max_steps
+        Most iterations of each adjustment.
     """
     if trusted.all():
-        result = adjust(observations, start, basis)
+        result = adjust(observations, start, basis, max_steps=max_steps)
         if isinstance(result, FitFailure):
             return result
-        chi2 = chi2_of_points(observations, result[0])
+        chi2 = chi2_of_points(observations, result.state)
         levels, outlier = _judge(observations, chi2)
         if not outlier.any() and levels.max() < SUSPECT_LEVEL:
-            state, equations = result
-            every = np.ones(len(chi2))
-            return Solution(observations, state, basis, equations, every, levels, 0.0 * levels)
+            return Solution(
+                observations,
+                result.state,
+                basis,
+                result.equations,
+                np.ones(len(chi2)),
+                levels,
+                0.0 * levels,
+                result.is_converged,
+            )
     state = _reweighted(observations, start, basis, trusted)
     chi2 = chi2_of_points(observations, state)
     levels, outlier = _judge(observations, chi2)
     shares = _outlier_shares(observations, chi2)
     for _ in range(REJECTION_ROUNDS):
         weights = np.where(outlier, 0.0, 1.0)
-        kept = adjust(observations, state, basis, weights)
+        kept = adjust(observations, state, basis, weights, max_steps)
         if isinstance(kept, FitFailure):
             return kept
-        state, equations = kept
+        state, equations, is_converged = kept.state, kept.equations, kept.is_converged
         _, again = _judge(observations, chi2_of_points(observations, state))
         if np.array_equal(again, outlier):
             break
         outlier = again
-    return Solution(observations, state, basis, equations, weights, levels, shares)
+    return Solution(observations, state, basis, equations, weights, levels, shares, is_converged)
 
 
 def _reweighted(
@@ -150,7 +166,7 @@ def _reweighted(
         result = adjust(observations, state, basis, weights, steps)
         if isinstance(result, FitFailure):
             return state
-        state = result[0]
+        state = result.state
         chi2 = chi2_of_points(observations, state)
         typical = _typical(_view_levels(observations, chi2))
         before = weights

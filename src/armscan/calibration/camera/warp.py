@@ -19,15 +19,21 @@ _FIRST = SHARED_NAMES.index(WARP_NAMES[0])
 WARP_ROWS = slice(_FIRST, _FIRST + len(WARP_NAMES))
 
 
-def with_warp(flat: Solution) -> Solution | FitFailure:
+def with_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
     """Free the two bow parameters, starting from the flat solution and over the same points."""
     columns = np.zeros((len(SHARED_NAMES), len(WARP_NAMES)))
     columns[WARP_ROWS] = np.eye(len(WARP_NAMES))
     basis = np.concatenate([flat.basis, columns], axis=1)
-    result = adjust(flat.observations, flat.state, basis, flat.weights)
+    result = adjust(flat.observations, flat.state, basis, flat.weights, max_steps)
     if isinstance(result, FitFailure):
         return result
-    return replace(flat, state=result[0], basis=basis, equations=result[1])
+    return replace(
+        flat,
+        state=result.state,
+        basis=basis,
+        equations=result.equations,
+        is_converged=result.is_converged,
+    )
 
 
 def judge_warp(flat: Solution, bowed: Solution, covariance: FloatArray) -> BoardWarp:

@@ -21,6 +21,13 @@ from armscan.models.calibration import (
     SheetCalibration,
 )
 from armscan.models.camera import CameraModel
+from armscan.models.diagnostics import (
+    BowedBoard,
+    CameraDiagnostics,
+    FTest,
+    SensorDiagnostics,
+    SheetDiagnostics,
+)
 from armscan.models.light_sheet import LightSheet
 from armscan.storage.calibration_files import (
     camera_document,
@@ -65,6 +72,16 @@ def camera_calibration() -> CameraCalibration:
         n_points=1056,
         covered_px=np.array([10.1, 20.2, 900.3, 1200.4]),
         provenance=provenance(),
+        diagnostics=CameraDiagnostics(
+            free_parameters=("fx_px", "k1"),
+            model_reason="k2 does not pay",
+            hold_out_rms_px=0.1 + 0.3,
+            n_folds=8,
+            condition=1e3 / 7,
+            noise_scale=1.1,
+            covered_fraction=2 / 3,
+            board=BowedBoard((0.1 / 3, -0.2), (1e-3, 2e-3), FTest(17.3, 2, 1e-8 / 3)),
+        ),
     )
 
 
@@ -79,10 +96,19 @@ def sensor_calibration() -> SensorCalibration:
             n_points=900,
             depth_range_mm=(212.0 / 3, 290.0 / 3),
             is_redundant=True,
+            diagnostics=SheetDiagnostics(
+                0.1 / 3, FTest(9.1, 14, 1e-9), FTest(1.1, 12, 1 / 3), "it pays", 0.01, 0.02, 37.5
+            ),
         )
         for name in ("A", "B")
     )
-    return SensorCalibration(camera_calibration(), sheets, covariance(25, 2), provenance())
+    return SensorCalibration(
+        camera_calibration(),
+        sheets,
+        covariance(25, 2),
+        provenance(),
+        SensorDiagnostics(1.2, 3.4, "one sheet in each image"),
+    )
 
 
 def assert_same(left: Any, right: Any) -> None:
@@ -133,10 +159,12 @@ def test_unknown_figures_of_foreign_calibrations_are_null(tmp_path: Path) -> Non
     known = camera_calibration()
     values = {item.name: getattr(known, item.name) for item in fields(known)}
     values |= {"rms_px": math.nan, "sigma_point_px": math.nan, "has_covariance": False}
+    values["diagnostics"] = None
     path = tmp_path / "camera.json"
     path.write_bytes(camera_document(CameraCalibration(**values)))
     assert json.loads(path.read_text("utf-8"))["camera"]["rms_px"] is None
     assert math.isnan(read_camera_calibration(path).rms_px)
+    assert read_camera_calibration(path).diagnostics is None
 
 
 @pytest.mark.parametrize("name", ["camera_v1.json", "sensor_v1.json"])

@@ -9,6 +9,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 from armscan.models.camera import CameraModel
+from armscan.models.diagnostics import CameraDiagnostics, SensorDiagnostics, SheetDiagnostics
 from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES, LightSheet
 
 SHEET_PARAMETER_NAMES = (*PLANE_PARAMETER_NAMES, *(f"bow_u{i}v{j}_mm" for i, j in BOW_TERMS))
@@ -82,6 +83,8 @@ class CameraCalibration:
         (4,) smallest x, smallest y, largest x, largest y of the points used: validity in the image.
     provenance
         How it came to be.
+    diagnostics
+        Evidence for a reader; None where there is none, as in a foreign calibration.
     """
 
     camera: CameraModel
@@ -93,6 +96,7 @@ class CameraCalibration:
     n_points: int
     covered_px: FloatArray
     provenance: Provenance
+    diagnostics: CameraDiagnostics | None = None
 
     def __post_init__(self) -> None:
         n = len(CAMERA_PARAMETER_NAMES)
@@ -118,6 +122,8 @@ class SheetCalibration:
         Smallest and largest Z of the points used: the sheet is valid there.
     is_redundant
         False when two boards only just determine the plane, so that no residual checks it.
+    diagnostics
+        Evidence for a reader; None where there is none.
     """
 
     name: str
@@ -127,6 +133,7 @@ class SheetCalibration:
     n_points: int
     depth_range_mm: tuple[float, float]
     is_redundant: bool
+    diagnostics: SheetDiagnostics | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,12 +151,15 @@ class SensorCalibration:
         `SHEET_PARAMETER_NAMES`, in the order of ``sheets``.
     provenance
         How it came to be.
+    diagnostics
+        Evidence for a reader; None where there is none.
     """
 
     camera: CameraCalibration
     sheets: tuple[SheetCalibration, ...]
     covariance: FloatArray
     provenance: Provenance
+    diagnostics: SensorDiagnostics | None = None
 
     def __post_init__(self) -> None:
         if not self.sheets:

@@ -15,6 +15,7 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.camera_page import camera_page, parameter_rows
+from armscan.report.fit_diagnostics import camera_diagnostics
 from armscan.report.numbers import sentence, significant, without_source
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
@@ -120,6 +121,7 @@ def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibrat
         n_points=fit.n_points,
         covered_px=fit.coverage.covered_px,
         provenance=provenance,
+        diagnostics=camera_diagnostics(fit),
     )
 
 

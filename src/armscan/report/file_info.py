@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import FileFormatError
-from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
+from armscan.models.calibration import (
+    CameraCalibration,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.report.numbers import with_sigma
 from armscan.report.summary import Summary
@@ -150,8 +155,11 @@ def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:
 def _evidence(calibration: CameraCalibration) -> dict[str, Any]:
     if not calibration.has_covariance:
         return {"uncertainty": "none given"}
+    known = calibration.diagnostics
+    hold_out = None if known is None else known.hold_out_rms_px
     return {
         "rms_px": calibration.rms_px,
+        **({} if hold_out is None else {"hold_out_rms_px": hold_out}),
         "views": calibration.n_views,
         "points": calibration.n_points,
         **_origin(calibration.provenance),
@@ -160,17 +168,23 @@ def _evidence(calibration: CameraCalibration) -> dict[str, Any]:
 
 def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
     camera = calibration.camera.camera
-    sheets = [
-        f"{sheet.name} (rms {sheet.rms_mm:.4f} mm, Z {sheet.depth_range_mm[0]:.1f} to "
-        f"{sheet.depth_range_mm[1]:.1f} mm, {sheet.n_boards} boards)"
-        for sheet in calibration.sheets
-    ]
+    sheets = [_sheet_line(sheet) for sheet in calibration.sheets]
     return {
         "what": f"sensor calibration, {len(sheets)} light sheets, camera "
         f"{camera.width_px} x {camera.height_px} px",
         "sheets": sheets,
         **_origin(calibration.provenance),
     }
+
+
+def _sheet_line(sheet: SheetCalibration) -> str:
+    low, high = sheet.depth_range_mm
+    known = sheet.diagnostics
+    fit = f", lack of fit p = {known.final_test.p_value:.2g}" if known else ""
+    return (
+        f"{sheet.name} (rms {sheet.rms_mm:.4f} mm, Z {low:.1f} to {high:.1f} mm, "
+        f"{sheet.n_boards} boards{fit})"
+    )
 
 
 def _origin(provenance: Provenance) -> dict[str, Any]:

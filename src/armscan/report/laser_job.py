@@ -17,6 +17,7 @@ from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
 from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_exposures
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.profile import Profile, StripeFlag
+from armscan.report.fit_diagnostics import sensor_calibration
 from armscan.report.laser_page import laser_page, sheet_facts
 from armscan.report.numbers import sentence
 from armscan.report.outputs import calibration_outputs
@@ -113,7 +114,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         hashes,
     )
     document = sensor_document(
-        fit.to_calibration(provenance), (files.observations.name, observations)
+        sensor_calibration(fit, provenance), (files.observations.name, observations)
     )
     write_files(
         {files.document: document, files.observations: observations, files.page: render_page(page)},

@@ -22,15 +22,24 @@ from armscan.storage.calibration_schema import (
     SENSOR_SCHEMA,
     AxesBody,
     CameraBody,
+    CameraDiagnosticsBody,
     CovarianceBody,
     CoveredBody,
     InputFileBody,
     IntrinsicsBody,
     ObservationsBody,
     ProvenanceBody,
+    SensorDiagnosticsBody,
     SensorDocument,
     SheetBody,
+    SheetDiagnosticsBody,
     Triple,
+)
+from armscan.storage.diagnostics_bodies import (
+    camera_diagnostics,
+    diagnostics_body,
+    sensor_diagnostics,
+    sheet_diagnostics,
 )
 
 BOW_KEYS = tuple(f"u{i}_v{j}" for i, j in BOW_TERMS)
@@ -51,6 +60,7 @@ def camera_body(calibration: CameraCalibration) -> CameraBody:
         n_views=calibration.n_views,
         n_points=calibration.n_points,
         valid_region=CoveredBody(x_min_px=low_x, y_min_px=low_y, x_max_px=high_x, y_max_px=high_y),
+        diagnostics=diagnostics_body(calibration.diagnostics, CameraDiagnosticsBody),
     )
 
 
@@ -70,6 +80,7 @@ def camera_from_body(body: CameraBody, provenance: Provenance) -> CameraCalibrat
         n_points=body.n_points,
         covered_px=np.array([region.x_min_px, region.y_min_px, region.x_max_px, region.y_max_px]),
         provenance=provenance,
+        diagnostics=camera_diagnostics(body.diagnostics),
     )
 
 
@@ -83,6 +94,7 @@ def sensor_document_of(
         camera_provenance=provenance_body(calibration.camera.provenance),
         sheets=tuple(_sheet_body(sheet) for sheet in calibration.sheets),
         covariance=_covariance_body(calibration.parameter_names, calibration.covariance),
+        diagnostics=diagnostics_body(calibration.diagnostics, SensorDiagnosticsBody),
         observations=observations,
         provenance=provenance_body(calibration.provenance),
     )
@@ -100,7 +112,13 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
         provenance_from_body(document.provenance),
     )
     covariance = _covariance_from_body(document.covariance, empty.parameter_names)
-    return SensorCalibration(camera, sheets, covariance, empty.provenance)
+    return SensorCalibration(
+        camera,
+        sheets,
+        covariance,
+        empty.provenance,
+        sensor_diagnostics(document.diagnostics),
+    )
 
 
 def provenance_body(provenance: Provenance) -> ProvenanceBody:
@@ -152,6 +170,7 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
         depth_min_sensor_mm=low,
         depth_max_sensor_mm=high,
         is_redundant=calibration.is_redundant,
+        diagnostics=diagnostics_body(calibration.diagnostics, SheetDiagnosticsBody),
     )
 
 
@@ -168,6 +187,7 @@ def _sheet_from_body(body: SheetBody) -> SheetCalibration:
         n_points=body.n_points,
         depth_range_mm=(body.depth_min_sensor_mm, body.depth_max_sensor_mm),
         is_redundant=body.is_redundant,
+        diagnostics=sheet_diagnostics(body.diagnostics),
     )
 
 

@@ -17,17 +17,18 @@ def _nan_from_null(value: object) -> object:
     return math.nan if value is None else value
 
 
-def _null_from_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _null_if_unknown(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 KnownOrNot = Annotated[
     float,
     Field(allow_inf_nan=True),
     BeforeValidator(_nan_from_null),
-    PlainSerializer(_null_from_nan, return_type=float | None),
+    PlainSerializer(_null_if_unknown, return_type=float | None),
 ]
-"""A figure that a foreign calibration may not bring: ``null`` in the file, NaN in the program."""
+"""A figure that is not known, as of a foreign calibration: ``null`` in the file, NaN in the
+program."""
 
 Triple = tuple[float, float, float]
 
@@ -99,6 +100,55 @@ class CoveredBody(Body):
     y_max_px: float
 
 
+class FTestBody(Body):
+    """An F test."""
+
+    f_ratio: KnownOrNot
+    degrees_of_freedom: int = Field(ge=0)
+    p_value: KnownOrNot
+
+
+class BowedBoardBody(Body):
+    """Bow of the target along x and y, solved with the camera."""
+
+    bow_mm: tuple[float, float]
+    sigma_mm: tuple[float, float]
+    test: FTestBody
+
+
+class CameraDiagnosticsBody(Body):
+    """Evidence of a camera's calibration."""
+
+    free_parameters: tuple[str, ...]
+    model_reason: str
+    hold_out_rms_px: float | None
+    n_folds: int = Field(ge=0)
+    condition: KnownOrNot
+    noise_scale: float
+    covered_fraction: float
+    board: BowedBoardBody | None
+
+
+class SheetDiagnosticsBody(Body):
+    """Evidence of one light sheet."""
+
+    rms_px: float
+    plane_test: FTestBody
+    final_test: FTestBody
+    bow_decision: str
+    coplanarity_mm: float
+    coplanarity_sigma_mm: float
+    board_angle_deg: float
+
+
+class SensorDiagnosticsBody(Body):
+    """Evidence of all light sheets together."""
+
+    noise_factor: float
+    correlation_points: float
+    naming: str
+
+
 class CameraBody(Body):
     """A camera with its uncertainty."""
 
@@ -110,6 +160,7 @@ class CameraBody(Body):
     n_views: int = Field(ge=0)
     n_points: int = Field(ge=0)
     valid_region: CoveredBody
+    diagnostics: CameraDiagnosticsBody | None
 
 
 class AxesBody(Body):
@@ -134,6 +185,7 @@ class SheetBody(Body):
     depth_min_sensor_mm: float
     depth_max_sensor_mm: float
     is_redundant: bool
+    diagnostics: SheetDiagnosticsBody | None
 
 
 class CameraDocument(Body):
@@ -155,5 +207,6 @@ class SensorDocument(Body):
     camera_provenance: ProvenanceBody
     sheets: tuple[SheetBody, ...] = Field(min_length=1)
     covariance: CovarianceBody
+    diagnostics: SensorDiagnosticsBody | None
     observations: ObservationsBody | None = None
     provenance: ProvenanceBody

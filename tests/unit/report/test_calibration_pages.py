@@ -21,6 +21,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
 from armscan.report.camera_job import camera_calibration
 from armscan.report.camera_page import camera_page
+from armscan.report.fit_diagnostics import sensor_calibration
 from armscan.report.laser_job import laser_summary
 from armscan.report.laser_page import USE_COLOURS, laser_page
 from armscan.report.numbers import with_sigma
@@ -87,6 +88,34 @@ def test_document_of_a_camera_is_the_fit() -> None:
     assert document.n_views == 7
     np.testing.assert_array_equal(document.covariance, fit.covariance)
     np.testing.assert_array_equal(document.camera.parameters, fit.camera.parameters)
+    kept = document.diagnostics
+    assert kept is not None
+    assert kept.board is not None
+    assert fit.warp is not None
+    assert fit.cross_validation is not None
+    assert kept.board.sigma_mm == tuple(fit.warp.sigma_mm)
+    assert kept.board.test.p_value == fit.warp.p_value
+    assert (kept.hold_out_rms_px, kept.n_folds) == (
+        fit.cross_validation.rms_px,
+        fit.cross_validation.n_folds,
+    )
+    assert (kept.condition, kept.noise_scale) == (fit.condition, fit.noise_scale)
+
+
+def test_document_of_sheets_keeps_the_evidence() -> None:
+    fit = laser_fit()
+    document = sensor_calibration(fit, PROVENANCE)
+    (sheet,), (kept,) = fit.sheets, [sheet.diagnostics for sheet in document.sheets]
+    assert kept is not None
+    assert kept.plane_test.f_ratio == sheet.plane_test.f_ratio > kept.final_test.f_ratio
+    assert kept.final_test.p_value == sheet.final_test.p_value
+    assert (kept.rms_px, kept.board_angle_deg) == (sheet.rms_px, sheet.board_angle_deg)
+    assert (kept.coplanarity_mm, kept.coplanarity_sigma_mm) == (
+        sheet.coplanarity_mm,
+        sheet.coplanarity_sigma_mm,
+    )
+    assert document.diagnostics is not None
+    assert document.diagnostics.naming == fit.naming
 
 
 def test_laser_page_shows_every_point_and_the_bow() -> None:

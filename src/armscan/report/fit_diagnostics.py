@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a document keeps of the evidence that a fit brings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from armscan.calibration.camera.result import BoardWarp, CameraFit
+from armscan.calibration.laser.result import LackOfFit, LaserFit, SheetFit
+from armscan.models.calibration import Provenance, SensorCalibration
+from armscan.models.diagnostics import (
+    BowedBoard,
+    CameraDiagnostics,
+    FTest,
+    SensorDiagnostics,
+    SheetDiagnostics,
+)
+
+
+def camera_diagnostics(fit: CameraFit) -> CameraDiagnostics:
+    """Diagnostics of a camera's calibration."""
+    held_out = fit.cross_validation
+    return CameraDiagnostics(
+        free_parameters=fit.free_parameters,
+        model_reason=fit.model_reason,
+        hold_out_rms_px=None if held_out is None else held_out.rms_px,
+        n_folds=0 if held_out is None else held_out.n_folds,
+        condition=fit.condition,
+        noise_scale=fit.noise_scale,
+        covered_fraction=fit.coverage.fraction,
+        board=None if fit.warp is None else _bowed_board(fit.warp),
+    )
+
+
+def sensor_calibration(fit: LaserFit, provenance: Provenance) -> SensorCalibration:
+    """The document's content of a fit of light sheets, diagnostics included."""
+    plain = fit.to_calibration(provenance)
+    return replace(
+        plain,
+        sheets=tuple(
+            replace(sheet.calibration, diagnostics=_sheet_diagnostics(sheet))
+            for sheet in fit.sheets
+        ),
+        diagnostics=SensorDiagnostics(fit.noise_factor, fit.correlation_points, fit.naming),
+    )
+
+
+def _bowed_board(warp: BoardWarp) -> BowedBoard:
+    bow_x, bow_y = warp.bow_mm.tolist()
+    sigma_x, sigma_y = warp.sigma_mm.tolist()
+    test = FTest(warp.f_statistic, len(warp.bow_mm), warp.p_value)
+    return BowedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)
+
+
+def _sheet_diagnostics(fit: SheetFit) -> SheetDiagnostics:
+    return SheetDiagnostics(
+        rms_px=fit.rms_px,
+        plane_test=_test(fit.plane_test),
+        final_test=_test(fit.final_test),
+        bow_decision=fit.bow_decision,
+        coplanarity_mm=fit.coplanarity_mm,
+        coplanarity_sigma_mm=fit.coplanarity_sigma_mm,
+        board_angle_deg=fit.board_angle_deg,
+    )
+
+
+def _test(found: LackOfFit) -> FTest:
+    return FTest(found.f_ratio, found.degrees_of_freedom, found.p_value)

@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check unit docs clean
+.PHONY: demo test check unit clean
 demo: $(STAMP)
 	$(BIN)/armscan demo photos -o demo
 

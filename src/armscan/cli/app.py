@@ -20,6 +20,8 @@ from armscan.cli import (
 )
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+HELP_ORDER = ("demo", "calibrate", "reconstruct", "convert", "info", "doctor")
+"""The chain, then what looks at files; left to itself the library lists groups last."""
 
 app = typer.Typer(
     name="armscan",
@@ -49,8 +51,8 @@ calibrate = typer.Typer(
 calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
 calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
 app.add_typer(calibrate, name="calibrate")
-app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
+app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
 app.command("info", epilog=info.EXAMPLE)(info.info)
 app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
@@ -76,4 +78,6 @@ def root(
 
 def command() -> Any:
     """Return the whole tree as one callable command."""
-    return typer.main.get_command(app)
+    tree: Any = typer.main.get_command(app)
+    tree.commands = {name: tree.commands[name] for name in HELP_ORDER}
+    return tree

@@ -9,8 +9,8 @@ from typing import Annotated, cast
 
 import typer
 
+from armscan.cli.image_arguments import BitsAlign, BitsUsed, Target
 from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.shared import BitsAlign, BitsUsed, Target
 
 EXAMPLE = (
     "\b\nExample:\n"

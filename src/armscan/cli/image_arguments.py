@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands have."""
+"""Options on what images show and how they are read, which several commands have."""
 
 from __future__ import annotations
 

@@ -26,6 +26,8 @@ FLAG_COLOURS = {
     StripeFlag.NEIGHBOUR: ("#e0559b", "flagged: neighbour line"),
     StripeFlag.OUTLIER: ("#ffe14d", "flagged: off the line's course"),
     StripeFlag.SHORT_SEGMENT: ("#b58863", "flagged: too short a piece"),
+    StripeFlag.END: ("#f4f1de", "flagged: cut off at a slant"),
+    StripeFlag.TARGET_EDGE: ("#8d7bff", "flagged: along an edge of the target"),
 }
 OUTLINE, OUTLINE_EDGE = "#ffffff", "#1d2733"
 DOT_SIZE = 4.2

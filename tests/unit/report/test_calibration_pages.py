@@ -18,6 +18,7 @@ from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.result import LaserFit, PointUse
 from armscan.calibration.laser.target_edges import TargetEdges
 from armscan.records.exposure import Exposure
+from armscan.records.profile import StripeFlag
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
 from armscan.report.camera_job import camera_calibration
 from armscan.report.camera_page import camera_page
@@ -26,6 +27,7 @@ from armscan.report.laser_job import laser_summary
 from armscan.report.laser_page import USE_COLOURS, laser_page
 from armscan.report.numbers import with_sigma
 from armscan.report.page import render_page
+from armscan.report.stripe_figures import FLAG_COLOURS
 from camera_scene import Scene, make_views
 from sheet_rig import PROVENANCE, thesis_rig
 
@@ -167,3 +169,8 @@ def test_laser_summary_has_the_sheet_with_its_sigmas() -> None:
 def test_pages_say_where_the_data_come_from(is_simulated: bool) -> None:
     page = camera_page(camera_fit(), (), {}, PROVENANCE, is_simulated=is_simulated)
     assert ("simulated data" in text_of(render_page(page))) == is_simulated
+
+
+def test_flags_have_colours_of_their_own() -> None:
+    assert StripeFlag.TARGET_EDGE in FLAG_COLOURS
+    assert len({colour for colour, _ in FLAG_COLOURS.values()}) == len(FLAG_COLOURS)

@@ -85,7 +85,7 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     provenance = new_provenance(
         (*images, *background, request.sensor),
         command=request.command,
-        options=(request.options.stripes, request.options.depths, request.image_options),
+        options=(request.options, request.image_options),
         parent_ids=(sensor.provenance.document_id,),
         warnings=result.warnings,
     )

@@ -107,7 +107,10 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     is_simulated = are_simulated((*on, *off))
     by_source = {exposure.source: exposure for exposure in exposures}
     page = laser_page(fit, by_source, provenance, is_simulated=is_simulated)
-    hashes = dict(zip(by_source, (item.sha256 for item in provenance.inputs), strict=False))
+    hashes = {
+        exposure.source: item.sha256
+        for exposure, item in zip(exposures, provenance.inputs[: len(exposures)], strict=True)
+    }
     observations = pack_observations(
         [image.view for image in fit.images],
         [_with_edge_flags(image) for image in fit.images],

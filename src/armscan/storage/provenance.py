@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
-from dataclasses import fields
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -38,7 +38,8 @@ def new_provenance(
     command
         The command line, one word an entry.
     options
-        Options dataclasses in force; every field is recorded as ``Class.field``.
+        Options dataclasses in force; every field is recorded as ``Class.field``, one
+        that is a dataclass itself by its own class and fields.
     parent_ids
         Documents on which this one rests.
     warnings
@@ -51,10 +52,15 @@ def new_provenance(
         command=tuple(command),
         inputs=tuple(fingerprint(path) for path in inputs),
         parent_ids=tuple(parent_ids),
-        options=tuple(
-            (f"{type(group).__name__}.{item.name}", str(getattr(group, item.name)))
-            for group in options
-            for item in fields(group)
-        ),
+        options=tuple(entry for group in options for entry in _entries(group)),
         warnings=tuple(warnings),
     )
+
+
+def _entries(group: Any) -> Iterator[tuple[str, str]]:
+    for item in fields(group):
+        value = getattr(group, item.name)
+        if is_dataclass(value):
+            yield from _entries(value)
+        else:
+            yield f"{type(group).__name__}.{item.name}", str(value)

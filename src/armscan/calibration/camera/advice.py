@@ -106,4 +106,8 @@ def _about_warp(fit: CameraFit) -> list[str]:
     if fit.warp is None or not fit.warp.is_significant:
         return []
     bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
-    return [f"the board is bowed by {bow} mm (along x, along y)"]
+    largest = float(abs(fit.warp.bow_mm).sum())
+    return [
+        f"the board is bowed by {bow} mm (along x, along y): the light-sheet calibration takes it "
+        f"as flat; use a flatter board there, or expect errors of up to {largest:.2g} mm in height"
+    ]

@@ -237,6 +237,8 @@ def test_nothing_on_the_board_is_refused() -> None:
 @pytest.mark.parametrize(
     "bad",
     [
+        {"margin_mm": float("inf")},
+        {"margin_mm": float("nan")},
         {"n_sheets": -1},
         {"line_tolerance_mm": 0.0},
         {"outlier_sigma": 1.0},

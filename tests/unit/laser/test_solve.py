@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The joint fit against generalised least squares with one full covariance matrix, by hand."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from armscan.calibration.laser import solve
 from armscan.calibration.laser.observations import SheetObservations
-from armscan.calibration.laser.solve import CommonErrors, solve_sheets, square_root
+from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets, square_root
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
 N_IMAGES, N_STRIPE = 4, 15
@@ -57,6 +62,8 @@ def test_fit_and_joint_covariance_are_those_of_the_full_matrix() -> None:
     pose = [correlated(rng, np.full(6, 0.01)) for _ in range(N_IMAGES)]
     camera = correlated(rng, np.geomspace(0.001, 0.1, 9))
     solution = solve_sheets(points, [FLAT], CommonErrors(pose, camera), [False])
+    assert isinstance(solution, SheetSolution)
+    assert solution.has_converged
 
     _, residual, by_sheet, by_point = points.residuals_px([FLAT])
     by_camera = np.einsum("ni,nij->nj", by_point, points.by_camera)
@@ -93,3 +100,28 @@ def test_square_root_of_a_covariance_without_full_rank() -> None:
     covariance = np.outer(sigma, sigma)
     root = square_root(covariance)
     np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-9)
+
+
+EXACT = CommonErrors([np.zeros((6, 6))] * N_IMAGES, np.zeros((9, 9)))
+
+
+def test_points_on_one_line_are_a_failure_and_no_traceback() -> None:
+    points = observations(np.random.default_rng(4))
+    along = (points.points_mm - FLAT.origin_mm) @ FLAT.axes[0]
+    line = replace(points, points_mm=FLAT.origin_mm + along[:, None] * FLAT.axes[0])
+    failure = solve_sheets(line, [FLAT], EXACT, [False])
+    assert isinstance(failure, FitFailure)
+    assert "do not determine" in failure.reason
+
+
+def test_too_few_steps_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a start that is 5 degrees off one step is not enough."""
+    points = observations(np.random.default_rng(5))
+    start = FLAT.updated(np.array([1.75, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    settled = solve_sheets(points, [start], EXACT, [False])
+    assert isinstance(settled, SheetSolution)
+    assert settled.has_converged
+    monkeypatch.setattr(solve, "ITERATIONS", 1)
+    hasty = solve_sheets(points, [start], EXACT, [False])
+    assert isinstance(hasty, SheetSolution)
+    assert not hasty.has_converged

@@ -127,3 +127,34 @@ def test_the_outermost_squares_have_borders_too() -> None:
     assert len(near_px(upright(361.0, 330.0, 430.0), edges)) == 101
     assert len(near_px(upright(599.0, 330.0, 430.0), edges)) == 101
     assert len(near_px(upright(640.0, 330.0, 430.0), edges)) == 0
+
+
+def test_squares_behind_the_camera_are_left_out() -> None:
+    """A board edge on, its far row of squares behind the camera: the rest is still known."""
+    turned: Pose[Sensor, Board] = Pose.from_vectors(
+        np.array([np.radians(-80.0), 0.0, 0.0]), np.array([-50.0, -10.0, 75.0])
+    )
+    board = Chessboard(5, 4, 20.0)
+    corners = board.points_board_mm @ turned.rotation.T + turned.translation_mm
+    beyond = board.points_board_mm + np.array([0.0, 20.0, 0.0])
+    assert corners[:, 2].min() > 0.0
+    assert (beyond @ turned.rotation.T + turned.translation_mm)[:, 2].min() < 0.0
+    edges = find_target_edges(view_of(board), board, turned, CAMERA)
+    assert edges is not None
+    assert len(edges.points_px) > 100
+    assert CAMERA.is_inside(edges.points_px, -25.0).all()
+
+
+def test_edges_beyond_the_fold_of_the_lens_are_no_phantoms() -> None:
+    """R (1 - 0.5 r^2) is largest at r = 0.816: what lies further out comes back into the image."""
+    lens = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.array([-0.5, 0, 0, 0, 0]), 1001, 801)
+    board = Chessboard(5, 4, 200.0)
+    near: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-400.0, -300.0, 500.0]))
+    edges = find_target_edges(view_of(board), board, near, lens)
+    assert edges is not None
+    xy, is_valid = lens.undistort(edges.points_px)
+    assert is_valid.all()
+    on_board = xy * 500.0 + [400.0, 300.0]
+    off_line = np.abs(on_board / 200.0 - np.rint(on_board / 200.0)).min(axis=1)
+    np.testing.assert_allclose(off_line, 0.0, atol=1e-6)
+    assert np.linalg.norm(xy, axis=1).max() < 0.8165

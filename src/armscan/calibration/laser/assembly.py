@@ -77,6 +77,8 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
         is_bowed,
         sigma_factor=factors[used.sheet],
     )
+    if isinstance(solution, FitFailure):
+        return solution
     sheets = []
     for k in range(len(models)):
         fit = _sheet_fit(k, case, solution)
@@ -84,6 +86,11 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
             return fit
         sheets.append(fit)
     warnings = list(case.named.warnings)
+    if not solution.has_converged:
+        warnings.append(
+            f"the fit of the sheets has not settled: its last step was "
+            f"{solution.last_step_sigma:.2g} of a parameter's sigma; look at the boards' poses"
+        )
     for name, model in zip(case.named.names, models, strict=True):
         raised = model.sigma_factor / model.noise.sigma_factor
         if raised > 1.0:

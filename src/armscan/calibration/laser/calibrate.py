@@ -11,12 +11,12 @@ import numpy as np
 from armscan.calibration.laser.assembly import SheetCase, assemble_fit
 from armscan.calibration.laser.conditioning import refuse_few_boards
 from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
-from armscan.calibration.laser.naming import name_stripes
+from armscan.calibration.laser.naming import NamedStripes, name_stripes
 from armscan.calibration.laser.observations import SheetObservations, collect_observations
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit
 from armscan.calibration.laser.sheet_model import SheetModel, choose_model, start_sheet
-from armscan.calibration.laser.sightings import sight_stripes
+from armscan.calibration.laser.sightings import BoardImage, sight_stripes
 from armscan.calibration.laser.solve import CommonErrors, solve_sheets
 from armscan.geometry.arrays import BoolArray
 from armscan.geometry.estimate import FitFailure
@@ -55,8 +55,7 @@ def calibrate_sheets(
         cannot be named, and where nothing usable is left.
     """
     options = options or SheetOptions()
-    model = camera.camera
-    images = [sight_stripes(board, model, options) for board in boards]
+    images = [sight_stripes(board, camera.camera, options) for board in boards]
     if not any(image.sightings for image in images):
         return FitFailure(
             f"no straight stripe with {options.min_points} accepted points lies on the board in "
@@ -67,31 +66,54 @@ def calibrate_sheets(
     named = name_stripes(images, camera.covariance, options)
     if isinstance(named, FitFailure):
         return named
-    for k, name in enumerate(named.names):
-        failure = refuse_few_boards(name, sum(k in sheets for sheets in named.sheets))
-        if failure is not None:
-            return failure
     observations = collect_observations(images, named)
     errors = CommonErrors(
         [board.sensor_from_board.covariance for board in boards], camera.covariance
     )
-    starts: list[LightSheet] = []
-    for k, name in enumerate(named.names):
-        start = start_sheet(name, observations.select(observations.sheet == k), images)
-        if isinstance(start, FitFailure):
-            return start
-        starts.append(start)
+    starts = _starts(images, named, observations)
+    if isinstance(starts, FitFailure):
+        return starts
     scatter = scatter_by_stripe(observations, observations.residuals_px(starts)[1])
     observations = replace(observations, sigma_px=observations.sigma_px * scatter)
     models: list[SheetModel] = []
     kept = np.ones(len(observations), dtype=np.bool_)
     for k, start in enumerate(starts):
         own = observations.sheet == k
-        kept[own] = _without_outliers(observations.select(own), start, errors, options)
-        models.append(choose_model(observations.select(own & kept), start, errors, options))
+        chosen = _model_of(observations.select(own), start, errors, options)
+        if isinstance(chosen, FitFailure):
+            return FitFailure(f"sheet {named.names[k]}: {chosen.reason}", chosen.remedy)
+        kept[own] = chosen[0]
+        models.append(chosen[1])
     return assemble_fit(
         SheetCase(images, named, observations, scatter, kept, models, errors, camera, options)
     )
+
+
+def _starts(
+    images: Sequence[BoardImage], named: NamedStripes, observations: SheetObservations
+) -> list[LightSheet] | FitFailure:
+    for k, name in enumerate(named.names):
+        failure = refuse_few_boards(name, sum(k in sheets for sheets in named.sheets))
+        if failure is not None:
+            return failure
+    starts: list[LightSheet] = []
+    for k, name in enumerate(named.names):
+        start = start_sheet(name, observations.select(observations.sheet == k), images)
+        if isinstance(start, FitFailure):
+            return start
+        starts.append(start)
+    return starts
+
+
+def _model_of(
+    observations: SheetObservations, start: LightSheet, errors: CommonErrors, options: SheetOptions
+) -> tuple[BoolArray, SheetModel] | FitFailure:
+    """Points of one sheet that are kept, and the model that they ask for."""
+    near = _without_outliers(observations, start, errors, options)
+    if isinstance(near, FitFailure):
+        return near
+    model = choose_model(observations.select(near), start, errors, options)
+    return model if isinstance(model, FitFailure) else (near, model)
 
 
 def _without_outliers(
@@ -99,7 +121,7 @@ def _without_outliers(
     start: LightSheet,
     errors: CommonErrors,
     options: SheetOptions,
-) -> BoolArray:
+) -> BoolArray | FitFailure:
     """Keep the points near the plane; a bow widens the robust scale and so keeps its points."""
     keep = np.ones(len(observations), dtype=np.bool_)
     alone = observations.as_one_sheet()
@@ -110,6 +132,8 @@ def _without_outliers(
         solution = solve_sheets(
             used, [start], errors, [False], sigma_factor=noise.sigma_factor, is_robust=True
         )
+        if isinstance(solution, FitFailure):
+            return solution
         normalised = np.full(len(keep), np.inf)
         normalised[keep] = np.abs(solution.remaining_px / used.sigma_px) / noise.factor
         scale = max(1.0, 1.4826 * float(np.median(normalised[keep])))

@@ -14,7 +14,13 @@ from armscan.models.light_sheet import LightSheet
 
 MIN_SPREAD_RATIO = 0.01
 """Spread across the stripes over that along them, below which there is only one line."""
+MIN_SPREAD_SIGMAS = 5.0
+"""Spread across the stripes over its own uncertainty, below which it is not known to be there: a
+spread that is partly error makes the sheet look better known than it is."""
 MAX_TILT_SIGMA_DEG = 2.0
+MAX_PARALLEL_TILT_SIGMA_DEG = 0.4
+"""For parallel boards. Beyond it they lie so close that small differences of their poses decide:
+with simulated boards the errors were then several times the sigmas."""
 WEAK_TILT_SIGMA_DEG = 0.2
 PARALLEL_DEG = 2.0
 
@@ -90,15 +96,35 @@ def refuse_one_line(name: str, geometry: SheetGeometry) -> FitFailure | None:
     )
 
 
+def refuse_lost_spread(
+    name: str, geometry: SheetGeometry, across_sigma_mm: float
+) -> FitFailure | None:
+    """Refuse stripes whose spread is hardly larger than the errors of their boards' poses.
+
+    ``across_sigma_mm`` is the sigma of a point's place across the stripes by its board's pose.
+    """
+    across = float(geometry.spread_mm[1])
+    if across >= MIN_SPREAD_SIGMAS * across_sigma_mm:
+        return None
+    return FitFailure(
+        f"sheet {name}: its stripes spread {across:.3f} mm across each other, and the boards' "
+        f"poses are known to {across_sigma_mm:.3f} mm there: the spread must be "
+        f"{MIN_SPREAD_SIGMAS:.0f} times as large to tell the sheet's direction ({geometry.facts})",
+        "move the board further in depth, tilt it more, or show more of the target",
+    )
+
+
 def refuse_loose_tilt(
     name: str, geometry: SheetGeometry, tilt_sigma_deg: float
 ) -> FitFailure | None:
     """Refuse a sheet whose direction the boards' own errors leave open."""
-    if tilt_sigma_deg <= MAX_TILT_SIGMA_DEG:
+    is_parallel = geometry.board_angle_deg < PARALLEL_DEG
+    limit = MAX_PARALLEL_TILT_SIGMA_DEG if is_parallel else MAX_TILT_SIGMA_DEG
+    if tilt_sigma_deg <= limit:
         return None
     return FitFailure(
-        f"sheet {name}: its direction is known to {tilt_sigma_deg:.1f} deg only, need "
-        f"{MAX_TILT_SIGMA_DEG} ({geometry.facts})",
+        f"sheet {name}: its direction is known to {tilt_sigma_deg:.2f} deg only, need "
+        f"{limit} ({geometry.facts})",
         "move the board further in depth, tilt it more, or show more of the target",
     )
 

@@ -9,6 +9,7 @@ from armscan.calibration.laser.lack_of_fit import lack_of_fit, stripe_noise
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.solve import CommonErrors, solve_sheets
+from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
 MIN_BOARDS = 4
@@ -43,6 +44,9 @@ def find_misfit_image(
         rest = alone.select(alone.image != image)
         noise = stripe_noise(rest, rest.residuals_px([sheet])[1])
         solution = solve_sheets(rest, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
+        if isinstance(solution, FitFailure):
+            p_values.append(0.0)
+            continue
         p_values.append(lack_of_fit(rest, solution, noise).p_value)
     best = int(np.argmax(p_values))
     return int(images[best]) if p_values[best] >= options.lack_of_fit_p else None

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from armscan.errors import OptionError
@@ -54,6 +55,9 @@ class SheetOptions:
     min_boards_for_bow: int = 4
 
     def __post_init__(self) -> None:
+        _require(
+            math.isfinite(self.margin_mm), f"margin of {self.margin_mm} mm", "give a finite length"
+        )
         _require(0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32")
         _require(
             self.edge_widths >= 0.0,

@@ -12,6 +12,7 @@ from armscan.calibration.laser.conditioning import (
     SheetGeometry,
     describe_geometry,
     refuse_few_boards,
+    refuse_lost_spread,
     refuse_one_line,
 )
 from armscan.calibration.laser.lack_of_fit import (
@@ -90,8 +91,25 @@ def start_sheet(
         return FitFailure(f"sheet {name}: {plane.reason}", plane.remedy)
     directions = _stripe_directions(observations)
     sheet = sheet_from_plane(plane.value, observations.points_mm, directions)
-    one_line = refuse_one_line(name, sheet_geometry(sheet, observations, images))
-    return sheet if one_line is None else one_line
+    geometry = sheet_geometry(sheet, observations, images)
+    refused = refuse_one_line(name, geometry)
+    if refused is None:
+        uncertain = _across_sigma_mm(sheet, observations, images)
+        refused = refuse_lost_spread(name, geometry, uncertain)
+    return sheet if refused is None else refused
+
+
+def _across_sigma_mm(
+    sheet: LightSheet, observations: SheetObservations, images: Sequence[BoardImage]
+) -> float:
+    """Root mean square sigma, by the boards' poses, of where points lie across the stripes."""
+    by_pose = np.einsum("i,nij->nj", sheet.axes[1], observations.by_pose)
+    total = 0.0
+    for i in np.unique(observations.image):
+        own = by_pose[observations.image == i]
+        covariance = images[i].data.sensor_from_board.covariance
+        total += float(np.einsum("ni,ij,nj->", own, covariance, own))
+    return float(np.sqrt(max(total, 0.0) / len(observations)))
 
 
 def _stripe_directions(observations: SheetObservations) -> FloatArray:
@@ -107,17 +125,20 @@ def choose_model(
     start: LightSheet,
     errors: CommonErrors,
     options: SheetOptions,
-) -> SheetModel:
+) -> SheetModel | FitFailure:
     """Fit the plane, test its fit, and let the sheet bow if the test asks for it."""
     alone = observations.as_one_sheet()
     noise = stripe_noise(alone, alone.residuals_px([start])[1])
-    first = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
-    noise = stripe_noise(alone, first.remaining_px)
     flat = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
+    if not isinstance(flat, FitFailure):
+        noise = stripe_noise(alone, flat.remaining_px)
+        flat = solve_sheets(alone, [start], errors, [False], sigma_factor=noise.sigma_factor)
+    if isinstance(flat, FitFailure):
+        return flat
     plane_test = lack_of_fit(alone, flat, noise)
     test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
 
-    def plane(decision: str) -> SheetModel:
+    def plane(decision: str) -> SheetModel | FitFailure:
         factor = noise.sigma_factor
         model = SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision, factor)
         return _with_explained_stripes(model, alone, errors, options)
@@ -131,12 +152,12 @@ def choose_model(
             f"bow from their own errors: {options.min_boards_for_bow} are needed"
         )
     condition = _bow_condition(alone, flat)
-    if condition > MAX_BOW_CONDITION:
+    bowed = solve_sheets(alone, [start], errors, [True], sigma_factor=noise.sigma_factor)
+    if condition > MAX_BOW_CONDITION or isinstance(bowed, FitFailure):
         return plane(
             f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
             f"to determine a bow (condition {condition:.2g})"
         )
-    bowed = solve_sheets(alone, [start], errors, [True], sigma_factor=noise.sigma_factor)
     ratio, p_value = gain_of_bow(flat, bowed, noise)
     if p_value >= options.lack_of_fit_p:
         return plane(
@@ -158,7 +179,7 @@ def _with_explained_stripes(
     observations: SheetObservations,
     errors: CommonErrors,
     options: SheetOptions,
-) -> SheetModel:
+) -> SheetModel | FitFailure:
     """Raise the stripes' sigmas until the model fits, if it did not.
 
     What a model leaves unexplained is charged to the stripes, not to the boards: else the boards'
@@ -172,6 +193,8 @@ def _with_explained_stripes(
         solution = solve_sheets(
             observations, [sheet], errors, [model.is_bowed], sigma_factor=factor
         )
+        if isinstance(solution, FitFailure):
+            return solution
         sheet = solution.sheets[0]
         test = lack_of_fit(observations, solution, model.noise, factor)
     return replace(model, sheet=sheet, sigma_factor=factor)

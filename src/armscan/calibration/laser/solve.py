@@ -17,11 +17,18 @@ import numpy as np
 
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
 ITERATIONS = 12
 STEP_TOLERANCE_MM = 1e-9
+CONVERGED_SIGMA = 0.01
+"""A last step below this part of every parameter's own sigma does not matter any more."""
+MAX_TILT_STEP = 1.0
+"""A step that turns a sheet by more than 45 degrees has left what the linearised fit can do."""
 HUBER_SIGMA = 2.5
+MIN_EIGENVALUE = 1e-13
+"""Of the normal matrix scaled to a unit diagonal, whose rounding is about 1e-15."""
 N_SHEET = 8
 N_PLANE = 3
 
@@ -74,6 +81,8 @@ class SheetSolution:
         Weighted squares of ``remaining_px`` plus squares of ``common``.
     n_parameters
         Free parameters of all sheets.
+    last_step_sigma
+        Largest last step of a parameter, in its own sigma.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -84,6 +93,12 @@ class SheetSolution:
     common: FloatArray
     chi2: float
     n_parameters: int
+    last_step_sigma: float = 0.0
+
+    @property
+    def has_converged(self) -> bool:
+        """Whether the last step was too small to matter."""
+        return self.last_step_sigma <= CONVERGED_SIGMA
 
 
 def square_root(covariance: FloatArray) -> FloatArray:
@@ -102,7 +117,7 @@ def solve_sheets(
     *,
     sigma_factor: float | FloatArray = 1.0,
     is_robust: bool = False,
-) -> SheetSolution:
+) -> SheetSolution | FitFailure:
     """Fit the sheets by Gauss-Newton steps.
 
     Parameters
@@ -119,6 +134,12 @@ def solve_sheets(
         Multiplies the stripes' sigmas in the weights; one number, or one a point.
     is_robust
         Weigh points down by Huber's function on what remains; for finding outliers.
+
+    Returns
+    -------
+    SheetSolution or FitFailure
+        A failure where the points do not determine a sheet, or a step turns one by more than 45
+        degrees.
     """
     sheets = [_without_bow(sheet) for sheet in start]
     active = np.concatenate(
@@ -128,9 +149,14 @@ def solve_sheets(
     robust = np.ones(len(observations))
     for _ in range(ITERATIONS):
         design, residual, height = _linearised(observations, sheets, errors, active)
-        step, information = _weighted_step(design, residual, robust / sigma**2, int(active.sum()))
+        solved = _weighted_step(design, residual, robust / sigma**2, int(active.sum()))
+        if solved is None:
+            return _UNDETERMINED
+        step, inverse = solved
         full = np.zeros(N_SHEET * len(sheets))
         full[active] = step[: int(active.sum())]
+        if _turns_too_far(full, sheets):
+            return _UNDETERMINED
         sheets = [
             sheet.updated(full[N_SHEET * k : N_SHEET * (k + 1)]) for k, sheet in enumerate(sheets)
         ]
@@ -145,14 +171,27 @@ def solve_sheets(
     remaining = residual + design[:, n_active:] @ common
     return SheetSolution(
         tuple(sheets),
-        _joint_covariance(np.asarray(np.linalg.inv(information)), active, errors),
+        _joint_covariance(inverse, active, errors),
         height,
         residual,
         remaining,
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
         n_active,
+        float((np.abs(step) / np.sqrt(np.diag(inverse)))[:n_active].max()),
     )
+
+
+_UNDETERMINED = FitFailure(
+    "the stripes do not determine the light sheets: the fit leaves the plane through the points",
+    "spread the boards over more depth, tilt them differently, and check their poses",
+)
+
+
+def _turns_too_far(full: FloatArray, sheets: Sequence[LightSheet]) -> bool:
+    tilts_mm = full.reshape(len(sheets), N_SHEET)[:, :2]
+    scales_mm = np.array([sheet.scale_mm for sheet in sheets])
+    return bool((np.abs(tilts_mm).max(axis=1) > MAX_TILT_STEP * scales_mm).any())
 
 
 def _without_bow(sheet: LightSheet) -> LightSheet:
@@ -177,13 +216,24 @@ def _linearised(
 
 def _weighted_step(
     design: FloatArray, residual: FloatArray, weight: FloatArray, n_active: int
-) -> tuple[FloatArray, FloatArray]:
-    """Solve the normal equations; the common errors are known to be 0 +- 1."""
+) -> tuple[FloatArray, FloatArray] | None:
+    """Step and inverse of the normal matrix; the common errors are known to be 0 +- 1.
+
+    None where the matrix is not positive definite to rounding, so that neither means anything.
+    """
     weighted = design * weight[:, None]
     information = weighted.T @ design
     prior = np.arange(len(information)) >= n_active
     information[prior, prior] += 1.0
-    return np.asarray(-np.linalg.solve(information, weighted.T @ residual)), information
+    diagonal = np.diag(information)
+    if not np.isfinite(information).all() or not (diagonal > 0.0).all():
+        return None
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    if not values[0] > MIN_EIGENVALUE:
+        return None
+    inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
+    return np.asarray(-inverse @ (weighted.T @ residual)), np.asarray(inverse)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:

@@ -23,6 +23,11 @@ from armscan.vision.targets.view import CircleEdges, TargetView
 
 SAMPLE_PX = 1.0
 """Spacing in the image of the points that stand for a straight edge."""
+COARSE = 64
+"""Points by which the part of an edge that is seen is found."""
+MARGIN_PX = 20.0
+"""Edges are followed this far outside the image."""
+SAME_RAY = 1e-6
 MIN_RIM_POINTS = 8
 """With fewer, the shape of a circle's rim is not known."""
 
@@ -121,25 +126,44 @@ def _borders(
     lines += [np.array([[low[0], value], [high[0], value]]) for value in y]
     points, directions = [], []
     for ends in lines:
-        image = _image_of_line(ends, sensor_from_board, camera)
+        image, is_seen = _image_of_line(ends, sensor_from_board, camera)
         step = np.gradient(image, axis=0)
-        points.append(image)
-        directions.append(step / np.linalg.norm(step, axis=1)[:, None])
+        length = np.linalg.norm(step, axis=1)
+        is_seen &= np.isfinite(length) & (length > 0.0)
+        points.append(image[is_seen])
+        directions.append(step[is_seen] / length[is_seen, None])
     return TargetEdges(np.concatenate(points), np.concatenate(directions))
 
 
 def _image_of_line(
     ends_mm: FloatArray, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
-) -> FloatArray:
-    """(K, 2) pixels about `SAMPLE_PX` apart along a straight line on the board."""
+) -> tuple[FloatArray, BoolArray]:
+    """(K, 2) pixels at most `SAMPLE_PX` apart along a straight line on the board, and (K,) where.
 
-    def image(n: int) -> FloatArray:
-        t = np.linspace(0.0, 1.0, n)[:, None]
+    Only the part of the line in and near the image is sampled finely. Not seen are points behind
+    the camera, far outside the image, and beyond the lens model's fold: those the model throws
+    back into the image, and the pixel's own ray does not lead to them.
+    """
+
+    def image(low: float, high: float, n: int) -> tuple[FloatArray, BoolArray]:
+        t = np.linspace(low, high, n)[:, None]
         on_board = np.pad(ends_mm[0] + t * (ends_mm[1] - ends_mm[0]), ((0, 0), (0, 1)))
-        return camera.project(
-            on_board @ sensor_from_board.rotation.T + sensor_from_board.translation_mm
-        )
+        points = on_board @ sensor_from_board.rotation.T + sensor_from_board.translation_mm
+        q = camera.project(points)
+        is_seen = camera.is_inside(q, -MARGIN_PX)
+        xy, has_ray = camera.undistort(np.where(is_seen[:, None], q, 0.0))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ideal = points[:, :2] / points[:, 2:]
+            is_own = (np.abs(ideal - xy) < SAME_RAY).all(axis=1)
+        return q, is_seen & has_ray & is_own
 
-    coarse = image(16)
-    length_px = float(np.linalg.norm(np.diff(coarse, axis=0), axis=1).sum())
-    return image(max(int(np.ceil(length_px / SAMPLE_PX)), 2))
+    coarse, is_seen = image(0.0, 1.0, COARSE)
+    seen = np.flatnonzero(is_seen)
+    if len(seen) == 0:
+        return coarse, is_seen
+    first, last = max(int(seen[0]) - 1, 0), min(int(seen[-1]) + 1, COARSE - 1)
+    steps = np.linalg.norm(np.diff(coarse[is_seen], axis=0), axis=1)
+    # A line that leaves the image may end within a step of the last point seen.
+    length_px = float(steps.sum()) + 2.0 * float(steps.max(initial=SAMPLE_PX))
+    n = max(int(np.ceil(length_px / SAMPLE_PX)), 2)
+    return image(first / (COARSE - 1), last / (COARSE - 1), n)

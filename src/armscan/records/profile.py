@@ -30,6 +30,8 @@ class StripeFlag(IntFlag):
     """Belongs to a segment that is too short to be a stripe."""
     TARGET_EDGE = 64
     """Along an edge of a calibration target's marks: set by the calibration, not the extraction."""
+    END = 128
+    """Where something cuts the line at a slant: the fitted column or row reaches past its end."""
 
 
 REJECTING = (
@@ -39,6 +41,7 @@ REJECTING = (
     | StripeFlag.OUTLIER
     | StripeFlag.SHORT_SEGMENT
     | StripeFlag.TARGET_EDGE
+    | StripeFlag.END
 )
 
 

@@ -13,6 +13,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.vision.stripe.classic import THESIS_METHODS, link_centres
 from armscan.vision.stripe.colour import colour_plane
+from armscan.vision.stripe.ends import is_cut_off
 from armscan.vision.stripe.flags import (
     is_asymmetric,
     is_background_step,
@@ -158,6 +159,7 @@ def to_profile(
     flags[is_asymmetric(fits, width)] |= int(StripeFlag.ASYMMETRIC)
     near = is_near_other_line(fits.neighbour, chain, width, options.neighbour_sigmas)
     flags[near] |= int(StripeFlag.NEIGHBOUR)
+    flags[is_cut_off(fits, points, width, plane.image.shape)] |= int(StripeFlag.END)
     flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -142,8 +143,9 @@ def _solve_model(
     def solve(model: DistortionModel) -> Solution | FitFailure:
         return _solve(used, observations, prepared, model, options)
 
-    def validate(solution: Solution) -> CrossValidation | None:
-        return cross_validate(solution, sources, options.n_folds)
+    def validate(solution: Solution, reference: Solution) -> CrossValidation | None:
+        on_points = replace(solution, weights=reference.weights)
+        return cross_validate(on_points, sources, options.n_folds)
 
     def folds(solution: Solution) -> bool:
         camera = solution.state.camera(observations.width_px, observations.height_px)
@@ -158,7 +160,7 @@ def _solve_model(
     solution = solve(model)
     if isinstance(solution, FitFailure):
         return solution
-    return ChosenModel(model, solution, validate(solution), reason)
+    return ChosenModel(model, solution, validate(solution, solution), reason)
 
 
 def _solve(

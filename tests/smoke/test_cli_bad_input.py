@@ -163,7 +163,7 @@ def test_images_with_and_without_laser_swapped(
 ) -> None:
     words = laser_words(calibrated, tmp_path / "s.json", on=calibrated.off)
     said = fails(*words, "--off", calibrated.on, writes=tmp_path)
-    assert "stripe" in said
+    assert "swap the images with and without laser" in said
 
 
 def test_no_laser_in_the_image(calibrated: Bench, fails: Fails, tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.result import LaserFit, PointUse
 from armscan.calibration.laser.target_edges import TargetEdges
 from armscan.records.exposure import Exposure
-from armscan.records.profile import StripeFlag
+from armscan.records.profile import REJECTING, StripeFlag
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
 from armscan.report.camera_job import camera_calibration
 from armscan.report.camera_page import camera_page
@@ -171,6 +171,6 @@ def test_pages_say_where_the_data_come_from(is_simulated: bool) -> None:
     assert ("simulated data" in text_of(render_page(page))) == is_simulated
 
 
-def test_flags_have_colours_of_their_own() -> None:
-    assert StripeFlag.TARGET_EDGE in FLAG_COLOURS
+def test_every_flag_that_rejects_has_a_colour_of_its_own() -> None:
+    assert {flag for flag in StripeFlag if flag & REJECTING} == set(FLAG_COLOURS)
     assert len({colour for colour, _ in FLAG_COLOURS.values()}) == len(FLAG_COLOURS)

@@ -17,6 +17,8 @@ MIN_INSIDE = 0.9
 """A sheet is possible for a segment if this part of its points lies within its reach."""
 MAX_INSIDE_OTHERS = 0.1
 """It is the only one possible if no other sheet has more than this."""
+CALIBRATED = "within its calibrated depths"
+WIDENED = "within reach of its calibrated depths"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +67,9 @@ def choose_sheets(
     """Give every stripe point to a sheet.
 
     In this order: the user's word; the only sheet there is; the exposure's only laser; and else,
-    segment by segment, the one sheet that puts the segment within reach of its calibrated depth
-    range (`DepthRange.limits_mm`), if no other sheet does so for its own.
+    segment by segment, the one sheet that puts the segment into its calibrated depth range, if no
+    other sheet does so for its own. Only where no sheet does, the ranges are widened
+    (`DepthRange.limits_mm`) and the same is asked again.
 
     Parameters
     ----------
@@ -110,32 +113,37 @@ def _by_depth(
     profile: Profile, sensor: SensorCalibration, depths: DepthRange, possible: list[int]
 ) -> SheetChoice:
     chosen = np.full(len(profile), -1)
-    inside = {k: _inside(profile, sensor, depths, k) for k in possible}
     ambiguous: list[str] = []
-    for segment in np.unique(profile.segment[profile.is_accepted]):
-        own = profile.segment == segment
-        used = own & profile.is_accepted
-        share = {k: float(inside[k][used].mean()) for k in possible}
-        best = max(possible, key=lambda k: share[k])
-        others = max((share[k] for k in possible if k != best), default=0.0)
-        if share[best] < MIN_INSIDE:
-            continue
-        if others > MAX_INSIDE_OTHERS:
-            ambiguous.append(_shares(share, sensor))
-            continue
-        chosen[own] = best
-    if ambiguous:
-        raise EstimationError(
-            f"{len(ambiguous)} stripe segments may belong to more than one light sheet (points "
-            f"within reach of its calibrated depth range: {ambiguous[0]})",
-            where=profile.source,
-            remedy="name the sheet with --sheet, or photograph one laser at a time",
-        )
-    used = [int(k) for k in np.unique(chosen[chosen >= 0])]
-    if not used:
-        return SheetChoice(chosen, "no sheet puts a stripe within reach of its calibrated depths")
-    how = "the only sheet that puts the stripe within reach of its calibrated depths: "
-    return SheetChoice(chosen, how + ", ".join(_reach(sensor.sheets[k], depths) for k in used))
+    reaches = []
+    for how, accepted in ((CALIBRATED, DepthRange(0.0)), (WIDENED, depths)):
+        inside = {k: _inside(profile, sensor, accepted, k) for k in possible}
+        found: set[int] = set()
+        for segment in np.unique(profile.segment[profile.is_accepted & (chosen == -1)]):
+            own = profile.segment == segment
+            used = own & profile.is_accepted
+            share = {k: float(inside[k][used].mean()) for k in possible}
+            best = max(possible, key=lambda k: share[k])
+            others = max((share[k] for k in possible if k != best), default=0.0)
+            if share[best] < MIN_INSIDE:
+                continue
+            if others > MAX_INSIDE_OTHERS:
+                ambiguous.append(f"{how}: {_shares(share, sensor)}")
+                continue
+            chosen[own] = best
+            found.add(best)
+        if ambiguous:
+            raise EstimationError(
+                f"{len(ambiguous)} stripe segments may belong to more than one light sheet (points "
+                f"{ambiguous[0]})",
+                where=profile.source,
+                remedy="name the sheet with --sheet, or photograph one laser at a time",
+            )
+        if found:
+            names = ", ".join(_reach(sensor.sheets[k], depths) for k in sorted(found))
+            reaches.append(f"the only sheet that puts the stripe {how}: {names}")
+    return SheetChoice(
+        chosen, "; ".join(reaches) or "no sheet puts a stripe within reach of its calibrated depths"
+    )
 
 
 def _inside(profile: Profile, sensor: SensorCalibration, depths: DepthRange, k: int) -> BoolArray:

@@ -81,6 +81,32 @@ def test_the_words_tell_the_calibrated_depths_from_those_accepted() -> None:
     assert "within reach" in choice.how
 
 
+def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
+    """At x/z = 0.05: left z = 315.8, calibrated; right z = 285.7, outside its 290 to 320 mm."""
+    sensor = two_sheets()
+    right = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (290.0, 320.0), True)
+    sensor = SensorCalibration(
+        sensor.camera, (sensor.sheets[0], right), sensor.covariance, PROVENANCE
+    )
+    choice = choose_sheets(stripes(0.05), sensor, DepthRange(3.0))
+    assert set(choice.sheet.tolist()) == {0}
+    assert "within its calibrated depths: left" in choice.how
+    assert "within reach" not in choice.how
+
+
+def test_only_segments_outside_all_calibrated_depths_ask_the_widened_ones() -> None:
+    """Left's first stripe as above; the second (z = 240 or 400) is reached by left alone."""
+    sensor = two_sheets()
+    right = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (290.0, 320.0), True)
+    sensor = SensorCalibration(
+        sensor.camera, (sensor.sheets[0], right), sensor.covariance, PROVENANCE
+    )
+    choice = choose_sheets(stripes(0.05, -0.25), sensor, DepthRange(1.5))
+    assert set(choice.sheet.tolist()) == {0}
+    assert choice.how.count("left") == 2
+    assert "within reach" in choice.how
+
+
 def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
     with pytest.raises(EstimationError, match="--sheet"):
         choose_sheets(stripes(0.0), two_sheets(), DepthRange())

@@ -109,7 +109,7 @@ def coverage_map(fit: CameraFit) -> Picture:
         title="Coverage",
         caption=f"Dots are target points of the used views; {100 * fit.coverage.fraction:.0f} % of "
         "the cells hold one. "
-        + (f"Nothing was seen in: {empty}." if empty else "No region of the image is empty."),
+        + (f"Nothing was seen in: {empty}." if empty else "No ninth of the image is empty."),
     )
 
 

@@ -20,6 +20,7 @@ from armscan.report.summary import Summary, Table, summary_json
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import read_sensor_calibration
 from armscan.storage.clouds import read_ply
+from armscan.storage.simulated import are_simulated
 
 T = TypeVar("T")
 
@@ -116,9 +117,13 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
 
 
 def _check_folder(folder: Path) -> None:
-    """Refuse to write between files that are not an earlier demo's."""
-    foreign = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    foreign = [name for name in foreign if name not in OWN_NAMES]
+    """Refuse to write between files that are not an earlier demo's.
+
+    A demo is known by its rendered photographs.
+    """
+    found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
+    is_demo = are_simulated((folder / "photos" / "camera",))
+    foreign = [name for name in found if not is_demo or name not in OWN_NAMES]
     if foreign:
         raise OutputError(
             f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
@@ -153,8 +158,9 @@ def _facts(errors: PhotoErrors) -> tuple[tuple[str, str], ...]:
         ),
         (
             "in sigmas",
-            f"camera {errors.camera_normalised:.1f} (of {errors.n_camera_parameters} numbers), "
-            f"sheet {sheet.normalised:.1f} (of {sheet.n_parameters}), "
+            f"camera {errors.camera_normalised:.1f} ({errors.n_camera_parameters**0.5:.1f} is "
+            f"usual for {errors.n_camera_parameters} numbers), sheet {sheet.normalised:.1f} "
+            f"({sheet.n_parameters**0.5:.1f} is usual for {sheet.n_parameters}), "
             f"points {errors.points_normalised_rms:.2f} rms",
         ),
     )

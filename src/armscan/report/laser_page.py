@@ -94,7 +94,9 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
         ),
         (
             "Redundant",
-            "yes" if calibration.is_redundant else "no: two stripes fix a plane, nothing checks it",
+            "yes"
+            if calibration.is_redundant
+            else "no: two stripes fix a plane, only their coplanarity checks it",
         ),
         (
             "Stripes miss a common plane by",

@@ -25,7 +25,7 @@ DEFAULT_OPTIONS = ImageOptions()
 
 
 def read_exposure(
-    path: Path,
+    path: Path | str,
     options: ImageOptions = DEFAULT_OPTIONS,
     *,
     source: str | None = None,
@@ -54,6 +54,7 @@ def read_exposure(
     OptionError
         If pixels exceed the stated bits.
     """
+    path = Path(path)
     name = path.name if source is None else source
     data = read_bytes(path)
     kind = image_format(data)

@@ -113,7 +113,8 @@ def _with_yaml_header(text: str) -> str:
 def _plain(node: cv2.FileNode) -> Any:
     """The content of a node as mappings, lists, numbers and text."""
     if node.isMap():
-        return {key: _plain(node.getNode(key)) for key in node.keys()}  # noqa: SIM118 - no mapping
+        keys = node.keys()
+        return {key: _plain(node.getNode(key)) for key in keys}
     if node.isSeq():
         return [_plain(node.at(index)) for index in range(node.size())]
     if node.isString():

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import SHEET_PARAMETER_NAMES, SensorCalibration
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import Profile
 
@@ -44,10 +46,69 @@ def meet_sheets(
     return points, is_met
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class StripePoints:
+    """Points of one exposure in the Sensor frame, with what their errors come from.
+
+    Parameters
+    ----------
+    row
+        (M,) index of each point in the profile.
+    points_mm
+        (M, 3) in the Sensor frame.
+    noise_mm
+        (M, 3) one standard deviation of the stripe's own noise: the direction in which it acts,
+        within the sheet, times its size.
+    by_sensor
+        (M, 3, 17) derivative by the camera's 9 parameters and the 8 of the point's sheet.
+    sheet
+        (M,) index into ``sensor.sheets``.
+    """
+
+    row: IntArray
+    points_mm: FloatArray
+    noise_mm: FloatArray
+    by_sensor: FloatArray
+    sheet: IntArray
+
+
 def triangulate(
     profile: Profile, sheet_of_point: IntArray, sensor: SensorCalibration
 ) -> PointCloud:
-    """Turn stripe points into Sensor points.
+    """Turn stripe points into a cloud in the Sensor frame.
+
+    Parameters and errors are those of `triangulate_stripe`.
+
+    Returns
+    -------
+    PointCloud
+        In the order of the profile; ``covariance_mm2`` is stripe noise plus calibration,
+        ``sigma_noise_mm`` the stripe noise alone.
+    """
+    stripe = triangulate_stripe(profile, sheet_of_point, sensor)
+    covariance = stripe.noise_mm[:, :, None] * stripe.noise_mm[:, None, :]
+    for k in range(len(sensor.sheets)):
+        own = stripe.sheet == k
+        joint = sensor_covariance(sensor, k)
+        covariance[own] += stripe.by_sensor[own] @ joint @ stripe.by_sensor[own].transpose(0, 2, 1)
+    return PointCloud(
+        "Sensor",
+        stripe.points_mm,
+        0.5 * (covariance + covariance.transpose(0, 2, 1)),
+        np.linalg.norm(stripe.noise_mm, axis=1),
+        stripe.sheet,
+        tuple(sheet.name for sheet in sensor.sheets),
+        np.zeros(len(stripe.row), dtype=np.int64),
+        (profile.source,),
+        profile.segment[stripe.row],
+        profile.intensity[stripe.row],
+    )
+
+
+def triangulate_stripe(
+    profile: Profile, sheet_of_point: IntArray, sensor: SensorCalibration
+) -> StripePoints:
+    """Intersect the rays of stripe points with their sheets, and say where errors come from.
 
     The stripe's noise acts across the stripe; along it a point's place is a choice of where to
     sample, not a measurement, so it has no error of its own. A point therefore errs in one
@@ -63,17 +124,34 @@ def triangulate(
     sensor
         Camera and sheets with their joint covariance.
 
-    Returns
-    -------
-    PointCloud
-        In the order of the profile; ``covariance_mm2`` is stripe noise plus calibration,
-        ``sigma_noise_mm`` the stripe noise alone.
-
     Raises
     ------
     InputError
         If ``sheet_of_point`` does not fit the profile or the sheets.
     """
+    sheets = _checked_sheets(profile, sheet_of_point, sensor)
+    xy, has_ray, dxy_dq, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(
+        profile.points_px
+    )
+    points = np.zeros((len(profile), 3))
+    noise = np.zeros((len(profile), 3))
+    by_sensor = np.zeros((len(profile), 3, N_CAMERA + len(SHEET_PARAMETER_NAMES)))
+    is_met = np.zeros(len(profile), dtype=np.bool_)
+    for k, calibrated in enumerate(sensor.sheets):
+        own = np.flatnonzero(has_ray & (sheets == k))
+        points[own], is_met[own], dpoint_dxy, dpoint_dsheet = (
+            calibrated.sheet.intersect_with_jacobian(xy[own])
+        )
+        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dq[own], profile.normals_px[own])
+        noise[own] = across * profile.sigma_px[own, None]
+        by_sensor[own] = np.concatenate([dpoint_dxy @ dxy_dcamera[own], dpoint_dsheet], axis=2)
+    kept = np.flatnonzero(is_met)
+    return StripePoints(kept, points[kept], noise[kept], by_sensor[kept], sheets[kept])
+
+
+def _checked_sheets(
+    profile: Profile, sheet_of_point: IntArray, sensor: SensorCalibration
+) -> IntArray:
     sheets = np.asarray(sheet_of_point)
     if sheets.shape != (len(profile),):
         raise InputError(
@@ -85,43 +163,16 @@ def triangulate(
             f"{len(sensor.sheets)} sheets",
             where=profile.source,
         )
-    xy, has_ray, dxy_dq, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(
-        profile.points_px
-    )
-    points = np.zeros((len(profile), 3))
-    covariance = np.zeros((len(profile), 3, 3))
-    noise = np.zeros(len(profile))
-    is_met = np.zeros(len(profile), dtype=np.bool_)
-    for k, calibrated in enumerate(sensor.sheets):
-        own = np.flatnonzero(has_ray & (sheets == k))
-        points[own], is_met[own], dpoint_dxy, dpoint_dsheet = (
-            calibrated.sheet.intersect_with_jacobian(xy[own])
-        )
-        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dq[own], profile.normals_px[own])
-        across *= profile.sigma_px[own, None]
-        by_calibration = np.concatenate([dpoint_dxy @ dxy_dcamera[own], dpoint_dsheet], axis=2)
-        joint = _covariance_of(sensor, k)
-        covariance[own] = across[:, :, None] * across[:, None, :] + (
-            by_calibration @ joint @ by_calibration.transpose(0, 2, 1)
-        )
-        noise[own] = np.linalg.norm(across, axis=1)
-    kept = np.flatnonzero(is_met)
-    return PointCloud(
-        "Sensor",
-        points[kept],
-        0.5 * (covariance[kept] + covariance[kept].transpose(0, 2, 1)),
-        noise[kept],
-        sheets[kept],
-        tuple(sheet.name for sheet in sensor.sheets),
-        np.zeros(len(kept), dtype=np.int64),
-        (profile.source,),
-        profile.segment[kept],
-        profile.intensity[kept],
-    )
+    return sheets
 
 
-def _covariance_of(sensor: SensorCalibration, k: int) -> FloatArray:
-    """(17, 17) covariance of the camera's parameters and those of sheet ``k``."""
-    own = sensor.sheet_parameter_slice(k)
-    places = np.concatenate([np.arange(N_CAMERA), np.arange(own.start, own.stop)])
+def sensor_columns(sensor: SensorCalibration, sheet: int) -> IntArray:
+    """(17,) places, in ``sensor.covariance``, of the camera's parameters and one sheet's."""
+    own = sensor.sheet_parameter_slice(sheet)
+    return np.concatenate([np.arange(N_CAMERA), np.arange(own.start, own.stop)])
+
+
+def sensor_covariance(sensor: SensorCalibration, sheet: int) -> FloatArray:
+    """(17, 17) covariance of the camera's parameters and those of one sheet."""
+    places = sensor_columns(sensor, sheet)
     return np.asarray(sensor.covariance[np.ix_(places, places)])

@@ -33,6 +33,12 @@ class Exposure:
         Names of the laser sources that were on.
     t_ns
         Mid-exposure time, or None if unknown.
+    camera
+        Number of the camera, counted from 0.
+    trigger_id
+        Number that the arm's sample of the same trigger bears too, or None.
+    view
+        Exposures of equal view saw one rigid arrangement; None stands for a view of its own.
     """
 
     image: ImageArray
@@ -41,6 +47,9 @@ class Exposure:
     window: SensorWindow = field(default_factory=SensorWindow)
     lasers: tuple[str, ...] = ()
     t_ns: int | None = None
+    camera: int = 0
+    trigger_id: int | None = None
+    view: str | None = None
 
     def __post_init__(self) -> None:
         image = np.ascontiguousarray(self.image)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the digital twin offers to the pipeline, which finds it by name in the registry."""
+
+from __future__ import annotations
+
+from typing import Literal, Protocol
+
+from armscan.devices.scan_source import ScanSource
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.records.arm_track import ArmTrack
+
+TwinScene = Literal[
+    "camera", "laser", "hand-eye", "plate", "ball", "steps", "still-step", "part", "probing"
+]
+Preset = Literal["clean", "thesis", "harsh"]
+
+
+class TwinTruth(Protocol):
+    """What the twin was made from; asked for after a measurement, to state its errors."""
+
+    @property
+    def camera_parameters(self) -> FloatArray:
+        """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``."""
+
+    @property
+    def sheet_points_mm(self) -> FloatArray:
+        """(N, 3) true points of the light sheet over the working region, Sensor frame."""
+
+    @property
+    def tool_from_sensor(self) -> Pose[Tool, Sensor]:
+        """The true hand-eye."""
+
+    @property
+    def plate_plane(self) -> FloatArray:
+        """(4,) unit normal and D of the best plane through the true plate, in Base (eq. 2.55)."""
+
+    @property
+    def ball_diameter_mm(self) -> float:
+        """Of the reference ball."""
+
+    @property
+    def step_heights_mm(self) -> tuple[float, ...]:
+        """Heights of the gauge blocks over the face that they stand on."""
+
+    def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
+        """Signed distance (N,) of points (N, 3) in Base from the free-form part's surface."""
+
+    def part_normals(self, points_base_mm: FloatArray) -> FloatArray:
+        """(N, 3) unit normals of that surface next to points (N, 3)."""
+
+    def document(self) -> bytes:
+        """All of it as JSON, with the mark ``"simulated": true``."""
+
+
+class Probing(Protocol):
+    """The plate touched with a real tip, as the arm reports it."""
+
+    @property
+    def arm(self) -> ArmTrack:
+        """One sample a touch."""
+
+    @property
+    def tool_from_probe_mm(self) -> FloatArray:
+        """(3,) calibrated centre of the tip in Tool."""
+
+    @property
+    def tip_diameter_mm(self) -> float:
+        """Calibrated diameter of the tip."""
+
+
+class Twin(Protocol):
+    """One simulated instrument: head, arm and what stands around it, drawn from one seed."""
+
+    @property
+    def head(self) -> str:
+        """Name of the head, for example ``thesis-single``."""
+
+    @property
+    def preset(self) -> Preset:
+        """How good the instrument and how kind the surroundings are."""
+
+    @property
+    def seed(self) -> int:
+        """Everything random follows from it."""
+
+    @property
+    def target(self) -> str:
+        """The calibration target as the command line names it."""
+
+    @property
+    def truth(self) -> TwinTruth:
+        """What it was made from."""
+
+    def scan(self, scene: TwinScene) -> ScanSource:
+        """The recording of one scene; pixels are rendered when an exposure is asked for.
+
+        ``camera`` and ``laser`` have no arm. In ``laser`` each view is a pair: laser on (lasers
+        ``A``), then off (no lasers). In ``hand-eye`` equal views are one posture. ``still-step``
+        is one exposure of a 20 mm step.
+        """
+
+    def probe_plate(self) -> Probing:
+        """Touch the plate of the scene ``hand-eye``."""

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
 from armscan.errors import EstimationError
 from armscan.geometry.estimate import FitFailure
-from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.camera_page import camera_page, parameter_rows
-from armscan.report.fit_diagnostics import camera_diagnostics
 from armscan.report.numbers import sentence, significant, without_source
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
@@ -106,22 +104,6 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
     )
     return camera_summary(
         run, (files.document, files.observations, files.page), is_simulated=page.is_simulated
-    )
-
-
-def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:
-    """The document's content of a fit."""
-    return CameraCalibration(
-        camera=fit.camera,
-        covariance=fit.covariance,
-        has_covariance=True,
-        rms_px=fit.rms_px,
-        sigma_point_px=fit.sigma_point_px,
-        n_views=fit.n_views,
-        n_points=fit.n_points,
-        covered_px=fit.coverage.covered_px,
-        provenance=provenance,
-        diagnostics=camera_diagnostics(fit),
     )
 
 

@@ -14,10 +14,10 @@ from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, Sheet
 from armscan.errors import EstimationError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
+from armscan.pipeline.documents import sensor_calibration
 from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_exposures
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.profile import Profile, StripeFlag
-from armscan.report.fit_diagnostics import sensor_calibration
 from armscan.report.laser_page import laser_page, sheet_facts
 from armscan.report.numbers import sentence
 from armscan.report.outputs import calibration_outputs

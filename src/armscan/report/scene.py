@@ -63,8 +63,10 @@ def scene_markup(
     lines: list[SceneLines],
     labels: list[tuple[str, tuple[float, float, float]]],
     alt: str,
+    *,
+    is_z_up: bool = False,
 ) -> str:
-    """``<canvas>`` with its data; positions are in the Sensor frame.
+    """``<canvas>`` with its data; positions are in the Sensor frame, or in one with Z up.
 
     Parameters
     ----------
@@ -74,6 +76,8 @@ def scene_markup(
         Texts with their positions in mm.
     alt
         What it shows, in words.
+    is_z_up
+        True for frames like Base, whose Z points up; in Sensor Y points down and Z away.
     """
     points = np.concatenate([item.points_mm for item in dots])
     segments = np.concatenate([item.points_mm for item in lines] or [np.zeros((0, 3))])
@@ -90,7 +94,8 @@ def scene_markup(
         f'data-points="{_packed(points)}" data-colours="{_encoded(colours)}" '
         f'data-lines="{_packed(segments)}" data-line-colours="{_encoded(line_colours)}" '
         f'data-centre="{_packed((low + high) / 2)}" '
-        f'data-labels="{escape(texts)}" data-yaw="-0.65" data-pitch="0.42"></canvas>'
+        f'data-labels="{escape(texts)}" data-yaw="-0.65" data-pitch="0.42" '
+        f'data-up="{"z" if is_z_up else "-y"}"></canvas>'
     )
 
 

@@ -17,12 +17,11 @@ from armscan.calibration.camera.result import CameraFit
 from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.result import LaserFit, PointUse
 from armscan.calibration.laser.target_edges import TargetEdges
+from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
-from armscan.report.camera_job import camera_calibration
 from armscan.report.camera_page import camera_page
-from armscan.report.fit_diagnostics import sensor_calibration
 from armscan.report.laser_job import laser_summary
 from armscan.report.laser_page import USE_COLOURS, laser_page
 from armscan.report.numbers import with_sigma

@@ -1,4 +1,5 @@
-// Points and lines in space, turned by dragging; orthographic, Sensor axes (x right, y down, z away).
+// Points and lines in space, turned by dragging; orthographic. The axes are Sensor's
+// (x right, y down, z away), or with z up (x right, y away).
 function drawScenes() {
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const floats = (text) => new Float32Array(bytes(text).buffer);
@@ -12,7 +13,8 @@ function drawScenes() {
 
     function turned() {
       const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
-      return (x, y, z) => [cy * x + sy * z, cp * y - sp * (cy * z - sy * x)];
+      const seen = (x, y, z) => [cy * x + sy * z, cp * y - sp * (cy * z - sy * x)];
+      return data.up === "z" ? (x, y, z) => seen(x, -z, y) : seen;
     }
 
     function reachOf(turn) {

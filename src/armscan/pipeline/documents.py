@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a document keeps of the evidence that a fit brings."""
+"""From what a fit found to what a calibration document keeps, its evidence included."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from armscan.calibration.camera.result import BoardWarp, CameraFit
 from armscan.calibration.laser.result import LackOfFit, LaserFit, SheetFit
-from armscan.models.calibration import Provenance, SensorCalibration
+from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.models.diagnostics import (
     BowedBoard,
     CameraDiagnostics,
@@ -17,7 +17,23 @@ from armscan.models.diagnostics import (
 )
 
 
-def camera_diagnostics(fit: CameraFit) -> CameraDiagnostics:
+def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:
+    """The document's content of a fit."""
+    return CameraCalibration(
+        camera=fit.camera,
+        covariance=fit.covariance,
+        has_covariance=True,
+        rms_px=fit.rms_px,
+        sigma_point_px=fit.sigma_point_px,
+        n_views=fit.n_views,
+        n_points=fit.n_points,
+        covered_px=fit.coverage.covered_px,
+        provenance=provenance,
+        diagnostics=_camera_diagnostics(fit),
+    )
+
+
+def _camera_diagnostics(fit: CameraFit) -> CameraDiagnostics:
     """Diagnostics of a camera's calibration."""
     held_out = fit.cross_validation
     return CameraDiagnostics(

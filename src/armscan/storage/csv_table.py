@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of text: UTF-8, comma, decimal point, ``#`` comments, columns found by their names."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import FileFormatError, InputError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.storage.images import read_bytes
+
+INT64 = np.iinfo(np.int64)
+LINE_BREAK = re.compile(r"\r\n|\n|\r")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CsvTable:
+    """A table of text, and where each row stood.
+
+    Parameters
+    ----------
+    where
+        Name of the file, for messages.
+    columns
+        Cells of each column, stripped of blanks, in the order of the header.
+    lines
+        Number of the line of each row, counted from 1.
+    comments
+        Text after each ``#``, in order.
+    is_cut
+        True if the last line does not end with a line break.
+    """
+
+    where: str
+    columns: Mapping[str, tuple[str, ...]]
+    lines: tuple[int, ...]
+    comments: tuple[str, ...] = ()
+    is_cut: bool = False
+
+    def __len__(self) -> int:
+        """Count of rows."""
+        return len(self.lines)
+
+    def __contains__(self, name: str) -> bool:
+        """True if there is a column of that name."""
+        return name in self.columns
+
+    def place(self, row: int) -> str:
+        """File and line of a row, for messages."""
+        return f"{self.where}, line {self.lines[row]}"
+
+    def require(self, names: Sequence[str]) -> None:
+        """Raise if a column is missing.
+
+        Raises
+        ------
+        FileFormatError
+            Naming the columns that are missing, and those that there are.
+        """
+        missing = [name for name in names if name not in self.columns]
+        if not missing:
+            return
+        other = [name for name in self.columns if name not in names]
+        near = {name: get_close_matches(name, other, 1, 0.5) for name in missing}
+        hints = [f"'{found[0]}' may be '{name}'" for name, found in near.items() if found]
+        raise FileFormatError(
+            f"no column is called {', '.join(missing)} (there are: {', '.join(self.columns)})",
+            where=self.where,
+            remedy=f"write the header {','.join(names)}"
+            + (f"; {', '.join(hints)}" if hints else ""),
+        )
+
+    def floats(self, names: Sequence[str], *, may_lack: bool = False) -> FloatArray:
+        """Return columns as numbers (N, len(names)).
+
+        Parameters
+        ----------
+        names
+            Columns.
+        may_lack
+            Take empty cells and ``nan`` as NaN instead of refusing them.
+
+        Raises
+        ------
+        FileFormatError
+            Naming line and column of a cell that is no finite number.
+        """
+        cells = zip(*(self.columns[name] for name in names), strict=True)
+        values = [
+            [self._float(cell, row, name, may_lack) for cell, name in zip(line, names, strict=True)]
+            for row, line in enumerate(cells)
+        ]
+        return np.array(values, dtype=np.float64).reshape(len(self), len(names))
+
+    def ints(self, name: str, missing: int | None = None) -> IntArray:
+        """Return a column as whole numbers (N,).
+
+        Parameters
+        ----------
+        name
+            The column.
+        missing
+            Stands for an empty cell; None refuses empty cells.
+
+        Raises
+        ------
+        FileFormatError
+            Naming line and column of a cell that is no whole number of 64 bits.
+        """
+        cells = enumerate(self.columns[name])
+        values = [self._int(cell, row, name, missing) for row, cell in cells]
+        return np.array(values, dtype=np.int64)
+
+    def _float(self, cell: str, row: int, name: str, may_lack: bool) -> float:
+        try:
+            value = float(cell) if cell else math.nan
+        except ValueError:
+            value = math.inf
+        if math.isfinite(value) or (may_lack and math.isnan(value)):
+            return value
+        raise FileFormatError(
+            f"'{cell}' in column {name} is no number", where=self.place(row), remedy="correct it"
+        )
+
+    def _int(self, cell: str, row: int, name: str, missing: int | None) -> int:
+        if not cell and missing is not None:
+            return missing
+        try:
+            value = int(cell)
+        except ValueError as error:
+            raise FileFormatError(
+                f"'{cell}' in column {name} is no whole number",
+                where=self.place(row),
+                remedy="write all digits, without point or exponent",
+            ) from error
+        if not INT64.min <= value <= INT64.max:
+            raise FileFormatError(
+                f"{value} in column {name} needs more than 64 bits", where=self.place(row)
+            )
+        return value
+
+
+def read_csv(path: Path) -> CsvTable:
+    """Read a table.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty, not UTF-8, has no header, a column twice, or a row of
+        another length than the header.
+    """
+    return parse_csv(read_bytes(path), str(path))
+
+
+def parse_csv(data: bytes, where: str) -> CsvTable:
+    """Parse the content of a table; see `read_csv`."""
+    text = _decoded(data, where)
+    rows: list[tuple[int, list[str]]] = []
+    comments: list[str] = []
+    for number, line in enumerate(LINE_BREAK.split(text), start=1):
+        stripped = line.strip()
+        if stripped.startswith("#"):
+            comments.append(stripped[1:].strip())
+        elif stripped:
+            rows.append((number, _cells(line, f"{where}, line {number}")))
+    if not rows:
+        raise FileFormatError("the table has no header", where=where, remedy="copy the file again")
+    header = _checked_header(rows[0][1], where)
+    body = rows[1:]
+    for number, cells in body:
+        if len(cells) != len(header):
+            raise _wrong_length(header, cells, where, number, is_last=number == body[-1][0])
+    columns = zip(*(cells for _, cells in body), strict=True) if body else ([()] * len(header))
+    return CsvTable(
+        where,
+        dict(zip(header, (tuple(cells) for cells in columns), strict=True)),
+        tuple(number for number, _ in body),
+        tuple(comments),
+        not text.endswith(("\n", "\r")),
+    )
+
+
+def csv_bytes(columns: Mapping[str, Sequence[str]], comments: Sequence[str] = ()) -> bytes:
+    """Text of a table: comments, header, rows; a cell that holds a comma is quoted.
+
+    Raises
+    ------
+    InputError
+        If a cell holds a line break.
+    """
+    for name, cells in columns.items():
+        if any(LINE_BREAK.search(cell) for cell in cells):
+            raise InputError(f"a cell of column {name} holds a line break")
+    buffer = io.StringIO()
+    for comment in comments:
+        buffer.write(f"# {comment}\n")
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return buffer.getvalue().encode()
+
+
+def number_text(value: float) -> str:
+    """Shortest text that reads back as the same number; empty for NaN."""
+    return "" if math.isnan(value) else repr(float(value))
+
+
+def _decoded(data: bytes, where: str) -> str:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise FileFormatError(
+            "this is not UTF-8 text", where=where, remedy="save it as CSV in UTF-8"
+        ) from error
+    if "\0" in text:
+        raise FileFormatError("this is no text", where=where, remedy="save it as CSV in UTF-8")
+    return text
+
+
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], strict=True))]
+    except csv.Error as error:
+        raise FileFormatError(f"the line cannot be split ({error})", where=where) from error
+
+
+def _checked_header(header: list[str], where: str) -> list[str]:
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        raise FileFormatError(
+            "columns are not separated by commas",
+            where=where,
+            remedy="save it with commas between columns and points in numbers",
+        )
+    if all(_is_number(cell) for cell in header):
+        raise FileFormatError(
+            "the first line holds numbers, not the names of columns",
+            where=where,
+            remedy="write a header with the names of the columns",
+        )
+    repeated = sorted({name for name in header if header.count(name) > 1})
+    if repeated or "" in header:
+        fact = f"more than one column is called {repeated[0]}" if repeated else "a name is missing"
+        raise FileFormatError(f"{fact} in the header", where=where, remedy="name each column once")
+    return header
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _wrong_length(
+    header: list[str], cells: list[str], where: str, number: int, *, is_last: bool
+) -> FileFormatError:
+    is_short = len(cells) < len(header)
+    if is_short and is_last:
+        remedy = "the file may be cut: copy it again or remove its last line"
+    elif is_short:
+        remedy = "leave unknown cells empty, but write their commas"
+    else:
+        remedy = "write numbers with a decimal point, not a comma"
+    return FileFormatError(
+        f"{len(cells)} cells, but the header has {len(header)}",
+        where=f"{where}, line {number}",
+        remedy=remedy,
+    )

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that can only be in another unit than millimetres."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.rotation import vector_from_rotation
+
+REACH_MM = 10.0
+"""No arm keeps its last link this near to the origin of Base; in metres, no arm gets farther."""
+MOVED_MM = 0.01
+TURNED_RAD = math.radians(3.0)
+
+METRES_REMEDY = (
+    "multiply x, y and z by 1000; if they are millimetres, add 1000 to each x, for Base may lie "
+    "anywhere"
+)
+
+
+def are_within_reach_of_base(translations_mm: FloatArray) -> bool:
+    """True if all (N, 3) positions lie within 10 mm of Base's origin, and not all at it."""
+    if not len(translations_mm):
+        return False
+    distance = np.linalg.norm(translations_mm, axis=1)
+    return bool(0.0 < distance.max() < REACH_MM)
+
+
+def are_surely_metres(rotations: FloatArray, translations_mm: FloatArray) -> bool:
+    """True if the poses of an arm make no sense in millimetres.
+
+    They do not where the tool stays within 10 mm of Base's origin and moves, while it turns about
+    two axes: a stage of small travel does not turn, and a turntable turns about one axis only.
+
+    Parameters
+    ----------
+    rotations
+        (N, 3, 3) of ``base_from_tool``.
+    translations_mm
+        (N, 3) as written under the name of millimetres.
+    """
+    if len(rotations) < 3 or not are_within_reach_of_base(translations_mm):
+        return False
+    moved = np.linalg.norm(translations_mm - translations_mm.mean(axis=0), axis=1).max()
+    chosen = np.unique(np.linspace(0, len(rotations) - 1, 200).astype(np.int64))
+    turns = np.array([vector_from_rotation(rotations[0].T @ rotations[k]) for k in chosen])
+    _, _, axes = np.linalg.svd(turns, full_matrices=False)
+    about_second = np.abs(turns @ axes[1]).max()
+    return bool(moved > MOVED_MM and about_second > TURNED_RAD)

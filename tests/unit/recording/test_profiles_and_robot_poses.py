@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Profiles of a sensor that delivers points, and the robot's poses that go with them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.errors import FileFormatError
+from armscan.storage.profiles import read_profiles
+from armscan.storage.robot_poses import read_robot_poses
+
+DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[4] / "shared" / "data"))
+YAML = "%YAML:1.0\n---\nscan_line: [ 1.5e+00, 0., .Nan, 2.,\n    0., -3.5, 4., 0., -6. ]\n"
+
+
+def written(folder: Path, name: str, content: str) -> Path:
+    path = folder / name
+    path.write_text(content, encoding="utf-8")
+    return path
+
+
+def test_yaml_triplets_are_points_and_nan_is_a_gap(tmp_path: Path) -> None:
+    (profile,) = read_profiles([written(tmp_path, "p1.yml", YAML)])
+    assert profile.points_mm.tolist() == [[2.0, 0.0, -3.5], [4.0, 0.0, -6.0]]
+    assert (profile.source, profile.n_gaps) == ("p1.yml", 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "points"),
+    [
+        ("x_mm,z_mm\n1,2\n3,\n5,6\n", [[1, 0, 2], [5, 0, 6]]),
+        ("z_mm,y_mm,x_mm\n1,2,3\nnan,0,0\n", [[3, 2, 1]]),
+    ],
+)
+def test_csv_profiles(tmp_path: Path, text: str, points: list[list[float]]) -> None:
+    (profile,) = read_profiles([written(tmp_path, "p.csv", text)])
+    assert profile.points_mm.tolist() == points
+
+
+def test_a_folder_or_a_pattern_stands_for_its_profiles_in_natural_order(tmp_path: Path) -> None:
+    for name in ("p10.yml", "p2.yml", "p1.yml"):
+        written(tmp_path, name, YAML)
+    written(tmp_path, "poses.txt", "1 2 3 4 5 6\n")
+    for given in (tmp_path, f"{tmp_path}/p*.yml"):
+        assert [item.source for item in read_profiles([given])] == ["p1.yml", "p2.yml", "p10.yml"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("p.yml", YAML[:-20], "cut short"),
+        ("p.yml", "%YAML:1.0\n---\nscan_line: [ 1., 2. ]\n", "three a point"),
+        ("p.yml", "%YAML:1.0\n---\nscan_line: [ 1., 2., x ]\n", "'x' in scan_line"),
+        ("p.yml", "%YAML:1.0\n---\nscan_line: [ 1., 0., .Nan ]\n", "no point (1 gaps)"),
+        ("p.yml", "%YAML:1.0\n---\nother: 1\n", "no list called scan_line"),
+        ("p.csv", "x_mm,y\n1,2\n", "no column is called z_mm"),
+    ],
+)
+def test_bad_profiles_are_refused(tmp_path: Path, name: str, text: str, said: str) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        read_profiles([written(tmp_path, name, text)])
+    assert said in str(caught.value)
+
+
+ROW = "10 20 1000 0 0 90"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{ROW}\n{ROW}\n",
+        f"# robot 1\nX,Y,Z,W,P,R\n{ROW.replace(' ', ',')}\n{ROW}\n",
+        f"\ufeffx_mm,y_mm,z_mm,a_deg,b_deg,c_deg\r\n{ROW}\r\n\r\n{ROW}",
+        f'{{"RobPoses": [[{ROW.replace(" ", ",")}], [{ROW.replace(" ", ",")}]]}}',
+    ],
+)
+def test_robot_poses_of_every_form(tmp_path: Path, text: str) -> None:
+    poses = read_robot_poses(written(tmp_path, "poses", text), "extrinsic-xyz")
+    assert len(poses) == 2
+    np.testing.assert_array_equal(poses[1].translation_mm, [10.0, 20.0, 1000.0])
+    np.testing.assert_allclose(poses[1].rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+def test_the_convention_decides_what_the_angles_mean(tmp_path: Path) -> None:
+    """W = P = 90 deg: R = Ry Rx sends x to -z, R = Rx Ry sends it to y."""
+    path = written(tmp_path, "poses", "0 0 500 90 90 0\n")
+    extrinsic = read_robot_poses(path, "extrinsic-xyz")[0].rotation
+    intrinsic = read_robot_poses(path, "intrinsic-xyz")[0].rotation
+    np.testing.assert_allclose(extrinsic @ [1, 0, 0], [0, 0, -1], atol=1e-15)
+    np.testing.assert_allclose(intrinsic @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 2 3 4 5\n", "line 1: a pose is not six numbers"),
+        ("Z,Y,X,W,P,R\n1 2 3 4 5 6\n", "line 1: a pose is not six numbers"),
+        ('{"RobPoses": [[1, 2, 3, 4, 5, null]]}', "pose 1: a pose is not six numbers"),
+        ('{"Poses": []}', "no list called RobPoses"),
+        ("# nothing\n", "no pose"),
+        ("0 0 90 1300 500 200\n", "an angle of 1300 deg"),
+        ("1.3 0 .5 0 0 0\n1.2 0 .5 20 0 0\n1.2 .1 .5 0 20 0\n", "look like metres"),
+    ],
+)
+def test_bad_pose_tables_are_refused(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(FileFormatError) as caught:
+        read_robot_poses(written(tmp_path, "poses", text), "extrinsic-xyz")
+    assert said in str(caught.value)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the reference data are not here (ARMSCAN_DATA)")
+@pytest.mark.parametrize(
+    ("folder", "table", "count"),
+    [("sphere_profiles", "RobPoses.rob", 15), ("plate_profiles", "rob2board.txt", 12)],
+)
+def test_the_reference_profiles_and_poses_are_read(folder: str, table: str, count: int) -> None:
+    profiles = read_profiles([DATA / folder])
+    poses = read_robot_poses(DATA / folder / table, "extrinsic-xyz")
+    assert len(profiles) == len(poses) == count
+    assert [int(item.source.strip("p").split("_")[0].split(".")[0]) for item in profiles] == [
+        *range(1, count + 1)
+    ]
+    assert all(len(item) > 100 and not item.points_mm[:, 1].any() for item in profiles)

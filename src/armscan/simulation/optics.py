@@ -8,7 +8,7 @@ steps instead of Newton's method, so that a slip in one of the two formulas show
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -74,8 +74,21 @@ class RenderCamera:
         v = self.cy + self.fy * (gain * y + shift_y)
         return np.stack([u, v], axis=-1)
 
-    def rays(self, pixels_px: FloatArray) -> FloatArray:
+    def cropped(self, x_px: int, y_px: int, width_px: int, height_px: int) -> RenderCamera:
+        """Camera that delivers only the rectangle whose top-left pixel is given."""
+        return replace(
+            self, cx=self.cx - x_px, cy=self.cy - y_px, width_px=width_px, height_px=height_px
+        )
+
+    def rays(self, pixels_px: FloatArray, tolerance: float = _STEP_TOLERANCE) -> FloatArray:
         """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
+
+        Parameters
+        ----------
+        pixels_px
+            (..., 2) pixels.
+        tolerance
+            Size of the step after which the search ends; what is left is smaller by far.
 
         Raises
         ------
@@ -91,7 +104,7 @@ class RenderCamera:
             new_x, new_y = (seen_x - shift_x) / gain, (seen_y - shift_y) / gain
             step = max(_largest(new_x - x), _largest(new_y - y))
             x, y = new_x, new_y
-            if step < _STEP_TOLERANCE:
+            if step < tolerance:
                 return np.stack([x, y], axis=-1)
         raise InputError(
             "the rendered camera's distortion cannot be inverted over its image",
@@ -102,7 +115,7 @@ class RenderCamera:
         self, x: FloatArray, y: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         square = x**2 + y**2
-        gain = 1.0 + self.k1 * square + self.k2 * square**2 + self.k3 * square**3
+        gain = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
         lever = 2.0 * (self.p1 * y + self.p2 * x)
         return gain, x * lever + self.p2 * square, y * lever + self.p1 * square
 

@@ -10,9 +10,10 @@ from typing import Protocol, cast
 import numpy as np
 
 from armscan.devices.registry import load_driver
-from armscan.geometry.arrays import BoolArray, FloatArray
-from armscan.models.calibration import SensorCalibration, SheetCalibration
+from armscan.geometry.arrays import FloatArray
+from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.truth_errors import SheetErrors, camera_errors, sheet_errors
 from armscan.records.cloud import PointCloud
 
 ON_OBJECT_MM = 2.0
@@ -39,31 +40,6 @@ class PhotoTruth(Protocol):
 
     def object_normals(self, points_sensor_mm: FloatArray) -> FloatArray:
         """(N, 3) normals of the object's surface next to points (N, 3)."""
-
-
-@dataclass(frozen=True, slots=True)
-class SheetErrors:
-    """A calibrated sheet against the true one, over the region of the boards.
-
-    Parameters
-    ----------
-    angle_deg
-        Between the two surfaces' directions in the middle.
-    offset_mm
-        Between them in the middle.
-    rms_mm
-        Root mean square distance over the true stripes.
-    normalised
-        Length of the error of the parameters in their own sigmas, ``sqrt(e' C^-1 e)``.
-    n_parameters
-        Count of parameters in it: 3 for a plane, 8 with a bow.
-    """
-
-    angle_deg: float
-    offset_mm: float
-    rms_mm: float
-    normalised: float
-    n_parameters: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +95,7 @@ def compare_with_truth(
     sensor: SensorCalibration, cloud: PointCloud, truth: PhotoTruth
 ) -> PhotoErrors:
     """Compare a calibrated sensor with one sheet, and the cloud it measured, with the truth."""
-    error = sensor.camera.camera.parameters - truth.camera_parameters
-    covariance = sensor.camera.covariance
-    is_free = np.asarray(np.diag(covariance) > 0.0)
+    camera = camera_errors(sensor.camera, truth.camera_parameters)
     distance = truth.object_distance_mm(cloud.points_mm)
     is_on = np.abs(distance) < ON_OBJECT_MM
     normals = truth.object_normals(cloud.points_mm[is_on])
@@ -129,11 +103,11 @@ def compare_with_truth(
     on_object = distance[is_on]
     normalised = on_object / np.sqrt(variance)
     return PhotoErrors(
-        focal_px=float(error[0]),
-        focal_sigma_px=float(np.sqrt(covariance[0, 0])),
-        camera_normalised=_normalised(error, covariance, is_free),
-        n_camera_parameters=int(is_free.sum()),
-        sheet=_sheet_errors(
+        focal_px=camera.focal_px,
+        focal_sigma_px=camera.focal_sigma_px,
+        camera_normalised=camera.normalised,
+        n_camera_parameters=camera.n_parameters,
+        sheet=sheet_errors(
             sensor.sheets[0],
             sensor.covariance[sensor.sheet_parameter_slice(0), sensor.sheet_parameter_slice(0)],
             truth.sheet_points_mm,
@@ -145,27 +119,3 @@ def compare_with_truth(
         points_normalised_rms=float(np.sqrt(np.mean(normalised**2))),
         points_within_2_sigma=float(np.mean(np.abs(normalised) < 2.0)),
     )
-
-
-def _sheet_errors(
-    calibration: SheetCalibration, covariance: FloatArray, true_points_mm: FloatArray
-) -> SheetErrors:
-    """Fit the parameters' error to the heights of true points over the calibrated sheet."""
-    sheet = calibration.sheet
-    height, _, dheight = sheet.height_with_jacobian(true_points_mm)
-    is_free = np.asarray(np.diag(covariance) > 0.0)
-    error = np.zeros(len(covariance))
-    error[is_free] = np.linalg.lstsq(dheight[:, is_free], height, rcond=None)[0]
-    plane = np.linalg.lstsq(dheight[:, :3], height, rcond=None)[0]
-    return SheetErrors(
-        angle_deg=float(np.degrees(np.hypot(plane[0], plane[1]) / sheet.scale_mm)),
-        offset_mm=float(plane[2]),
-        rms_mm=float(np.sqrt(np.mean(height**2))),
-        normalised=_normalised(error, covariance, is_free),
-        n_parameters=int(is_free.sum()),
-    )
-
-
-def _normalised(error: FloatArray, covariance: FloatArray, is_free: BoolArray) -> float:
-    chosen = np.ix_(is_free, is_free)
-    return float(np.sqrt(error[is_free] @ np.linalg.solve(covariance[chosen], error[is_free])))

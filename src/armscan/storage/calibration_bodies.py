@@ -54,7 +54,7 @@ def camera_body(calibration: CameraCalibration) -> CameraBody:
     return CameraBody(
         intrinsics=IntrinsicsBody(width_px=camera.width_px, height_px=camera.height_px, **values),
         has_covariance=calibration.has_covariance,
-        covariance=_covariance_body(PARAMETER_NAMES, calibration.covariance),
+        covariance=covariance_body(PARAMETER_NAMES, calibration.covariance),
         rms_px=calibration.rms_px,
         sigma_point_px=calibration.sigma_point_px,
         n_views=calibration.n_views,
@@ -72,7 +72,7 @@ def camera_from_body(body: CameraBody, provenance: Provenance) -> CameraCalibrat
         camera=CameraModel.from_parameters(
             [getattr(inner, name) for name in PARAMETER_NAMES], inner.width_px, inner.height_px
         ),
-        covariance=_covariance_from_body(body.covariance, PARAMETER_NAMES),
+        covariance=covariance_from_body(body.covariance, PARAMETER_NAMES),
         has_covariance=body.has_covariance,
         rms_px=body.rms_px,
         sigma_point_px=body.sigma_point_px,
@@ -93,7 +93,7 @@ def sensor_document_of(
         camera=camera_body(calibration.camera),
         camera_provenance=provenance_body(calibration.camera.provenance),
         sheets=tuple(_sheet_body(sheet) for sheet in calibration.sheets),
-        covariance=_covariance_body(calibration.parameter_names, calibration.covariance),
+        covariance=covariance_body(calibration.parameter_names, calibration.covariance),
         diagnostics=diagnostics_body(calibration.diagnostics, SensorDiagnosticsBody),
         observations=observations,
         provenance=provenance_body(calibration.provenance),
@@ -111,7 +111,7 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
         np.zeros((size, size)),
         provenance_from_body(document.provenance),
     )
-    covariance = _covariance_from_body(document.covariance, empty.parameter_names)
+    covariance = covariance_from_body(document.covariance, empty.parameter_names)
     return SensorCalibration(
         camera,
         sheets,
@@ -156,11 +156,11 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
     low, high = calibration.depth_range_mm
     return SheetBody(
         name=calibration.name,
-        origin_sensor_mm=_triple(sheet.origin_mm),
+        origin_sensor_mm=triple(sheet.origin_mm),
         axes=AxesBody(
-            u_sensor=_triple(sheet.axes[0]),
-            v_sensor=_triple(sheet.axes[1]),
-            normal_sensor=_triple(sheet.axes[2]),
+            u_sensor=triple(sheet.axes[0]),
+            v_sensor=triple(sheet.axes[1]),
+            normal_sensor=triple(sheet.axes[2]),
         ),
         scale_mm=sheet.scale_mm,
         bow_mm=dict(zip(BOW_KEYS, sheet.bow_mm.tolist(), strict=True)),
@@ -191,18 +191,27 @@ def _sheet_from_body(body: SheetBody) -> SheetCalibration:
     )
 
 
-def _triple(values: FloatArray) -> Triple:
+def triple(values: FloatArray) -> Triple:
+    """Three numbers of an array (3,)."""
     x, y, z = values.tolist()
     return x, y, z
 
 
-def _covariance_body(names: Sequence[str], matrix: FloatArray) -> CovarianceBody:
+def covariance_body(names: Sequence[str], matrix: FloatArray) -> CovarianceBody:
+    """Body of a covariance (P, P) with P names."""
     return CovarianceBody(
         parameter_names=tuple(names), matrix=tuple(tuple(row) for row in matrix.tolist())
     )
 
 
-def _covariance_from_body(body: CovarianceBody, names: Sequence[str]) -> FloatArray:
+def covariance_from_body(body: CovarianceBody, names: Sequence[str]) -> FloatArray:
+    """Covariance (P, P) from its body.
+
+    Raises
+    ------
+    InputError
+        If names or size are not those expected, or it is not symmetric with a positive diagonal.
+    """
     if body.parameter_names != tuple(names):
         raise InputError("the covariance's parameter names are not those of the model, in order")
     if any(len(row) != len(names) for row in body.matrix) or len(body.matrix) != len(names):

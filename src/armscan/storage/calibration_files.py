@@ -21,6 +21,7 @@ from armscan.storage.calibration_bodies import (
 )
 from armscan.storage.calibration_schema import (
     CAMERA_SCHEMA,
+    SCANNER_SCHEMA,
     SCHEMA_VERSION,
     SENSOR_SCHEMA,
     CameraDocument,
@@ -35,7 +36,12 @@ D = TypeVar("D", bound=BaseModel)
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 
-KINDS = {CAMERA_SCHEMA: "camera calibration", SENSOR_SCHEMA: "sensor calibration"}
+KINDS = {
+    CAMERA_SCHEMA: "camera calibration",
+    SENSOR_SCHEMA: "sensor calibration",
+    SCANNER_SCHEMA: "scanner calibration",
+}
+STAGES = {CAMERA_SCHEMA: "camera", SENSOR_SCHEMA: "laser", SCANNER_SCHEMA: "hand-eye"}
 
 
 def camera_document(
@@ -53,7 +59,7 @@ def camera_document(
     document = CameraDocument(
         schema=CAMERA_SCHEMA,
         camera=camera_body(calibration),
-        observations=_observations_body(observations),
+        observations=observations_body(observations),
         provenance=provenance_body(calibration.provenance),
     )
     return json_bytes(document.model_dump(mode="json", by_alias=True))
@@ -63,7 +69,7 @@ def sensor_document(
     calibration: SensorCalibration, observations: tuple[str, bytes] | None = None
 ) -> bytes:
     """Text of ``sensor.json``; see `camera_document`."""
-    document = sensor_document_of(calibration, _observations_body(observations))
+    document = sensor_document_of(calibration, observations_body(observations))
     return json_bytes(document.model_dump(mode="json", by_alias=True))
 
 
@@ -108,7 +114,7 @@ def read_sensor_calibration(path: Path) -> SensorCalibration:
 
 
 def _camera(data: bytes, path: Path) -> CameraCalibration:
-    document = _validated(CameraDocument, CAMERA_SCHEMA, data, path)
+    document = validated_document(CameraDocument, CAMERA_SCHEMA, data, path)
     try:
         return camera_from_body(document.camera, provenance_from_body(document.provenance))
     except InputError as error:
@@ -116,14 +122,30 @@ def _camera(data: bytes, path: Path) -> CameraCalibration:
 
 
 def _sensor(data: bytes, path: Path) -> SensorCalibration:
-    document = _validated(SensorDocument, SENSOR_SCHEMA, data, path)
+    document = validated_document(SensorDocument, SENSOR_SCHEMA, data, path)
     try:
         return sensor_from_document(document)
     except InputError as error:
         raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
 
 
-def _validated(kind: type[D], schema: str, data: bytes, path: Path) -> D:
+def validated_document(kind: type[D], schema: str, data: bytes, path: Path) -> D:
+    """Check the content of a document against its schema.
+
+    Parameters
+    ----------
+    kind
+        Model of the document.
+    schema
+        Name that its key ``schema`` must have.
+    data, path
+        Content and name of the file.
+
+    Raises
+    ------
+    FileFormatError
+        If it is of another kind or a newer version, cut, or a key is missing, unknown or wrong.
+    """
     where = str(path)
     content = parse_json(data, where)
     wanted = KINDS[schema]
@@ -132,13 +154,13 @@ def _validated(kind: type[D], schema: str, data: bytes, path: Path) -> D:
         raise FileFormatError(
             f"this is a {KINDS[found]}, and a {wanted} is needed",
             where=where,
-            remedy=f"name the file that `armscan calibrate {_stage(schema)}` wrote",
+            remedy=f"name the file that `armscan calibrate {STAGES[schema]}` wrote",
         )
     if found != schema:
         raise FileFormatError(
             f"this is not a {wanted} of armscan",
             where=where,
-            remedy=f"name the file that `armscan calibrate {_stage(schema)}` wrote",
+            remedy=f"name the file that `armscan calibrate {STAGES[schema]}` wrote",
         )
     version = content.get("schema_version")
     if isinstance(version, int) and version > SCHEMA_VERSION:
@@ -159,11 +181,8 @@ def _validated(kind: type[D], schema: str, data: bytes, path: Path) -> D:
         ) from error
 
 
-def _stage(schema: str) -> str:
-    return "camera" if schema == CAMERA_SCHEMA else "laser"
-
-
-def _observations_body(observations: tuple[str, bytes] | None) -> ObservationsBody | None:
+def observations_body(observations: tuple[str, bytes] | None) -> ObservationsBody | None:
+    """Body that names a file of observations and its hash; None for None."""
     if observations is None:
         return None
     name, content = observations

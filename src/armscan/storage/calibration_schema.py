@@ -11,6 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 SCHEMA_VERSION: Final = 1
 CAMERA_SCHEMA: Final = "armscan/camera-calibration"
 SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
+SCANNER_SCHEMA: Final = "armscan/scanner-calibration"
 
 
 def _nan_from_null(value: object) -> object:

@@ -70,7 +70,7 @@ class CsvTable:
         if not missing:
             return
         other = [name for name in self.columns if name not in names]
-        near = {name: get_close_matches(name, other, 1, 0.5) for name in missing}
+        near = {name: get_close_matches(name, other, 1, 0.4) for name in missing}
         hints = [f"'{found[0]}' may be '{name}'" for name, found in near.items() if found]
         raise FileFormatError(
             f"no column is called {', '.join(missing)} (there are: {', '.join(self.columns)})",

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations of made-up numbers, whose documents are the golden files."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from armscan.geometry.fitting import Plane
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.models.calibration import (
+    CameraCalibration,
+    InputFile,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.camera import CameraModel
+from armscan.models.diagnostics import (
+    BowedBoard,
+    CameraDiagnostics,
+    FTest,
+    SensorDiagnostics,
+    SheetDiagnostics,
+)
+from armscan.models.light_sheet import LightSheet
+from armscan.models.scanner import (
+    ArmNoise,
+    HandEyeCalibration,
+    HandEyeDiagnostics,
+    ScannerCalibration,
+)
+
+
+def covariance(size: int, seed: int) -> np.ndarray:
+    """Without linear algebra libraries, whose last bits differ between machines."""
+    values = 1.0 / np.arange(seed + 2, seed + 2 + size)
+    return np.multiply.outer(values, values) / 7 + np.diag(values / 1e6)
+
+
+def provenance() -> Provenance:
+    return Provenance(
+        document_id="3f0c1a9e-0000-4000-8000-000000000001",
+        created_utc="2026-01-02T03:04:05+00:00",
+        armscan_version="0.1.0",
+        command=("armscan", "calibrate", "camera", "größe *.png"),
+        inputs=(InputFile("photos/größe 1.png", "00" * 32),),
+        parent_ids=("parent",),
+        options=(("CameraOptions.solve_warp", "False"),),
+        warnings=("only three views",),
+    )
+
+
+def camera_calibration() -> CameraCalibration:
+    distortion = np.array([0.1, -0.2, 1e-17, 3e-4, 1 / 3])
+    camera = CameraModel(1431.1 / 3, 1430.9 / 7, 479.0 + 1e-13, 639.0 / 1.1, distortion, 960, 1280)
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance(9, 1),
+        has_covariance=True,
+        rms_px=0.1 + 0.2,
+        sigma_point_px=1 / 7,
+        n_views=16,
+        n_points=1056,
+        covered_px=np.array([10.1, 20.2, 900.3, 1200.4]),
+        provenance=provenance(),
+        diagnostics=CameraDiagnostics(
+            free_parameters=("fx_px", "k1"),
+            model_reason="k2 does not pay",
+            hold_out_rms_px=0.1 + 0.3,
+            n_folds=8,
+            condition=1e3 / 7,
+            noise_scale=1.1,
+            covered_fraction=2 / 3,
+            board=BowedBoard((0.1 / 3, -0.2), (1e-3, 2e-3), FTest(17.3, 2, 1e-8 / 3)),
+        ),
+    )
+
+
+def sensor_calibration() -> SensorCalibration:
+    axes = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+    sheets = tuple(
+        SheetCalibration(
+            name=name,
+            sheet=LightSheet(np.array([1.0, 2.0, 300.0]) / 7, axes, 41.3 / 3, np.arange(5) / 70),
+            rms_mm=0.03,
+            n_boards=3,
+            n_points=900,
+            depth_range_mm=(212.0 / 3, 290.0 / 3),
+            is_redundant=True,
+            diagnostics=SheetDiagnostics(
+                0.1 / 3, FTest(9.1, 14, 1e-9), FTest(1.1, 12, 1 / 3), "it pays", 0.01, 0.02, 37.5
+            ),
+        )
+        for name in ("A", "B")
+    )
+    return SensorCalibration(
+        camera_calibration(),
+        sheets,
+        covariance(25, 2),
+        provenance(),
+        SensorDiagnostics(1.2, 3.4, "one sheet in each image"),
+    )
+
+
+def scanner_calibration(*, has_sensor: bool = True) -> ScannerCalibration:
+    axes = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+    pose: Pose[Tool, Sensor] = Pose(axes.T, np.array([-149.94, 714.56, 1 / 3]))
+    hand_eye = HandEyeCalibration(
+        tool_from_sensor=pose,
+        covariance=covariance(6, 3),
+        sensor_coupling=np.arange(150).reshape(6, 25) / 7 if has_sensor else None,
+        arm_noise=ArmNoise(0.02 / 3, 1e-5 / 7, 0.001, 0.0),
+        rms_mm=0.1 / 3,
+        n_postures=12,
+        n_exposures=36,
+        n_points=9000,
+        plate=Plane(np.array([1.0, 2.0, 300.0]) / 7, axes),
+        diagnostics=HandEyeDiagnostics(
+            "plate" if has_sensor else "sphere",
+            6,
+            1e3 / 7,
+            "along the laser line",
+            0.01 / 3,
+            math.nan,
+            True,
+            0.1 / 7,
+            0.2 / 7,
+            1 / 3,
+        ),
+    )
+    sensor = sensor_calibration() if has_sensor else None
+    return ScannerCalibration(sensor, hand_eye, provenance(), latency_ns=-(2**53 + 1))
+
+
+def assert_same(left: Any, right: Any) -> None:
+    """Compare dataclasses of arrays exactly, bit for bit."""
+    assert type(left) is type(right)
+    if is_dataclass(left):
+        for item in fields(left):
+            assert_same(getattr(left, item.name), getattr(right, item.name))
+    elif isinstance(left, tuple):
+        assert len(left) == len(right)
+        for a, b in zip(left, right, strict=True):
+            assert_same(a, b)
+    elif isinstance(left, float) and math.isnan(left):
+        assert math.isnan(right)
+    else:
+        np.testing.assert_array_equal(left, right)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -110,8 +110,12 @@ class ArmModel:
     def with_parameters(self, parameters: FloatArray) -> ArmModel:
         """The same arm with other (4 n,) ``parameters``; flange, limits and name stay."""
         table = frozen_floats(parameters, (4 * self.n_axes,), "arm parameters").reshape(-1, 4)
-        return ArmModel(
-            *table.T, self.flange, self.joint_min_rad, self.joint_max_rad, name=self.name
+        return replace(
+            self,
+            theta_offset_rad=table[:, 0],
+            offset_mm=table[:, 1],
+            length_mm=table[:, 2],
+            twist_rad=table[:, 3],
         )
 
 

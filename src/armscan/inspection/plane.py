@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A flat face against a plane (figure 5.12)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.fitting import Plane, fit_plane
+from armscan.inspection.cleaning import Region, Selection, fit_robustly, outlier_rule, select
+from armscan.inspection.histogram import describe_deviations
+from armscan.inspection.options import InspectionOptions
+from armscan.inspection.results import MeasuredLength, PlaneInspection, PointCounts
+from armscan.inspection.search import dominant_flat
+from armscan.inspection.uncertainty import FitLinearised, measured_length
+from armscan.records.cloud import PointCloud
+
+
+def plane_from_coefficients(coefficients: FloatArray, near_mm: FloatArray) -> Plane:
+    """The plane ``a x + b y + c z + D = 0`` (eq. 2.55), its point next to ``near_mm`` (3,).
+
+    Parameters
+    ----------
+    coefficients
+        (4,) a, b, c, D in mm; they may share any factor.
+    near_mm
+        Some point; the plane's own is the foot of its perpendicular.
+
+    Raises
+    ------
+    InputError
+        If a, b and c are all zero.
+    """
+    size = float(np.linalg.norm(coefficients[:3]))
+    if not size > 0.0:
+        raise InputError("a plane whose A, B and C are all 0", remedy="give A,B,C,D with D in mm")
+    normal = coefficients[:3] / size
+    height = float(normal @ near_mm) + float(coefficients[3]) / size
+    along = np.linalg.svd(normal[None, :])[2][1]
+    axes = np.stack([along, np.cross(normal, along), normal])
+    return Plane(near_mm - height * normal, axes)
+
+
+def inspect_plane(
+    cloud: PointCloud,
+    reference: Plane | None = None,
+    *,
+    reference_text: str = "the given plane",
+    region: Region | None = None,
+    options: InspectionOptions | None = None,
+) -> PlaneInspection | FitFailure:
+    """Inspect a flat face.
+
+    Parameters
+    ----------
+    cloud
+        Points in any frame.
+    reference
+        The plane to be met, in the same frame; without it the plane that most points lie near is
+        looked for, and only the fitted reference is reported.
+    reference_text
+        Where it came from, for the definitions.
+    region
+        Only points inside are looked at.
+    options
+        What belongs to the face; the default if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points.
+    """
+    options = options or InspectionOptions()
+    selection = select(cloud, region, options, options.min_points)
+    points = selection.points_mm
+    middle = points.mean(axis=0)
+    start = reference if reference is not None else _search(points, middle, options)
+    if isinstance(start, FitFailure):
+        return start
+    is_near = np.abs(start.distance_mm(points)) <= options.feature_mm
+    if int(is_near.sum()) < options.min_points:
+        return FitFailure(
+            f"{int(is_near.sum())} of {len(points)} points lie within {options.feature_mm:g} mm of "
+            f"{reference_text}; the nearest is {_nearest(start, points):.3g} mm away",
+            "check the plane, its frame and its unit (mm), or widen --feature-mm",
+        )
+    feature = selection.rows[is_near]
+    return _inspected(selection, feature, start, reference, reference_text)
+
+
+def _search(
+    points: FloatArray, middle: FloatArray, options: InspectionOptions
+) -> Plane | FitFailure:
+    normal = dominant_flat(points - middle, options.search_band_mm)
+    if isinstance(normal, FitFailure):
+        return normal
+    heights = (points - middle) @ normal
+    # the densest bin: a median would fall between two faces
+    edges = np.arange(heights.min(), heights.max() + 2 * options.search_band_mm, 0.1)
+    counts = np.histogram(heights, edges)[0]
+    height = float(edges[int(counts.argmax())]) + 0.05
+    near = points[np.abs(heights - height) <= options.search_band_mm]
+    fit = fit_plane(near)
+    return fit if isinstance(fit, FitFailure) else fit.value
+
+
+def _nearest(plane: Plane, points: FloatArray) -> float:
+    return float(np.abs(plane.distance_mm(points)).min())
+
+
+def _inspected(
+    selection: Selection,
+    feature: IntArray,
+    start: Plane,
+    reference: Plane | None,
+    reference_text: str,
+) -> PlaneInspection | FitFailure:
+    cloud, options = selection.cloud, selection.options
+    points = cloud.points_mm[feature]
+    fit = fit_robustly(points, start, _plane, Plane.distance_mm, options)
+    if isinstance(fit, FitFailure):
+        return fit
+    plane, is_fitted = fit
+    towards = start if reference is not None else _towards_sensor(cloud, feature, plane)
+    plane = _facing(plane, towards)
+    near_text = reference_text if reference is not None else "the face that most points lie near"
+    counts = PointCounts(
+        n_given=len(cloud),
+        n_region=len(selection.rows),
+        n_feature=len(feature),
+        n_fitted=int(is_fitted.sum()),
+        feature_rule=f"points within {options.feature_mm:g} mm of {near_text}",
+        fit_rule=outlier_rule(options),
+    )
+    text = f"all {len(feature)} points within {options.feature_mm:g} mm of {near_text}"
+    fitted = describe_deviations(
+        plane.distance_mm(points), "fitted", "the least-squares plane of these points", text
+    )
+    nominal, offset, tilt = None, None, math.nan
+    if reference is not None:
+        nominal = describe_deviations(
+            reference.distance_mm(points), "nominal", reference_text, text
+        )
+        offset = _offset(plane, reference, cloud, feature[is_fitted])
+        sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
+        tilt = 1000.0 * math.asin(min(1.0, float(sine)))
+    return PlaneInspection(
+        plane, reference, feature, is_fitted, counts, fitted, nominal, offset, tilt
+    )
+
+
+def _plane(points: FloatArray) -> Plane | FitFailure:
+    fit = fit_plane(points)
+    return fit if isinstance(fit, FitFailure) else fit.value
+
+
+def _towards_sensor(cloud: PointCloud, feature: IntArray, plane: Plane) -> Plane:
+    """The fitted plane with its normal to the side that was scanned, where the cloud knows it."""
+    if cloud.normals is None:
+        return plane
+    return (
+        plane if float(cloud.normals[feature].mean(axis=0) @ plane.normal) >= 0 else _turned(plane)
+    )
+
+
+def _facing(plane: Plane, towards: Plane) -> Plane:
+    return plane if float(plane.normal @ towards.normal) >= 0.0 else _turned(plane)
+
+
+def _turned(plane: Plane) -> Plane:
+    return Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
+
+
+def _offset(plane: Plane, reference: Plane, cloud: PointCloud, used: IntArray) -> MeasuredLength:
+    points = cloud.points_mm[used]
+    local = (points - plane.point_mm) @ plane.axes.T
+    jacobian = -np.column_stack([local[:, 0], local[:, 1], np.ones(len(local))])
+    fit = FitLinearised(
+        jacobian,
+        np.tile(plane.normal, (len(points), 1)),
+        local[:, 2],
+        np.array([0.0, 0.0, 1.0]),
+    )
+    height = float(reference.distance_mm(plane.point_mm[None, :])[0])
+    return measured_length(height, fit, cloud, used)

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an inspection found: every number with its definition, nominal and fitted kept apart."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.fitting import Plane
+from armscan.geometry.sphere import Sphere
+
+ReferenceKind = Literal["nominal", "fitted"]
+"""``nominal``: known before the measurement; ``fitted``: made from the points themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Statistic:
+    """One number and what it means.
+
+    Parameters
+    ----------
+    key
+        Name for programs, with its unit.
+    label
+        Name for people.
+    value, unit
+        The number; NaN where it is not defined.
+    reference
+        What the deviations are counted from.
+    definition
+        Reference, points and formula in words.
+    """
+
+    key: str
+    label: str
+    value: float
+    unit: str
+    reference: ReferenceKind
+    definition: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deviations:
+    """Deviations of points from one reference.
+
+    Parameters
+    ----------
+    reference, reference_text
+        What they are counted from, as a kind and in words.
+    points_text
+        Which points these are, in words.
+    deviations_mm
+        (N,) signed, in the order of the points.
+    statistics
+        Of them.
+    """
+
+    reference: ReferenceKind
+    reference_text: str
+    points_text: str
+    deviations_mm: FloatArray
+    statistics: tuple[Statistic, ...]
+
+    def __post_init__(self) -> None:
+        values = frozen_floats(self.deviations_mm, (None,), "deviations_mm")
+        object.__setattr__(self, "deviations_mm", values)
+
+    def value(self, key: str) -> float:
+        """Value of one statistic; KeyError if there is none of that name."""
+        return {item.key: item.value for item in self.statistics}[key]
+
+
+@dataclass(frozen=True, slots=True)
+class PointCounts:
+    """What became of the points of a cloud.
+
+    Parameters
+    ----------
+    n_given
+        Points of the cloud.
+    n_region
+        Of these, points inside the region that was asked for.
+    n_feature
+        Of these, points that belong to the feature: all statistics are over them.
+    n_fitted
+        Of these, points that the fit used.
+    feature_rule, fit_rule
+        How the last two were chosen, in words.
+    """
+
+    n_given: int
+    n_region: int
+    n_feature: int
+    n_fitted: int
+    feature_rule: str
+    fit_rule: str
+
+    @property
+    def n_outliers(self) -> int:
+        """Points of the feature that the fit left out; the statistics count them."""
+        return self.n_feature - self.n_fitted
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredLength:
+    """A fitted length and how well it is known.
+
+    Parameters
+    ----------
+    value_mm
+        The length.
+    sigma_scatter_mm
+        Standard deviation from what differs between exposures (jackknife over them); NaN where
+        there are too few.
+    sigma_propagated_mm
+        Standard deviation from the points' own covariances, errors being common to an exposure
+        and independent between exposures; NaN where the cloud carries none.
+    """
+
+    value_mm: float
+    sigma_scatter_mm: float
+    sigma_propagated_mm: float
+
+    @property
+    def sigma_mm(self) -> float:
+        """The larger of both; NaN if neither is known."""
+        known = [
+            sigma
+            for sigma in (self.sigma_scatter_mm, self.sigma_propagated_mm)
+            if math.isfinite(sigma)
+        ]
+        return max(known, default=math.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneInspection:
+    """A flat face.
+
+    Parameters
+    ----------
+    plane
+        Least-squares plane.
+    reference
+        The plane that was to be met, or None.
+    rows
+        (N,) rows of the feature's points in the cloud.
+    is_fitted
+        (N,) True for those that the fit used.
+    counts
+        What became of the points.
+    fitted
+        Distances from ``plane``.
+    nominal
+        Distances from ``reference``; None without one.
+    offset
+        Height of ``plane`` over ``reference`` at the middle of the points; None without one.
+    tilt_mrad
+        Angle between the two; NaN without a reference.
+    """
+
+    plane: Plane
+    reference: Plane | None
+    rows: IntArray
+    is_fitted: BoolArray
+    counts: PointCounts
+    fitted: Deviations
+    nominal: Deviations | None
+    offset: MeasuredLength | None
+    tilt_mrad: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rows", frozen_ints(self.rows, (None,), "rows"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SphereInspection:
+    """A ball.
+
+    Parameters
+    ----------
+    sphere
+        Least-squares sphere, radius free.
+    nominal_diameter_mm
+        Of the standard ball.
+    diameter
+        Fitted, with its standard deviation.
+    rows, is_fitted, counts
+        As for a plane.
+    fitted
+        Distances from the fitted sphere: distance to its centre minus the fitted radius.
+    nominal
+        Distance to the same centre minus the nominal radius (figure 5.14).
+    seen_cap_deg
+        Half opening of the smallest cap about the mean direction that holds the points; 180 is
+        the whole ball.
+    """
+
+    sphere: Sphere
+    nominal_diameter_mm: float
+    diameter: MeasuredLength
+    rows: IntArray
+    is_fitted: BoolArray
+    counts: PointCounts
+    fitted: Deviations
+    nominal: Deviations
+    seen_cap_deg: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rows", frozen_ints(self.rows, (None,), "rows"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepInspection:
+    """Two parallel faces.
+
+    Parameters
+    ----------
+    lower, upper
+        Rows of both faces' points in the cloud, margins taken off.
+    normal
+        (3,) common unit normal, from the lower face to the upper one.
+    nominal_height_mm
+        Of the standard.
+    height
+        Distance between the parallel planes that were fitted jointly.
+    counts
+        What became of the points.
+    fitted
+        Distances of the points of both faces from their own fitted plane.
+    nominal
+        Heights of the upper face's points over the fitted lower plane, minus the nominal height.
+    heights_mm
+        (U,) the same heights themselves (figure 5.19).
+    normal_rule
+        Where the normal came from, in words.
+    """
+
+    lower: IntArray
+    upper: IntArray
+    normal: FloatArray
+    nominal_height_mm: float
+    height: MeasuredLength
+    counts: PointCounts
+    fitted: Deviations
+    nominal: Deviations
+    heights_mm: FloatArray
+    normal_rule: str
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            object.__setattr__(self, name, frozen_ints(getattr(self, name), (None,), name))
+        for name, shape in (("normal", (3,)), ("heights_mm", (None,))):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A ball against the standard (figure 5.14)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.sphere import Sphere, fit_sphere
+from armscan.inspection.cleaning import Region, Selection, fit_robustly, outlier_rule, select
+from armscan.inspection.histogram import describe_deviations
+from armscan.inspection.options import InspectionOptions
+from armscan.inspection.results import MeasuredLength, PointCounts, SphereInspection
+from armscan.inspection.search import find_ball
+from armscan.inspection.uncertainty import FitLinearised, measured_length
+from armscan.records.cloud import PointCloud
+
+LARGEST_MISFIT = 0.02
+"""Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball."""
+
+SETTLING_ROUNDS = 3
+
+
+def inspect_sphere(
+    cloud: PointCloud,
+    diameter_mm: float,
+    *,
+    region: Region | None = None,
+    options: InspectionOptions | None = None,
+) -> SphereInspection | FitFailure:
+    """Find a ball of known diameter anywhere in a cloud and inspect it.
+
+    Parameters
+    ----------
+    cloud
+        Points in any frame; other objects may be among them.
+    diameter_mm
+        Of the standard ball.
+    region
+        Only points inside are looked at.
+    options
+        What belongs to the ball; the default if None.
+
+    Raises
+    ------
+    InputError
+        If there are too few points or the diameter is not positive.
+    """
+    options = options or InspectionOptions()
+    if not 0.0 < diameter_mm < 1e4:
+        raise InputError(f"a ball of {diameter_mm} mm diameter", remedy="give the diameter in mm")
+    selection = select(cloud, region, options, options.min_points)
+    points = selection.points_mm
+    found = find_ball(points, diameter_mm / 2.0, options.search_band_mm)
+    if isinstance(found, FitFailure):
+        return found
+    centre, n_near = found
+    if n_near < options.min_points:
+        return FitFailure(
+            f"there is no ball of {diameter_mm:g} mm: the best place for one has {n_near} of "
+            f"{len(points)} points on it, {options.min_points} are needed",
+            "check the diameter, or show where the ball is with --region",
+        )
+    return _settled(selection, Sphere(centre, diameter_mm / 2.0), diameter_mm)
+
+
+def _settled(
+    selection: Selection, sphere: Sphere, diameter_mm: float
+) -> SphereInspection | FitFailure:
+    """Fit to the feature, choose the feature anew about the fit, until it stays."""
+    points, options = selection.points_mm, selection.options
+    is_feature = np.zeros(len(points), dtype=np.bool_)
+    is_fitted = is_feature
+    for _ in range(SETTLING_ROUNDS):
+        chosen = np.abs(sphere.distance_mm(points)) <= options.feature_mm
+        if np.array_equal(chosen, is_feature):
+            break
+        is_feature = chosen
+        fit = fit_robustly(points[chosen], sphere, _sphere, Sphere.distance_mm, options)
+        if isinstance(fit, FitFailure):
+            return fit
+        sphere, is_fitted = fit
+        misfit = 2.0 * sphere.radius_mm - diameter_mm
+        if abs(misfit) > LARGEST_MISFIT * diameter_mm:
+            return FitFailure(
+                f"the points that a ball of {diameter_mm:g} mm could have lie on one of "
+                f"{2.0 * sphere.radius_mm:.4g} mm",
+                "check the diameter, or show where the ball is with --region",
+            )
+    return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
+
+
+def _sphere(points: FloatArray) -> Sphere | FitFailure:
+    fit = fit_sphere(points)
+    return fit if isinstance(fit, FitFailure) else fit.value
+
+
+def _described(
+    selection: Selection,
+    is_feature: BoolArray,
+    is_fitted: BoolArray,
+    sphere: Sphere,
+    diameter_mm: float,
+) -> SphereInspection:
+    cloud, options = selection.cloud, selection.options
+    feature = selection.rows[is_feature]
+    points = cloud.points_mm[feature]
+    near = f"within {options.feature_mm:g} mm of the fitted sphere"
+    counts = PointCounts(
+        n_given=len(cloud),
+        n_region=len(selection.rows),
+        n_feature=len(feature),
+        n_fitted=int(is_fitted.sum()),
+        feature_rule=f"points {near}; it was found by its diameter, anywhere in the cloud",
+        fit_rule=outlier_rule(options),
+    )
+    text = f"all {len(feature)} points {near}"
+    from_centre = sphere.distance_mm(points) + sphere.radius_mm
+    return SphereInspection(
+        sphere=sphere,
+        nominal_diameter_mm=diameter_mm,
+        diameter=_diameter(sphere, cloud, feature[is_fitted]),
+        rows=feature,
+        is_fitted=is_fitted,
+        counts=counts,
+        fitted=describe_deviations(
+            from_centre - sphere.radius_mm,
+            "fitted",
+            "the least-squares sphere (centre and radius free)",
+            text,
+        ),
+        nominal=describe_deviations(
+            from_centre - diameter_mm / 2.0,
+            "nominal",
+            f"the standard ball's radius of {diameter_mm / 2.0:g} mm about the centre of the "
+            "least-squares sphere",
+            text,
+        ),
+        seen_cap_deg=_cap_deg(points[is_fitted] - sphere.centre_mm),
+    )
+
+
+def _diameter(sphere: Sphere, cloud: PointCloud, used: IntArray) -> MeasuredLength:
+    offset = cloud.points_mm[used] - sphere.centre_mm
+    distance = np.linalg.norm(offset, axis=1)
+    outward = offset / distance[:, None]
+    fit = FitLinearised(
+        np.column_stack([-outward, -np.ones(len(outward))]),
+        outward,
+        distance - sphere.radius_mm,
+        np.array([0.0, 0.0, 0.0, 2.0]),
+    )
+    return measured_length(2.0 * sphere.radius_mm, fit, cloud, used)
+
+
+def _cap_deg(offset_mm: FloatArray) -> float:
+    outward = offset_mm / np.linalg.norm(offset_mm, axis=1, keepdims=True)
+    mean = outward.mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    if size < 1e-9:
+        return 180.0
+    return math.degrees(math.acos(float(np.clip((outward @ mean / size).min(), -1.0, 1.0))))

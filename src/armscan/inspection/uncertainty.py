@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a fitted length is known, when the points of an exposure err together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.inspection.results import MeasuredLength
+from armscan.records.cloud import PointCloud
+
+MIN_BLOCKS = 4
+"""Fewest exposures whose differences say anything about their scatter."""
+
+COARSE_BLOCKS = 12
+"""Consecutive exposures are also taken together in this many blocks, as neighbours err alike."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitLinearised:
+    """A least-squares fit about its optimum.
+
+    Parameters
+    ----------
+    jacobian
+        (N, P) derivative of each point's residual by the parameters.
+    directions
+        (N, 3) unit vector along which each point's error changes its residual.
+    residuals_mm
+        (N,) at the optimum.
+    length_by_parameters
+        (P,) derivative of the length that is asked for.
+    """
+
+    jacobian: FloatArray
+    directions: FloatArray
+    residuals_mm: FloatArray
+    length_by_parameters: FloatArray
+
+
+def measured_length(
+    value_mm: float, fit: FitLinearised, cloud: PointCloud, rows: IntArray
+) -> MeasuredLength:
+    """A length with both of its standard deviations.
+
+    Parameters
+    ----------
+    value_mm
+        The length.
+    fit
+        What it follows from.
+    cloud
+        Source of covariances and exposures.
+    rows
+        (N,) rows in the cloud of the points of the fit.
+    """
+    exposure = np.unique(cloud.exposure[rows], return_inverse=True)[1].astype(np.int64)
+    n = int(exposure.max()) + 1 if len(exposure) else 0
+    scatter = [_jackknife_mm(fit, exposure, n)]
+    if n >= 2 * COARSE_BLOCKS:
+        scatter.append(_jackknife_mm(fit, exposure * COARSE_BLOCKS // n, COARSE_BLOCKS))
+    known = [sigma for sigma in scatter if math.isfinite(sigma)]
+    propagated = _propagated_mm(fit, cloud, rows, exposure, n)
+    return MeasuredLength(value_mm, max(known, default=math.nan), propagated)
+
+
+def _jackknife_mm(fit: FitLinearised, block: IntArray, n_blocks: int) -> float:
+    """Delete-a-block jackknife of the length, linearised about the optimum."""
+    if n_blocks < MIN_BLOCKS:
+        return math.nan
+    p = fit.jacobian.shape[1]
+    normal = np.zeros((n_blocks, p, p))
+    right = np.zeros((n_blocks, p))
+    for i in range(p):
+        right[:, i] = np.bincount(block, fit.jacobian[:, i] * fit.residuals_mm, n_blocks)
+        for j in range(p):
+            normal[:, i, j] = np.bincount(block, fit.jacobian[:, i] * fit.jacobian[:, j], n_blocks)
+    remaining = normal.sum(axis=0) - normal
+    if not np.all(np.linalg.cond(remaining) < 1e12):
+        return math.nan
+    change = np.linalg.solve(remaining, right[:, :, None])[:, :, 0] @ fit.length_by_parameters
+    spread = change - change.mean()
+    return float(np.sqrt((n_blocks - 1) / n_blocks * (spread @ spread)))
+
+
+def _propagated_mm(
+    fit: FitLinearised, cloud: PointCloud, rows: IntArray, exposure: IntArray, n: int
+) -> float:
+    """Each exposure is shifted as a whole by an error of its points' mean covariance.
+
+    The stripes' own noise, which is independent from point to point, comes on top.
+    """
+    covariance = cloud.covariance_mm2[rows]
+    if not covariance.any():
+        return math.nan
+    information = fit.jacobian.T @ fit.jacobian
+    influence = fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters)
+    pull = np.stack(
+        [np.bincount(exposure, influence * fit.directions[:, k], n) for k in range(3)], axis=1
+    )
+    count = np.bincount(exposure, minlength=n)
+    variance = float((influence**2) @ (cloud.sigma_noise_mm[rows] ** 2))
+    for i in range(3):
+        for j in range(3):
+            mean = np.bincount(exposure, covariance[:, i, j], n) / count
+            variance += float((pull[:, i] * mean) @ pull[:, j])
+    return math.sqrt(max(variance, 0.0))

@@ -122,7 +122,8 @@ class Body:
         from armscan.simulation.march_kernel import march
 
         directions_part = directions @ self.sensor_from_part.rotation
-        rays = np.concatenate([self._in_part(origins_mm), directions_part], axis=1)
+        origins_part = np.broadcast_to(self._in_part(origins_mm), directions_part.shape)
+        rays = np.concatenate([origins_part, directions_part], axis=1)
         travelled = np.zeros(len(rays))
         march(rays, self._rows, self._balls, HIT_MM, travelled)
         return travelled

@@ -106,16 +106,23 @@ class LineLaser:
 
         The power of the fan spreads over its width and thickness; the surface takes the cosine.
         """
+        reach, peak = self.reach_and_peak(points_mm, normals)
+        return np.asarray(peak * np.exp(-0.5 * reach**2))
+
+    def reach_and_peak(
+        self, points_mm: FloatArray, normals: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Distance (N,) from the sheet's centre, in sigmas, and irradiance (N,) if it were zero."""
         forward, across, up, distance = self._local(points_mm)
         elevation = np.arctan2(up, np.hypot(forward, across))
         sigma = self.thickness_mm(distance)
-        profile = np.exp(-0.5 * (distance * (elevation - self.skew_rad) / sigma) ** 2)
+        reach = distance * (elevation - self.skew_rad) / sigma
         spread = self.waist_mm * self.waist_distance_mm / (sigma * distance)
         fan = np.arctan2(across, forward) / self.half_angle_rad
         along = np.where(np.abs(fan) <= 1.0, 1.0 - self.falloff * fan**2, 0.0)
-        to_source = (self.source_mm - points_mm) / distance[:, None]
-        cosine = np.maximum(np.sum(to_source * normals, axis=1), 0.0)
-        return np.asarray(self.irradiance * profile * spread * along * cosine)
+        facing = np.einsum("ni,ni->n", self.source_mm - points_mm, normals)
+        cosine = np.maximum(facing / distance, 0.0)
+        return np.asarray(reach), np.asarray(self.irradiance * spread * along * cosine)
 
     def _local(self, points_mm: FloatArray) -> tuple[FloatArray, ...]:
         """Coordinates along forward, across and normal, and the distance from the source."""

@@ -21,7 +21,7 @@ from armscan.geometry.arrays import FloatArray, ImageArray
 Float = TypeVar("Float", np.float32, np.float64)
 
 _MAX_STEPS = 400
-_STEP_TOLERANCE = 1e-13
+STEP_TOLERANCE = 1e-13
 _KERNEL_SIGMAS = 6.0
 
 
@@ -80,7 +80,7 @@ class RenderCamera:
             self, cx=self.cx - x_px, cy=self.cy - y_px, width_px=width_px, height_px=height_px
         )
 
-    def rays(self, pixels_px: FloatArray, tolerance: float = _STEP_TOLERANCE) -> FloatArray:
+    def rays(self, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE) -> FloatArray:
         """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
 
         Parameters

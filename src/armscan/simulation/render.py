@@ -131,13 +131,22 @@ def laser_band(scene: Scene, camera: RenderCamera, laser: LineLaser) -> BoolArra
     reach = np.full(len(grid), np.nan)
     is_hit = hits.surface >= 0
     reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
-    corners = _corners(reach.reshape(len(v), len(u)))
+    band = pixels_near_sheet(reach.reshape(len(v), len(u)))
+    return np.asarray(band[: camera.height_px, : camera.width_px])
+
+
+def pixels_near_sheet(reach: FloatArray) -> BoolArray:
+    """(8 (H - 1), 8 (W - 1)) True for pixels next to the sheet, whose reach (H, W) is known.
+
+    The reach, in sigmas, is given on the coarse grid; NaN where nothing is met.
+    """
+    corners = _corners(reach)
     low = np.where(np.isnan(corners), np.inf, corners).min(axis=0)
     high = np.where(np.isnan(corners), -np.inf, corners).max(axis=0)
     cells = ((low <= BAND_SIGMAS) & (high >= -BAND_SIGMAS)).astype(np.uint8)
     cells = cv2.dilate(cells, np.ones((3, 3), np.uint8))
     band = np.repeat(np.repeat(cells, COARSE_STEP_PX, axis=0), COARSE_STEP_PX, axis=1)
-    return np.asarray(band[: camera.height_px, : camera.width_px] > 0)
+    return np.asarray(band > 0)
 
 
 def _corners(grid: FloatArray) -> FloatArray:

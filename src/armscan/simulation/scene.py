@@ -74,7 +74,7 @@ class Scene:
 
     def trace(self, origins_mm: FloatArray, directions: FloatArray) -> Hits:
         """First hits of rays from (N, 3) or (3,) origins along unit directions (N, 3)."""
-        origins = np.broadcast_to(np.asarray(origins_mm, dtype=np.float64), directions.shape)
+        origins = np.asarray(origins_mm, dtype=np.float64).reshape(-1, 3)
         distance = np.full(len(directions), np.inf)
         surface = np.full(len(directions), -1, dtype=np.int64)
         for index, candidate in enumerate(self.surfaces):

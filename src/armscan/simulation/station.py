@@ -4,23 +4,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, ImageArray, frozen_floats
 from armscan.geometry.frames import Base, Board, Sensor
 from armscan.geometry.poses import Points, Pose
+from armscan.simulation.band_light import PosedView, Region, band_light, look
 from armscan.simulation.board import PrintedBoard
+from armscan.simulation.board_photo import render_board
 from armscan.simulation.flat_pattern import FlatPattern
 from armscan.simulation.head import Head, Window
 from armscan.simulation.light import LineLaser
-from armscan.simulation.render import laser_band, render_laser
+from armscan.simulation.render import COARSE_STEP_PX, laser_band
 from armscan.simulation.scene import Lamp, Scene
+from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
 from armscan.simulation.shapes import Placed
 from armscan.simulation.stripe_truth import find_stripe
-from armscan.simulation.thing import Thing
+from armscan.simulation.surfaces import Surface
+from armscan.simulation.thing import Finish, Thing
 
 ROOM = Lamp(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0.0, 0.0, 1.0))
 """Light of the room around the arm: white that faces up sees about full scale; scaled later."""
@@ -150,15 +156,36 @@ def render_exposure(
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
-    light = np.zeros((settings.window.height_px, settings.window.width_px))
-    camera = head.camera.cropped(*_corners(settings.window))
-    for pose in base_from_sensor:
-        scene = seen_from(station, pose)
-        for laser in _chosen(head, settings.lasers):
-            line = render_laser(scene, camera, laser, head.imaging.speckle, rng)
-            light += line.light * (settings.laser_gain / len(base_from_sensor))
-    ambient = head.imaging.ambient if settings.room_light is None else settings.room_light
-    return head.imaging.detector.expose(head.imaging.detector.scatter(light) + 0.5 * ambient, rng)
+    light = exposure_light(head, station, base_from_sensor, settings, rng)
+    return expose_mono(light, head.imaging.detector, rng)
+
+
+def exposure_light(
+    head: Head,
+    station: Station,
+    base_from_sensor: Sequence[Pose[Base, Sensor]],
+    settings: ExposureSettings,
+    rng: np.random.Generator,
+) -> NDArray[np.float32]:
+    """Light (H, W) of one exposure on the sensor, parts of full scale, without sensor noise."""
+    imaging, window = head.imaging, settings.window
+    region = Region.around(window.x_px, window.y_px, window.width_px, window.height_px)
+    views = [_view(head, station, pose, region) for pose in base_from_sensor]
+    light = np.zeros((window.height_px, window.width_px), np.float32)
+    inside = (
+        slice(window.y_px - region.y_px, window.y_px - region.y_px + window.height_px),
+        slice(window.x_px - region.x_px, window.x_px - region.x_px + window.width_px),
+    )
+    for laser in _chosen(head, settings.lasers):
+        line = band_light(views, head.camera, laser, region, speckle=imaging.speckle, rng=rng)
+        light += np.float32(settings.laser_gain) * line[inside]
+    light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
+    light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
+    middle = len(views) // 2
+    brightness = imaging.ambient if settings.room_light is None else settings.room_light
+    room = _room(head, station, base_from_sensor[middle], views[middle], region)
+    light += np.float32(brightness) * room[inside]
+    return light
 
 
 def true_stripes(
@@ -185,13 +212,52 @@ def true_stripes(
     return tuple(stripes)
 
 
+def _view(head: Head, station: Station, pose: Pose[Base, Sensor], region: Region) -> PosedView:
+    finishes = tuple(thing.finish for thing in station.things)
+    return look(seen_from(station, pose), (*finishes, Finish()), head.camera, region)
+
+
+def _room(
+    head: Head, station: Station, pose: Pose[Base, Sensor], view: PosedView, region: Region
+) -> FloatArray:
+    """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
+    _, (rows, columns) = region.nodes_px()
+    nodes = view.scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
+    step = 1.0 / COARSE_STEP_PX
+    size = (region.width_px, region.height_px)
+    coarse = cv2.warpAffine(
+        nodes,
+        np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
+        size,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    if station.target is None:
+        return np.asarray(coarse)
+    camera = head.camera.cropped(region.x_px, region.y_px, *size)
+    board = board_seen_from(station.target, pose)
+    background = np.asarray(coarse, dtype=np.float64)[..., None]
+    return render_board(board, camera, view.scene.lamp, background)[..., 0]
+
+
 def seen_from(station: Station, base_from_sensor: Pose[Base, Sensor]) -> Scene:
     """The station's things, then its target, in the Sensor frame."""
     sensor_from_base = base_from_sensor.inverse()
-    surfaces: list[Placed | PrintedBoard] = [Placed(t, sensor_from_base) for t in station.things]
+    surfaces: list[Surface] = [Placed(thing, sensor_from_base) for thing in station.things]
     if station.target is not None:
         surfaces.append(board_seen_from(station.target, base_from_sensor))
-    return Scene(tuple(surfaces))
+    return Scene(tuple(surfaces), lamp=_lamp_seen_from(station.room, sensor_from_base))
+
+
+def _lamp_seen_from(room: Lamp, sensor_from_base: Pose[Sensor, Base]) -> Lamp:
+    position: Points[Base] = Points(np.array([room.position_mm]))
+    x, y, z = (sensor_from_base @ position).xyz_mm[0]
+    up = sensor_from_base.rotation @ np.asarray(room.up)
+    return replace(
+        room,
+        position_mm=(float(x), float(y), float(z)),
+        up=(float(up[0]), float(up[1]), float(up[2])),
+    )
 
 
 def board_seen_from(target: Target, base_from_sensor: Pose[Base, Sensor]) -> PrintedBoard:

@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
 from armscan.simulation.light import LineLaser
-from armscan.simulation.optics import RenderCamera
+from armscan.simulation.optics import STEP_TOLERANCE, RenderCamera
 from armscan.simulation.scene import Hits, Scene
 
 BISECTIONS = 30
@@ -45,9 +45,11 @@ class StripeTruth:
         object.__setattr__(self, "surface", frozen_floats(self.surface, (n,), "surface"))
 
 
-def camera_rays(camera: RenderCamera, pixels_px: FloatArray) -> FloatArray:
+def camera_rays(
+    camera: RenderCamera, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE
+) -> FloatArray:
     """(N, 3) unit directions, in the Sensor frame, of full-sensor pixels (N, 2)."""
-    xy = camera.rays(pixels_px)
+    xy = camera.rays(pixels_px, tolerance)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 

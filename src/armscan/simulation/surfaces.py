@@ -18,7 +18,10 @@ class Surface(Protocol):
     """A surface in the frame of the scene, with what it reflects."""
 
     def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
-        """(N,) distance to the first hit along unit directions (N, 3); infinite for none."""
+        """(N,) distance to the first hit along unit directions (N, 3); infinite for none.
+
+        Origins are (N, 3), or (1, 3) if all rays start at one point.
+        """
 
     def normals(self, points_mm: FloatArray) -> FloatArray:
         """(N, 3) outward unit normals at points (N, 3) of the surface."""
@@ -91,6 +94,11 @@ class Sphere:
     def normals(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
         return np.asarray((points_mm - self.centre_mm) / self.radius_mm)
+
+    def distance_mm(self, points_mm: FloatArray) -> FloatArray:
+        """(N,) signed distance of points (N, 3) from the surface; positive outside."""
+        away = np.linalg.norm(points_mm - self.centre_mm, axis=1)
+        return np.asarray(away - self.radius_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""

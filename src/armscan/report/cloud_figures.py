@@ -20,13 +20,15 @@ def cloud_view(cloud: PointCloud) -> Picture:
     sigma_um = 1000.0 * cloud.sigma_mm[::step]
     low, high = (float(value) for value in np.percentile(sigma_um, [2, 98]))
     dots = SceneDots(cloud.points_mm[::step], ramp_colours(sigma_um, low, high))
-    scene = scene_markup([dots], [], [], "Measured points in space")
+    is_z_up = cloud.frame != "Sensor"
+    scene = scene_markup([dots], [], [], "Measured points in space", is_z_up=is_z_up)
     shown = f" Every {step}th point is shown." if step > 1 else ""
     return Picture(
         ramp_markup(f"sigma {low:.0f} µm", f"{high:.0f} µm") + scene,
         title=f"Points in space ({cloud.frame} frame)",
-        caption="Colour is each point's standard deviation along its worst direction, stripe "
-        "noise and calibration together. Drag to turn; click, then scroll to zoom." + shown,
+        caption="Colour is each point's standard deviation along its worst direction, "
+        f"{'stripe noise, arm' if is_z_up else 'stripe noise'} and calibration together. "
+        "Drag to turn; click, then scroll to zoom." + shown,
     )
 
 

@@ -13,11 +13,11 @@ from armscan.records.exposure import Exposure
 from armscan.report import cloud_figures as figures
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
-from armscan.report.page import Card, Gallery, Legend, Page, Section, Text
-from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
+from armscan.report.page import Card, Gallery, Page, Section, Text
+from armscan.report.stripe_figures import evenly_chosen
+from armscan.report.stripe_gallery import stripe_gallery
 from armscan.report.summary import Table
 
-FATE_COLOURS = {PointFate.NO_RAY: "#8a6d5a", PointFate.OUT_OF_DEPTH: "#ff7a3c"}
 MAX_PROFILES = 6
 PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
 
@@ -83,26 +83,5 @@ def fate_table(result: Reconstruction) -> Table:
 
 
 def _images_section(result: Reconstruction, exposures: Mapping[str, Exposure]) -> Section:
-    flags = 0
-    for image in result.images:
-        for value in image.profile.flags[image.fate == int(PointFate.FLAGGED)]:
-            flags |= int(value)
-    seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in result.images)}
-    fates = {int(fate): (FATE_COLOURS[fate], fate.label) for fate in PointFate if fate in seen}
-    shown = evenly_chosen([image for image in result.images if image.profile.source in exposures])
-    pictures = tuple(
-        stripe_picture(
-            exposures[image.profile.source],
-            image.profile,
-            image.fate,
-            image.sheet,
-            {int(fate): colour for fate, colour in FATE_COLOURS.items()},
-            caption=f"{image.count(PointFate.MEASURED)} of {len(image.profile)} points measured",
-        )
-        for image in shown
-    )
-    text = "Every stripe point, measured or not. Dark photographs are brightened here."
-    if len(shown) < len(result.images):
-        text += f" {len(shown)} of {len(result.images)} images are shown, evenly chosen."
-    legend = Legend(stripe_legend(result.cloud.sheet_names, fates, flags))
-    return Section("The stripes", (Text(text), legend, Gallery(pictures, 420), fate_table(result)))
+    blocks = stripe_gallery(result.images, result.cloud.sheet_names, exposures)
+    return Section("The stripes", (*blocks, fate_table(result)))

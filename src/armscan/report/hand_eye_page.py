@@ -10,10 +10,9 @@ import numpy as np
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.models.scanner import ScannerCalibration
-from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.result import ReconstructedImage
 from armscan.records.exposure import Exposure
 from armscan.report import hand_eye_figures as figures
-from armscan.report.cloud_page import FATE_COLOURS
 from armscan.report.hand_eye_numbers import (
     chi2_verdict,
     hand_eye_facts,
@@ -24,8 +23,8 @@ from armscan.report.hand_eye_numbers import (
 from armscan.report.hand_eye_scene import posture_scene
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
-from armscan.report.page import Card, Facts, Gallery, Legend, Page, Section, Text
-from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
+from armscan.report.page import Card, Facts, Gallery, Page, Section, Text
+from armscan.report.stripe_gallery import stripe_gallery
 from armscan.report.summary import Table
 
 NOISE_TEXT = (
@@ -76,7 +75,9 @@ def hand_eye_page(
         _noise_section(fit),
     ]
     if images:
-        sections.append(_stripes_section(scanner, images, exposures or {}))
+        names = [] if scanner.sensor is None else [sheet.name for sheet in scanner.sensor.sheets]
+        blocks = stripe_gallery(images, names, exposures or {})
+        sections.append(Section("The stripes", blocks))
     sections.append(origin_section(scanner.provenance))
     hand_eye = fit.calibration
     return Page(
@@ -208,32 +209,3 @@ def _noise_section(fit: HandEyeFit) -> Section:
         rows.append(("These standard deviations are", origin))
     text = Text(NOISE_TEXT)
     return Section("The noise model", (text, Facts(tuple(rows))))
-
-
-def _stripes_section(
-    scanner: ScannerCalibration,
-    images: Sequence[ReconstructedImage],
-    exposures: Mapping[str, Exposure],
-) -> Section:
-    flags = 0
-    for image in images:
-        for value in image.profile.flags[image.fate == int(PointFate.FLAGGED)]:
-            flags |= int(value)
-    seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in images)}
-    fates = {int(fate): (FATE_COLOURS[fate], fate.label) for fate in PointFate if fate in seen}
-    shown = evenly_chosen([image for image in images if image.profile.source in exposures])
-    pictures = tuple(
-        stripe_picture(
-            exposures[image.profile.source],
-            image.profile,
-            image.fate,
-            image.sheet,
-            {int(fate): colour for fate, colour in FATE_COLOURS.items()},
-            caption=f"{image.count(PointFate.MEASURED)} of {len(image.profile)} points measured",
-        )
-        for image in shown
-    )
-    names = [] if scanner.sensor is None else [sheet.name for sheet in scanner.sensor.sheets]
-    text = f"Every stripe point, used or not. {len(shown)} of {len(images)} exposures are shown."
-    legend = Legend(stripe_legend(names, fates, flags))
-    return Section("The stripes", (Text(text), legend, Gallery(pictures, 420)))

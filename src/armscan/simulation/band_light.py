@@ -36,6 +36,8 @@ Image32 = NDArray[np.float32]
 RAY_TOLERANCE = 1e-7
 """The search for a pixel's ray stops at such a step: what is left is below 1e-4 px."""
 _FAR_SIGMAS = 9.0
+_SLACK_SIGMAS = 0.6
+"""Half a pixel across the line, and what interpolation on the coarse grid may be wrong by."""
 _EDGE_SIGMAS = 1.5
 _EDGE_SHARE = 0.08
 _TILE_ROWS, _TILE_COLUMNS = 48, 192
@@ -166,8 +168,7 @@ def _sheet(view: PosedView, camera: RenderCamera, laser: LineLaser, region: Regi
     peak = np.zeros(shape, np.float32)
     reach[rows, columns] = np.clip(values[0], -_FAR_SIGMAS, _FAR_SIGMAS)
     peak[rows, columns] = values[1]
-    at_edge = _edges(reach, peak, is_lit)
-    edge_rows, edge_columns = np.nonzero(at_edge)
+    edge_rows, edge_columns = _edges(reach, peak, is_lit)
     edges = np.full(shape, -1, np.int32)
     edges[edge_rows, edge_columns] = np.arange(len(edge_rows))
     edge_light = _edge_light(view, camera, laser, _pixels(region, edge_rows, edge_columns))
@@ -175,11 +176,44 @@ def _sheet(view: PosedView, camera: RenderCamera, laser: LineLaser, region: Regi
 
 
 def _near_sheet(view: PosedView, laser: LineLaser, region: Region) -> BoolArray:
+    """(H, W) pixels that the light may reach.
+
+    Where the coarse grid meets one surface smoothly, the reach is interpolated to tell; elsewhere
+    all pixels of cells next to the sheet are taken.
+    """
     _, shape = region.nodes_px()
-    reach = np.full(len(view.nodes.surface), np.nan)
-    is_hit = view.nodes.surface >= 0
+    surface = view.nodes.surface
+    reach = np.full(len(surface), np.nan)
+    is_hit = surface >= 0
     reach[is_hit] = laser.reach_mm(view.nodes.points_mm[is_hit])
-    return pixels_near_sheet(reach.reshape(shape))
+    band = pixels_near_sheet(reach.reshape(shape))
+    coarse = np.where(is_hit, reach, 0.0).reshape(shape).astype(np.float32)
+    between = to_pixels(coarse, region)
+    is_rough = _rough_cells(coarse, surface.reshape(shape))
+    return np.asarray(band & (is_rough | (np.abs(between) < BAND_SIGMAS + _SLACK_SIGMAS)))
+
+
+def _rough_cells(reach: Image32, surface: IntArray) -> BoolArray:
+    """(H, W) pixels of cells whose corners or neighbours differ in surface, or bend in reach."""
+    square = np.ones((3, 3), np.uint8)
+    marks = (surface + 1).astype(np.float32)
+    differs = cv2.dilate(marks, square) != cv2.erode(marks, square)
+    bends = np.abs(cv2.Laplacian(reach, cv2.CV_32F)) > _SLACK_SIGMAS
+    rough = cv2.dilate((differs | bends | (surface < 0)).astype(np.uint8), square)[:-1, :-1]
+    return np.asarray(np.kron(rough, np.ones((COARSE_STEP_PX, COARSE_STEP_PX), np.uint8)) > 0)
+
+
+def to_pixels(nodes: Image32, region: Region) -> Image32:
+    """(H, W) values of a region's pixels between those of its coarse grid."""
+    step = 1.0 / COARSE_STEP_PX
+    pixels = cv2.warpAffine(
+        nodes,
+        np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
+        (region.width_px, region.height_px),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(pixels, dtype=np.float32)
 
 
 def _pixels(region: Region, rows: IntArray, columns: IntArray) -> FloatArray:
@@ -221,15 +255,21 @@ def _gloss(view: PosedView, laser: LineLaser, hits: Hits, normals: FloatArray) -
     return np.asarray(strength * np.exp(-0.5 * angle_square / width**2))
 
 
-def _edges(reach: Image32, peak: Image32, is_lit: BoolArray) -> BoolArray:
-    """Pixels whose neighbourhood cannot be interpolated: reach or brightness jumps there."""
+def _edges(reach: Image32, peak: Image32, is_lit: BoolArray) -> tuple[IntArray, IntArray]:
+    """Rows and columns of pixels whose surroundings cannot be interpolated: something jumps."""
     square = np.ones((3, 3), np.uint8)
-    spread = cv2.dilate(reach, square) - cv2.erode(reach, square)
-    high = cv2.dilate(peak, square)
-    jump = high - cv2.erode(peak, square)
-    inside = cv2.erode(is_lit.astype(np.uint8), square) > 0
-    near = np.abs(reach) < BAND_SIGMAS
-    return np.asarray(inside & ((spread > _EDGE_SIGMAS) | (jump > _EDGE_SHARE * high)) & near)
+    used = np.flatnonzero(is_lit.any(axis=1))
+    if len(used) == 0:
+        return used, used
+    rows = slice(int(used[0]), int(used[-1]) + 1)
+    near, light = reach[rows], peak[rows]
+    spread = cv2.dilate(near, square) - cv2.erode(near, square)
+    high = cv2.dilate(light, square)
+    jump = high - cv2.erode(light, square)
+    inside = cv2.erode(is_lit[rows].astype(np.uint8), square) > 0
+    rough = (spread > _EDGE_SIGMAS) | (jump > _EDGE_SHARE * high)
+    found_rows, found_columns = np.nonzero(inside & rough & (np.abs(near) < BAND_SIGMAS))
+    return found_rows + rows.start, found_columns
 
 
 def _edge_light(

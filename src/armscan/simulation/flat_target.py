@@ -120,6 +120,8 @@ def marks_px(
 
 def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
     """Return the relative illumination (H, W), 1 where it is full."""
+    if lighting.gradient == 0.0:
+        return np.broadcast_to(1.0, (camera.height_px, camera.width_px))
     u = (np.arange(camera.width_px) / max(camera.width_px - 1, 1))[None, :] - 0.5
     v = (np.arange(camera.height_px) / max(camera.height_px - 1, 1))[:, None] - 0.5
     cosine, sine = np.cos(lighting.gradient_azimuth_rad), np.sin(lighting.gradient_azimuth_rad)

@@ -41,8 +41,8 @@ _SOURCE_MM = np.array([0.0, -124.8, 0.0])
 _AIM_MM = 140.0
 _HALF_ANGLE_RAD = 0.32
 _SKEW_RAD = 0.06
-_THICKNESS_MM = 0.057
-_DIVERGENCE_RAD = 5.6e-4
+_THICKNESS_MM = 0.075
+_DIVERGENCE_RAD = 4.3e-4
 """Far field of a 405 nm beam of that waist."""
 
 _TOOL_FROM_SENSOR = (

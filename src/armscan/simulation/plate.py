@@ -15,7 +15,6 @@ from armscan.simulation.surfaces import MISS
 N_WAVES = 7
 """Half waves over each side of a plate: on 200 mm the shortest is 29 mm long."""
 _GRID = 61
-_INTERSECTIONS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,13 +134,17 @@ class FlatPlate:
     def _cosines(self, position_mm: FloatArray, axis: int, count: int) -> FloatArray:
         """(N, count) cosines of whole multiples of the angle, by their recurrence."""
         cosine = np.cos(self._angle(position_mm, axis))
-        columns = np.ones((len(cosine), count))
+        columns = np.ones((count, len(cosine)))
         for k in range(1, count):
-            columns[:, k] = cosine if k == 1 else 2 * cosine * columns[:, k - 1] - columns[:, k - 2]
-        return columns
+            columns[k] = cosine if k == 1 else 2 * cosine * columns[k - 1] - columns[k - 2]
+        return columns.T
 
     def _sines(self, position_mm: FloatArray, axis: int, count: int) -> FloatArray:
-        """(N, count) derivatives of the cosines by the position."""
-        order = np.arange(count)
+        """(N, count) derivatives of the cosines by the position, by the same recurrence."""
         angle = self._angle(position_mm, axis)
-        return np.asarray(-np.sin(angle[:, None] * order) * order * np.pi / self.size_mm[axis])
+        cosine, sine = np.cos(angle), np.sin(angle)
+        columns = np.zeros((count, len(cosine)))
+        for k in range(1, count):
+            columns[k] = sine if k == 1 else 2 * cosine * columns[k - 1] - columns[k - 2]
+        columns *= (-np.pi / self.size_mm[axis] * np.arange(count))[:, None]
+        return columns.T

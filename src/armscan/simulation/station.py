@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,13 +13,14 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, ImageArray, frozen_floats
 from armscan.geometry.frames import Base, Board, Sensor
 from armscan.geometry.poses import Points, Pose
-from armscan.simulation.band_light import PosedView, Region, band_light, look
+from armscan.simulation.band_light import PosedView, Region, band_light, look, to_pixels
 from armscan.simulation.board import PrintedBoard
 from armscan.simulation.board_photo import render_board
 from armscan.simulation.flat_pattern import FlatPattern
 from armscan.simulation.head import Head, Window
+from armscan.simulation.imaging import Imaging
 from armscan.simulation.light import LineLaser
-from armscan.simulation.render import COARSE_STEP_PX, laser_band
+from armscan.simulation.render import laser_band
 from armscan.simulation.scene import Lamp, Scene
 from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
 from armscan.simulation.shapes import Placed
@@ -69,6 +69,16 @@ class Station:
     things: tuple[Thing, ...]
     target: Target | None = None
     room: Lamp = ROOM
+
+    def under(self, imaging: Imaging) -> Station:
+        """The station with the gloss and texture that a preset makes of it."""
+        return replace(
+            self,
+            things=tuple(
+                replace(thing, finish=thing.finish.scaled(imaging.gloss, imaging.texture))
+                for thing in self.things
+            ),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +179,7 @@ def exposure_light(
 ) -> NDArray[np.float32]:
     """Light (H, W) of one exposure on the sensor, parts of full scale, without sensor noise."""
     imaging, window = head.imaging, settings.window
+    station = station.under(imaging)
     region = Region.around(window.x_px, window.y_px, window.width_px, window.height_px)
     views = [_view(head, station, pose, region) for pose in base_from_sensor]
     light = np.zeros((window.height_px, window.width_px), np.float32)
@@ -223,18 +234,10 @@ def _room(
     """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
     _, (rows, columns) = region.nodes_px()
     nodes = view.scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
-    step = 1.0 / COARSE_STEP_PX
-    size = (region.width_px, region.height_px)
-    coarse = cv2.warpAffine(
-        nodes,
-        np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
-        size,
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    coarse = to_pixels(nodes, region)
     if station.target is None:
         return np.asarray(coarse)
-    camera = head.camera.cropped(region.x_px, region.y_px, *size)
+    camera = head.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     board = board_seen_from(station.target, pose)
     background = np.asarray(coarse, dtype=np.float64)[..., None]
     return render_board(board, camera, view.scene.lamp, background)[..., 0]

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -45,6 +45,10 @@ class Finish:
             raise InputError("gloss and texture cannot be negative")
         if min(self.gloss_width_rad, self.texture_mm) <= 0.0:
             raise InputError("a gloss needs a width and a texture a grain")
+
+    def scaled(self, gloss: float, texture: float) -> Finish:
+        """The finish with its gloss and its texture multiplied."""
+        return replace(self, gloss=gloss * self.gloss, texture=texture * self.texture)
 
 
 MATT_PAINT = Finish(gloss=0.06, gloss_width_rad=0.35, texture=0.03)

@@ -71,6 +71,8 @@ class PlateReference:
         Count of probed points; 0 where only A, B, C, D are known.
     source
         Where it came from.
+    tip_diameter_mm
+        Diameter of the probe's tip that was compensated for; 0 where not known.
     """
 
     plane: Plane
@@ -78,6 +80,7 @@ class PlateReference:
     rms_mm: float | None = None
     n_points: int = 0
     source: str = ""
+    tip_diameter_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if self.covariance is not None:

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hand-eye from stripes on a flat plate: the thesis's method at its statistical best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armscan.calibration.hand_eye.conditioning import (
+    conditioning_warnings,
+    describe_conditioning,
+    refuse_few_postures,
+    refuse_open_hand_eye,
+)
+from armscan.calibration.hand_eye.least_squares import design
+from armscan.calibration.hand_eye.left_out import leave_each_out
+from armscan.calibration.hand_eye.noise_model import noise_components, total_covariance
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate_checks import (
+    agreement_warnings,
+    explain_misfit,
+    point_warnings,
+)
+from armscan.calibration.hand_eye.plate_fit import hand_eye_information, plane_after
+from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
+from armscan.calibration.hand_eye.plate_outliers import CheckedFit, fit_without_wrong_postures
+from armscan.calibration.hand_eye.plate_residuals import PlateState, place_nodes, shifted_plane
+from armscan.calibration.hand_eye.plate_result import (
+    hand_eye_calibration,
+    posture_results,
+    reference_facts,
+    stripe_residuals,
+)
+from armscan.calibration.hand_eye.plate_search import Start, find_start
+from armscan.calibration.hand_eye.posture_geometry import REMEDY, common_to_postures
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.geometry.arrays import BoolArray
+from armscan.geometry.estimate import FitFailure
+
+
+def calibrate_on_plate(
+    stripes: Sequence[PosedStripe],
+    plate: PlateReference,
+    options: HandEyeOptions | None = None,
+) -> HandEyeFit | FitFailure:
+    """Find where the sensor sits on the arm's last link (2.3.3.2).
+
+    The linear start solves eq. 2.72 for the unknowns that one light sheet determines. The
+    refinement minimises eq. 2.76 over the six parameters of eq. 2.69 and 2.70, weighted by the
+    covariance of all residuals: pose errors common to a posture, smooth flatness of the plate,
+    stripe noise and the uncertainty of the probed plane. Scatter that is not given is estimated.
+
+    Parameters
+    ----------
+    stripes
+        One entry an exposure; equal postures were taken without moving the arm.
+    plate
+        The plate in Base.
+    options
+        Defaults if None.
+
+    Returns
+    -------
+    HandEyeFit
+        The hand-eye with its covariance and evidence, or why there is none.
+    """
+    options = options or HandEyeOptions()
+    kept = straight_stripes(stripes, options)
+    nodes = condense(stripes, kept, options.nodes_per_stripe)
+    few = refuse_few_postures(len(nodes.used_postures))
+    if few is not None:
+        return few
+    start = find_start(nodes, plate.plane)
+    refusal = _refuse_start(nodes, plate, start, options)
+    if refusal is not None:
+        return refusal
+    checked = fit_without_wrong_postures(nodes, plate, start, options)
+    if isinstance(checked, FitFailure):
+        return checked
+    return _result(stripes, kept, plate, options, start=start, checked=checked)
+
+
+def _refuse_start(
+    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
+) -> FitFailure | None:
+    state = PlateState(start.tool_from_sensor, np.zeros(3))
+    placed = place_nodes(nodes, plate.plane, state)
+    components = noise_components(nodes, placed, plate.plane, options)
+    total = total_covariance(components, np.array([c.sigma for c in components]))
+    slopes = design(placed, options.solve_plate)
+    conditioning = describe_conditioning(hand_eye_information(slopes, total))
+    cause = common_to_postures(nodes, plate.plane)
+    refusal = refuse_open_hand_eye(conditioning, cause, REMEDY)
+    if refusal is not None:
+        return refusal
+    if not start.typical_mm <= options.max_rms_mm:
+        return explain_misfit(nodes, plate, start, options)
+    if start.n_rivals:
+        return FitFailure(
+            f"{len(nodes.used_postures)} postures leave {start.n_rivals + 1} or more different "
+            f"hand-eyes that explain the stripes equally well{cause}",
+            f"add postures: {REMEDY}",
+        )
+    return None
+
+
+def _result(
+    stripes: Sequence[PosedStripe],
+    kept: tuple[BoolArray, ...],
+    plate: PlateReference,
+    options: HandEyeOptions,
+    *,
+    start: Start,
+    checked: CheckedFit,
+) -> HandEyeFit:
+    fit, nodes = checked.fit, checked.nodes
+    conditioning = describe_conditioning(hand_eye_information(fit.slopes, fit.total))
+    plane = shifted_plane(plate.plane, plane_after(fit, plate))
+    residuals = stripe_residuals(stripes, kept, fit.refined.state.tool_from_sensor, plane)
+    left = leave_each_out(nodes, fit.refined.placed.residual_mm, fit.linear)
+    postures = posture_results(nodes, fit, residuals, left, plane)
+    cause = common_to_postures(nodes, plate.plane)
+    return HandEyeFit(
+        hand_eye_calibration(
+            nodes,
+            fit,
+            plate,
+            options,
+            conditioning=conditioning,
+            residuals=residuals,
+            postures=postures,
+        ),
+        start.linear or start.tool_from_sensor,
+        residuals,
+        postures,
+        conditioning.singular_values,
+        reference_facts(plate, options, fit),
+        (
+            *checked.warnings,
+            *conditioning_warnings(conditioning, len(postures), cause),
+            *agreement_warnings(nodes, plate, fit, options),
+            *point_warnings(stripes, kept, options),
+        ),
+    )

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Were the poses read in the wrong convention, direction or unit? Try the others on the data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from armscan.calibration.hand_eye.plate_nodes import PlateNodes
+from armscan.calibration.hand_eye.plate_search import find_start
+from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
+from armscan.geometry.fitting import Plane
+
+BETTER = 0.1
+"""A reading is offered if it leaves less than this part of what the given one leaves."""
+_ASK_FOR_UNIT = "give the translations of the poses in mm"
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Another way to read the poses, what it would leave, and how to ask for it."""
+
+    words: str
+    remedy: str
+    typical_mm: float
+
+
+def find_readings(nodes: PlateNodes, plate: Plane, typical_mm: float) -> tuple[Reading, ...]:
+    """Readings of the same poses that the stripes agree with, the best first.
+
+    Parameters
+    ----------
+    nodes, plate
+        The data as read.
+    typical_mm
+        What they leave as read.
+    """
+    found = []
+    for words, remedy, moved in _readings(nodes):
+        left = find_start(moved, plate).typical_mm
+        if left < BETTER * typical_mm:
+            found.append(Reading(words, remedy, left))
+    return tuple(sorted(found, key=lambda reading: reading.typical_mm))
+
+
+def _readings(nodes: PlateNodes) -> Iterator[tuple[str, str, PlateNodes]]:
+    rotations, translations = nodes.rotations, nodes.translations_mm
+    names: tuple[EulerConvention, ...] = get_args(EulerConvention)
+    for read in names:
+        angles = euler_from_rotations(rotations, read)
+        for meant in names:
+            if meant != read:
+                yield (
+                    f"if the angles were read as {read}, reading them as {meant}",
+                    f"give the rotation convention {meant}",
+                    nodes.moved(rotations_from_euler(angles, meant), translations),
+                )
+    back = rotations.transpose(0, 2, 1)
+    yield (
+        "taking the poses as tool_from_base",
+        "give base_from_tool: the inverse of the poses given",
+        nodes.moved(back, -np.einsum("sij,sj->si", back, translations)),
+    )
+    yield (
+        "transposing the rotations",
+        "give the rotations row by row, the tool's axes in the columns",
+        nodes.moved(back, translations),
+    )
+    for factor, unit in ((1000.0, "metres"), (25.4, "inches")):
+        yield (
+            f"reading the translations in {unit}",
+            _ASK_FOR_UNIT,
+            nodes.moved(rotations, factor * translations),
+        )
+    for shift in (-1, 1):
+        yield (
+            "giving each exposure the pose of the one "
+            + ("after" if shift < 0 else "before")
+            + " it",
+            "check that no exposure and no pose is missing or doubled",
+            nodes.moved(np.roll(rotations, shift, axis=0), np.roll(translations, shift, axis=0)),
+        )

@@ -16,11 +16,14 @@ from armscan.cli import (
     demo,
     doctor,
     info,
+    inspect_plane,
+    inspect_sphere,
+    inspect_step,
     reconstruct,
 )
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-HELP_ORDER = ("demo", "calibrate", "reconstruct", "convert", "info", "doctor")
+HELP_ORDER = ("demo", "calibrate", "reconstruct", "inspect", "convert", "info", "doctor")
 """The chain, then what looks at files; left to itself the library lists groups last."""
 
 app = typer.Typer(
@@ -50,7 +53,18 @@ calibrate = typer.Typer(
 )
 calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
 calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
+inspect = typer.Typer(
+    help="Compare measured points with a plane, a ball or a step.",
+    epilog="\b\nExample:\n  armscan inspect sphere ball.ply --diameter 34.96 -o ball.html",
+    context_settings=HELP_OPTIONS,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+inspect.command("plane", epilog=inspect_plane.EXAMPLE)(inspect_plane.plane)
+inspect.command("sphere", epilog=inspect_sphere.EXAMPLE)(inspect_sphere.sphere)
+inspect.command("step", epilog=inspect_step.EXAMPLE)(inspect_step.step)
 app.add_typer(calibrate, name="calibrate")
+app.add_typer(inspect, name="inspect")
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)

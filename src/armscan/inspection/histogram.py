@@ -86,38 +86,41 @@ def describe_deviations(
     mean, rms = (float(d.mean()), float(np.sqrt(d @ d / n))) if n else (math.nan, math.nan)
     std = float(d.std(ddof=1)) if n > 1 else math.nan
     extent = float(np.ptp(d)) if n else math.nan
-    about = f"deviations from {reference_text}, over {points_text}"
     rows = [
-        ("mean_mm", "mean", mean, "mm", f"arithmetic mean of the signed {about}"),
+        ("mean_mm", "mean", mean, "mm", "arithmetic mean, with sign"),
         (
             "std_mm",
             "standard deviation",
             std,
             "mm",
-            f"standard deviation about their mean, divided by n - 1 = {n - 1}, of the {about}",
+            f"about their mean, divided by n - 1 = {n - 1}",
         ),
-        ("rms_mm", "rms", rms, "mm", f"root mean square (divided by n = {n}) of the {about}"),
-        ("range_mm", "range", extent, "mm", f"largest minus smallest of the {about}"),
+        ("rms_mm", "rms", rms, "mm", f"root mean square about the reference, divided by n = {n}"),
+        ("range_mm", "range", extent, "mm", "largest minus smallest"),
         (
             "d95_mm",
             "narrowest shell with 95 %",
             narrowest_shell_mm(d),
             "mm",
-            "width of the narrowest shell that holds 95 % (rounded up to a whole point) of the "
-            f"{about}; form D95 in the sense of ISO 10360-8",
+            "width of the narrowest shell that holds 95 %, rounded up to a whole point (form D95 "
+            "as ISO 10360-8 defines it)",
         ),
-        *(_share(d, limit, about) for limit in WITHIN_MM),
+        *(_share(d, limit) for limit in WITHIN_MM),
     ]
-    statistics = tuple(Statistic(k, label, v, u, reference, text) for k, label, v, u, text in rows)
+    about = f"deviations from {reference_text}, {points_text}"
+    statistics = tuple(
+        Statistic(key, label, value, unit, reference, formula, f"{label} of {about}: {formula}")
+        for key, label, value, unit, formula in rows
+    )
     return Deviations(reference, reference_text, points_text, d, statistics)
 
 
-def _share(d: FloatArray, limit_mm: float, about: str) -> tuple[str, str, float, str, str]:
+def _share(d: FloatArray, limit_mm: float) -> tuple[str, str, float, str, str]:
     share = 100.0 * float((np.abs(d) <= limit_mm).mean()) if len(d) else math.nan
     return (
         within_key(limit_mm),
         f"within ±{limit_mm:g} mm",
         share,
         "%",
-        f"part of all points whose deviation is at most {limit_mm:g} mm, of the {about}",
+        f"part of the points whose deviation is at most {limit_mm:g} mm either way",
     )

@@ -29,8 +29,10 @@ class Statistic:
         The number; NaN where it is not defined.
     reference
         What the deviations are counted from.
+    formula
+        How it follows from the deviations, in words.
     definition
-        Reference, points and formula in words.
+        The same with the reference and the points: complete in itself.
     """
 
     key: str
@@ -38,6 +40,7 @@ class Statistic:
     value: float
     unit: str
     reference: ReferenceKind
+    formula: str
     definition: str
 
 

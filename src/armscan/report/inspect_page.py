@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of an inspection."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from armscan.inspection.results import Deviations, PointCounts
+from armscan.models.calibration import Provenance
+from armscan.report.numbers import sentence, significant
+from armscan.report.origin import footer, origin_section
+from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
+from armscan.report.summary import Table
+
+STATEMENT = (
+    "Nominal means: known before the measurement. Fitted means: made from these points "
+    "themselves, so it cannot show an error of size or place. Every statistic is over all points "
+    "of the feature; points that a fit left out are counted. Forms are computed as ISO 10360-8 "
+    "defines them; this is not an accredited test."
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InspectionReport:
+    """One inspection, ready for a page, a terminal and a program.
+
+    Parameters
+    ----------
+    title, subtitle
+        What was inspected.
+    cards
+        Key figures.
+    facts
+        The same for a terminal.
+    references
+        Deviations with a heading for each, nominal first.
+    histograms, views
+        Pictures.
+    counts
+        What became of the points.
+    geometry
+        The fitted feature, as (label, value).
+    warnings
+        Sentences that a person should read first.
+    data
+        All of it for programs.
+    """
+
+    title: str
+    subtitle: str
+    cards: tuple[Card, ...]
+    facts: tuple[tuple[str, str], ...]
+    references: tuple[tuple[str, Deviations], ...]
+    histograms: tuple[Picture, ...]
+    views: tuple[Picture, ...]
+    counts: PointCounts
+    geometry: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    data: Mapping[str, Any]
+
+    @property
+    def brief_tables(self) -> tuple[Table, ...]:
+        """The statistics side by side, for a terminal."""
+        names = [item.label for item in self.references[0][1].statistics]
+        rows = tuple(
+            (name, *(_value(deviations, k) for _, deviations in self.references))
+            for k, name in enumerate(names)
+        )
+        heads = tuple(f"{deviations.reference} reference" for _, deviations in self.references)
+        return (Table(("statistic", *heads), rows),)
+
+
+def inspection_page(
+    report: InspectionReport, provenance: Provenance, *, is_simulated: bool = False
+) -> Page:
+    """Lay out the page."""
+    statistics = tuple(
+        block
+        for heading, deviations in report.references
+        for block in (
+            Text(
+                f"{sentence(heading)} Deviations are counted from {deviations.reference_text}; "
+                f"{deviations.points_text}."
+            ),
+            definitions_table(deviations),
+        )
+    )
+    return Page(
+        title=f"{report.title} inspected",
+        subtitle=report.subtitle,
+        cards=report.cards,
+        warnings=tuple(sentence(warning) for warning in report.warnings),
+        sections=(
+            Section("Deviations", (Gallery(report.histograms, 420),)),
+            Section("In space", (Gallery(report.views, 560),)),
+            Section("Statistics", (Text(STATEMENT), *statistics)),
+            Section("Which points", (counts_table(report.counts),)),
+            Section("The fitted feature", (Facts(report.geometry),)),
+            origin_section(provenance),
+        ),
+        is_simulated=is_simulated,
+        footer=footer(provenance),
+    )
+
+
+def definitions_table(deviations: Deviations) -> Table:
+    """Statistics of one reference, each with its definition."""
+    rows = tuple(
+        (item.label, _value(deviations, k), item.formula)
+        for k, item in enumerate(deviations.statistics)
+    )
+    return Table((f"{deviations.reference} reference", "value", "definition"), rows, "", (2,))
+
+
+def counts_table(counts: PointCounts) -> Table:
+    """What became of the points, with the rules."""
+    return Table(
+        ("points", "count", "rule"),
+        (
+            ("given", f"{counts.n_given:,}", "all points of the cloud"),
+            ("in the region", f"{counts.n_region:,}", "inside --region; all without it"),
+            ("of the feature", f"{counts.n_feature:,}", counts.feature_rule),
+            ("used by the fit", f"{counts.n_fitted:,}", counts.fit_rule),
+            ("left out by the fit", f"{counts.n_outliers:,}", "of the feature, minus used"),
+        ),
+        "",
+        (2,),
+    )
+
+
+def deviations_data(deviations: Deviations) -> dict[str, Any]:
+    """Deviations' statistics for programs, with their definitions."""
+    return {
+        "reference": deviations.reference,
+        "counted_from": deviations.reference_text,
+        "points": deviations.points_text,
+        **{item.key: item.value for item in deviations.statistics},
+        "definitions": {item.key: item.definition for item in deviations.statistics},
+    }
+
+
+def counts_data(counts: PointCounts) -> dict[str, Any]:
+    """Counts for programs."""
+    return {
+        "n_given": counts.n_given,
+        "n_region": counts.n_region,
+        "n_feature": counts.n_feature,
+        "n_fitted": counts.n_fitted,
+        "n_outliers": counts.n_outliers,
+        "feature_rule": counts.feature_rule,
+        "fit_rule": counts.fit_rule,
+    }
+
+
+def _value(deviations: Deviations, k: int) -> str:
+    item = deviations.statistics[k]
+    if item.unit == "%":
+        # 99.999 must not read as if nothing were outside
+        return "above 99.99 %" if 99.995 <= item.value < 100.0 else f"{item.value:.2f} %"
+    return significant(item.value, item.unit)

@@ -161,10 +161,9 @@ def _slices(image: BoolArray, top: int, left: int, margin: int) -> tuple[slice, 
 def _sheet(view: PosedView, camera: RenderCamera, laser: LineLaser, region: Region) -> _Sheet:
     """Trace one ray for every pixel that the laser's light may reach."""
     shape = (region.height_px, region.width_px)
-    is_lit = _near_sheet(view, laser, region)
+    is_lit, reach = _near_sheet(view, laser, region)
     rows, columns = np.nonzero(is_lit)
     values = _shade(view, camera, laser, _pixels(region, rows, columns))
-    reach = np.full(shape, _FAR_SIGMAS, np.float32)
     peak = np.zeros(shape, np.float32)
     reach[rows, columns] = np.clip(values[0], -_FAR_SIGMAS, _FAR_SIGMAS)
     peak[rows, columns] = values[1]
@@ -175,8 +174,8 @@ def _sheet(view: PosedView, camera: RenderCamera, laser: LineLaser, region: Regi
     return _Sheet(reach, peak, edges, edge_light, is_lit)
 
 
-def _near_sheet(view: PosedView, laser: LineLaser, region: Region) -> BoolArray:
-    """(H, W) pixels that the light may reach.
+def _near_sheet(view: PosedView, laser: LineLaser, region: Region) -> tuple[BoolArray, Image32]:
+    """(H, W) pixels that the light may reach, and the coarse reach for all the others.
 
     Where the coarse grid meets one surface smoothly, the reach is interpolated to tell; elsewhere
     all pixels of cells next to the sheet are taken.
@@ -190,7 +189,9 @@ def _near_sheet(view: PosedView, laser: LineLaser, region: Region) -> BoolArray:
     coarse = np.where(is_hit, reach, 0.0).reshape(shape).astype(np.float32)
     between = to_pixels(coarse, region)
     is_rough = _rough_cells(coarse, surface.reshape(shape))
-    return np.asarray(band & (is_rough | (np.abs(between) < BAND_SIGMAS + _SLACK_SIGMAS)))
+    # Outside, the sign of the reach still matters: it is interpolated across the band's rim.
+    far = np.clip(between, -_FAR_SIGMAS, _FAR_SIGMAS)
+    return band & (is_rough | (np.abs(between) < BAND_SIGMAS + _SLACK_SIGMAS)), far
 
 
 def _rough_cells(reach: Image32, surface: IntArray) -> BoolArray:

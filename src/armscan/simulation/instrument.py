@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mechanical half of the presets, and all that one twin is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from armscan.devices.twin import Preset
+from armscan.simulation.hand_path import Unsteadiness
+from armscan.simulation.head import Head, build_head
+from armscan.simulation.measuring_arm import ArmErrors, MeasuringArm
+from armscan.simulation.plate_probing import ProbeErrors
+from armscan.simulation.stations import Bench
+
+
+@dataclass(frozen=True, slots=True)
+class Mechanics:
+    """How good the arm and its probe are, and how steady the hand.
+
+    Parameters
+    ----------
+    arm, probe, hand
+        Sizes of their errors.
+    exposure_s
+        Exposure time during scans: what the hand does meanwhile blurs the image.
+    """
+
+    arm: ArmErrors
+    probe: ProbeErrors
+    hand: Unsteadiness = field(default_factory=Unsteadiness)
+    exposure_s: float = 1e-3
+
+
+MECHANICS: dict[Preset, Mechanics] = {
+    "clean": Mechanics(ArmErrors(0.01, 0.0, 0.0, 0.0, 0.0), ProbeErrors(0.0, 0.0, 0.0)),
+    "thesis": Mechanics(ArmErrors(0.9, 1.3, 0.7, 0.3, 0.001), ProbeErrors(0.0015, 0.0015, 0.0005)),
+    "harsh": Mechanics(
+        ArmErrors(2.3, 3.3, 1.8, 0.8, 0.0025),
+        ProbeErrors(0.003, 0.004, 0.001),
+        Unsteadiness(tilt_deg=2.5, depth_mm=1.5, aside_mm=2.0, speed=0.4),
+        exposure_s=2e-3,
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instrument:
+    """Head, arm and bench of one twin.
+
+    Parameters
+    ----------
+    head
+        Camera, laser and mounting.
+    arm
+        True and believed.
+    bench
+        What stands around.
+    mechanics
+        What they were drawn from.
+    """
+
+    head: Head
+    arm: MeasuringArm
+    bench: Bench
+    mechanics: Mechanics
+
+    @staticmethod
+    def build(head: str, preset: Preset, seed: int) -> Instrument:
+        """Draw one instrument; everything follows from the seed."""
+        mechanics = MECHANICS[preset]
+        return Instrument(
+            head=build_head(head, preset, seed),
+            arm=MeasuringArm.build(mechanics.arm, np.random.default_rng([seed, 2])),
+            bench=Bench.build(preset, np.random.default_rng([seed, 3])),
+            mechanics=mechanics,
+        )

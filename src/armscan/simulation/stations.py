@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands before the arm: the plate, the ball, the gauge blocks, the part, all in Base."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armscan.devices.twin import Preset
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Base, Part, Plate
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector
+from armscan.simulation.body import Body
+from armscan.simulation.free_form import free_form_part
+from armscan.simulation.plate import FlatPlate
+from armscan.simulation.shapes import Box, Placed
+from armscan.simulation.station import Station
+from armscan.simulation.surfaces import Sphere
+from armscan.simulation.thing import CERAMIC, GROUND_STEEL, MATT_PAINT, Thing
+
+BALL_DIAMETER_MM = 34.96
+STEP_HEIGHTS_MM = (20.0, 5.0)
+STEP_CENTRES_MM = ((-19.0, 0.0), (19.0, 0.0))
+STEP_FACE_MM = (22.0, 30.0)
+PLATE_SIZE_MM = (200.0, 200.0)
+
+_PLATE_MM = (620.0, -160.0, -6.4)
+_BALL_MM = (610.0, -140.0, 60.0)
+_PART_MM = (610.0, -150.0, 20.0)
+_GROUND_SIZE_MM = (120.0, 120.0)
+_GROUND_FLATNESS_MM = 0.001
+_FLATNESS_MM: dict[Preset, float] = {"clean": 0.001, "thesis": 0.015, "harsh": 0.04}
+_WHITE = (0.8, 0.8, 0.8)
+_STEEL = (0.45, 0.45, 0.45)
+_PLACE_MM = 15.0
+_LEVEL_RAD = 0.004
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bench:
+    """The things of one twin, each where it stands for its scene.
+
+    Parameters
+    ----------
+    plate, base_from_plate
+        The reference plate; z = 0 of its frame is the best plane through it.
+    ball
+        In Base.
+    base_from_ground
+        Frame of the ground plate under the gauge blocks, its normal along z.
+    ground
+        That plate, in its frame.
+    part, base_from_part
+        The free-form part in its own frame, and where it stands.
+    """
+
+    plate: FlatPlate
+    base_from_plate: Pose[Base, Plate]
+    ball: Sphere
+    ground: FlatPlate
+    base_from_ground: Pose[Base, Plate]
+    part: Body
+    base_from_part: Pose[Base, Part]
+
+    @staticmethod
+    def build(preset: Preset, rng: np.random.Generator) -> Bench:
+        """Draw the things and put them down by hand: a little aside, not quite level."""
+        plate = FlatPlate.draw(PLATE_SIZE_MM, _FLATNESS_MM[preset], rng, _WHITE)
+        ground = FlatPlate.draw(_GROUND_SIZE_MM, _GROUND_FLATNESS_MM, rng, _STEEL)
+        ball = np.array(_BALL_MM) + _PLACE_MM * rng.uniform(-1.0, 1.0, 3)
+        return Bench(
+            plate=plate,
+            base_from_plate=_put_down(_PLATE_MM, rng),
+            ball=Sphere(ball, 0.5 * BALL_DIAMETER_MM, _WHITE),
+            ground=ground,
+            base_from_ground=_put_down(_PLATE_MM, rng),
+            part=free_form_part(),
+            base_from_part=_put_down(_PART_MM, rng),
+        )
+
+    @property
+    def plate_plane(self) -> FloatArray:
+        """(4,) unit normal and D of the best plane through the plate, in Base (eq. 2.55)."""
+        normal = self.base_from_plate.rotation[:, 2]
+        return np.array([*normal, -normal @ self.base_from_plate.translation_mm])
+
+    def with_plate(self) -> Station:
+        """The reference plate alone."""
+        return Station((Thing("plate", Placed(self.plate, self.base_from_plate), CERAMIC),))
+
+    def with_ball(self) -> Station:
+        """The ball alone, held from below by what no camera sees."""
+        return Station((Thing("ball", self.ball, MATT_PAINT),))
+
+    def with_steps(self) -> Station:
+        """Two gauge blocks wrung to a ground plate."""
+        things = [Thing("ground", Placed(self.ground, self.base_from_ground), GROUND_STEEL)]
+        for height, (x, y) in zip(STEP_HEIGHTS_MM, STEP_CENTRES_MM, strict=True):
+            block = Box(np.array([*STEP_FACE_MM, height]), _STEEL)
+            foot: Pose[Plate, Part] = Pose(np.eye(3), np.array([x, y, 0.0]))
+            placed = Placed(block, self.base_from_ground @ foot)
+            things.append(Thing(f"block {height:g} mm", placed, GROUND_STEEL))
+        return Station(tuple(things))
+
+    def with_part(self) -> Station:
+        """The free-form part alone."""
+        return Station((Thing("part", Placed(self.part, self.base_from_part), MATT_PAINT),))
+
+    def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
+        """Signed distance (N,) of points (N, 3) in Base from the free-form part."""
+        return self.part.distance_mm(self._in_part(points_base_mm))
+
+    def part_normals(self, points_base_mm: FloatArray) -> FloatArray:
+        """(N, 3) unit normals, in Base, of the part next to points (N, 3)."""
+        normals = self.part.normals(self._in_part(points_base_mm))
+        return np.asarray(normals @ self.base_from_part.rotation.T)
+
+    def _in_part(self, points_base_mm: FloatArray) -> FloatArray:
+        pose = self.base_from_part
+        return np.asarray((points_base_mm - pose.translation_mm) @ pose.rotation)
+
+
+def _put_down(place_mm: tuple[float, float, float], rng: np.random.Generator) -> Pose[Base, Any]:
+    """Pose near a place, turned by hand and not quite level."""
+    turn = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)]))
+    level = rotation_from_vector(np.array([*(_LEVEL_RAD * rng.standard_normal(2)), 0.0]))
+    shift = np.array([_PLACE_MM, _PLACE_MM, 1.0]) * rng.uniform(-1.0, 1.0, 3)
+    return Pose(level @ turn, np.array(place_mm) + shift)

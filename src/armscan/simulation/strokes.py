@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a person scans each object: the strokes of a hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.rotation import rotation_from_vector
+from armscan.simulation.aim import Aim
+from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_CENTRES_MM, Bench
+from armscan.simulation.sweep import Stroke
+
+HALF_WAY_DEG = -21.3
+"""Tilt at which laser and camera lie equally far from the face's normal."""
+DEPTH_MM = 137.0
+"""Middle of the depths that the scanning window sees."""
+
+BALL_TILTS_DEG = (4.0, 36.0, 40.0, 34.0, 40.0, 36.0, 38.0)
+BALL_AZIMUTHS_DEG = (0.0, 15.0, 75.0, 135.0, 195.0, 255.0, 315.0)
+_BALL_WAY_MM = 25.0
+_PART_WAYS = ((-14.0, -25.0, 40.0), (-5.0, -6.0, 45.0), (5.0, 6.0, 50.0), (14.0, 25.0, 42.0))
+"""Place across the part (mm), lean to that side (degrees), speed (mm/s)."""
+_BALL_HEIGHT = 0.8
+"""Height, in radii, at which the stripe's middle passes over the ball's centre."""
+
+
+def plate_strokes(bench: Bench) -> list[Stroke]:
+    """Three strokes of 130 mm across the plate, the head held differently in each."""
+    face, origin = bench.base_from_plate.rotation, bench.base_from_plate.translation_mm
+    ways = (
+        ((-30.0, -65.0), (-30.0, 65.0), Aim(HALF_WAY_DEG, 3.0, 4.0, DEPTH_MM), 42.0),
+        ((30.0, 65.0), (28.0, -65.0), Aim(-10.0, -6.0, -3.0, DEPTH_MM), 50.0),
+        ((-65.0, 0.0), (65.0, 5.0), Aim(-34.0, 2.0, 84.0, DEPTH_MM), 38.0),
+    )
+    return [
+        Stroke(face, _on(face, origin, start), _on(face, origin, end), aim, speed, 8)
+        for start, end, aim, speed in ways
+    ]
+
+
+def ball_strokes(bench: Bench) -> list[Stroke]:
+    """From above, then from six sides."""
+    strokes = []
+    for k, (tilt, azimuth) in enumerate(zip(BALL_TILTS_DEG, BALL_AZIMUTHS_DEG, strict=True)):
+        face = _leaning(tilt, azimuth)
+        middle = bench.ball.centre_mm + _BALL_HEIGHT * 0.5 * BALL_DIAMETER_MM * face[:, 2]
+        way = (-1.0) ** k * 0.5 * _BALL_WAY_MM * face[:, 1]
+        aim = Aim(HALF_WAY_DEG, 0.0, 0.0, DEPTH_MM)
+        strokes.append(Stroke(face, middle - way, middle + way, aim, 30.0 + 2.0 * k, 10))
+    return strokes
+
+
+def step_strokes(bench: Bench) -> list[Stroke]:
+    """Two strokes over both blocks and the ground beside them, there and back."""
+    face, origin = bench.base_from_ground.rotation, bench.base_from_ground.translation_mm
+    lift = 10.0 * face[:, 2]
+    return [
+        Stroke(
+            face,
+            _on(face, origin, (0.0, side * 11.0)) + lift,
+            _on(face, origin, (0.0, -side * 11.0)) + lift,
+            Aim(HALF_WAY_DEG + turn, 0.0, roll, DEPTH_MM),
+            30.0,
+            12,
+        )
+        for side, turn, roll in ((-1.0, 0.0, 2.0), (1.0, -6.0, -2.0))
+    ]
+
+
+def part_strokes(bench: Bench) -> list[Stroke]:
+    """Four strokes along the part, from its back, its top twice, and its front."""
+    pose = bench.base_from_part
+    strokes = []
+    for side, lean, speed in (
+        (-14.0, 25.0, 40.0),
+        (-5.0, 6.0, 45.0),
+        (5.0, -6.0, 50.0),
+        (14.0, -25.0, 42.0),
+    ):
+        face = pose.rotation @ _leaning(abs(lean), -90.0 if lean > 0.0 else 90.0) @ _quarter_turn()
+        start, end = (
+            pose.translation_mm + pose.rotation @ np.array([x, side, 13.0]) for x in (-40.0, 40.0)
+        )
+        aim = Aim(HALF_WAY_DEG, 0.0, 0.0, DEPTH_MM)
+        strokes.append(Stroke(face, start, end, aim, speed, 10))
+    return strokes
+
+
+def still_step(bench: Bench) -> tuple[FloatArray, FloatArray, Aim]:
+    """Face (3, 3), spot (3,) in Base and aim of one look at the higher block and the ground."""
+    face, origin = bench.base_from_ground.rotation, bench.base_from_ground.translation_mm
+    spot = _on(face, origin, STEP_CENTRES_MM[0]) + 10.0 * face[:, 2]
+    return face, spot, Aim(HALF_WAY_DEG, 0.0, 0.0, DEPTH_MM)
+
+
+def _on(face: FloatArray, origin_mm: FloatArray, place_mm: tuple[float, float]) -> FloatArray:
+    return np.asarray(origin_mm + face[:, :2] @ np.array(place_mm))
+
+
+def _leaning(tilt_deg: float, azimuth_deg: float) -> FloatArray:
+    """(3, 3) axes of a face that leans towards an azimuth, without turning about the vertical."""
+    azimuth = np.radians(azimuth_deg)
+    axis = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    return rotation_from_vector(np.radians(tilt_deg) * axis)
+
+
+def _quarter_turn() -> FloatArray:
+    """A face whose y axis runs along the x of the one before it."""
+    return np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scene of the twin as a source of exposures: pixels are rendered when they are asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.frames import Base, Sensor
+from armscan.geometry.poses import Pose
+from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
+from armscan.records.sensor_window import SensorWindow
+from armscan.records.session import CameraSetup, ExposureRow, Session, SessionKind
+from armscan.simulation.head import Head
+from armscan.simulation.station import (
+    ExposureSettings,
+    Station,
+    TrueStripe,
+    render_exposure,
+    true_stripes,
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """One exposure before it is rendered.
+
+    Parameters
+    ----------
+    row
+        Its line in the list of exposures.
+    station
+        What stands before the head.
+    base_from_sensor
+        Where the head is in the middle of the exposure.
+    settings
+        Window, lasers, light.
+    sub_poses
+        The same at evenly weighted times of the exposure; empty if the head stands still.
+    """
+
+    row: ExposureRow
+    station: Station
+    base_from_sensor: Pose[Base, Sensor]
+    settings: ExposureSettings
+    sub_poses: tuple[Pose[Base, Sensor], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwinScan:
+    """One scene, in the form of any recording; see `armscan.devices.scan_source.ScanSource`.
+
+    Parameters
+    ----------
+    name
+        What messages and reports call it.
+    kind
+        Scan or calibration.
+    head
+        That looks.
+    shots
+        In order of time.
+    arm
+        What the arm reported, or None.
+    seed
+        (K,) numbers from which, with the row, the noise of an exposure follows.
+    """
+
+    name: str
+    kind: SessionKind
+    head: Head
+    shots: tuple[Shot, ...]
+    arm: ArmTrack | None
+    seed: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if not self.shots:
+            raise InputError("a scan without exposures", where=self.name)
+
+    @property
+    def session(self) -> Session:
+        """Facts that hold for all exposures."""
+        window = self.shots[0].settings.window
+        setup = CameraSetup(
+            width_px=window.width_px,
+            height_px=window.height_px,
+            window=SensorWindow(window.x_px, window.y_px),
+            bits_used=self.head.imaging.detector.bits,
+        )
+        return Session(kind=self.kind, cameras=(setup,), is_simulated=True)
+
+    @property
+    def rows(self) -> tuple[ExposureRow, ...]:
+        """All exposures without their pixels, in order of time."""
+        return tuple(shot.row for shot in self.shots)
+
+    @property
+    def is_simulated(self) -> bool:
+        """True: the images are rendered."""
+        return True
+
+    def exposure(self, row: int) -> Exposure:
+        """Render one exposure; the same every time and in whatever order they are asked for."""
+        shot = self.shots[row]
+        rng = np.random.default_rng([*self.seed, row])
+        poses = shot.sub_poses or (shot.base_from_sensor,)
+        image = render_exposure(self.head, shot.station, poses, shot.settings, rng)
+        window = shot.settings.window
+        return Exposure(
+            image,
+            shot.row.source,
+            bits_used=self.head.imaging.detector.bits,
+            window=SensorWindow(window.x_px, window.y_px),
+            lasers=shot.row.lasers,
+            t_ns=shot.row.t_ns,
+            camera=shot.row.camera,
+            trigger_id=shot.row.trigger_id,
+            view=shot.row.view,
+        )
+
+    def true_stripes(self, row: int) -> tuple[TrueStripe, ...]:
+        """Where the sheets' centres truly lie in one exposure, at its middle."""
+        shot = self.shots[row]
+        return true_stripes(self.head, shot.station, shot.base_from_sensor, shot.settings)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a twin was made from."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from armscan.devices.twin import Preset
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.simulation.instrument import Instrument
+from armscan.simulation.plate_probing import TIP_DIAMETER_MM, TRUE_PROBE_MM
+from armscan.simulation.sheet_middle import sheet_points_mm
+from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_HEIGHTS_MM
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InstrumentTruth:
+    """See `armscan.devices.twin.TwinTruth`.
+
+    Parameters
+    ----------
+    instrument
+        The twin's.
+    preset, seed
+        What it was drawn from.
+    """
+
+    instrument: Instrument
+    preset: Preset
+    seed: int
+
+    @property
+    def camera_parameters(self) -> FloatArray:
+        """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``."""
+        c = self.instrument.head.camera
+        return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
+
+    @property
+    def sheet_points_mm(self) -> FloatArray:
+        """(N, 3) true points of the light sheet over the working region, Sensor frame."""
+        return sheet_points_mm(self.instrument.head)
+
+    @property
+    def tool_from_sensor(self) -> Pose[Tool, Sensor]:
+        """The true hand-eye."""
+        return self.instrument.head.tool_from_sensor
+
+    @property
+    def plate_plane(self) -> FloatArray:
+        """(4,) unit normal and D of the best plane through the true plate, in Base (eq. 2.55)."""
+        return self.instrument.bench.plate_plane
+
+    @property
+    def ball_diameter_mm(self) -> float:
+        """Of the reference ball."""
+        return BALL_DIAMETER_MM
+
+    @property
+    def step_heights_mm(self) -> tuple[float, ...]:
+        """Heights of the gauge blocks over the ground plate."""
+        return STEP_HEIGHTS_MM
+
+    def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
+        """Signed distance (N,) of points (N, 3) in Base from the free-form part's surface."""
+        return self.instrument.bench.part_distance_mm(points_base_mm)
+
+    def part_normals(self, points_base_mm: FloatArray) -> FloatArray:
+        """(N, 3) unit normals of that surface next to points (N, 3)."""
+        return self.instrument.bench.part_normals(points_base_mm)
+
+    def document(self) -> bytes:
+        """All of it as JSON, with the mark ``"simulated": true``."""
+        arm, bench = self.instrument.arm, self.instrument.bench
+        content: dict[str, Any] = {
+            "simulated": True,
+            "head": self.instrument.head.name,
+            "preset": self.preset,
+            "seed": self.seed,
+            "camera_parameters": self.camera_parameters.tolist(),
+            "sheet_points_sensor_mm": self.sheet_points_mm.tolist(),
+            "tool_from_sensor": _pose(self.tool_from_sensor),
+            "plate_plane_base": self.plate_plane.tolist(),
+            "base_from_plate": _pose(bench.base_from_plate),
+            "ball": {
+                "diameter_mm": self.ball_diameter_mm,
+                "centre_base_mm": bench.ball.centre_mm.tolist(),
+            },
+            "steps": {
+                "heights_mm": list(self.step_heights_mm),
+                "base_from_ground": _pose(bench.base_from_ground),
+            },
+            "base_from_part": _pose(bench.base_from_part),
+            "probe": {
+                "tool_from_probe_mm": TRUE_PROBE_MM.tolist(),
+                "tip_diameter_mm": TIP_DIAMETER_MM,
+            },
+            "arm": {
+                "axes": arm.true.axes.tolist(),
+                "points_mm": arm.true.points_mm.tolist(),
+                "encoder_noise_rad": arm.white_rad,
+                "encoder_waves_rad": arm.waves_rad.tolist(),
+            },
+        }
+        return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def _pose(pose: Pose[Any, Any]) -> dict[str, Any]:
+    return {
+        "rotation": pose.rotation.tolist(),
+        "translation_mm": pose.translation_mm.tolist(),
+    }

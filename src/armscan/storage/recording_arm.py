@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``arm.csv``: what the arm reported over time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import FileFormatError, InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.euler import EulerConvention
+from armscan.models.arm import ArmModel
+from armscan.models.arm_forward import forward
+from armscan.records.arm_track import NO_TRIGGER, ArmTrack
+from armscan.records.session import PoseForm
+from armscan.storage.csv_table import CsvTable, number_text
+from armscan.storage.pose_forms import (
+    FORM_COLUMNS,
+    POSITION,
+    pose_numbers,
+    rotations_of_form,
+)
+from armscan.storage.pose_units import (
+    METRES_REMEDY,
+    are_surely_metres,
+    are_within_reach_of_base,
+)
+
+ARM_FILE = "arm.csv"
+JOINT = re.compile(r"j(\d+)_rad")
+WARN_TURNS_RAD = 2.0 * np.pi
+REFUSE_TURNS_RAD = 4.0 * np.pi
+
+Columns = Mapping[str, tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmTable:
+    """What ``arm.csv`` says.
+
+    Parameters
+    ----------
+    track
+        The samples.
+    form
+        How the poses are written.
+    extra
+        Columns that are not known.
+    warnings
+        What is odd in it.
+    """
+
+    track: ArmTrack
+    form: PoseForm
+    extra: Columns
+    warnings: tuple[str, ...]
+
+
+def read_arm_table(
+    table: CsvTable,
+    form: PoseForm | None,
+    rotation: EulerConvention,
+    arm: ArmModel | None,
+) -> ArmTable:
+    """Samples of ``arm.csv``; a row is ``base_from_tool``.
+
+    Parameters
+    ----------
+    table
+        The file.
+    form
+        How the poses are written; None lets the columns decide.
+    rotation
+        Convention of Euler angles.
+    arm
+        Turns joint angles into poses; needed for the form ``joints`` only.
+
+    Raises
+    ------
+    FileFormatError
+        If columns are missing, a time or trigger id appears twice, times go back, a rotation is
+        none, or numbers can only be in another unit.
+    """
+    table.require(("t_ns",))
+    if not len(table):
+        raise FileFormatError("the table holds no sample", where=table.where)
+    times = _times(table)
+    chosen = _form(table, form)
+    joint_names = _joint_names(table)
+    used = ("t_ns", "trigger_id", *joint_names)
+    joints = table.floats(joint_names, may_lack=True) if joint_names else None
+    if chosen == "joints":
+        is_known, rotations, positions = _from_joints(table, joints, arm)
+    else:
+        used += (*POSITION, *FORM_COLUMNS[chosen])
+        is_known, rotations, positions = _from_poses(table, chosen, rotation)
+    _refuse_metres(rotations[is_known], positions[is_known], table.where)
+    track = ArmTrack(times, rotations, positions, is_known, _triggers(table), joints)
+    extra = {name: cells for name, cells in table.columns.items() if name not in used}
+    return ArmTable(track, chosen, extra, tuple(_warnings(track, table.where)))
+
+
+def arm_columns(
+    track: ArmTrack, form: PoseForm, rotation: EulerConvention, extra: Columns
+) -> dict[str, tuple[str, ...]]:
+    """Columns of ``arm.csv``: poses in the form asked for, and joints wherever they are known.
+
+    Raises
+    ------
+    InputError
+        If joints are asked for and not known.
+    """
+    columns = {"t_ns": tuple(str(time) for time in track.t_ns)}
+    if form == "joints" and track.joints_rad is None:
+        raise InputError("the arm gave no joint angles", remedy="write its poses")
+    if form != "joints":
+        numbers = np.hstack(
+            [track.translations_mm, pose_numbers(track.rotations, track.is_known, form, rotation)]
+        )
+        numbers[~track.is_known] = np.nan
+        columns |= _texts((*POSITION, *FORM_COLUMNS[form]), numbers)
+    if track.joints_rad is not None:
+        names = tuple(f"j{k}_rad" for k in range(1, track.joints_rad.shape[1] + 1))
+        columns |= _texts(names, track.joints_rad)
+    if track.trigger_ids is not None:
+        ids = track.trigger_ids
+        columns["trigger_id"] = tuple("" if k == NO_TRIGGER else str(k) for k in ids)
+    return {**columns, **extra}
+
+
+def _texts(names: tuple[str, ...], numbers: FloatArray) -> dict[str, tuple[str, ...]]:
+    return {
+        name: tuple(number_text(value) for value in numbers[:, k]) for k, name in enumerate(names)
+    }
+
+
+def _times(table: CsvTable) -> IntArray:
+    times = table.ints("t_ns")
+    seen: dict[int, int] = {}
+    for k, time in enumerate(times.tolist()):
+        if time in seen:
+            raise FileFormatError(
+                f"t_ns {time} appears again (first in line {table.lines[seen[time]]})",
+                where=table.place(k),
+                remedy="remove one of the two samples",
+            )
+        seen[time] = k
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        raise FileFormatError(
+            f"t_ns goes back from {times[back[0]]}",
+            where=table.place(int(back[0]) + 1),
+            remedy="sort the lines by time",
+        )
+    return times
+
+
+def _triggers(table: CsvTable) -> IntArray | None:
+    if "trigger_id" not in table:
+        return None
+    ids = table.ints("trigger_id", NO_TRIGGER)
+    seen: dict[int, int] = {}
+    for k, number in enumerate(ids.tolist()):
+        if not table.columns["trigger_id"][k]:
+            continue
+        if number < 0 or number in seen:
+            fact = "is negative" if number < 0 else f"is in line {table.lines[seen[number]]} too"
+            raise FileFormatError(
+                f"trigger_id {number} {fact}",
+                where=table.place(k),
+                remedy="give each trigger one sample of the arm and a number from 0 on",
+            )
+        seen[number] = k
+    return ids
+
+
+def _form(table: CsvTable, stated: PoseForm | None) -> PoseForm:
+    complete: list[PoseForm] = [
+        form
+        for form, names in FORM_COLUMNS.items()
+        if form != "joints" and all(name in table for name in (*POSITION, *names))
+    ]
+    if _joint_names(table):
+        complete.append("joints")
+    if stated is None and complete:
+        return complete[0]
+    if stated is not None and stated in complete:
+        return stated
+    _hint_at_names(table)
+    if stated == "joints" or (stated is None and any(JOINT.fullmatch(n) for n in table.columns)):
+        table.require(("t_ns", "j1_rad"))
+    form = stated or "quaternion"
+    if complete:
+        raise FileFormatError(
+            f"session.toml says '{form}', but the columns are those of '{complete[0]}'",
+            where=table.where,
+            remedy="correct form under [pose], or the header",
+        )
+    table.require(("t_ns", *POSITION, *FORM_COLUMNS[form]))
+    return form
+
+
+def _hint_at_names(table: CsvTable) -> None:
+    """Refuse headers whose meaning is plain, but which are not those of the format."""
+    names = set(table.columns)
+    hints = (
+        ({"x_m"}, "positions are in metres", "multiply them by 1000 and name them x_mm,y_mm,z_mm"),
+        ({"a_rad"}, "Euler angles are in radians", "write degrees as a_deg,b_deg,c_deg"),
+        ({"j1_deg"}, "joints are in degrees", "write radians as j1_rad, j2_rad and so on"),
+        ({"q1", "q2", "q3"}, "the order of the quaternion is not said", "name it qw,qx,qy,qz"),
+        ({"w", "x", "y", "z"}, "the columns lack units", "name them x_mm,y_mm,z_mm,qw,qx,qy,qz"),
+    )
+    for signs, fact, remedy in hints:
+        if signs <= names:
+            raise FileFormatError(fact, where=table.where, remedy=remedy)
+
+
+def _joint_names(table: CsvTable) -> tuple[str, ...]:
+    """Columns ``j1_rad`` to ``jN_rad`` if there are any and none is missing between."""
+    numbers = [int(found[1]) for name in table.columns if (found := JOINT.fullmatch(name))]
+    if not numbers:
+        return ()
+    names = tuple(f"j{k}_rad" for k in range(1, max(numbers) + 1))
+    table.require(names)
+    return names
+
+
+def _from_poses(
+    table: CsvTable, form: PoseForm, rotation: EulerConvention
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    names = (*POSITION, *FORM_COLUMNS[form])
+    numbers = table.floats(names, may_lack=True)
+    is_known = np.asarray(np.isfinite(numbers).all(axis=1))
+    lines = np.flatnonzero(is_known)
+    rotations = np.tile(np.eye(3), (len(table), 1, 1))
+    rotations[lines] = rotations_of_form(
+        numbers[lines, 3:], form, rotation, [table.place(int(k)) for k in lines]
+    )
+    positions = np.where(is_known[:, None], numbers[:, :3], 0.0)
+    return is_known, rotations, positions
+
+
+def _from_joints(
+    table: CsvTable, joints: FloatArray | None, arm: ArmModel | None
+) -> tuple[BoolArray, FloatArray, FloatArray]:
+    if joints is None or arm is None:
+        raise FileFormatError(
+            "joint angles need the arm's geometry",
+            where=table.where,
+            remedy="put its arm.toml into the recording, or record poses",
+        )
+    if joints.shape[1] != arm.n_axes:
+        raise FileFormatError(
+            f"{joints.shape[1]} joints, but the arm '{arm.name}' has {arm.n_axes}",
+            where=table.where,
+            remedy="give the arm that was recorded",
+        )
+    is_known = np.asarray(np.isfinite(joints).all(axis=1))
+    largest = float(np.abs(joints[is_known]).max()) if is_known.any() else 0.0
+    if largest > REFUSE_TURNS_RAD:
+        raise FileFormatError(
+            f"a joint angle of {largest:g} rad is more than two turns: these look like degrees",
+            where=table.where,
+            remedy="multiply the joint angles by pi/180",
+        )
+    rotations = np.tile(np.eye(3), (len(table), 1, 1))
+    positions = np.zeros((len(table), 3))
+    rotations[is_known], positions[is_known] = forward(arm, joints[is_known])
+    return is_known, rotations, positions
+
+
+def _refuse_metres(rotations: FloatArray, positions_mm: FloatArray, where: str) -> None:
+    if are_surely_metres(rotations, positions_mm):
+        raise FileFormatError(
+            "the tool turns and moves but stays within 10 mm of Base's origin: positions look "
+            "like metres",
+            where=where,
+            remedy=METRES_REMEDY,
+        )
+
+
+def _warnings(track: ArmTrack, where: str) -> list[str]:
+    found = []
+    n_gaps = int((~track.is_known).sum())
+    if n_gaps:
+        found.append(f"{where}: {n_gaps} of {len(track)} samples have no pose: gaps, not bridged")
+    if are_within_reach_of_base(track.translations_mm[track.is_known]):
+        found.append(
+            f"{where}: all positions are within 10 mm of Base's origin: are they in metres?"
+        )
+    if track.joints_rad is not None:
+        known = track.joints_rad[track.is_known]
+        if known.size and float(np.nanmax(np.abs(known))) > WARN_TURNS_RAD:
+            found.append(f"{where}: a joint angle exceeds one turn: are they in degrees?")
+    return found

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a scan of a flat plate to the hand-eye."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.devices.scan_source import ScanSource
+from armscan.errors import OptionError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.frames import Base, Tool
+from armscan.geometry.poses import Pose
+from armscan.models.calibration import SensorCalibration
+from armscan.pipeline.exposure_pairs import check_sizes
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.reconstruct import ReconstructOptions, measure_exposure
+from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.sync import SyncOptions, exposure_poses
+from armscan.reconstruction.triangulate import StripePoints, sensor_columns, triangulate_stripe
+from armscan.records.exposure import Exposure
+from armscan.records.session import ExposureRow
+
+STAGE = "stripes on the plate"
+SAME_PLACE_MM = 0.05
+SAME_TURN_RAD = 2e-4
+"""Consecutive exposures without a view whose poses differ by less are one posture."""
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeScanOptions:
+    """How a scan of the plate becomes a hand-eye.
+
+    Parameters
+    ----------
+    hand_eye
+        The calibration itself.
+    measure
+        Stripe extraction and the depths accepted.
+    sync
+        How exposures find their pose.
+    max_exposures
+        Of a longer scan, so many are used, evenly spread.
+    """
+
+    hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
+    measure: ReconstructOptions = field(default_factory=ReconstructOptions)
+    sync: SyncOptions = field(default_factory=SyncOptions)
+    max_exposures: int = 300
+
+    def __post_init__(self) -> None:
+        if self.max_exposures < 3:
+            raise OptionError(
+                f"at most {self.max_exposures} exposures",
+                where="hand-eye options",
+                remedy="allow at least 3",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeRun:
+    """A hand-eye, and what was seen on the way.
+
+    Parameters
+    ----------
+    fit
+        The result.
+    stripes
+        The stripes that it rests on, with their poses.
+    images
+        What each of these exposures gave, in the same order.
+    not_used
+        (source, reason) of exposures that were left out.
+    warnings
+        What is weak about the scan, in words; those of the calibration are in ``fit``.
+    """
+
+    fit: HandEyeFit
+    stripes: tuple[PosedStripe, ...]
+    images: tuple[ReconstructedImage, ...]
+    not_used: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def calibrate_hand_eye_from_scan(
+    source: ScanSource,
+    sensor: SensorCalibration,
+    plate: PlateReference,
+    options: HandEyeScanOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> HandEyeRun | FitFailure:
+    """Measure the stripe of every exposure on the plate and calibrate.
+
+    Exposures of equal view are one posture; without views, consecutive exposures whose poses agree
+    are one, so that a moving scan has a posture an exposure.
+
+    Parameters
+    ----------
+    source
+        The scan, with an arm; exposures with the laser off serve as background of their view.
+    sensor
+        Camera and sheets.
+    plate
+        The plate in Base.
+    options
+        Defaults if None.
+    progress
+        Told of every exposure.
+
+    Raises
+    ------
+    InputError
+        If the scan has no arm, or its images are not of the camera's sensor.
+    EstimationError
+        If no exposure has a pose, or the sheet of a stripe is ambiguous.
+    """
+    options = options or HandEyeScanOptions()
+    poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
+    is_lit = [bool(row.lasers) for row in source.rows]
+    if not any(is_lit):
+        is_lit = [True] * len(source.rows)
+    dark = {row.view: k for k, row in enumerate(source.rows) if not is_lit[k] and row.view}
+    not_used = [
+        (row.source, "the arm gave no pose for it")
+        for k, row in enumerate(source.rows)
+        if is_lit[k] and not poses.has_pose[k]
+    ]
+    rows = np.flatnonzero(np.array(is_lit) & poses.has_pose)
+    chosen = _spread(rows, options.max_exposures)
+    warnings = list(poses.warnings)
+    if len(chosen) < len(rows):
+        warnings.append(f"{len(chosen)} of {len(rows)} exposures were used, evenly spread")
+    postures, merged = _postures(
+        [source.rows[k] for k in chosen], [poses.pose(int(k)) for k in chosen]
+    )
+    warnings += merged
+    stripes: list[PosedStripe] = []
+    images: list[ReconstructedImage] = []
+    for done, (k, posture) in enumerate(zip(chosen, postures, strict=True)):
+        exposure = source.exposure(int(k))
+        progress(ProgressEvent(STAGE, done, len(chosen), exposure.source))
+        partner = dark.get(source.rows[k].view) if source.rows[k].view else None
+        background = None if partner is None else source.exposure(partner)
+        image = _measure(exposure, background, sensor, options)
+        if image.count(PointFate.MEASURED) < options.hand_eye.min_points:
+            not_used.append((exposure.source, "no stripe was measured in it"))
+            continue
+        images.append(image)
+        stripes.append(posed_stripe(image, sensor, posture, poses.pose(int(k))))
+    progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
+    if not_used:
+        named = ", ".join(f"{name} ({reason})" for name, reason in not_used[:4])
+        warnings.append(f"{len(not_used)} exposures were not used: {named}")
+    fit = calibrate_on_plate(stripes, plate, options.hand_eye)
+    if isinstance(fit, FitFailure):
+        return fit
+    return HandEyeRun(fit, tuple(stripes), tuple(images), tuple(not_used), tuple(warnings))
+
+
+def posed_stripe(
+    image: ReconstructedImage,
+    sensor: SensorCalibration,
+    posture: str,
+    base_from_tool: Pose[Base, Tool],
+) -> PosedStripe:
+    """Triangulate the measured points of one exposure and give them their pose.
+
+    Parameters
+    ----------
+    image
+        Stripe points with their sheets.
+    sensor
+        Camera and sheets.
+    posture
+        Name of the arm's posture.
+    base_from_tool
+        As the arm reported it.
+    """
+    sheet = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
+    points = triangulate_stripe(image.profile, sheet, sensor)
+    by_sensor = _by_all_parameters(points, sensor)
+    return PosedStripe(
+        image.profile.source,
+        posture,
+        base_from_tool,
+        points.points_mm,
+        points.noise_mm,
+        points.sheet,
+        by_sensor,
+    )
+
+
+def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> FloatArray:
+    spread = np.zeros((len(points.row), 3, len(sensor.parameter_names)))
+    for k in range(len(sensor.sheets)):
+        own = np.flatnonzero(points.sheet == k)
+        spread[np.ix_(own, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[own]
+    return spread
+
+
+def _measure(
+    exposure: Exposure,
+    background: Exposure | None,
+    sensor: SensorCalibration,
+    options: HandEyeScanOptions,
+) -> ReconstructedImage:
+    check_sizes([exposure], sensor.camera.camera)
+    return measure_exposure((exposure, background), sensor, options.measure)
+
+
+def _spread(rows: IntArray, most: int) -> IntArray:
+    if len(rows) <= most:
+        return rows
+    return rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
+
+
+def _postures(
+    rows: list[ExposureRow], poses: list[Pose[Base, Tool]]
+) -> tuple[list[str], tuple[str, ...]]:
+    """Name the posture of each exposure; say which were put together without being asked."""
+    names: list[str] = []
+    n_merged = 0
+    first = 0
+    for k, row in enumerate(rows):
+        if row.view is not None:
+            names.append(row.view)
+            continue
+        may_join = k > 0 and rows[k - 1].view is None
+        if may_join and _agree(poses[first], poses[k]):
+            names.append(names[-1])
+            n_merged += 1
+            continue
+        first = k
+        names.append(f"exposure {row.index}")
+    if not n_merged:
+        return names, ()
+    return names, (
+        f"{n_merged} exposures were taken where the one before was (within {SAME_PLACE_MM} mm and "
+        f"{np.degrees(SAME_TURN_RAD):.3f} deg) and count as one posture with it",
+    )
+
+
+def _agree(pose: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
+    shift = float(np.linalg.norm(pose.translation_mm - other.translation_mm))
+    turn: Pose[Tool, Tool] = pose.inverse() @ other
+    angle = float(np.linalg.norm(turn.rotation_vector_rad))
+    return shift < SAME_PLACE_MM and angle < SAME_TURN_RAD

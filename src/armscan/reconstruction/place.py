@@ -225,7 +225,9 @@ def arm_covariance(
 
 def _propagated(jacobian: FloatArray, factor: FloatArray) -> FloatArray:
     """(N, 3, 3) J F F' J' of (N, 3, P) derivatives."""
-    moved = (jacobian.reshape(-1, jacobian.shape[2]) @ factor).reshape(len(jacobian), 3, -1)
+    n_points, _, n_parameters = jacobian.shape
+    moved = jacobian.reshape(3 * n_points, n_parameters) @ factor
+    moved = moved.reshape(n_points, 3, factor.shape[1])
     return np.asarray(moved @ moved.transpose(0, 2, 1))
 
 

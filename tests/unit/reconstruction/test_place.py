@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Placing in Base: differences of every parameter, repeats with all errors, limits of space."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import placing_rig as rig
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Points, Pose
+from armscan.geometry.rotation import rotation_from_vector
+from armscan.models.camera import CameraModel
+from armscan.models.scanner import ArmNoise
+from armscan.reconstruction.place import (
+    arm_covariance,
+    place_delivered_points,
+    place_stripe,
+    place_with_jacobian,
+    prepare_placing,
+    scan_point_mm,
+)
+from armscan.reconstruction.triangulate import meet_sheets, triangulate_stripe
+from armscan.reconstruction.volume import BaseBox, parse_volume
+from sheet_rig import thesis_rig
+
+PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
+SHEET_OF = np.array([0, 1, 1])
+
+
+def test_points_go_through_hand_eye_then_arm() -> None:
+    points = np.random.default_rng(0).normal([0.0, 0.0, 140.0], 30.0, (5, 3))
+    placed = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
+    expected = rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(points))
+    np.testing.assert_allclose(placed.points_base_mm, expected.xyz_mm, atol=1e-11)
+
+
+def test_derivatives_by_point_and_hand_eye() -> None:
+    points = np.random.default_rng(1).normal([0.0, 0.0, 140.0], 30.0, (4, 3))
+    placed = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
+
+    def at(step: FloatArray, shift: FloatArray) -> FloatArray:
+        moved = rig.stepped(rig.TOOL_FROM_SENSOR, step)
+        return place_with_jacobian(points + shift, rig.BASE_FROM_TOOL, moved).points_base_mm
+
+    for k in range(6):
+        step = 1e-5 * np.eye(6)[k]
+        difference = (at(step, np.zeros(3)) - at(-step, np.zeros(3))) / 2e-5
+        np.testing.assert_allclose(placed.by_hand_eye[:, :, k], difference, atol=1e-6)
+    for k in range(3):
+        shift = 1e-3 * np.eye(3)[k]
+        difference = (at(np.zeros(6), shift) - at(np.zeros(6), -shift)) / 2e-3
+        np.testing.assert_allclose(
+            np.tile(placed.by_sensor_point[:, k], (4, 1)), difference, atol=1e-9
+        )
+
+
+def covariance_by_differences() -> FloatArray:
+    """(3, 3, 3) from the definition: sensor errors move the points AND, coupled, the hand-eye."""
+    scanner = rig.scanner()
+    assert scanner.sensor is not None
+    camera, pair = thesis_rig().camera, rig.sheets()
+    joint = scanner.sensor.covariance
+    sigma = np.sqrt(np.diag(joint))
+
+    def at(sensor_step: FloatArray, hand_eye_step: FloatArray, shift_px: FloatArray) -> FloatArray:
+        other = CameraModel.from_parameters(camera.parameters + sensor_step[:9], 2048, 1536)
+        moved = (pair[0].updated(sensor_step[9:17]), pair[1].updated(sensor_step[17:]))
+        points, _ = meet_sheets(PLACES_PX + shift_px, SHEET_OF, rig.sensor_of(other, moved))
+        hand_eye = rig.stepped(rig.TOOL_FROM_SENSOR, hand_eye_step + rig.coupling() @ sensor_step)
+        return (rig.BASE_FROM_TOOL @ (hand_eye @ Points(points))).xyz_mm
+
+    none, still, here = np.zeros(25), np.zeros(6), np.zeros(2)
+    by_sensor = np.stack(
+        [(at(s, still, here) - at(-s, still, here)) for s in np.diag(1e-3 * sigma)], axis=2
+    ) / (2e-3 * sigma)
+    by_hand_eye = (
+        np.stack([(at(none, s, here) - at(none, -s, here)) for s in 1e-5 * np.eye(6)], axis=2)
+        / 2e-5
+    )
+    step_px = 1e-3 * np.array([0.6, 0.8])
+    noise = rig.SIGMA_PX * (at(none, still, step_px) - at(none, still, -step_px)) / 2e-3
+    own = by_hand_eye @ scanner.hand_eye.covariance @ by_hand_eye.transpose(0, 2, 1)
+    follow = by_sensor @ joint @ by_sensor.transpose(0, 2, 1)
+    return np.asarray(own + follow + noise[:, :, None] * noise[:, None, :])
+
+
+def test_covariance_term_by_term_on_two_sheets() -> None:
+    """Each point takes the camera, its own sheet and the hand-eye, with the coupling's sign."""
+    placing = prepare_placing(rig.scanner())
+    assert placing.scanner.sensor is not None
+    profile = rig.profile_at(PLACES_PX)
+    stripe = triangulate_stripe(profile, SHEET_OF, placing.scanner.sensor)
+    quiet = replace(
+        placing,
+        scanner=replace(
+            placing.scanner,
+            hand_eye=replace(placing.scanner.hand_eye, arm_noise=ArmNoise(0.0, 0.0)),
+        ),
+    )
+    cloud = place_stripe(stripe, profile, rig.BASE_FROM_TOOL, quiet)
+    # The coupling reaches the other sheet's parameters, which move this point through the
+    # hand-eye alone: they belong to the joint covariance too.
+    expected = covariance_by_differences()
+    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(cloud.covariance_mm2 / size, expected / size, atol=1e-5)
+    loud = place_stripe(stripe, profile, rig.BASE_FROM_TOOL, placing)
+    middle = (
+        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(scan_point_mm(placing.scanner)[None]))
+    ).xyz_mm[0]
+    np.testing.assert_allclose(
+        loud.covariance_mm2 - cloud.covariance_mm2,
+        arm_covariance(cloud.points_mm, middle, rig.ARM_NOISE),
+        atol=1e-12,
+    )
+    assert cloud.frame == "Base"
+    assert cloud.sheet.tolist() == SHEET_OF.tolist()
+
+
+def test_covariance_is_that_of_repeats() -> None:
+    """1500 scanners drawn from their own documents: mean of e' C^-1 e is 3 +- 4 sigma.
+
+    The arm errs about the scan point: drawn as a turn of the tool there and a shift.
+    """
+    scanner = rig.scanner()
+    assert scanner.sensor is not None
+    placing = prepare_placing(scanner)
+    camera, pair = thesis_rig().camera, rig.sheets()
+    place, sheet = PLACES_PX[:1], SHEET_OF[:1]
+    profile = rig.profile_at(place)
+    cloud = place_stripe(
+        triangulate_stripe(profile, sheet, scanner.sensor), profile, rig.BASE_FROM_TOOL, placing
+    )
+    middle = (
+        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(scan_point_mm(scanner)[None]))
+    ).xyz_mm[0]
+    rng = np.random.default_rng(12)
+    position = np.hypot(rig.ARM_NOISE.position_mm, rig.ARM_NOISE.exposure_position_mm)
+    turn = np.hypot(rig.ARM_NOISE.rotation_rad, rig.ARM_NOISE.exposure_rotation_rad)
+    n_repeats, squares = 1500, []
+    draws = rng.multivariate_normal(np.zeros(31), scanner.covariance, n_repeats)
+    for error in draws:
+        other = CameraModel.from_parameters(camera.parameters + error[:9], 2048, 1536)
+        moved = (pair[0].updated(error[9:17]), pair[1].updated(error[17:25]))
+        noisy = place + rng.normal(0.0, rig.SIGMA_PX) * np.array([0.6, 0.8])
+        points, _ = meet_sheets(noisy, sheet, rig.sensor_of(other, moved))
+        spin = rotation_from_vector(rng.normal(0.0, turn, 3))
+        arm = Pose(
+            spin @ rig.BASE_FROM_TOOL.rotation,
+            spin @ (rig.BASE_FROM_TOOL.translation_mm - middle)
+            + middle
+            + rng.normal(0.0, position, 3),
+        )
+        found = arm @ (rig.stepped(rig.TOOL_FROM_SENSOR, error[25:]) @ Points(points))
+        miss = (found.xyz_mm - cloud.points_mm)[0]
+        squares.append(miss @ np.linalg.solve(cloud.covariance_mm2[0], miss))
+    assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / n_repeats)
+
+
+def test_the_arm_errs_least_at_the_scan_point() -> None:
+    """By hand: 100 mm along x, rotation s adds (100 s)^2 across and nothing along."""
+    noise = ArmNoise(0.01, 1e-4, 0.02, 2e-4)
+    at, beside = arm_covariance(np.array([[0.0, 0, 0], [100.0, 0, 0]]), np.zeros(3), noise)
+    np.testing.assert_allclose(at, np.eye(3) * 5e-4)
+    turned = 100.0**2 * 5e-8
+    np.testing.assert_allclose(beside, np.diag([5e-4, 5e-4 + turned, 5e-4 + turned]))
+
+
+def test_points_that_a_sensor_delivered() -> None:
+    """Without camera the hand-eye's covariance is all; the scan point is the points' middle."""
+    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None)
+    placing = prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
+    points = np.array([[0.0, -10.0, 100.0], [0.0, 10.0, 110.0]])
+    noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])
+    placed, covariance = place_delivered_points(points, noise, rig.BASE_FROM_TOOL, placing)
+    by = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
+    expected = by.by_hand_eye @ hand_eye.covariance @ by.by_hand_eye.transpose(0, 2, 1)
+    expected += arm_covariance(placed, placed.mean(axis=0), rig.ARM_NOISE)
+    turned = noise @ by.by_sensor_point.T
+    expected += turned[:, :, None] * turned[:, None, :]
+    np.testing.assert_allclose(covariance, expected, atol=1e-12)
+    with pytest.raises(InputError, match="camera"):
+        place_delivered_points(points, noise, rig.BASE_FROM_TOOL, prepare_placing(rig.scanner()))
+
+
+def test_a_covariance_that_is_none_is_refused() -> None:
+    broken = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
+    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=broken)
+    with pytest.raises(InputError, match="positive semi-definite"):
+        prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
+
+
+def test_volume() -> None:
+    box = parse_volume("0,10,-5,5,2,3")
+    inside = box.holds(np.array([[0.0, -5, 2], [10, 5, 3], [10.1, 0, 2.5], [5, 0, 1.9]]))
+    assert inside.tolist() == [True, True, False, False]
+    assert str(parse_volume(str(box))) == str(box)
+    for wrong in ("0,10,5,-5,2,3", "1,2,3", "a,b,c,d,e,f", "0,nan,0,1,0,1"):
+        with pytest.raises(OptionError):
+            parse_volume(wrong)
+    with pytest.raises(OptionError):
+        BaseBox(np.zeros(3), np.zeros(3))

@@ -10,14 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Board, Sensor
+from armscan.geometry.frames import Base, Sensor
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.records.session import ExposureRow
 from armscan.simulation.flat_pattern import CirclePattern
 from armscan.simulation.head import Head
 from armscan.simulation.scene import Lamp
+from armscan.simulation.sheet_middle import sheet_middle_mm
 from armscan.simulation.station import ExposureSettings, Station, Target
 from armscan.simulation.surfaces import Floor
 from armscan.simulation.thing import Thing
@@ -49,6 +51,27 @@ class Place:
     depth_mm: float
 
 
+@dataclass(frozen=True, slots=True)
+class StripePlace:
+    """Where a target is held so that the stripe crosses it.
+
+    Parameters
+    ----------
+    tilt_x_deg, tilt_y_deg, roll_deg
+        As for `Place`.
+    aside_mm
+        Middle of the target beside the middle of the stripe.
+    depth_mm
+        Depth of the middle of the stripe.
+    """
+
+    tilt_x_deg: float
+    tilt_y_deg: float
+    roll_deg: float
+    aside_mm: float
+    depth_mm: float
+
+
 CAMERA_PLACES: tuple[Place, ...] = (
     Place(0, 0, 2, 0.50, 0.50, 124),
     Place(0, 3, -3, 0.29, 0.35, 140),
@@ -67,15 +90,15 @@ CAMERA_PLACES: tuple[Place, ...] = (
     Place(-20, 12, 90, 0.50, 0.50, 164),
 )
 
-LASER_PLACES: tuple[Place, ...] = (
-    Place(-6, 3, 1, 0.50, 0.34, 118),
-    Place(-20, 8, -4, 0.44, 0.38, 125),
-    Place(4, -10, 5, 0.56, 0.45, 132),
-    Place(-25, -6, 2, 0.40, 0.50, 139),
-    Place(-8, 20, -6, 0.60, 0.54, 146),
-    Place(0, -18, 3, 0.42, 0.58, 152),
-    Place(-18, 4, 8, 0.58, 0.62, 159),
-    Place(-4, -4, -3, 0.50, 0.66, 166),
+LASER_PLACES: tuple[StripePlace, ...] = (
+    StripePlace(-6, 3, 1, 0.0, 117),
+    StripePlace(-22, 10, -4, -4.0, 124),
+    StripePlace(6, -14, 5, 5.0, 131),
+    StripePlace(-26, -8, 2, -6.0, 138),
+    StripePlace(-8, 24, -6, 4.0, 145),
+    StripePlace(2, -22, -4, -6.0, 152),
+    StripePlace(-20, 5, 3, 6.0, 159),
+    StripePlace(-4, -4, -3, 0.0, 168),
 )
 
 _LAMP = Lamp(even=0.7, direct=0.35, position_mm=(120.0, -260.0, -250.0), up=(0.0, 0.0, -1.0))
@@ -87,6 +110,7 @@ _WITH_LASER = 0.15
 _JITTER_DEG = 2.0
 _JITTER_SHARE = 0.008
 _RIM_PX = 12.0
+_SLIDES = 51
 _INTERVAL_NS = 2_000_000_000
 
 
@@ -108,7 +132,7 @@ def laser_shots(head: Head, rng: np.random.Generator) -> tuple[Shot, ...]:
     unlit = ExposureSettings(head.full_window, room_light=light)
     shots = []
     for k, place in enumerate(LASER_PLACES):
-        target = _held(head, place, rng)
+        target = _held_in_sheet(head, place, rng)
         for j, (state, settings) in enumerate((("on", lit), ("off", unlit))):
             row = ExposureRow(
                 2 * k + j,
@@ -130,23 +154,53 @@ def _shot(row: ExposureRow, target: Target, settings: ExposureSettings) -> Shot:
 def _held(head: Head, place: Place, rng: np.random.Generator) -> Target:
     """Target near a place, moved away until all of it is in view."""
     jitter = rng.uniform(-1.0, 1.0, 6)
-    degrees = np.array([place.tilt_x_deg, place.tilt_y_deg, place.roll_deg])
-    about_x, about_y, roll = (
-        rotation_from_vector(np.radians(angle) * axis)
-        for angle, axis in zip(degrees + _JITTER_DEG * jitter[:3], np.eye(3), strict=True)
-    )
-    rotation = about_y @ about_x @ roll
+    rotation = _rotation(place, jitter[:3])
     size = np.array([head.camera.width_px, head.camera.height_px])
     share = np.array([place.across, place.down]) + _JITTER_SHARE * jitter[3:5]
     ray = np.array([*head.camera.rays(share * size), 1.0])
     depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[5])
-    middle = np.append(PATTERN.marks_board_mm.mean(axis=0)[:2], 0.0)
     while True:
-        pose: Pose[Base, Board] = Pose(rotation, depth * ray - rotation @ middle)
-        rim = head.camera.project(_corners_mm() @ rotation.T + pose.translation_mm)
-        if bool(((rim > _RIM_PX) & (rim < size - _RIM_PX)).all()):
-            return Target(PATTERN, pose)
+        target = _with_middle(rotation, depth * ray)
+        if _is_in_view(head, target):
+            return target
         depth *= 1.01
+
+
+def _held_in_sheet(head: Head, place: StripePlace, rng: np.random.Generator) -> Target:
+    """Target whose plane the stripe meets at a depth, slid within it until all is in view."""
+    jitter = rng.uniform(-1.0, 1.0, 5)
+    rotation = _rotation(place, jitter[:3])
+    depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[3])
+    on_stripe = sheet_middle_mm(head, depth) + np.array([place.aside_mm + jitter[4], 0, 0])
+    normal = rotation[:, 2]
+    on_axis = np.array([0.0, 0.0, normal @ on_stripe / normal[2]])
+    for share in np.linspace(0.0, 1.0, _SLIDES):
+        target = _with_middle(rotation, on_stripe + share * (on_axis - on_stripe))
+        if _is_in_view(head, target):
+            return target
+    raise InputError(f"the target at {depth:.0f} mm is larger than the camera's view")
+
+
+def _rotation(place: Place | StripePlace, jitter: FloatArray) -> FloatArray:
+    degrees = np.array([place.tilt_x_deg, place.tilt_y_deg, place.roll_deg])
+    about_x, about_y, roll = (
+        rotation_from_vector(np.radians(angle) * axis)
+        for angle, axis in zip(degrees + _JITTER_DEG * jitter, np.eye(3), strict=True)
+    )
+    return np.asarray(about_y @ about_x @ roll)
+
+
+def _with_middle(rotation: FloatArray, middle_mm: FloatArray) -> Target:
+    """Target whose middle is at a point (3,)."""
+    middle = np.append(PATTERN.marks_board_mm.mean(axis=0)[:2], 0.0)
+    return Target(PATTERN, Pose(rotation, middle_mm - rotation @ middle))
+
+
+def _is_in_view(head: Head, target: Target) -> bool:
+    pose = target.base_from_board
+    rim = head.camera.project(_corners_mm() @ pose.rotation.T + pose.translation_mm)
+    size = np.array([head.camera.width_px, head.camera.height_px])
+    return bool(((rim > _RIM_PX) & (rim < size - _RIM_PX)).all())
 
 
 def _corners_mm() -> FloatArray:

@@ -27,7 +27,7 @@ from armscan.reconstruction.triangulate import StripePoints, sensor_columns, tri
 from armscan.records.exposure import Exposure
 from armscan.records.session import ExposureRow
 
-STAGE = "stripes on the plate"
+STAGE = "stripes of the postures"
 SAME_PLACE_MM = 0.05
 SAME_TURN_RAD = 2e-4
 """Consecutive exposures without a view whose poses differ by less are one posture."""
@@ -88,6 +88,22 @@ class HandEyeRun:
     warnings: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedStripes:
+    """What a hand-eye calibration needs of a scan, and what was seen on the way.
+
+    Parameters
+    ----------
+    stripes, images, not_used, warnings
+        As of `HandEyeRun`.
+    """
+
+    stripes: tuple[PosedStripe, ...]
+    images: tuple[ReconstructedImage, ...]
+    not_used: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+
+
 def calibrate_hand_eye_from_scan(
     source: ScanSource,
     sensor: SensorCalibration,
@@ -122,6 +138,24 @@ def calibrate_hand_eye_from_scan(
         If no exposure has a pose, or the sheet of a stripe is ambiguous.
     """
     options = options or HandEyeScanOptions()
+    seen = observe_stripes(source, sensor, options, progress=progress)
+    fit = calibrate_on_plate(seen.stripes, plate, options.hand_eye)
+    if isinstance(fit, FitFailure):
+        return fit
+    return HandEyeRun(fit, seen.stripes, seen.images, seen.not_used, seen.warnings)
+
+
+def observe_stripes(
+    source: ScanSource,
+    sensor: SensorCalibration,
+    options: HandEyeScanOptions,
+    *,
+    progress: Progress = silent,
+) -> ObservedStripes:
+    """Measure the stripe of every exposure that has a pose; the rest as `calibrate_hand_eye_from_scan`.
+
+    Whatever reference the stripes lie on: a plate or a sphere.
+    """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
     is_lit = [bool(row.lasers) for row in source.rows]
     if not any(is_lit):
@@ -158,10 +192,7 @@ def calibrate_hand_eye_from_scan(
     if not_used:
         named = ", ".join(f"{name} ({reason})" for name, reason in not_used[:4])
         warnings.append(f"{len(not_used)} exposures were not used: {named}")
-    fit = calibrate_on_plate(stripes, plate, options.hand_eye)
-    if isinstance(fit, FitFailure):
-        return fit
-    return HandEyeRun(fit, tuple(stripes), tuple(images), tuple(not_used), tuple(warnings))
+    return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), tuple(warnings))
 
 
 def posed_stripe(

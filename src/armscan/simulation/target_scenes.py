@@ -96,7 +96,7 @@ LASER_PLACES: tuple[StripePlace, ...] = (
     StripePlace(6, -14, 5, 5.0, 131),
     StripePlace(-26, -8, 2, -6.0, 138),
     StripePlace(-8, 24, -6, 4.0, 145),
-    StripePlace(2, -22, -4, -6.0, 152),
+    StripePlace(2, -22, 7, -6.0, 152),
     StripePlace(-20, 5, 3, 6.0, 159),
     StripePlace(-4, -4, -3, 0.0, 168),
 )

@@ -152,7 +152,7 @@ def observe_stripes(
     *,
     progress: Progress = silent,
 ) -> ObservedStripes:
-    """Measure the stripe of every exposure that has a pose; the rest as `calibrate_hand_eye_from_scan`.
+    """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
 
     Whatever reference the stripes lie on: a plate or a sphere.
     """

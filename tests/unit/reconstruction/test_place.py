@@ -121,7 +121,7 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
 
 
 def test_covariance_is_that_of_repeats() -> None:
-    """1500 scanners drawn from their own documents: mean of e' C^-1 e is 3 +- 4 sigma.
+    """600 scanners drawn from their own documents: mean of e' C^-1 e is 3 +- 4 sigma.
 
     The arm errs about the scan point: drawn as a turn of the tool there and a shift.
     """
@@ -140,7 +140,7 @@ def test_covariance_is_that_of_repeats() -> None:
     rng = np.random.default_rng(12)
     position = np.hypot(rig.ARM_NOISE.position_mm, rig.ARM_NOISE.exposure_position_mm)
     turn = np.hypot(rig.ARM_NOISE.rotation_rad, rig.ARM_NOISE.exposure_rotation_rad)
-    n_repeats, squares = 1500, []
+    n_repeats, squares = 600, []
     draws = rng.multivariate_normal(np.zeros(31), scanner.covariance, n_repeats)
     for error in draws:
         other = CameraModel.from_parameters(camera.parameters + error[:9], 2048, 1536)

@@ -20,10 +20,14 @@ from armscan.cli import (
     inspect_sphere,
     inspect_step,
     reconstruct,
+    simulate,
 )
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-HELP_ORDER = ("demo", "calibrate", "reconstruct", "inspect", "convert", "info", "doctor")
+HELP_ORDER = (
+    *("demo", "simulate", "calibrate", "reconstruct", "inspect"),
+    *("convert", "info", "doctor"),
+)
 """The chain, then what looks at files; left to itself the library lists groups last."""
 
 app = typer.Typer(
@@ -66,6 +70,7 @@ inspect.command("step", epilog=inspect_step.EXAMPLE)(inspect_step.step)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect, name="inspect")
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
+app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
 app.command("info", epilog=info.EXAMPLE)(info.info)

@@ -125,8 +125,8 @@ def arm_columns(
     if track.joints_rad is not None:
         names = tuple(f"j{k}_rad" for k in range(1, track.joints_rad.shape[1] + 1))
         columns |= _texts(names, track.joints_rad)
-    if track.trigger_ids is not None:
-        ids = track.trigger_ids
+    ids = track.trigger_ids
+    if ids is not None and (ids != NO_TRIGGER).any():
         columns["trigger_id"] = tuple("" if k == NO_TRIGGER else str(k) for k in ids)
     return {**columns, **extra}
 

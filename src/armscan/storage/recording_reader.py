@@ -100,11 +100,9 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
     table = read_csv(folder / EXPOSURES_FILE)
     rows, unknown = exposure_rows(table)
     check_files(folder, rows)
-    path = folder / SESSION_FILE
-    said = read_session_file(path) if path.exists() else SessionFile(Session(cameras=()))
+    said, assumed = _said(folder)
     warnings = [*said.warnings, *_odd(table, unknown)]
     warnings += [f"{table.where}: {name} is listed again" for name in repeated_files(rows)]
-    assumed = [] if path.exists() else [f"there is no {SESSION_FILE}"]
     track, form, arm_model, arm_unknown = None, said.session.pose_form, None, {}
     if (folder / ARM_FILE).exists():
         arm_csv = read_csv(folder / ARM_FILE)
@@ -117,7 +115,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
     cameras, facts = _cameras(folder, rows, said)
     session = replace(said.session, cameras=cameras, pose_form=form, assumed=(*assumed, *facts))
     if session.head is not None and not (folder / session.head).is_file():
-        warnings.append(f"{path}: there is no file {session.head}")
+        warnings.append(f"{folder / SESSION_FILE}: there is no file {session.head}")
     return FolderRecording(
         folder,
         session,
@@ -129,6 +127,43 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
         arm_unknown,
         arm_model,
     )
+
+
+def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
+    """Read what the arm reported, from a folder with or without images.
+
+    Parameters
+    ----------
+    folder
+        Holds ``arm.csv``, and as a rule ``session.toml``.
+    arm
+        Turns joint angles into poses; ``arm.toml`` of the folder if None.
+
+    Returns
+    -------
+    track
+        The samples.
+    notes
+        What is odd in the files or was assumed, in words.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is missing, damaged or against a rule of the format.
+    """
+    said, notes = _said(folder)
+    table = read_csv(folder / ARM_FILE)
+    found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))
+    notes += [*said.warnings, *_odd(table, found.extra), *found.warnings]
+    return found.track, (*notes, *_assumed_of_arm(found, said))
+
+
+def _said(folder: Path) -> tuple[SessionFile, list[str]]:
+    """The session, and that there is none if there is none."""
+    path = folder / SESSION_FILE
+    if path.exists():
+        return read_session_file(path), []
+    return SessionFile(Session(cameras=())), [f"there is no {SESSION_FILE}"]
 
 
 def _check_folder(folder: Path) -> None:

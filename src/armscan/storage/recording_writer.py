@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
-from uuid import uuid4
 
 from armscan.devices.scan_source import ScanSource
-from armscan.errors import InputError, OutputError
+from armscan.errors import InputError
 from armscan.models.arm import ArmModel
 from armscan.records.session import CameraSetup, ExposureRow, PixelColour, Session
 from armscan.storage.arm_files import ARM_MODEL_FILE, arm_model_toml
+from armscan.storage.atomic_folder import new_folder
 from armscan.storage.csv_table import csv_bytes
 from armscan.storage.images import read_bytes
 from armscan.storage.recording_arm import ARM_FILE, arm_columns
@@ -69,13 +67,10 @@ def write_recording(
     InputError
         If an exposure is not what its session says.
     """
-    check_new_folder(folder)
     session = written_session(source)
     rows = _named(source, names)
     contents = _contents(source, session) if encoded is None else encoded
-    partial = folder.resolve().with_name(f".{folder.resolve().name}.{uuid4().hex}.part")
-    try:
-        partial.mkdir()
+    with new_folder(folder) as partial:
         for done, (row, content) in enumerate(zip(rows, contents, strict=True), start=1):
             path = partial / row.source
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -83,38 +78,6 @@ def write_recording(
             if progress is not None:
                 progress(done, len(rows), row.source)
         _write_tables(partial, source, session, rows, arm)
-        if folder.exists():
-            folder.rmdir()
-        partial.rename(folder.resolve())
-    except OSError as error:
-        raise OutputError(
-            f"nothing was written ({error.strerror or error})",
-            where=str(folder),
-            remedy="free some space or choose another folder",
-        ) from error
-    finally:
-        with suppress(OSError):
-            shutil.rmtree(partial, ignore_errors=True)
-
-
-def check_new_folder(folder: Path) -> None:
-    """Raise before long work if a recording could not be written.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds something, or the one above does not exist.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise OutputError(
-            "this exists and is not empty", where=str(folder), remedy="name a new folder"
-        )
-    if not folder.resolve().parent.is_dir():
-        raise OutputError(
-            "there is no such folder to write to",
-            where=str(folder.resolve().parent),
-            remedy="create it first",
-        )
 
 
 def written_session(source: ScanSource) -> Session:

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan simulate``: a recording of the digital twin, its truth in a file beside it."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.output import AsJson, progress_bar, show
+
+EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan simulate thesis-single camera -o board\n"
+    "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3"
+)
+
+
+class Scene(StrEnum):
+    """What the head looks at."""
+
+    CAMERA = "camera"
+    LASER = "laser"
+    HAND_EYE = "hand-eye"
+    PLATE = "plate"
+    BALL = "ball"
+    STEPS = "steps"
+    STILL_STEP = "still-step"
+    PART = "part"
+    PROBING = "probing"
+
+
+class PresetName(StrEnum):
+    """How good the instrument is."""
+
+    CLEAN = "clean"
+    THESIS = "thesis"
+    HARSH = "harsh"
+
+
+def simulate(
+    head: Annotated[str, typer.Argument(help="The head: thesis-single.", show_default=False)],
+    scene: Annotated[Scene, typer.Argument(help="What it looks at.", show_default=False)],
+    *,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Folder of the recording; new or empty.", show_default=False
+        ),
+    ],
+    preset: Annotated[
+        PresetName, typer.Option(help="How good the instrument, how kind the surroundings.")
+    ] = PresetName.THESIS,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+    processes: Annotated[
+        int, typer.Option(min=1, max=64, help="Processes that render; few images take one.")
+    ] = 2,
+    as_json: AsJson = False,
+) -> None:
+    """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
+
+    Scenes: camera and laser are images of a target for the head's calibration; hand-eye is the
+    plate from many postures; plate, ball, steps and part are scans by hand; still-step is one
+    exposure; probing is the plate touched with a tip.
+    """
+    from armscan.pipeline.simulate import SimulateOptions
+    from armscan.report.simulate_job import SimulateRequest, run_simulation
+
+    options = SimulateOptions(preset.value, seed, processes)
+    with progress_bar() as progress:
+        summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
+    show(summary, as_json=as_json)

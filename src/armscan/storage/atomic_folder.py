@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders that appear complete or not at all."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+from armscan.errors import OutputError
+
+
+def check_new_folder(folder: Path) -> None:
+    """Raise before long work if a folder could not be written afterwards.
+
+    Raises
+    ------
+    OutputError
+        If it holds something, or the one above does not exist.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError(
+            "this exists and is not empty", where=str(folder), remedy="name a new folder"
+        )
+    parent = folder.resolve().parent
+    if not parent.is_dir():
+        raise OutputError(
+            "there is no such folder to write to", where=str(parent), remedy="create it first"
+        )
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Give a folder of another name to write into; it gets its name when the block has ended.
+
+    If the block raises or is interrupted, nothing is left of it.
+
+    Parameters
+    ----------
+    folder
+        Must not exist, or be empty.
+
+    Raises
+    ------
+    OutputError
+        As `check_new_folder`, or if the disk is full or refuses.
+    """
+    check_new_folder(folder)
+    target = folder.resolve()
+    partial = target.with_name(f".{target.name}.{uuid4().hex}.part")
+    try:
+        partial.mkdir()
+        yield partial
+        if target.exists():
+            target.rmdir()
+        partial.rename(target)
+    except OSError as error:
+        raise OutputError(
+            f"nothing was written ({error.strerror or error})",
+            where=str(folder),
+            remedy="free some space or choose another folder",
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

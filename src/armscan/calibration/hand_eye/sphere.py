@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye from a sphere in one least squares, from whatever postures there are.
+
+Eq. 2.46 places every stripe point in Base; its distance from the sphere's surface is the residual.
+Hand-eye and centre are unknown. Neither the section circle nor postures that only shift are
+needed, and no side of the sheet has to be told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from armscan.calibration.hand_eye.conditioning import (
+    LEAST_POSTURES,
+    Conditioning,
+    conditioning_warnings,
+    describe_conditioning,
+    refuse_few_postures,
+    refuse_open_hand_eye,
+)
+from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.sphere_evidence import sphere_fit
+from armscan.calibration.hand_eye.sphere_options import (
+    DEFAULT_OPTIONS,
+    SphereOptions,
+    check_diameter,
+)
+from armscan.calibration.hand_eye.sphere_refine import (
+    SphereSolution,
+    descend,
+    free_columns,
+    refine_with_noise,
+    with_weights,
+)
+from armscan.calibration.hand_eye.sphere_residuals import (
+    RADIUS_COLUMN,
+    SphereNodes,
+    SphereState,
+    place_on_sphere,
+    sphere_nodes,
+)
+from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.calibration.hand_eye.sphere_start import start_candidates
+from armscan.errors import InputError
+from armscan.geometry.estimate import FitFailure
+
+START_NODES = 6
+START_POINTS = 48
+"""Of each stripe, for the search; the refinement takes all."""
+NAMED_STRIPES = 3
+LOOSE_PART = 0.2
+"""A combination known less well than this part of the diameter is not determined."""
+ROBUST_ROUNDS = 5
+POSTURES_REMEDY = (
+    "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
+    "at another height"
+)
+
+
+def calibrate_on_sphere(
+    stripes: Sequence[PosedStripe], diameter_mm: float, options: SphereOptions = DEFAULT_OPTIONS
+) -> HandEyeFit | FitFailure:
+    """Find the hand-eye from stripes on a sphere that does not move.
+
+    Parameters
+    ----------
+    stripes
+        Exposures with the arm's pose; points off the sphere are rejected.
+    diameter_mm
+        Of the sphere.
+    options
+        Rejection, noise, and what is solved along.
+
+    Returns
+    -------
+    HandEyeFit
+        With method "sphere"; covariance from the scatter of the arm's pose (common to a posture)
+        and of the sensor, both estimated from the residuals unless given.
+
+    Raises
+    ------
+    InputError
+        If one posture's name stands for different poses.
+    OptionError
+        If the diameter is none.
+    """
+    check_diameter(diameter_mm)
+    _check_postures(stripes)
+    radius = 0.5 * diameter_mm
+    sections, left_out = find_sections(stripes, radius, options)
+    n_postures = len({section.stripe.posture for section in sections})
+    refused = _refuse_sections(len(sections), left_out, diameter_mm)
+    if refused is None:
+        refused = refuse_few_postures(n_postures)
+    if refused is not None:
+        return refused
+    thinned = tuple(section.thinned(START_POINTS) for section in sections)
+    start = _search(sphere_nodes(thinned, START_NODES), radius, options)
+    if isinstance(start, FitFailure):
+        return start
+    nodes = sphere_nodes(sections, options.nodes_per_stripe)
+    solution = _refine(nodes, start, options)
+    if solution is None:
+        return FitFailure(
+            "the postures do not determine hand-eye and sphere together", POSTURES_REMEDY
+        )
+    information = np.asarray(np.linalg.inv(solution.linear.covariance[:6, :6]))
+    conditioning = describe_conditioning(information)
+    refused = _refuse_postures(conditioning, diameter_mm)
+    if refused is not None:
+        return refused
+    warnings = (*left_out, *conditioning_warnings(conditioning, n_postures, ""))
+    given = replace(start, radius_mm=radius)
+    return sphere_fit(nodes, solution, conditioning, given, warnings)
+
+
+def _refuse_sections(
+    n_sections: int, left_out: tuple[str, ...], diameter_mm: float
+) -> FitFailure | None:
+    """Refuse where most stripes do not show the sphere."""
+    if len(left_out) <= n_sections:
+        return None
+    return FitFailure(
+        f"{len(left_out)} stripes show no section of a sphere of {diameter_mm:g} mm diameter, "
+        f"{n_sections} do: {'; '.join(left_out[:NAMED_STRIPES])}",
+        "check the sphere's diameter, and that the stripes lie on the sphere",
+    )
+
+
+def _refuse_postures(conditioning: Conditioning, diameter_mm: float) -> FitFailure | None:
+    """Refuse postures that leave a combination of the unknowns open or nearly so."""
+    cause = ": the tool hardly turns, or about one axis only"
+    refused = refuse_open_hand_eye(conditioning, cause, POSTURES_REMEDY)
+    if refused is None and conditioning.singular_values[-1] * LOOSE_PART * diameter_mm < 1.0:
+        return FitFailure(
+            f"the postures hardly determine the hand-eye{cause} (least known: "
+            f"{conditioning.weakest})",
+            POSTURES_REMEDY,
+        )
+    return refused
+
+
+def _check_postures(stripes: Sequence[PosedStripe]) -> None:
+    seen: dict[str, PosedStripe] = {}
+    for stripe in stripes:
+        first = seen.setdefault(stripe.posture, stripe)
+        turned = np.abs(first.base_from_tool.rotation - stripe.base_from_tool.rotation).max()
+        moved = first.base_from_tool.translation_mm - stripe.base_from_tool.translation_mm
+        if turned > 0.01 or np.abs(moved).max() > 1.0:
+            raise InputError(
+                f"posture '{stripe.posture}' has different poses in {first.source} and "
+                f"{stripe.source}",
+                remedy="give every posture of the arm a name of its own",
+            )
+
+
+def _search(
+    nodes: SphereNodes, radius_mm: float, options: SphereOptions
+) -> SphereState | FitFailure:
+    """Best of several minima of the plain sum of squares, refused where the data contradict."""
+    free = free_columns(options)
+    plain = np.eye(len(nodes))
+    ends = []
+    for start in start_candidates(nodes, radius_mm):
+        state, cost, _ = descend(nodes, start, plain, np.arange(RADIUS_COLUMN))
+        ends.append((cost, state))
+    ends.sort(key=lambda pair: pair[0])
+    state, _, _ = descend(nodes, ends[0][1], plain, free)
+    typical = float(np.median(np.abs(place_on_sphere(nodes, state).residual_mm)))
+    if typical > options.max_rms_mm:
+        return FitFailure(
+            f"no hand-eye puts the points on one sphere of {2.0 * radius_mm:g} mm diameter: they "
+            f"stay {typical:.2f} mm away (median)",
+            "check the convention of the arm's angles, the order of poses and profiles, the "
+            "sphere's diameter, and that the sphere did not move",
+        )
+    return state
+
+
+def _refine(
+    nodes: SphereNodes, start: SphereState, options: SphereOptions
+) -> SphereSolution | None:
+    """Refine; postures whose pose errs far more than the others' lose weight."""
+    weights = np.ones(len(nodes.postures))
+    solution = refine_with_noise(nodes, start, options, weights)
+    for _ in range(ROBUST_ROUNDS):
+        if solution is None or len(nodes.postures) <= LEAST_POSTURES:
+            return solution
+        updated = with_weights(nodes, solution, options.posture_sigma)
+        if float(np.abs(updated - weights).max()) < 0.02:
+            break
+        weights = updated
+        solution = refine_with_noise(nodes, solution.state, options, weights)
+    return solution

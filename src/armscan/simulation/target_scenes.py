@@ -96,9 +96,9 @@ LASER_PLACES: tuple[StripePlace, ...] = (
     StripePlace(6, -14, 5, 5.0, 131),
     StripePlace(-26, -8, 2, -6.0, 138),
     StripePlace(-8, 24, -6, 4.0, 145),
-    StripePlace(2, -22, 7, -6.0, 152),
-    StripePlace(-20, 5, 3, 6.0, 159),
-    StripePlace(-4, -4, -3, 0.0, 168),
+    StripePlace(2, -22, 7, -6.0, 150),
+    StripePlace(-20, 5, 3, 6.0, 157),
+    StripePlace(18, 2, 0, 0.0, 163),
 )
 
 _LAMP = Lamp(even=0.7, direct=0.35, position_mm=(120.0, -260.0, -250.0), up=(0.0, 0.0, -1.0))

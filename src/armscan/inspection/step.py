@@ -129,7 +129,7 @@ def inspect_step(
     chosen = _fitted(search, faces)
     if isinstance(chosen, FitFailure):
         return chosen
-    return _measured(search, chosen, *_lean(section, normal))
+    return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
 
 
 def _section(selection: Selection) -> _Section | FitFailure:
@@ -158,7 +158,8 @@ def _stripes(search: _Search) -> IntArray | None:
 def _upwards(selection: Selection) -> FloatArray:
     """Direction in which the upper face is called upper: to the side that was scanned."""
     cloud, rows = selection.cloud, selection.rows
-    if cloud.normals is not None:
+    # normals are zero where none could be estimated, as on a single stripe
+    if cloud.normals is not None and cloud.normals[rows].any():
         return np.asarray(cloud.normals[rows].mean(axis=0))
     if cloud.frame == "Sensor":
         return np.asarray(-cloud.points_mm[rows].mean(axis=0))
@@ -195,7 +196,7 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
     return _Chosen(faces, masks[0], masks[1], used)
 
 
-def _lean(section: _Section, normal: FloatArray | None) -> tuple[float, str]:
+def _lean(section: _Section, upwards: FloatArray, normal: FloatArray | None) -> tuple[float, str]:
     """Angle in rad of the faces' normal out of the light sheet, and where it came from."""
     if section.sheet_normal is None:
         return 0.0, "the faces' common normal, fitted to their points"
@@ -208,7 +209,8 @@ def _lean(section: _Section, normal: FloatArray | None) -> tuple[float, str]:
     size = float(np.linalg.norm(normal))
     if not size > 0.0:
         raise InputError("the normal of the step's faces is zero")
-    sine = float(normal @ section.sheet_normal) / size
+    sign = 1.0 if float(normal @ upwards) >= 0.0 else -1.0
+    sine = sign * float(normal @ section.sheet_normal) / size
     lean = math.asin(max(-1.0, min(1.0, sine)))
     return lean, (
         f"one exposure: the light sheet leans by {math.degrees(abs(lean)):.3f} degrees against "

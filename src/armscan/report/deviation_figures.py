@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
@@ -21,7 +21,8 @@ from armscan.report.scene import SceneDots, scene_markup
 MAX_SHOWN = 20_000
 BAND_MM = 0.05
 LEAST_HALF_WIDTH_MM = 0.01
-DIVERGING = "RdYlBu_r"
+RAMP = LinearSegmentedColormap.from_list("deviation", ("#1d4fa5", "#a9b4bd", "#c2331c"))
+"""Blue below, grey at zero, red above: a white middle would vanish on the page."""
 
 
 def deviation_histogram(
@@ -121,11 +122,16 @@ def deviation_view(
     dots = SceneDots(points_mm[::step], _diverging(shown, limit))
     every = f" Every {step}th point is shown." if step > 1 else ""
     return Picture(
-        _diverging_ramp(limit) + scene_markup([dots], [], [], title),
+        _diverging_ramp(limit) + scene_markup([dots], [], [], title, is_z_up=frame != "Sensor"),
         title=f"{title} ({frame} frame)",
         caption=f"Colour is the deviation from {reference}; points beyond the ramp have its end's "
         f"colour. Drag to turn; click, then scroll to zoom.{every}",
     )
+
+
+def share_text(percent: float) -> str:
+    """A share with two decimals that never reads 100 if something is outside."""
+    return "above 99.99 %" if 99.995 <= percent < 100.0 else f"{percent:.2f} %"
 
 
 def _bars(axes: Axes, edges_mm: FloatArray, counts: NDArray[np.int64]) -> None:
@@ -152,14 +158,11 @@ def _caption(deviations: Deviations, before: str, beyond: int, half_width_mm: fl
 
 def _diverging(values: FloatArray, limit: float) -> NDArray[np.uint8]:
     share = np.clip(0.5 + 0.5 * values / limit, 0.0, 1.0)
-    return np.asarray(colormaps[DIVERGING](share, bytes=True), dtype=np.uint8)[:, :3]
+    return np.asarray(RAMP(share, bytes=True), dtype=np.uint8)[:, :3]
 
 
 def _diverging_ramp(limit: float) -> str:
-    stops = [
-        "#{:02x}{:02x}{:02x}".format(*colormaps[DIVERGING](k / 10, bytes=True)[:3])
-        for k in range(11)
-    ]
+    stops = ["#{:02x}{:02x}{:02x}".format(*RAMP(k / 10, bytes=True)[:3]) for k in range(11)]
     text = significant(limit, "mm", 2)
     return (
         f'<p class="ramp">−{text}<span style="background: linear-gradient(to right, '

@@ -9,6 +9,7 @@ from typing import Any
 
 from armscan.inspection.results import Deviations, PointCounts
 from armscan.models.calibration import Provenance
+from armscan.report.deviation_figures import share_text
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
@@ -157,6 +158,5 @@ def counts_data(counts: PointCounts) -> dict[str, Any]:
 def _value(deviations: Deviations, k: int) -> str:
     item = deviations.statistics[k]
     if item.unit == "%":
-        # 99.999 must not read as if nothing were outside
-        return "above 99.99 %" if 99.995 <= item.value < 100.0 else f"{item.value:.2f} %"
+        return share_text(item.value)
     return significant(item.value, item.unit)

@@ -24,6 +24,7 @@ from armscan.report.deviation_figures import (
     deviation_histogram,
     deviation_view,
     height_histogram,
+    share_text,
 )
 from armscan.report.inspect_page import InspectionReport, counts_data, deviations_data
 from armscan.report.numbers import significant, with_sigma
@@ -278,7 +279,7 @@ def _sigma_facts(length: MeasuredLength, name: str) -> tuple[tuple[str, str], ..
 def _share_card(deviations: Deviations) -> Card:
     share = deviations.value(within_key(BAND_MM))
     return Card(
-        f"Within ±{BAND_MM:g} mm", f"{share:.2f} %", f"of the {deviations.reference} reference"
+        f"Within ±{BAND_MM:g} mm", share_text(share), f"of the {deviations.reference} surface"
     )
 
 

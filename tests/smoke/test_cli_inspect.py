@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan inspect``: numbers, pages, clouds of other programs, failures in one sentence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.cli import main
+from armscan.storage.clouds import ply_bytes, xyz_bytes
+from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
+
+Fails = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("clouds")
+    exposure = np.repeat(np.arange(20), 40)
+    outward = ball_stripes(20, 40)
+    rng = np.random.default_rng(1)
+    points = outward * (RADIUS_MM + 0.01 + rng.normal(0.0, 0.005, (800, 1)))
+    ball = cloud_of(points + np.array([300.0, 20.0, 90.0]), exposure)
+    (folder / "ball.ply").write_bytes(ply_bytes(ball))
+    (folder / "ball.xyz").write_bytes(xyz_bytes(ball))
+    points, exposure = block_stripes(20.0, n_points=200)
+    (folder / "block.ply").write_bytes(ply_bytes(cloud_of(points, exposure)))
+    return folder
+
+
+def report(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, object]:
+    assert main(["inspect", *(str(word) for word in words), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_a_ball_with_its_page(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "ball.html"
+    found = report(capsys, "sphere", clouds / "ball.ply", "--diameter", 34.96, "-o", page)
+    assert found["diameter_error_mm"] == pytest.approx(0.02, abs=0.003)
+    assert found["written"] == [page.as_posix()]
+    text = page.read_text(encoding="utf-8")
+    assert "nominal reference" in text
+    assert "fitted reference" in text
+    assert "about their mean, divided by n - 1 = 799" in text
+    assert "not an accredited test" in text
+    assert 'class="scene"' in text
+
+
+def test_a_ball_of_another_program_has_no_sigma(
+    clouds: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["inspect", "sphere", str(clouds / "ball.xyz"), "--diameter", "34.96"]) == 0
+    out = capsys.readouterr().out
+    assert "Nominal diameter      34.96 mm" in out
+    assert "±" not in out.split("Nominal diameter")[0]
+    assert "carries no standard deviations" in out
+
+
+def test_a_step_and_a_plane(clouds: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = report(capsys, "step", clouds / "block.ply", "--height", 20, "--margin", 2)
+    assert found["height_error_mm"] == pytest.approx(0.0, abs=1e-9)
+    given = ["plane", clouds / "block.ply", "--plane", "0,0,2,0.04"]
+    found = report(capsys, *given, "--region=-50,50,-50,50,-1,1")
+    nominal, points = found["nominal"], found["points"]
+    assert isinstance(nominal, dict)
+    assert isinstance(points, dict)
+    assert nominal["mean_mm"] == pytest.approx(0.02)
+    assert points["n_region"] < points["n_given"]
+    assert nominal["offset"]["value_mm"] == pytest.approx(0.02)
+
+
+def test_a_plane_against_a_probed_plate(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plate = tmp_path / "plate.csv"
+    corners = [(x, y) for x in (0, 30, 60) for y in (0, 40)]
+    rows = "".join(f"{x},{y},-0.05\n" for x, y in corners)
+    plate.write_text("x_mm,y_mm,z_mm\n" + rows)
+    found = report(capsys, "plane", clouds / "block.ply", "--plate", plate)
+    nominal = found["nominal"]
+    assert isinstance(nominal, dict)
+    assert abs(nominal["mean_mm"]) == pytest.approx(0.05)
+    assert nominal["counted_from"] == "the plane of plate.csv"
+
+
+def test_what_cannot_be_inspected_gets_one_sentence(
+    clouds: Path, tmp_path: Path, fails: Fails
+) -> None:
+    ball = clouds / "ball.ply"
+    assert "25.4 mm" in fails("inspect", "sphere", ball, "--diameter", 25.4)
+    assert "--diameter" in fails("inspect", "sphere", ball)
+    assert "6 are needed" in fails(
+        "inspect", "sphere", ball, "--diameter", 34.96, "--region", "0,1,2"
+    )
+    assert "not a list of numbers" in fails(
+        "inspect", "sphere", ball, "--diameter", 34.96, "--region", "left,right"
+    )
+    assert "holds 0 points" in fails(
+        "inspect", "sphere", ball, "--diameter", 34.96, "--region", "0,1,0,1,0,1"
+    )
+    assert "no two parallel faces 7" in fails(
+        "inspect", "step", clouds / "block.ply", "--height", 7
+    )
+    page = tmp_path / "page.pdf"
+    assert "end it in .html" in fails("inspect", "plane", ball, "-o", page, writes=tmp_path)
+    plate = tmp_path / "plate.csv"
+    plate.write_text("A,B,C,D\n0,0,1,6.4\n")
+    assert "both --plane and --plate" in fails(
+        "inspect", "plane", ball, "--plane", "0,0,1,0", "--plate", plate
+    )
+    assert "there is no such file" in fails("inspect", "plane", tmp_path / "absent.ply")

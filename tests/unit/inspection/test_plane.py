@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planes: exact shapes, outliers that stay counted, references kept apart, bad input."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.fitting import Plane
+from armscan.inspection.cleaning import Region
+from armscan.inspection.options import InspectionOptions
+from armscan.inspection.plane import inspect_plane, plane_from_coefficients
+from armscan.inspection.results import PlaneInspection
+from inspection_clouds import cloud_of, random_motion
+
+GRID = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0), [0.0]), axis=-1).reshape(-1, 3)
+
+
+def inspected(result: PlaneInspection | FitFailure) -> PlaneInspection:
+    assert not isinstance(result, FitFailure), result
+    return result
+
+
+def given_plane(a: float, b: float, c: float, d: float) -> Plane:
+    return plane_from_coefficients(np.array([a, b, c, d]), np.array([10.0, 5.0, 0.0]))
+
+
+def test_offset_and_tilt_show_against_the_nominal_plane_only() -> None:
+    """Points at z = 0.04 + 0.001 x over the plane z = 0, given with a factor of -2."""
+    points = GRID + np.outer(0.04 + 0.001 * GRID[:, 0], [0.0, 0.0, 1.0])
+    found = inspected(inspect_plane(cloud_of(points), given_plane(0.0, 0.0, -2.0, 0.0)))
+    assert found.nominal is not None
+    assert found.offset is not None
+    # the reference's normal points down, so points above it are negative
+    assert found.offset.value_mm == pytest.approx(-(0.04 + 0.0095))
+    assert found.tilt_mrad == pytest.approx(1000.0 * np.arctan(0.001))
+    assert found.nominal.value("mean_mm") == pytest.approx(-0.0495)
+    assert found.nominal.value("within_50_um_percent") == pytest.approx(55.0)
+    assert found.nominal.reference == "nominal"
+    assert found.fitted.reference == "fitted"
+    assert found.fitted.value("range_mm") == pytest.approx(0.0, abs=1e-12)
+
+
+def test_outliers_leave_the_fit_but_not_the_statistics() -> None:
+    rng = np.random.default_rng(5)
+    points = GRID + rng.normal(0.0, 0.005, (200, 1)) * [0.0, 0.0, 1.0]
+    outliers = np.arange(0, 200, 10)
+    points[outliers, 2] += 0.5
+    far = np.array([[5.0, 5.0, 30.0]])
+    found = inspected(inspect_plane(cloud_of(np.concatenate([points, far]))))
+    assert found.counts.n_given == 201
+    assert found.counts.n_feature == 200
+    assert found.counts.n_outliers == 20
+    assert np.flatnonzero(~found.is_fitted).tolist() == outliers.tolist()
+    assert found.fitted.value("within_50_um_percent") == pytest.approx(90.0)
+    assert abs(found.plane.normal[2]) == pytest.approx(1.0, abs=1e-6)
+    assert len(found.fitted.deviations_mm) == 200
+
+
+def test_moving_points_and_reference_changes_nothing() -> None:
+    rng = np.random.default_rng(6)
+    points = GRID + rng.normal(0.0, 0.01, GRID.shape)
+    still = inspected(inspect_plane(cloud_of(points), given_plane(0.0, 0.0, 1.0, -0.02)))
+    for seed in range(3):
+        rotation, shift = random_motion(seed)
+        moved = points @ rotation.T + shift
+        normal = rotation[:, 2]
+        reference = plane_from_coefficients(
+            np.array([*normal, -0.02 - normal @ shift]), moved.mean(axis=0)
+        )
+        found = inspected(inspect_plane(cloud_of(moved), reference))
+        assert found.nominal is not None
+        assert still.nominal is not None
+        assert found.offset is not None
+        assert still.offset is not None
+        for key in ("mean_mm", "std_mm", "d95_mm"):
+            assert found.nominal.value(key) == pytest.approx(still.nominal.value(key), abs=1e-9)
+            assert found.fitted.value(key) == pytest.approx(still.fitted.value(key), abs=1e-9)
+        assert found.offset.value_mm == pytest.approx(still.offset.value_mm, abs=1e-9)
+        assert found.tilt_mrad == pytest.approx(still.tilt_mrad, abs=1e-6)
+
+
+def test_the_largest_of_several_faces_is_found_without_a_reference() -> None:
+    wall = np.stack([np.zeros(80), np.tile(np.arange(10.0), 8), np.repeat(np.arange(8.0), 10)], 1)
+    small = GRID[:90] + np.array([0.0, 0.0, 8.0])
+    found = inspected(inspect_plane(cloud_of(np.concatenate([wall, small, GRID]))))
+    assert np.abs(found.plane.coefficients) == pytest.approx([0, 0, 1, 0], abs=1e-9)
+    # of the wall, the two rows at z = 0 and 1 lie within 1 mm as well
+    assert found.counts.n_feature == len(GRID) + 20
+
+
+def test_a_region_leaves_the_rest_out() -> None:
+    other = GRID[:150] + np.array([0.0, 0.0, 8.0])
+    cloud = cloud_of(np.concatenate([GRID, other]))
+    region = Region(np.array([-1.0, -1.0, 7.0]), np.array([30.0, 30.0, 9.0]))
+    found = inspected(inspect_plane(cloud, region=region))
+    assert found.counts.n_region == 150
+    assert found.rows.min() == 200
+    with pytest.raises(OptionError, match="not all below"):
+        Region(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 1.0]))
+
+
+def test_the_fitted_normal_points_to_the_scanned_side() -> None:
+    for sign in (1.0, -1.0):
+        normals = np.tile([0.0, 0.0, sign], (len(GRID), 1))
+        found = inspected(inspect_plane(cloud_of(GRID, normals=normals)))
+        assert found.plane.normal[2] == pytest.approx(sign)
+
+
+def test_input_without_a_plane_is_refused_in_words() -> None:
+    with pytest.raises(InputError, match="the cloud holds 0 points; an inspection needs 30"):
+        inspect_plane(cloud_of(np.zeros((0, 3))))
+    line = np.outer(np.arange(50.0), [1.0, 2.0, 3.0])
+    failure = inspect_plane(cloud_of(line))
+    assert isinstance(failure, FitFailure)
+    assert "on one line" in failure.reason
+    failure = inspect_plane(cloud_of(GRID), given_plane(0.0, 0.0, 1.0, -500.0))
+    assert isinstance(failure, FitFailure)
+    assert "0 of 200 points lie within 1 mm" in failure.reason
+    assert "the nearest is 500 mm away" in failure.reason
+    with pytest.raises(InputError, match="all 0"):
+        given_plane(0.0, 0.0, 0.0, 1.0)
+    with pytest.raises(OptionError, match="search band"):
+        InspectionOptions(feature_mm=0.1)

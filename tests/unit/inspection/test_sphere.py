@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Balls: found anywhere by their diameter, an oracle, outliers counted, wrong input in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.results import SphereInspection
+from armscan.inspection.sphere import inspect_sphere
+from inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
+
+DIAMETER_MM = 2.0 * RADIUS_MM
+CENTRE = np.array([600.0, -120.0, 90.0])
+
+
+def inspected(result: SphereInspection | FitFailure) -> SphereInspection:
+    assert not isinstance(result, FitFailure), result
+    return result
+
+
+def ball(diameter_mm: float, noise_mm: float = 0.0, seed: int = 1) -> FloatArray:
+    outward = ball_stripes(20, 60)
+    noise = np.random.default_rng(seed).normal(0.0, 1.0, (len(outward), 1)) * noise_mm
+    return np.asarray(CENTRE + outward * (diameter_mm / 2.0 + noise))
+
+
+def test_an_exact_ball_that_is_too_large_errs_against_the_nominal_only() -> None:
+    found = inspected(inspect_sphere(cloud_of(ball(DIAMETER_MM + 0.08)), DIAMETER_MM))
+    assert found.diameter.value_mm == pytest.approx(DIAMETER_MM + 0.08, abs=1e-9)
+    assert found.sphere.centre_mm == pytest.approx(CENTRE, abs=1e-9)
+    assert found.nominal.value("mean_mm") == pytest.approx(0.04, abs=1e-9)
+    assert found.nominal.value("within_50_um_percent") == 100.0
+    assert found.nominal.value("within_30_um_percent") == 0.0
+    assert found.fitted.value("within_30_um_percent") == 100.0
+    assert found.fitted.value("rms_mm") == pytest.approx(0.0, abs=1e-9)
+    assert "34.96" not in found.fitted.reference_text
+    assert "radius of 17.48 mm" in found.nominal.reference_text
+    # corners of the stripes: cos(70 deg)^2 from the middle of the cap
+    assert found.seen_cap_deg == pytest.approx(np.rad2deg(np.arccos(np.cos(np.deg2rad(70)) ** 2)))
+
+
+def test_the_fit_is_that_of_an_optimiser() -> None:
+    points = ball(DIAMETER_MM, 0.01)
+    found = inspected(inspect_sphere(cloud_of(points), DIAMETER_MM))
+    assert found.counts.n_outliers == 0
+    oracle = least_squares(
+        lambda p: np.linalg.norm(points - p[:3], axis=1) - p[3],
+        [*CENTRE, RADIUS_MM],
+        xtol=1e-15,
+        ftol=1e-15,
+    )
+    assert found.sphere.centre_mm == pytest.approx(oracle.x[:3], abs=1e-7)
+    assert found.diameter.value_mm == pytest.approx(2.0 * oracle.x[3], abs=1e-7)
+
+
+def test_a_small_ball_is_found_above_a_large_table_on_a_post() -> None:
+    rng = np.random.default_rng(2)
+    table = np.column_stack([rng.uniform(450, 750, 9000), rng.uniform(-270, 30, 9000)])
+    table = np.column_stack([table, rng.normal(40.0, 0.01, 9000)])
+    angle = rng.uniform(0.0, 2.0 * np.pi, 300)
+    post = CENTRE + np.column_stack(
+        [4.0 * np.cos(angle), 4.0 * np.sin(angle), rng.uniform(-50.0, -19.0, 300)]
+    )
+    cloud = cloud_of(np.concatenate([table, post, ball(DIAMETER_MM, 0.01)]))
+    found = inspected(inspect_sphere(cloud, DIAMETER_MM))
+    assert found.counts.n_feature == 1200
+    assert found.rows.min() == 9300
+    assert found.diameter.value_mm == pytest.approx(DIAMETER_MM, abs=0.003)
+
+
+def test_outliers_leave_the_fit_but_not_the_histogram() -> None:
+    points = ball(DIAMETER_MM, 0.005)
+    outward = (points - CENTRE) / np.linalg.norm(points - CENTRE, axis=1)[:, None]
+    bad = np.arange(0, 1200, 20)
+    points[bad] += 0.3 * outward[bad]
+    points[7] += 5.0 * outward[7]
+    found = inspected(inspect_sphere(cloud_of(points), DIAMETER_MM))
+    assert found.diameter.value_mm == pytest.approx(DIAMETER_MM, abs=0.003)
+    assert found.counts.n_given == 1200
+    assert found.counts.n_feature == 1199
+    assert found.counts.n_outliers == len(bad)
+    assert found.nominal.value("within_80_um_percent") == pytest.approx(100.0 * 1139 / 1199)
+    assert found.nominal.value("range_mm") > 0.29
+
+
+def test_moving_the_ball_changes_nothing() -> None:
+    points = ball(DIAMETER_MM, 0.01)
+    still = inspected(inspect_sphere(cloud_of(points), DIAMETER_MM))
+    for seed in range(3):
+        rotation, shift = random_motion(seed)
+        moved = inspected(inspect_sphere(cloud_of(points @ rotation.T + shift), DIAMETER_MM))
+        assert moved.diameter.value_mm == pytest.approx(still.diameter.value_mm, abs=1e-7)
+        assert moved.sphere.centre_mm == pytest.approx(
+            still.sphere.centre_mm @ rotation.T + shift, abs=1e-6
+        )
+        for key in ("std_mm", "d95_mm"):
+            assert moved.nominal.value(key) == pytest.approx(still.nominal.value(key), abs=1e-7)
+
+
+def test_input_without_the_ball_is_refused_in_words() -> None:
+    points = ball(DIAMETER_MM, 0.005)
+    wrong = inspect_sphere(cloud_of(points), 25.4)
+    assert isinstance(wrong, FitFailure)
+    assert "25.4" in wrong.reason
+    assert "lie on one of 34.9" in wrong.reason
+    in_metres = inspect_sphere(cloud_of(points / 1000.0), DIAMETER_MM)
+    assert isinstance(in_metres, FitFailure)
+    flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
+    assert isinstance(inspect_sphere(cloud_of(flat), DIAMETER_MM), FitFailure)
+    line = inspect_sphere(cloud_of(np.outer(np.arange(50.0), [1.0, 2.0, 3.0])), DIAMETER_MM)
+    assert isinstance(line, FitFailure)
+    for few in (0, 29):
+        with pytest.raises(InputError, match=f"holds {few} points"):
+            inspect_sphere(cloud_of(points[:few]), DIAMETER_MM)
+    with pytest.raises(InputError, match=r"-1\.0 mm diameter"):
+        inspect_sphere(cloud_of(points), -1.0)

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Steps: through the arm and from one still exposure, whose lean no exposure can tell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.options import StepOptions
+from armscan.inspection.results import StepInspection
+from armscan.inspection.step import inspect_step
+from inspection_clouds import block_stripes, cloud_of, random_motion
+
+HEIGHT_MM = 20.0
+
+
+def inspected(result: StepInspection | FitFailure) -> StepInspection:
+    assert not isinstance(result, FitFailure), result
+    return result
+
+
+def profile(lean_rad: float, noise_mm: float = 0.0, seed: int = 1) -> FloatArray:
+    """Stripe of a sheet leaning by an angle over a 20 mm step at x = 5, in the Sensor frame.
+
+    The faces' normal is (0, sin, -cos) of the lean; the sheet is the plane y = 0.
+    """
+    x = np.linspace(-30.0, 30.0, 901)
+    on_block = x > 5.0
+    drop = np.where(on_block, 0.0, HEIGHT_MM / np.cos(lean_rad))
+    z = 130.0 + drop + np.random.default_rng(seed).normal(0.0, noise_mm, len(x))
+    return np.column_stack([x, np.zeros_like(x), z])[~((x > 2.0) & (x < 5.0))]
+
+
+def test_an_exact_block_through_the_arm() -> None:
+    points, exposure = block_stripes(HEIGHT_MM + 0.011)
+    for seed in range(3):
+        rotation, shift = random_motion(seed)
+        normals = np.tile(rotation[:, 2], (len(points), 1))
+        cloud = cloud_of(points @ rotation.T + shift, exposure, normals=normals)
+        found = inspected(inspect_step(cloud, HEIGHT_MM))
+        assert found.height.value_mm == pytest.approx(HEIGHT_MM + 0.011, abs=1e-9)
+        assert found.normal == pytest.approx(rotation[:, 2], abs=1e-9)
+        assert found.nominal.value("mean_mm") == pytest.approx(0.011, abs=1e-9)
+        assert found.fitted.value("std_mm") == pytest.approx(0.0, abs=1e-9)
+        assert set(exposure[found.upper]) <= set(range(11, 30))
+
+
+def test_margins_keep_away_from_edges_corners_and_what_stands_about() -> None:
+    points, exposure = block_stripes(HEIGHT_MM)
+    found = inspected(
+        inspect_step(cloud_of(points, exposure), HEIGHT_MM, step_options=StepOptions(margin_mm=2.0))
+    )
+    x, y = points[found.upper, 0], points[found.upper, 1]
+    # the block's first and last point along each stripe lie up to 0.24 mm inside its edges
+    assert x.min() >= 7.0
+    assert x.max() <= 23.0
+    # its outermost stripes, at y = 11 and 29, are 1 mm from stripes on the table at 10 and 30
+    assert (y.min(), y.max()) == (12.0, 28.0)
+    low = points[found.lower]
+    beside = (low[:, 1] > 10) & (low[:, 1] < 30)
+    assert low[beside & (low[:, 0] < 15), 0].max() <= 3.1
+    assert low[beside & (low[:, 0] > 15), 0].min() >= 30.0
+
+
+def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:
+    """Without a normal the sheet counts as square: at 5 degrees 20 mm reads 20 / cos 5."""
+    lean = np.deg2rad(5.0)
+    cloud = cloud_of(profile(lean), frame="Sensor")
+    square = inspected(inspect_step(cloud, HEIGHT_MM))
+    assert square.height.value_mm == pytest.approx(HEIGHT_MM / np.cos(lean), abs=1e-9)
+    assert "taken to stand square" in square.normal_rule
+    true = np.array([0.0, np.sin(lean), -np.cos(lean)])
+    for normal in (true, -3.0 * true):
+        told = inspected(inspect_step(cloud, HEIGHT_MM, normal=normal))
+        assert told.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
+        assert told.normal == pytest.approx(true, abs=1e-9)
+        assert "leans by 5.000 degrees" in told.normal_rule
+
+
+def test_an_error_of_the_given_normal_along_the_stripe_does_no_harm() -> None:
+    """Only the lean is taken from it: 0.5 degrees about the sheet's normal change nothing."""
+    turn = np.deg2rad(0.5)
+    normal = np.array([np.sin(turn), 0.0, -np.cos(turn)])
+    found = inspected(
+        inspect_step(cloud_of(profile(0.0), frame="Sensor"), HEIGHT_MM, normal=normal)
+    )
+    assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
+
+
+def test_outliers_leave_the_fit_but_not_the_heights() -> None:
+    points = profile(0.0, 0.004)
+    found = inspected(inspect_step(cloud_of(points, frame="Sensor"), HEIGHT_MM))
+    points[700:710, 2] -= 0.4
+    hit = inspected(inspect_step(cloud_of(points, frame="Sensor"), HEIGHT_MM))
+    assert hit.counts.n_outliers >= 10
+    assert hit.height.value_mm == pytest.approx(found.height.value_mm, abs=2e-4)
+    assert len(hit.heights_mm) == len(found.heights_mm)
+    assert hit.heights_mm.max() > HEIGHT_MM + 0.38
+
+
+def test_points_of_another_program_have_no_stripes_and_work_all_the_same() -> None:
+    points, _ = block_stripes(HEIGHT_MM)
+    found = inspected(inspect_step(cloud_of(points), HEIGHT_MM))
+    assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=1e-9)
+
+
+def test_input_without_the_step_is_refused_in_words() -> None:
+    points, exposure = block_stripes(HEIGHT_MM)
+    wrong = inspect_step(cloud_of(points, exposure), 10.0)
+    assert isinstance(wrong, FitFailure)
+    assert "no two parallel faces 10 ± 0.5 mm apart" in wrong.reason
+    assert "stand 20.000 mm apart" in wrong.reason
+    flat = inspect_step(cloud_of(points[points[:, 2] == 0.0]), HEIGHT_MM)
+    assert isinstance(flat, FitFailure)
+    line = np.outer(np.arange(80.0), [1.0, 2.0, 3.0])
+    assert isinstance(inspect_step(cloud_of(line), HEIGHT_MM), FitFailure)
+    wide = StepOptions(margin_mm=12.0)
+    failure = inspect_step(cloud_of(points, exposure), HEIGHT_MM, step_options=wide)
+    assert isinstance(failure, FitFailure)
+    assert "--margin" in failure.remedy
+    with pytest.raises(InputError, match="the cloud holds 0 points"):
+        inspect_step(cloud_of(np.zeros((0, 3))), HEIGHT_MM)
+    with pytest.raises(InputError, match="-3"):
+        inspect_step(cloud_of(points), -3.0)
+    with pytest.raises(InputError, match="normal of the step's faces is zero"):
+        inspect_step(cloud_of(profile(0.0)), HEIGHT_MM, normal=np.zeros(3))
+    with pytest.raises(OptionError, match="margin of -1"):
+        StepOptions(margin_mm=-1.0)

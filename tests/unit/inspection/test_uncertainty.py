@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Standard deviations of fitted lengths against repeated simulated measurements."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.results import MeasuredLength
+from armscan.inspection.sphere import inspect_sphere
+from armscan.inspection.step import inspect_step
+from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
+
+ARM_MM = 0.008
+NOISE_MM = 0.004
+N_RUNS = 60
+SPREAD_LIMIT = 1.0 + 3.3 / math.sqrt(2 * N_RUNS)
+"""Ratio of a standard deviation from 60 runs to the true one: 99.9 % below (normal errors)."""
+
+
+def ball_diameter(seed: int) -> MeasuredLength:
+    """Exposures err as a whole by the arm, points by the stripe's noise."""
+    rng = np.random.default_rng(seed)
+    outward = ball_stripes(16, 30)
+    exposure = np.repeat(np.arange(16), 30)
+    points = RADIUS_MM * outward + rng.normal(0.0, ARM_MM, (16, 3))[exposure]
+    points += outward * rng.normal(0.0, NOISE_MM, (len(points), 1))
+    found = inspect_sphere(
+        cloud_of(points, exposure, sigma_mm=ARM_MM, noise_mm=NOISE_MM), 2 * RADIUS_MM
+    )
+    assert not isinstance(found, FitFailure)
+    return found.diameter
+
+
+def test_the_diameters_sigma_is_its_scatter_over_repeats() -> None:
+    """Taking points for independent would make it 5 times too small."""
+    found = [ball_diameter(seed) for seed in range(N_RUNS)]
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    propagated = float(np.mean([item.sigma_propagated_mm for item in found]))
+    jackknife = float(np.sqrt(np.mean([item.sigma_scatter_mm**2 for item in found])))
+    assert 1.0 / SPREAD_LIMIT < scatter / propagated < SPREAD_LIMIT
+    # a jackknife is biased upwards, the more so the fewer the exposures
+    assert 0.85 / SPREAD_LIMIT < scatter / jackknife < SPREAD_LIMIT
+    assert found[0].sigma_mm == max(found[0].sigma_scatter_mm, found[0].sigma_propagated_mm)
+
+
+def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
+    """An exposure that crosses both faces shifts both: the height's sigma is far below its own."""
+    clean, exposure = block_stripes(20.0, n_points=200)
+    heights = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        points = clean + rng.normal(0.0, 0.02, (40, 3))[exposure]
+        points[:, 2] += rng.normal(0.0, NOISE_MM, len(points))
+        found = inspect_step(cloud_of(points, exposure, sigma_mm=0.02, noise_mm=NOISE_MM), 20.0)
+        assert not isinstance(found, FitFailure)
+        heights.append(found.height)
+    scatter = float(np.std([item.value_mm for item in heights], ddof=1))
+    propagated = float(np.mean([item.sigma_propagated_mm for item in heights]))
+    limit = 1.0 + 3.3 / math.sqrt(2 * 30)
+    assert 1.0 / limit < scatter / propagated < limit
+
+
+def test_a_cloud_without_exposures_or_covariances_has_no_sigma() -> None:
+    points = RADIUS_MM * ball_stripes(16, 30)
+    found = inspect_sphere(cloud_of(points, sigma_mm=0.0), 2 * RADIUS_MM)
+    assert not isinstance(found, FitFailure)
+    assert math.isnan(found.diameter.sigma_mm)
+
+
+def test_blocks_of_neighbouring_exposures_count_where_they_err_alike() -> None:
+    """48 exposures in runs of 4 that err alike: the jackknife must not take them for 48."""
+    rng = np.random.default_rng(4)
+    outward = ball_stripes(48, 20)
+    exposure = np.repeat(np.arange(48), 20)
+    alike = np.repeat(rng.normal(0.0, ARM_MM, (12, 3)), 4, axis=0)
+    points = RADIUS_MM * outward + alike[exposure]
+    found = inspect_sphere(cloud_of(points, exposure, sigma_mm=ARM_MM), 2 * RADIUS_MM)
+    assert not isinstance(found, FitFailure)
+    assert found.diameter.sigma_scatter_mm > 1.3 * found.diameter.sigma_propagated_mm
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_too_few_exposures_say_nothing_of_their_scatter(n: int) -> None:
+    points = RADIUS_MM * ball_stripes(12, 30)
+    exposure = np.repeat(np.arange(12) * n // 12, 30)
+    found = inspect_sphere(cloud_of(points, exposure), 2 * RADIUS_MM)
+    assert not isinstance(found, FitFailure)
+    assert math.isnan(found.diameter.sigma_scatter_mm)
+    assert math.isfinite(found.diameter.sigma_mm)

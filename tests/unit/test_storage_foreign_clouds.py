@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds of other programs: what is read, and what is refused in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.errors import FileFormatError
+from armscan.storage.clouds import ply_bytes, xyz_bytes
+from armscan.storage.foreign_clouds import read_cloud
+from inspection_clouds import cloud_of
+
+POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5]])
+
+
+def test_an_own_cloud_keeps_all_it_carries(tmp_path: Path) -> None:
+    path = tmp_path / "own.ply"
+    path.write_bytes(ply_bytes(cloud_of(POINTS, np.array([0, 1]))))
+    found = read_cloud(path)
+    assert found.frame == "Base"
+    assert found.exposure.tolist() == [0, 1]
+    assert found.sigma_mm == pytest.approx([0.01, 0.01])
+
+
+def test_an_own_text_file_keeps_its_frame(tmp_path: Path) -> None:
+    path = tmp_path / "own.xyz"
+    path.write_bytes(xyz_bytes(cloud_of(POINTS, frame="Sensor")))
+    found = read_cloud(path)
+    assert found.frame == "Sensor"
+    assert found.points_mm == pytest.approx(POINTS)
+    assert not found.covariance_mm2.any()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "1.5 -2 3.25\n4 5 -6.5\n",
+        "2\n1.5 -2 3.25\n4 5 -6.5\n",
+        "x,y,z,intensity\n1.5,-2,3.25,7\n4,5,-6.5,8\n",
+        "\ufeff1.5;-2;3.25\r\n4;5;-6.5\r\n",
+        "# made elsewhere\n1.5 -2 3.25 # first\n4 5 -6.5",
+    ],
+)
+def test_text_of_other_programs(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "other.xyz"
+    path.write_text(text, encoding="utf-8")
+    found = read_cloud(path)
+    assert found.points_mm.tolist() == POINTS.tolist()
+    assert found.exposure_sources == ("other.xyz",)
+
+
+def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
+    path = tmp_path / "other.ply"
+    fields = "property float x\nproperty float y\nproperty float z\nproperty uchar red\n"
+    header = f"ply\nformat ascii 1.0\nelement vertex 2\n{fields}end_header\n"
+    path.write_text(header + "1.5 -2 3.25 9\n4 5 -6.5 9\n")
+    assert read_cloud(path).points_mm.tolist() == POINTS.tolist()
+    path.write_text(header.replace("property float z\n", "") + "1.5 -2 9\n4 5 9\n")
+    with pytest.raises(FileFormatError, match="no z"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("empty.xyz", "", "is empty"),
+        ("heads.csv", "x,y,z\n", "holds no points"),
+        ("two.xyz", "1 2 3\n4 5\n", "not understood"),
+        ("words.xyz", "1 2 3\nfour five six\n", "not understood"),
+        ("nan.xyz", "1 2 3\nnan 5 6\n", "not finite"),
+        ("cloud.stl", "1 2 3\n", "no point cloud that armscan knows"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path: Path, name: str, text: str, message: str) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=message):
+        read_cloud(path)

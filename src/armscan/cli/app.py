@@ -11,6 +11,7 @@ import typer.main
 
 from armscan.cli import (
     calibrate_camera,
+    calibrate_hand_eye,
     calibrate_laser,
     convert,
     demo,
@@ -46,7 +47,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 calibrate = typer.Typer(
-    help="Calibrate a camera, then its light sheets.",
+    help="Calibrate a camera, then its light sheets, then where they sit on the arm.",
     epilog=(
         "\b\nExample:\n"
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json"
@@ -67,6 +68,7 @@ inspect = typer.Typer(
 inspect.command("plane", epilog=inspect_plane.EXAMPLE)(inspect_plane.plane)
 inspect.command("sphere", epilog=inspect_sphere.EXAMPLE)(inspect_sphere.sphere)
 inspect.command("step", epilog=inspect_step.EXAMPLE)(inspect_step.step)
+calibrate.command("hand-eye", epilog=calibrate_hand_eye.EXAMPLE)(calibrate_hand_eye.hand_eye)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect, name="inspect")
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)

@@ -48,6 +48,13 @@ def calibration_outputs(document: Path, *, is_overwriting: bool) -> OutputFiles:
     return files
 
 
+def document_and_page(document: Path, *, is_overwriting: bool) -> OutputFiles:
+    """Check the place of ``NAME.json``, and of ``NAME.html`` beside it; raises the same."""
+    files = _named(document, (".json",))
+    check_outputs((files.document, files.page), is_overwriting=is_overwriting)
+    return files
+
+
 def cloud_outputs(document: Path, *, is_overwriting: bool) -> OutputFiles:
     """Check the place of ``NAME.ply`` or ``NAME.xyz``, and of ``NAME.html``; raises the same."""
     files = _named(document, (".ply", ".xyz"))

@@ -9,18 +9,12 @@ from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.records.exposure import Exposure
 from armscan.report.page import Block, Gallery, Legend, Text
 from armscan.report.stripe_figures import (
-    MAX_PICTURES,
     evenly_chosen,
     stripe_legend,
     stripe_picture,
 )
 
 FATE_COLOURS = {PointFate.NO_RAY: "#8a6d5a", PointFate.OUT_OF_DEPTH: "#ff7a3c"}
-
-
-def shown_sources(sources: Sequence[str], most: int = MAX_PICTURES) -> list[str]:
-    """Exposures that a page shows, evenly chosen: only their pixels are needed."""
-    return evenly_chosen(list(sources), most)
 
 
 def stripe_gallery(

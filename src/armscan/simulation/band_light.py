@@ -269,7 +269,9 @@ def _edges(reach: Image32, peak: Image32, is_lit: BoolArray) -> tuple[IntArray, 
     jump = high - cv2.erode(light, square)
     inside = cv2.erode(is_lit[rows].astype(np.uint8), square) > 0
     rough = (spread > _EDGE_SIGMAS) | (jump > _EDGE_SHARE * high)
-    found_rows, found_columns = np.nonzero(inside & rough & (np.abs(near) < BAND_SIGMAS))
+    # A pixel that misses the light itself may hold a sample that does not.
+    is_reached = (cv2.erode(np.abs(near), square) < BAND_SIGMAS) & (high > FAINTEST)
+    found_rows, found_columns = np.nonzero(inside & rough & is_reached)
     return found_rows + rows.start, found_columns
 
 

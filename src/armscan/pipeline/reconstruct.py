@@ -11,6 +11,7 @@ import numpy as np
 from armscan.errors import EstimationError
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes, pair_exposures
+from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
 from armscan.reconstruction.merge import merge_clouds
@@ -22,8 +23,6 @@ from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
 
 STAGE = "reconstruct"
-CLEAN_SHARE = 0.5
-"""An image of which less than this share of the stripe points is measured is pointed out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +88,9 @@ def reconstruct(
     progress(ProgressEvent(STAGE, len(pairs), len(pairs)))
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
-        raise EstimationError(_nothing_measured(images), remedy=_REMEDY)
-    return Reconstruction(cloud, tuple(images), _warnings(images, cloud, sensor))
+        raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
+    depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
+    return Reconstruction(cloud, tuple(images), measurement_warnings(images, depths, sensor))
 
 
 def measure_exposure(
@@ -114,13 +114,14 @@ def measure_exposure(
     return ReconstructedImage(profile, fate, choice.sheet, choice.how)
 
 
-_REMEDY = (
+NOTHING_MEASURED_REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
     "larger --depth-margin if the object stood further outside the calibrated depths"
 )
 
 
-def _nothing_measured(images: Sequence[ReconstructedImage]) -> str:
+def nothing_measured(images: Sequence[ReconstructedImage]) -> str:
+    """Say why these images gave no point at all."""
     n_points = sum(len(image.profile) for image in images)
     if n_points == 0:
         return f"no stripe was found in {len(images)} images"
@@ -130,45 +131,3 @@ def _nothing_measured(images: Sequence[ReconstructedImage]) -> str:
         if fate is not PointFate.MEASURED
     )
     return f"none of {n_points} stripe points could be measured: {counts}"
-
-
-def _warnings(
-    images: Sequence[ReconstructedImage], cloud: PointCloud, sensor: SensorCalibration
-) -> tuple[str, ...]:
-    warnings = []
-    empty = [image.profile.source for image in images if image.count(PointFate.MEASURED) == 0]
-    if empty:
-        warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:4])}")
-    doubtful = [
-        image.profile.source
-        for image in images
-        if 0 < image.count(PointFate.MEASURED) < CLEAN_SHARE * len(image.profile)
-    ]
-    if doubtful:
-        warnings.append(
-            f"less than half of what looked like a stripe could be measured in "
-            f"{', '.join(doubtful[:4])}: see in the pictures whether it is a laser line"
-        )
-    n_outside = sum(image.count(PointFate.OUT_OF_DEPTH) for image in images)
-    if n_outside:
-        warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
-    if not sensor.camera.has_covariance:
-        warnings.append(
-            "the camera came without covariance: the points' sigmas leave its errors out"
-        )
-    for k, sheet in enumerate(sensor.sheets):
-        low, high = sheet.depth_range_mm
-        depth = cloud.points_mm[cloud.sheet == k, 2]
-        beyond = np.maximum(low - depth, depth - high)
-        if (beyond > 0.0).any():
-            warnings.append(
-                f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
-                f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
-                f"{high:.1f} mm: their sigma supposes that the sheet goes on as it was calibrated"
-            )
-        if len(depth) and not sheet.is_redundant:
-            warnings.append(
-                f"sheet {sheet.name} rests on two boards only: nothing but the coplanarity of two "
-                "stripes checks it"
-            )
-    return tuple(warnings)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.errors import OptionError
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.records.cloud import PointCloud
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,3 +56,27 @@ def parse_volume(text: str, where: str = "--volume") -> BaseBox:
             f"'{text}' is no volume", where=where, remedy="give xmin,xmax,ymin,ymax,zmin,zmax in mm"
         )
     return BaseBox(values[0::2], values[1::2])
+
+
+def cut_cloud(cloud: PointCloud, box: BaseBox) -> PointCloud:
+    """The points of a cloud in Base that lie in the box; lists of names stay as they are.
+
+    Raises
+    ------
+    InputError
+        If the cloud is in another frame.
+    """
+    if cloud.frame != "Base":
+        raise InputError(f"a volume of Base cannot cut a cloud in {cloud.frame}")
+    kept = np.flatnonzero(box.holds(cloud.points_mm))
+    return replace(
+        cloud,
+        points_mm=cloud.points_mm[kept],
+        covariance_mm2=cloud.covariance_mm2[kept],
+        sigma_noise_mm=cloud.sigma_noise_mm[kept],
+        sheet=cloud.sheet[kept],
+        exposure=cloud.exposure[kept],
+        segment=cloud.segment[kept],
+        intensity=cloud.intensity[kept],
+        normals=None if cloud.normals is None else cloud.normals[kept],
+    )

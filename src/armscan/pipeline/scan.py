@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a scan, exposures and the arm's samples, to points in Base."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from armscan.devices.scan_source import ScanSource
+from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Base, Tool
+from armscan.geometry.poses import Pose
+from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
+from armscan.pipeline.measurement_warnings import measurement_warnings
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.reconstruct import (
+    NOTHING_MEASURED_REMEDY,
+    ReconstructOptions,
+    measure_exposure,
+    nothing_measured,
+)
+from armscan.pipeline.scan_images import ScanImages
+from armscan.pipeline.scan_result import (
+    ScanExposure,
+    ScanExposureFate,
+    ScanReconstruction,
+    scan_exposure,
+    scan_warnings,
+)
+from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
+from armscan.reconstruction.merge import merge_clouds
+from armscan.reconstruction.normals import NormalOptions, estimate_normals
+from armscan.reconstruction.place import Placing, place_stripe, prepare_placing
+from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.sync import SyncOptions, exposure_poses
+from armscan.reconstruction.triangulate import triangulate_stripe
+from armscan.reconstruction.volume import BaseBox, cut_cloud
+from armscan.records.cloud import PointCloud
+
+STAGE = "scan"
+MANY_WITHOUT_NORMAL = 0.1
+"""A larger share of points without normal is warned of."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScanOptions:
+    """How a scan becomes a cloud in Base.
+
+    Parameters
+    ----------
+    measure
+        Stripe extraction, the depths accepted in Sensor, the sheet.
+    sync
+        How exposures find their pose.
+    volume
+        Part of Base that is measured; None for all of it.
+    normals
+        Neighbourhood of the normals; None to leave them out.
+    threads
+        Exposures measured at a time.
+    """
+
+    measure: ReconstructOptions = field(default_factory=ReconstructOptions)
+    sync: SyncOptions = field(default_factory=SyncOptions)
+    volume: BaseBox | None = None
+    normals: NormalOptions | None = field(default_factory=NormalOptions)
+    threads: int = 2
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.threads <= 64:
+            raise OptionError(f"{self.threads} threads", remedy="give 1 to 64")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedImage:
+    """What one exposure gave: its stripe, its points in Base, their depths, those cut away."""
+
+    image: ReconstructedImage
+    cloud: PointCloud
+    depths_mm: tuple[FloatArray, ...]
+    n_outside_volume: int
+
+
+def measure_scan(
+    source: ScanSource,
+    scanner: ScannerCalibration,
+    options: ScanOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> ScanReconstruction:
+    """Measure the stripes of every exposure that has a pose and place them in Base.
+
+    Exposures are read one after another and dropped once measured; an image that cannot be read
+    is counted and named. Where rows name lasers, rows without any serve as background of the
+    exposures of their view.
+
+    Parameters
+    ----------
+    source
+        The scan.
+    scanner
+        Sensor, hand-eye and latency.
+    options
+        Defaults if None.
+    progress
+        Told of every exposure.
+
+    Raises
+    ------
+    InputError
+        If the scanner has no camera, the scan no arm, or an image is not of the scanner's sensor.
+    EstimationError
+        If no exposure has a pose, the sheet of a stripe is ambiguous, or nothing was measured.
+    """
+    options = options or ScanOptions()
+    if scanner.sensor is None:
+        raise InputError(
+            "the scanner's document has no camera and light sheet", remedy="give one with a sensor"
+        )
+    poses = exposure_poses(
+        source.rows, source.arm, source.session.clock, scanner.latency_ns, options.sync
+    )
+    images = ScanImages(source)
+    wanted = [int(k) for k in np.flatnonzero(images.is_lit & poses.has_pose)]
+    placing = prepare_placing(scanner)
+    placed: dict[int, PlacedImage] = {}
+    reasons: dict[int, str] = {}
+
+    def measure(row: int, pair: ExposurePair) -> PlacedImage:
+        return place_exposure(pair, poses.pose(row), placing, options)
+
+    def pairs() -> Iterator[tuple[int, ExposurePair]]:
+        for done, row in enumerate(wanted):
+            progress(ProgressEvent(STAGE, done, len(wanted), source.rows[row].source))
+            try:
+                pair = images.pair(row)
+            except ArmscanError as error:
+                reasons[row] = str(error)
+                continue
+            yield row, pair
+
+    for row, result in _in_threads(measure, pairs(), options.threads):
+        placed[row] = result
+    progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
+    exposures = _records(source, images, poses, placed, reasons)
+    return _joined(placed, exposures, poses, placing, options)
+
+
+def place_exposure(
+    pair: ExposurePair,
+    base_from_tool: Pose[Base, Tool],
+    placing: Placing,
+    options: ScanOptions,
+) -> PlacedImage:
+    """Measure one exposure and place its points in Base.
+
+    Raises
+    ------
+    InputError
+        If the image is not of the scanner's sensor, or the scanner has none.
+    EstimationError
+        If the sheet of a stripe is ambiguous.
+    """
+    sensor = placing.scanner.sensor
+    if sensor is None:
+        raise InputError("the scanner has no camera", remedy="give one with a sensor")
+    check_sizes([exposure for exposure in pair if exposure is not None], sensor.camera.camera)
+    image = measure_exposure(pair, sensor, options.measure)
+    sheet = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
+    stripe = triangulate_stripe(image.profile, sheet, sensor)
+    cloud = place_stripe(stripe, image.profile, base_from_tool, placing)
+    depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(len(sensor.sheets)))
+    inside = cloud if options.volume is None else cut_cloud(cloud, options.volume)
+    return PlacedImage(image, inside, depths, len(cloud) - len(inside))
+
+
+def _in_threads(
+    measure: Callable[[int, ExposurePair], PlacedImage],
+    pairs: Iterator[tuple[int, ExposurePair]],
+    threads: int,
+) -> Iterator[tuple[int, PlacedImage]]:
+    """Measure in order with a bounded number of exposures in memory; stops at the first error."""
+    pending: deque[tuple[int, Future[PlacedImage]]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for row, pair in pairs:
+                pending.append((row, pool.submit(measure, row, pair)))
+                if len(pending) > threads:
+                    first, result = pending.popleft()
+                    yield first, result.result()
+            while pending:
+                first, result = pending.popleft()
+                yield first, result.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _records(
+    source: ScanSource,
+    images: ScanImages,
+    poses: ExposurePoses,
+    placed: dict[int, PlacedImage],
+    reasons: dict[int, str],
+) -> tuple[ScanExposure, ...]:
+    records = []
+    for k, row in enumerate(source.rows):
+        if k in placed:
+            records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
+        elif k in reasons:
+            records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
+        elif not images.is_lit[k]:
+            records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
+        else:
+            reason = PoseFate(int(poses.fate[k])).label
+            records.append(ScanExposure(row, ScanExposureFate.NO_POSE, reason))
+    return tuple(records)
+
+
+def _joined(
+    placed: dict[int, PlacedImage],
+    exposures: Sequence[ScanExposure],
+    poses: ExposurePoses,
+    placing: Placing,
+    options: ScanOptions,
+) -> ScanReconstruction:
+    sensor = placing.scanner.sensor
+    rows = sorted(placed)
+    if sensor is None or not rows:
+        broken = "; ".join(e.reason for e in exposures if e.fate is ScanExposureFate.UNREADABLE)
+        raise EstimationError(f"no exposure with a pose could be measured: {broken or 'no laser'}")
+    images = tuple(placed[row].image for row in rows)
+    cloud = merge_clouds([placed[row].cloud for row in rows])
+    if len(cloud) == 0:
+        n_outside = sum(placed[row].n_outside_volume for row in rows)
+        if n_outside:
+            raise EstimationError(
+                f"all {n_outside} measured points lie outside the volume {options.volume}",
+                remedy="give limits in mm in the arm's base frame, or none",
+            )
+        raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
+    cloud, extra = _with_normals(cloud, rows, poses, placing, options)
+    depths = [
+        np.concatenate([placed[row].depths_mm[k] for row in rows])
+        for k in range(len(sensor.sheets))
+    ]
+    warnings = (
+        *scan_warnings(exposures, poses),
+        *measurement_warnings(images, depths, sensor),
+        *extra,
+    )
+    return ScanReconstruction(cloud, images, tuple(rows), tuple(exposures), poses, warnings)
+
+
+def _with_normals(
+    cloud: PointCloud,
+    rows: Sequence[int],
+    poses: ExposurePoses,
+    placing: Placing,
+    options: ScanOptions,
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """The cloud with normals towards the camera of each point's exposure."""
+    if options.normals is None:
+        return cloud, ()
+    eye = placing.scanner.hand_eye.tool_from_sensor.translation_mm
+    cameras = poses.rotations[list(rows)] @ eye + poses.translations_mm[list(rows)]
+    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], options.normals)
+    share = float((~normals.any(axis=1)).mean())
+    warnings: tuple[str, ...] = ()
+    if share > MANY_WITHOUT_NORMAL:
+        warnings = (
+            f"{100.0 * share:.0f} % of the points have no normal: within "
+            f"{options.normals.radius_mm} mm they lie on single lines, or on no plane",
+        )
+    return replace(cloud, normals=normals), warnings

@@ -43,6 +43,8 @@ from armscan.reconstruction.triangulate import triangulate_stripe
 from armscan.reconstruction.volume import BaseBox, cut_cloud
 from armscan.records.cloud import PointCloud
 
+__all__ = ["PlacedImage", "ScanOptions", "ScanReconstruction", "measure_scan", "place_exposure"]
+
 STAGE = "scan"
 MANY_WITHOUT_NORMAL = 0.1
 """A larger share of points without normal is warned of."""

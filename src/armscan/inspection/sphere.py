@@ -24,6 +24,10 @@ LARGEST_MISFIT = 0.02
 
 SETTLING_ROUNDS = 3
 
+LEAST_CONCENTRATION = 0.5
+"""Part of the feature's points that must lie within the search band of a ball's surface: any shape
+that happens to pass through the feature's shell spreads evenly over it instead."""
+
 
 def inspect_sphere(
     cloud: PointCloud,
@@ -91,6 +95,14 @@ def _settled(
                 f"{2.0 * sphere.radius_mm:.4g} mm",
                 "check the diameter, or show where the ball is with --region",
             )
+    near = np.abs(sphere.distance_mm(points[is_feature])) <= options.search_band_mm
+    if float(near.mean()) < LEAST_CONCENTRATION:
+        return FitFailure(
+            f"there is no ball of {diameter_mm:g} mm: at the best place for one, only "
+            f"{int(near.sum())} of {len(near)} points within {options.feature_mm:g} mm of its "
+            f"surface lie within {options.search_band_mm:g} mm",
+            "check the diameter, or show where the ball is with --region",
+        )
     return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
 
 

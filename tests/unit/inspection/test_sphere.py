@@ -111,7 +111,11 @@ def test_input_without_the_ball_is_refused_in_words() -> None:
     in_metres = inspect_sphere(cloud_of(points / 1000.0), DIAMETER_MM)
     assert isinstance(in_metres, FitFailure)
     flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
-    assert isinstance(inspect_sphere(cloud_of(flat), DIAMETER_MM), FitFailure)
+    box = np.concatenate([flat, flat[:, [0, 2, 1]], flat[:, [2, 1, 0]]])
+    for shape in (flat, box):
+        nothing = inspect_sphere(cloud_of(shape), DIAMETER_MM)
+        assert isinstance(nothing, FitFailure)
+        assert "ball" in nothing.reason or "sphere" in nothing.reason
     line = inspect_sphere(cloud_of(np.outer(np.arange(50.0), [1.0, 2.0, 3.0])), DIAMETER_MM)
     assert isinstance(line, FitFailure)
     for few in (0, 29):

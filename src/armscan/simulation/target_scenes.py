@@ -91,15 +91,16 @@ CAMERA_PLACES: tuple[Place, ...] = (
 )
 
 LASER_PLACES: tuple[StripePlace, ...] = (
-    StripePlace(-6, 3, 1, 0.0, 117),
-    StripePlace(-22, 10, -4, -4.0, 124),
-    StripePlace(6, -14, 5, 5.0, 131),
-    StripePlace(-26, -8, 2, -6.0, 138),
-    StripePlace(-8, 24, -6, 4.0, 145),
-    StripePlace(2, -22, 7, -6.0, 150),
-    StripePlace(-20, 5, 3, 6.0, 157),
-    StripePlace(18, 2, 0, 0.0, 163),
+    StripePlace(-6, 3, 1, -9.0, 117),
+    StripePlace(-22, 10, -2, 12.0, 124),
+    StripePlace(6, -12, 3, 14.0, 131),
+    StripePlace(-26, -8, 2, -16.0, 138),
+    StripePlace(-8, 20, -5, -17.0, 145),
+    StripePlace(2, -20, 6, 18.0, 150),
+    StripePlace(-20, 5, 3, -18.0, 157),
+    StripePlace(18, 2, 0, 17.0, 163),
 )
+"""Near and far on both sides: the target is half as wide as the stripe."""
 
 _LAMP = Lamp(even=0.7, direct=0.35, position_mm=(120.0, -260.0, -250.0), up=(0.0, 0.0, -1.0))
 _BACKGROUND = Thing(
@@ -110,7 +111,7 @@ _WITH_LASER = 0.15
 _JITTER_DEG = 2.0
 _JITTER_SHARE = 0.008
 _RIM_PX = 12.0
-_SLIDES = 51
+_SLIDES, _ASIDES = 41, 11
 _INTERVAL_NS = 2_000_000_000
 
 
@@ -171,13 +172,14 @@ def _held_in_sheet(head: Head, place: StripePlace, rng: np.random.Generator) -> 
     jitter = rng.uniform(-1.0, 1.0, 5)
     rotation = _rotation(place, jitter[:3])
     depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[3])
-    on_stripe = sheet_middle_mm(head, depth) + np.array([place.aside_mm + jitter[4], 0, 0])
-    normal = rotation[:, 2]
-    on_axis = np.array([0.0, 0.0, normal @ on_stripe / normal[2]])
-    for share in np.linspace(0.0, 1.0, _SLIDES):
-        target = _with_middle(rotation, on_stripe + share * (on_axis - on_stripe))
-        if _is_in_view(head, target):
-            return target
+    on_stripe = sheet_middle_mm(head, depth)
+    for share in np.linspace(1.0, 0.0, _ASIDES):
+        aside = _in_plane(rotation, on_stripe, share * (place.aside_mm + jitter[4]), on_stripe[1])
+        inward = _in_plane(rotation, on_stripe, aside[0], 0.0)
+        for slide in np.linspace(0.0, 1.0, _SLIDES):
+            target = _with_middle(rotation, aside + slide * (inward - aside))
+            if _is_in_view(head, target):
+                return target
     raise InputError(f"the target at {depth:.0f} mm is larger than the camera's view")
 
 
@@ -188,6 +190,13 @@ def _rotation(place: Place | StripePlace, jitter: FloatArray) -> FloatArray:
         for angle, axis in zip(degrees + _JITTER_DEG * jitter, np.eye(3), strict=True)
     )
     return np.asarray(about_y @ about_x @ roll)
+
+
+def _in_plane(rotation: FloatArray, point_mm: FloatArray, x_mm: float, y_mm: float) -> FloatArray:
+    """(3,) point with coordinates x, y in the plane of a target through another point."""
+    normal = rotation[:, 2]
+    rest = normal @ point_mm - normal[0] * x_mm - normal[1] * y_mm
+    return np.array([x_mm, y_mm, rest / normal[2]])
 
 
 def _with_middle(rotation: FloatArray, middle_mm: FloatArray) -> Target:

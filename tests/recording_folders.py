@@ -9,10 +9,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 
+from armscan.errors import FileFormatError
 from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
 from armscan.records.session import CameraSetup, ExposureRow, Session
+from armscan.storage.recording_reader import read_recording
 
 WIDTH_PX, HEIGHT_PX = 8, 6
 SESSION = f"""kind = "scan"
@@ -36,6 +39,21 @@ ARM = """t_ns,x_mm,y_mm,z_mm,qw,qx,qy,qz
 1500,901,1,400,0.8,0.6,0,0
 3500,902,2,400,0,0,1,0
 """
+
+
+HEADER = EXPOSURES.splitlines()[0]
+POSITION = "t_ns,x_mm,y_mm,z_mm,"
+
+
+def table(header: str, *lines: str) -> str:
+    return "\n".join((header, *lines)) + "\n"
+
+
+def refusal(folder: Path, **files: str | bytes | None) -> str:
+    """What is said when such a recording is read."""
+    with pytest.raises(FileFormatError) as caught:
+        read_recording(lab_folder(folder, **files))
+    return str(caught.value)
 
 
 def pixels(number: int, shape: tuple[int, ...] = (HEIGHT_PX, WIDTH_PX)) -> Any:

@@ -20,6 +20,7 @@ from armscan.storage.recording_exposures import (
     EXPOSURES_FILE,
     check_files,
     exposure_rows,
+    is_inside,
     repeated_files,
 )
 from armscan.storage.recording_images import read_recorded, setup_of_image
@@ -114,8 +115,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
         assumed += check_clock(rows, track, said, folder)
     cameras, facts = _cameras(folder, rows, said)
     session = replace(said.session, cameras=cameras, pose_form=form, assumed=(*assumed, *facts))
-    if session.head is not None and not (folder / session.head).is_file():
-        warnings.append(f"{folder / SESSION_FILE}: there is no file {session.head}")
+    warnings += _odd_head(folder, session.head)
     return FolderRecording(
         folder,
         session,
@@ -196,6 +196,19 @@ def _assumed_of_arm(found: ArmTable, said: SessionFile) -> list[str]:
     if found.form == "euler" and "pose.rotation" not in said.stated:
         facts.append(f"Euler angles are '{said.session.rotation}'")
     return facts
+
+
+def _odd_head(folder: Path, head: str | None) -> list[str]:
+    where = str(folder / SESSION_FILE)
+    if head is None or (is_inside(head) and (folder / head).is_file()):
+        return []
+    if not is_inside(head):
+        raise FileFormatError(
+            f"head is '{head}', no path inside the recording",
+            where=where,
+            remedy="copy the file into the recording and name it relative to that",
+        )
+    return [f"{where}: there is no file {head}"]
 
 
 def _odd(table: CsvTable, unknown: Mapping[str, tuple[str, ...]]) -> list[str]:

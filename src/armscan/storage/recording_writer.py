@@ -141,5 +141,6 @@ def _write_tables(
     if isinstance(source, FolderRecording) and session.head is not None:
         head = source.folder / session.head
         if head.is_file():
+            (folder / session.head).parent.mkdir(parents=True, exist_ok=True)
             (folder / session.head).write_bytes(head.read_bytes())
     (folder / SESSION_FILE).write_bytes(session_toml(session))

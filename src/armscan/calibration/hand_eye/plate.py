@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -36,7 +37,7 @@ from armscan.calibration.hand_eye.plate_result import (
 from armscan.calibration.hand_eye.plate_search import Start, find_start
 from armscan.calibration.hand_eye.posture_geometry import REMEDY, common_to_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.geometry.arrays import BoolArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 
 
@@ -44,6 +45,8 @@ def calibrate_on_plate(
     stripes: Sequence[PosedStripe],
     plate: PlateReference,
     options: HandEyeOptions | None = None,
+    *,
+    sensor_covariance: FloatArray | None = None,
 ) -> HandEyeFit | FitFailure:
     """Find where the sensor sits on the arm's last link (2.3.3.2).
 
@@ -60,6 +63,10 @@ def calibrate_on_plate(
         The plate in Base.
     options
         Defaults if None.
+    sensor_covariance
+        (P, P) of the sensor's parameters, in the order of the stripes' ``by_sensor``: its errors
+        bend all stripes alike, and are weighted accordingly. The covariance returned is for the
+        sensor as it is; ``sensor_coupling`` carries its errors on. None takes it as exact.
 
     Returns
     -------
@@ -68,7 +75,9 @@ def calibrate_on_plate(
     """
     options = options or HandEyeOptions()
     kept = straight_stripes(stripes, options)
-    nodes = condense(stripes, kept, options.nodes_per_stripe)
+    nodes = replace(
+        condense(stripes, kept, options.nodes_per_stripe), sensor_covariance=sensor_covariance
+    )
     few = refuse_few_postures(len(nodes.used_postures))
     if few is not None:
         return few

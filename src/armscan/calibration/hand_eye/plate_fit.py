@@ -30,6 +30,7 @@ from armscan.calibration.hand_eye.plate_residuals import (
     PlacedNodes,
     PlateState,
     place_nodes,
+    sensor_covariance,
 )
 from armscan.calibration.hand_eye.variance_components import (
     NoiseEstimate,
@@ -56,11 +57,11 @@ class PlateFit:
     components, noise
         Causes of scatter and their standard deviations.
     total
-        (N, N) covariance of the residuals, the probed plane's included.
+        (N, N) covariance of the residuals, by the probed plane and the sensor too.
     linear
         Solution linearised at the minimum.
     covariance
-        (K, K) of the parameters, estimated scatter not taken as known.
+        (K, K) of the parameters, estimated scatter not taken as known, without the sensor's part.
     """
 
     refined: Refined
@@ -110,7 +111,7 @@ def fit_plate(
     for _ in range(MAX_ROUNDS):
         placed = place_nodes(nodes, plate.plane, state)
         components = noise_components(nodes, placed, plate.plane, options)
-        fixed = plane_prior(placed, plate, options)
+        fixed = known_covariance(nodes, placed, plate, options)
         total = total_covariance(components, sigmas) + fixed
         try:
             refined = refine(nodes, plate.plane, state, total, solve_plate=options.solve_plate)
@@ -131,14 +132,24 @@ def fit_plate(
     if linear is None:
         return _no_solution()
     covariance = covariance_over_noise(residual, slopes, components, fixed, noise)
+    by_sensor = sensor_covariance(nodes, placed)
+    if by_sensor is not None:
+        covariance -= linear.gain @ by_sensor @ linear.gain.T
     return PlateFit(refined, slopes, components, noise, total, linear, covariance)
 
 
-def plane_prior(placed: PlacedNodes, plate: PlateReference, options: HandEyeOptions) -> FloatArray:
-    """(N, N) covariance of the residuals by the probed plane; zero where it is not a prior."""
-    if options.solve_plate or plate.covariance is None:
-        return np.zeros((len(placed.residual_mm),) * 2)
-    return plane_covariance(placed, plate.covariance)
+def known_covariance(
+    nodes: PlateNodes, placed: PlacedNodes, plate: PlateReference, options: HandEyeOptions
+) -> FloatArray:
+    """(N, N) covariance of the residuals by the probed plane and by the sensor's calibration.
+
+    Both err alike in all postures. The plane is left out where it is solved along or exact.
+    """
+    known = np.zeros((len(nodes), len(nodes)))
+    if not options.solve_plate and plate.covariance is not None:
+        known += plane_covariance(placed, plate.covariance)
+    by_sensor = sensor_covariance(nodes, placed)
+    return known if by_sensor is None else known + by_sensor
 
 
 def plane_after(fit: PlateFit, plate: PlateReference) -> FloatArray:

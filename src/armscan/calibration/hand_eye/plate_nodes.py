@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class PlateNodes:
         (S, 3, 3) and (S, 3) ``base_from_tool`` of each stripe.
     sources, postures
         Names.
+    sensor_covariance
+        (P, P) of the sensor's parameters; None where it is taken as exact.
     """
 
     points_mm: FloatArray
@@ -51,6 +53,7 @@ class PlateNodes:
     translations_mm: FloatArray
     sources: tuple[str, ...]
     postures: tuple[str, ...]
+    sensor_covariance: FloatArray | None = None
 
     def __len__(self) -> int:
         """Count of nodes."""
@@ -58,34 +61,19 @@ class PlateNodes:
 
     def select(self, kept: BoolArray) -> PlateNodes:
         """Keep some nodes; stripes and postures keep their numbers."""
-        by_sensor = None if self.by_sensor is None else self.by_sensor[kept]
-        return PlateNodes(
-            self.points_mm[kept],
-            self.noise_mm2[kept],
-            by_sensor,
-            self.sheet[kept],
-            self.stripe[kept],
-            self.posture[kept],
-            self.rotations,
-            self.translations_mm,
-            self.sources,
-            self.postures,
+        return replace(
+            self,
+            points_mm=self.points_mm[kept],
+            noise_mm2=self.noise_mm2[kept],
+            by_sensor=None if self.by_sensor is None else self.by_sensor[kept],
+            sheet=self.sheet[kept],
+            stripe=self.stripe[kept],
+            posture=self.posture[kept],
         )
 
     def moved(self, rotations: FloatArray, translations_mm: FloatArray) -> PlateNodes:
         """Give the stripes other poses, (S, 3, 3) and (S, 3)."""
-        return PlateNodes(
-            self.points_mm,
-            self.noise_mm2,
-            self.by_sensor,
-            self.sheet,
-            self.stripe,
-            self.posture,
-            rotations,
-            translations_mm,
-            self.sources,
-            self.postures,
-        )
+        return replace(self, rotations=rotations, translations_mm=translations_mm)
 
     @property
     def used_postures(self) -> IntArray:

@@ -125,3 +125,11 @@ def residual_by_sensor(nodes: PlateNodes, placed: PlacedNodes) -> FloatArray | N
     if nodes.by_sensor is None:
         return None
     return np.asarray(np.einsum("ni,nip->np", placed.normals_sensor, nodes.by_sensor))
+
+
+def sensor_covariance(nodes: PlateNodes, placed: PlacedNodes) -> FloatArray | None:
+    """(N, N) covariance of the residuals by the sensor's calibration; None where not known."""
+    by_sensor = residual_by_sensor(nodes, placed)
+    if by_sensor is None or nodes.sensor_covariance is None:
+        return None
+    return np.asarray(by_sensor @ nodes.sensor_covariance @ by_sensor.T)

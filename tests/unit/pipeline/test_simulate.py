@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes of a twin become recordings, their truth beside them; an interrupt leaves nothing.
+
+The twin here is a fake one that is found by the real one's name, so that no image is rendered.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+import fake_twin
+from armscan.cli.simulate import PresetName, Scene
+from armscan.devices.twin import Preset, TwinScene
+from armscan.errors import OptionError, OutputError
+from armscan.pipeline import simulate as pipeline
+from armscan.pipeline.progress import ProgressEvent
+from armscan.pipeline.simulate import SimulateOptions, simulate_scene
+from armscan.report.simulate_job import SimulateRequest, run_simulation
+from armscan.storage.probe_files import read_probe_tip
+from armscan.storage.recording_reader import read_arm_track, read_recording
+from armscan.storage.simulated import are_simulated
+from recording_folders import pixels
+
+HEAD = "thesis-single"
+
+
+@pytest.fixture(autouse=True)
+def _fake(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_twin.register(tmp_path_factory.mktemp("site"), monkeypatch)
+
+
+def check_images(folder: Path) -> None:
+    scan = read_recording(folder)
+    assert len(scan.rows) == fake_twin.N_IMAGES
+    for k in range(fake_twin.N_IMAGES):
+        np.testing.assert_array_equal(scan.exposure(k).image, pixels(k))
+
+
+def test_a_scene_is_a_recording_and_its_truth_lies_beside_it(tmp_path: Path) -> None:
+    events: list[ProgressEvent] = []
+    options = SimulateOptions(seed=3, processes=1)
+    found = simulate_scene(tmp_path / "ball.1", HEAD, "ball", options, events.append)
+    check_images(found.folder)
+    assert found.truth == tmp_path / "ball.1.truth.json"
+    assert json.loads(found.truth.read_text())["seed"] == 3
+    assert not list(found.folder.rglob("*truth*"))
+    assert are_simulated([found.folder / "images/0000.png"])
+    assert [(event.done, event.total) for event in events] == [(k, 6) for k in range(1, 7)]
+    assert (found.n_images, found.n_arm_samples) == (6, 4)
+
+
+def test_several_processes_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "IMAGES_A_PROCESS", 3)
+    simulate_scene(tmp_path / "two", HEAD, "ball", SimulateOptions(processes=2))
+    simulate_scene(tmp_path / "one", HEAD, "ball", SimulateOptions(processes=1))
+    names = [p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file()]
+    for name in names:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.parametrize("images_a_process", [1000, 3])
+def test_an_interrupt_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images_a_process: int
+) -> None:
+    monkeypatch.setattr(pipeline, "IMAGES_A_PROCESS", images_a_process)
+
+    def stop(event: ProgressEvent) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_scene(tmp_path / "scan", HEAD, "ball", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_probing_gives_touches_and_the_tip(tmp_path: Path) -> None:
+    found = simulate_scene(tmp_path / "touches", HEAD, "probing", SimulateOptions(seed=2))
+    track, notes = read_arm_track(found.folder)
+    assert (len(track), notes, found.n_images) == (4, (), 0)
+    tip = read_probe_tip(found.folder / "probe.toml")
+    assert (tip.centre_tool_mm.tolist(), tip.diameter_mm) == ([0.0, 0.5, 60.0], 6.0)
+    assert found.truth.exists() and are_simulated([found.folder / "arm.csv"])
+
+
+def test_results_that_exist_stop_it_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "scan.truth.json").write_text("mine")
+    with pytest.raises(OutputError, match="the file exists"):
+        simulate_scene(tmp_path / "scan", HEAD, "ball")
+    assert not (tmp_path / "scan").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine").write_text("")
+    with pytest.raises(OutputError, match="not empty"):
+        simulate_scene(tmp_path / "full", HEAD, "ball")
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"processes": 0}, {"preset": "best"}])
+def test_wrong_options_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(OptionError):
+        SimulateOptions(**wrong)
+
+
+def test_the_command_knows_all_scenes_and_presets() -> None:
+    assert tuple(Scene) == get_args(TwinScene)
+    assert tuple(PresetName) == get_args(Preset)
+
+
+@pytest.mark.parametrize("scene", get_args(TwinScene))
+def test_the_report_says_what_comes_next(tmp_path: Path, scene: TwinScene) -> None:
+    summary = run_simulation(SimulateRequest(HEAD, scene, tmp_path / "scan"))
+    word = {"camera": "camera", "laser": "laser", "hand-eye": "hand-eye", "probing": "probe"}
+    assert f" {word.get(scene, 'reconstruct')} " in summary.next_step
+    assert str(tmp_path / "scan") in summary.next_step
+    assert summary.data["simulated"] is True and summary.data["seed"] == 1

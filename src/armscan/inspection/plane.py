@@ -175,15 +175,20 @@ def _turned(plane: Plane) -> Plane:
     return Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
 
 
-def _offset(plane: Plane, reference: Plane, cloud: PointCloud, used: IntArray) -> MeasuredLength:
-    points = cloud.points_mm[used]
-    local = (points - plane.point_mm) @ plane.axes.T
-    jacobian = -np.column_stack([local[:, 0], local[:, 1], np.ones(len(local))])
-    fit = FitLinearised(
-        jacobian,
-        np.tile(plane.normal, (len(points), 1)),
+def linearised_plane(plane: Plane, points_mm: FloatArray) -> FitLinearised:
+    """The fit of a plane to points (N, 3) about its optimum; the length is the offset at
+    ``plane.point_mm``.
+    """
+    local = (points_mm - plane.point_mm) @ plane.axes.T
+    return FitLinearised(
+        -np.column_stack([local[:, 0], local[:, 1], np.ones(len(local))]),
+        np.tile(plane.normal, (len(local), 1)),
         local[:, 2],
         np.array([0.0, 0.0, 1.0]),
     )
+
+
+def _offset(plane: Plane, reference: Plane, cloud: PointCloud, used: IntArray) -> MeasuredLength:
+    fit = linearised_plane(plane, cloud.points_mm[used])
     height = float(reference.distance_mm(plane.point_mm[None, :])[0])
     return measured_length(height, fit, cloud, used)

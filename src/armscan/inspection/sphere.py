@@ -8,13 +8,13 @@ import math
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.sphere import Sphere, fit_sphere
 from armscan.inspection.cleaning import Region, Selection, fit_robustly, outlier_rule, select
 from armscan.inspection.histogram import describe_deviations
 from armscan.inspection.options import InspectionOptions
-from armscan.inspection.results import MeasuredLength, PointCounts, SphereInspection
+from armscan.inspection.results import PointCounts, SphereInspection
 from armscan.inspection.search import find_ball
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
@@ -131,11 +131,12 @@ def _described(
         fit_rule=outlier_rule(options),
     )
     text = f"all {len(feature)} points {near}"
+    linear = linearised_sphere(sphere, points[is_fitted])
     from_centre = sphere.distance_mm(points) + sphere.radius_mm
     return SphereInspection(
         sphere=sphere,
         nominal_diameter_mm=diameter_mm,
-        diameter=_diameter(sphere, cloud, feature[is_fitted]),
+        diameter=measured_length(2.0 * sphere.radius_mm, linear, cloud, feature[is_fitted]),
         rows=feature,
         is_fitted=is_fitted,
         counts=counts,
@@ -156,17 +157,17 @@ def _described(
     )
 
 
-def _diameter(sphere: Sphere, cloud: PointCloud, used: IntArray) -> MeasuredLength:
-    offset = cloud.points_mm[used] - sphere.centre_mm
+def linearised_sphere(sphere: Sphere, points_mm: FloatArray) -> FitLinearised:
+    """The fit of a sphere to points (N, 3) about its optimum; the length is the diameter."""
+    offset = points_mm - sphere.centre_mm
     distance = np.linalg.norm(offset, axis=1)
     outward = offset / distance[:, None]
-    fit = FitLinearised(
+    return FitLinearised(
         np.column_stack([-outward, -np.ones(len(outward))]),
         outward,
         distance - sphere.radius_mm,
         np.array([0.0, 0.0, 0.0, 2.0]),
     )
-    return measured_length(2.0 * sphere.radius_mm, fit, cloud, used)
 
 
 def _cap_deg(offset_mm: FloatArray) -> float:

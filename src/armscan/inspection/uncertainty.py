@@ -67,6 +67,13 @@ def measured_length(
     return MeasuredLength(value_mm, max(known, default=math.nan), propagated)
 
 
+def influence(fit: FitLinearised) -> FloatArray:
+    """(N, 3) derivative of the length by each point's error, up to the sign of all."""
+    information = fit.jacobian.T @ fit.jacobian
+    weight = fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters)
+    return np.asarray(weight[:, None] * fit.directions)
+
+
 def _jackknife_mm(fit: FitLinearised, block: IntArray, n_blocks: int) -> float:
     """Delete-a-block jackknife of the length, linearised about the optimum."""
     if n_blocks < MIN_BLOCKS:
@@ -96,13 +103,10 @@ def _propagated_mm(
     covariance = cloud.covariance_mm2[rows]
     if not covariance.any():
         return math.nan
-    information = fit.jacobian.T @ fit.jacobian
-    influence = fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters)
-    pull = np.stack(
-        [np.bincount(exposure, influence * fit.directions[:, k], n) for k in range(3)], axis=1
-    )
+    by_point = influence(fit)
+    pull = np.stack([np.bincount(exposure, by_point[:, k], n) for k in range(3)], axis=1)
     count = np.bincount(exposure, minlength=n)
-    variance = float((influence**2) @ (cloud.sigma_noise_mm[rows] ** 2))
+    variance = float((by_point**2).sum(axis=1) @ (cloud.sigma_noise_mm[rows] ** 2))
     for i in range(3):
         for j in range(3):
             mean = np.bincount(exposure, covariance[:, i, j], n) / count

@@ -204,7 +204,7 @@ def _finished(
         write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
         written = (request.output,)
     return Summary(
-        title=f"{report.title} inspected" + (" (simulated data)." if is_simulated else "."),
+        title=report.title + (" (simulated data)." if is_simulated else "."),
         facts=report.facts,
         tables=report.brief_tables,
         warnings=tuple(sentence(warning) for warning in report.warnings),

@@ -74,9 +74,13 @@ class InspectionReport:
 
 
 def inspection_page(
-    report: InspectionReport, provenance: Provenance, *, is_simulated: bool = False
+    report: InspectionReport,
+    provenance: Provenance,
+    *,
+    is_simulated: bool = False,
+    first: tuple[Section, ...] = (),
 ) -> Page:
-    """Lay out the page."""
+    """Lay out the page; ``first`` stands before its own sections."""
     statistics = tuple(
         block
         for heading, deviations in report.references
@@ -89,11 +93,12 @@ def inspection_page(
         )
     )
     return Page(
-        title=f"{report.title} inspected",
+        title=report.title,
         subtitle=report.subtitle,
         cards=report.cards,
         warnings=tuple(sentence(warning) for warning in report.warnings),
         sections=(
+            *first,
             Section("Deviations", (Gallery(report.histograms, 420),)),
             Section("In space", (Gallery(report.views, 560),)),
             Section("Statistics", (Text(STATEMENT), *statistics)),

@@ -69,7 +69,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         geometry += facts[-2:]
     cards.append(_points_card(found.counts))
     return InspectionReport(
-        title="Plane",
+        title="Plane inspected",
         subtitle=_subtitle(found.counts, cloud),
         cards=tuple(cards),
         facts=tuple(facts),
@@ -116,7 +116,7 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
             "centre and diameter are poorly told apart; scan more of the ball"
         )
     return InspectionReport(
-        title="Ball",
+        title="Ball inspected",
         subtitle=_subtitle(found.counts, cloud),
         cards=(
             Card("Fitted diameter", diameter, f"nominal {found.nominal_diameter_mm:g} mm"),
@@ -180,7 +180,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     )
     both = np.concatenate([found.lower, found.upper])
     return InspectionReport(
-        title="Step",
+        title="Step inspected",
         subtitle=_subtitle(found.counts, cloud),
         cards=(
             Card("Fitted height", height, f"nominal {found.nominal_height_mm:g} mm"),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.errors import EstimationError
+from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import fit_plane
@@ -39,6 +39,12 @@ def read_plate(path: Path, near_mm: FloatArray) -> PlateReference:
 
 
 def _fitted(found: ProbedPoints, path: Path) -> PlateReference:
+    if found.are_tip_centres:
+        raise InputError(
+            f"these are centres of a tip of {found.tip_diameter_mm:g} mm, not points on the plate",
+            where=str(path),
+            remedy="give the points on the surface that `armscan probe` writes",
+        )
     fit = fit_plane(found.points_mm)
     if isinstance(fit, FitFailure):
         raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)

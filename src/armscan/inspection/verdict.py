@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a measured error is within its limit, when the error itself is uncertain."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray
+
+Verdict = Literal["still valid", "not valid", "inconclusive"]
+
+COVERAGE = 2.0
+"""Expanded uncertainty over standard uncertainty, k of about 95 %."""
+
+LIMIT_SIGMAS = 3.0
+"""Default limit over the standard deviation that the calibration predicts."""
+
+MIN_EXPOSURE_POINTS = 20
+MIN_EXPOSURES = 4
+
+RULE = (
+    "passed if |E| is at most MPE - U, failed if |E| is above MPE + U, else inconclusive; E is the "
+    "error, MPE its limit and U the expanded uncertainty (k = 2) of the test itself"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One error against its limit.
+
+    Parameters
+    ----------
+    name
+        What was tested, in words.
+    error_mm
+        E.
+    predicted_mm
+        Standard deviation of E that the calibration's covariance predicts.
+    limit_mm, limit_rule
+        MPE and where it comes from.
+    uncertainty_mm, uncertainty_rule
+        U and what it holds.
+    verdict
+        By `RULE`.
+    """
+
+    name: str
+    error_mm: float
+    predicted_mm: float
+    limit_mm: float
+    limit_rule: str
+    uncertainty_mm: float
+    uncertainty_rule: str
+    verdict: Verdict
+
+
+def judge(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Verdict:
+    """Apply `RULE`; what is not known is inconclusive."""
+    if not (math.isfinite(error_mm) and math.isfinite(limit_mm) and math.isfinite(uncertainty_mm)):
+        return "inconclusive"
+    if abs(error_mm) <= limit_mm - uncertainty_mm:
+        return "still valid"
+    return "not valid" if abs(error_mm) > limit_mm + uncertainty_mm else "inconclusive"
+
+
+def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
+    """One failure fails all; without any, one open question leaves all open."""
+    order: tuple[Verdict, ...] = ("not valid", "inconclusive", "still valid")
+    return next(verdict for verdict in order if verdict in verdicts)
+
+
+def check_size(
+    name: str,
+    error_mm: float,
+    sigma_calibration_mm: float,
+    sigma_scan_mm: float,
+    *,
+    reference_u_mm: float = 0.0,
+    mpe_mm: float | None = None,
+) -> Check:
+    """Check a size or a place.
+
+    Parameters
+    ----------
+    name
+        What it is.
+    error_mm
+        Measured minus nominal.
+    sigma_calibration_mm
+        Standard deviation that the calibration's covariance predicts.
+    sigma_scan_mm
+        Standard deviation that the scan adds by its own scatter.
+    reference_u_mm
+        Expanded uncertainty (k = 2) of the nominal value.
+    mpe_mm
+        Limit; if None it follows from ``sigma_calibration_mm``, so that a calibration that is as
+        good as it says passes.
+    """
+    if mpe_mm is not None and not mpe_mm > 0.0:
+        raise InputError(f"a limit of {mpe_mm} mm", remedy="give a positive --mpe")
+    u = math.hypot(reference_u_mm, COVERAGE * sigma_scan_mm)
+    if mpe_mm is None:
+        limit = LIMIT_SIGMAS * sigma_calibration_mm + u
+        rule = f"{LIMIT_SIGMAS:g} standard deviations that the calibration predicts, plus U"
+    else:
+        limit, rule = mpe_mm, "given"
+    return Check(
+        name=name,
+        error_mm=error_mm,
+        predicted_mm=sigma_calibration_mm,
+        limit_mm=limit,
+        limit_rule=rule,
+        uncertainty_mm=u,
+        uncertainty_rule="the reference's expanded uncertainty and twice the standard deviation "
+        "that this scan's own scatter causes",
+        verdict=judge(error_mm, limit, u),
+    )
+
+
+def check_spread(
+    residuals_mm: FloatArray, variance_mm2: FloatArray, exposure: IntArray
+) -> Check | None:
+    """Whether exposures disagree more than the points' covariances let them.
+
+    A hand-eye that has moved puts exposures from different sides at different places, often
+    without changing a ball's fitted diameter.
+
+    Parameters
+    ----------
+    residuals_mm
+        (N,) distances from the fitted surface.
+    variance_mm2
+        (N,) predicted variance of each along that distance.
+    exposure
+        (N,) number of its exposure.
+
+    Returns
+    -------
+    Check
+        Of the root mean square of the exposures' mean residuals, or None for too few exposures.
+    """
+    number = np.unique(exposure, return_inverse=True)[1]
+    count = np.bincount(number)
+    enough = count >= MIN_EXPOSURE_POINTS
+    if int(enough.sum()) < MIN_EXPOSURES:
+        return None
+    mean = (np.bincount(number, residuals_mm) / count)[enough]
+    variance = (np.bincount(number, variance_mm2) / count)[enough]
+    error, predicted = float(np.sqrt(np.mean(mean**2))), float(np.sqrt(variance.mean()))
+    limit = LIMIT_SIGMAS * predicted
+    return Check(
+        name="disagreement of exposures (rms of each one's mean distance from the fitted surface)",
+        error_mm=error,
+        predicted_mm=predicted,
+        limit_mm=limit,
+        limit_rule=f"{LIMIT_SIGMAS:g} standard deviations that the points' covariances predict",
+        uncertainty_mm=0.0,
+        uncertainty_rule="none: no nominal value takes part",
+        verdict=judge(error, limit, 0.0),
+    )

@@ -35,7 +35,7 @@ from armscan.pipeline.scan_result import (
 )
 from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
 from armscan.reconstruction.merge import merge_clouds
-from armscan.reconstruction.normals import NormalOptions, estimate_normals
+from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
 from armscan.reconstruction.place import Placing, place_stripe, prepare_placing
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
@@ -65,14 +65,14 @@ class ScanOptions:
     normals
         Neighbourhood of the normals; None to leave them out.
     threads
-        Exposures measured at a time.
+        Exposures measured at a time, while the next one is read.
     """
 
     measure: ReconstructOptions = field(default_factory=ReconstructOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
     volume: BaseBox | None = None
     normals: NormalOptions | None = field(default_factory=NormalOptions)
-    threads: int = 2
+    threads: int = 1
 
     def __post_init__(self) -> None:
         if not 1 <= self.threads <= 64:
@@ -271,12 +271,15 @@ def _with_normals(
         return cloud, ()
     eye = placing.scanner.hand_eye.tool_from_sensor.translation_mm
     cameras = poses.rotations[list(rows)] @ eye + poses.translations_mm[list(rows)]
-    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], options.normals)
+    chosen = options.normals
+    if chosen.radius_mm is None:
+        chosen = replace(chosen, radius_mm=choose_radius_mm(cloud.points_mm, cloud.exposure))
+    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], chosen)
     share = float((~normals.any(axis=1)).mean())
     warnings: tuple[str, ...] = ()
     if share > MANY_WITHOUT_NORMAL:
         warnings = (
-            f"{100.0 * share:.0f} % of the points have no normal: within "
-            f"{options.normals.radius_mm} mm they lie on single lines, or on no plane",
+            f"{100.0 * share:.0f} % of the points have no normal: within {chosen.radius_mm:.1f} mm "
+            "they lie on single lines, or on no plane",
         )
     return replace(cloud, normals=normals), warnings

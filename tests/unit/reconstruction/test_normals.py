@@ -8,7 +8,13 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.normals import NormalOptions, estimate_normals
+from armscan.reconstruction.normals import (
+    LARGEST_RADIUS_MM,
+    SMALLEST_RADIUS_MM,
+    NormalOptions,
+    choose_radius_mm,
+    estimate_normals,
+)
 
 NOISE_MM = 0.01
 RADIUS_MM = 17.48
@@ -74,6 +80,19 @@ def test_lines_of_a_quick_sweep_need_a_wider_radius() -> None:
     assert not estimate_normals(points, seen).any()
     wide = estimate_normals(points, seen, NormalOptions(radius_mm=6.0))
     np.testing.assert_allclose(wide, np.tile([0.0, 0.0, 1.0], (len(points), 1)), atol=1e-9)
+
+
+def test_the_radius_follows_the_distance_between_exposures() -> None:
+    """Lines 3 mm apart, one an exposure: 2.5 spacings; dense or lonely ones meet the limits."""
+    for gap, expected in ((3.0, 7.5), (5.0, 12.5), (0.2, 2.0)):
+        flat = lines(gap, 48.0)
+        points = np.column_stack([flat, np.zeros(len(flat))])
+        exposure = np.round(flat[:, 1] / gap).astype(np.int64)
+        found = choose_radius_mm(points, exposure)
+        assert found == pytest.approx(expected, rel=0.05)
+    one = np.zeros(len(points), dtype=np.int64)
+    assert choose_radius_mm(points, one) == LARGEST_RADIUS_MM
+    assert choose_radius_mm(np.zeros((0, 3)), np.zeros(0, dtype=np.int64)) == SMALLEST_RADIUS_MM
 
 
 def test_no_points_and_wrong_shapes() -> None:

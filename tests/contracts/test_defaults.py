@@ -15,6 +15,7 @@ from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
 from armscan.pipeline.reconstruct import ReconstructOptions
+from armscan.pipeline.simulate import SimulateOptions
 from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.storage.image_options import ImageOptions
 from armscan.vision.stripe.options import StripeOptions
@@ -36,6 +37,11 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         "margin_mm": SheetOptions().margin_mm,
         **STRIPES,
         **IMAGES,
+    },
+    ("simulate",): {
+        "preset": SimulateOptions().preset,
+        "seed": SimulateOptions().seed,
+        "processes": SimulateOptions().processes,
     },
     ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
 }

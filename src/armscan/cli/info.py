@@ -18,11 +18,13 @@ EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 def info(
     files: Annotated[
         list[str],
-        typer.Argument(help="Images, calibrations, clouds, folders.", show_default=False),
+        typer.Argument(
+            help="Images, calibrations, clouds, recordings, folders.", show_default=False
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Say what files are: image, calibration, cloud, observations or folder."""
+    """Say what files are: image, calibration, cloud, observations, recording or folder."""
     show(describe(files), as_json=as_json)
 
 

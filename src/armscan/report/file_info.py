@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +19,21 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.report.numbers import with_sigma
+from armscan.report.scan_info import (
+    describe_arm,
+    describe_points,
+    describe_probe,
+    describe_recording,
+    describe_scanner,
+    describe_touches,
+)
 from armscan.report.summary import Summary
+from armscan.storage.arm_files import ARM_MODEL_FILE
 from armscan.storage.calibration_files import (
     read_calibration,
     read_camera_calibration,
 )
+from armscan.storage.calibration_schema import SCANNER_SCHEMA
 from armscan.storage.clouds import read_ply
 from armscan.storage.image_format import image_format
 from armscan.storage.image_paths import expand_paths
@@ -31,8 +41,28 @@ from armscan.storage.images import read_bytes, read_exposure
 from armscan.storage.json_text import parse_json
 from armscan.storage.observations import read_observations
 from armscan.storage.ply_format import parse_ply
+from armscan.storage.probe_files import PROBE_FILE
+from armscan.storage.recording_arm import ARM_FILE
+from armscan.storage.recording_exposures import EXPOSURES_FILE
+from armscan.storage.recording_reader import is_recording
+from armscan.storage.recording_session import SESSION_FILE
+from armscan.storage.scanner_files import read_scanner_calibration
 
 Facts = list[tuple[str, str]]
+
+
+def _parent(path: Path) -> dict[str, Any]:
+    """A table of a recording is described with its recording."""
+    return _folder(path.parent)
+
+
+DESCRIBE_NAMED: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ARM_MODEL_FILE: describe_arm,
+    PROBE_FILE: describe_probe,
+    SESSION_FILE: _parent,
+    EXPOSURES_FILE: _parent,
+    ARM_FILE: _parent,
+}
 
 
 def describe_files(names: Sequence[str]) -> Summary:
@@ -71,15 +101,23 @@ def _file(path: Path) -> dict[str, Any]:
         return _ply(path, data)
     if data.startswith(b"PK"):
         return _observations(path)
+    return _text(path, data)
+
+
+def _text(path: Path, data: bytes) -> dict[str, Any]:
     stripped = data.lstrip(b"\xef\xbb\xbf \t\r\n")
-    if stripped.startswith(b"{") and "schema" in parse_json(data, str(path)):
-        return _calibration(path)
+    if stripped.startswith(b"{") and "schema" in (content := parse_json(data, str(path))):
+        return _scanner(path) if content["schema"] == SCANNER_SCHEMA else _calibration(path)
+    if path.name in DESCRIBE_NAMED:
+        return DESCRIBE_NAMED[path.name](path)
+    if path.suffix.lower() == ".csv":
+        return describe_points(path)
     if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
         return _camera(read_camera_calibration(path), "camera calibration of another program")
     raise FileFormatError(
         "armscan does not know this kind of file",
         where=str(path),
-        remedy="give an image, a calibration, a PLY cloud or a folder",
+        remedy="give an image, a calibration, a PLY cloud, probed points or a folder",
     )
 
 
@@ -136,6 +174,11 @@ def _calibration(path: Path) -> dict[str, Any]:
     if isinstance(document, CameraCalibration):
         return _camera(document, "camera calibration")
     return _sensor(document)
+
+
+def _scanner(path: Path) -> dict[str, Any]:
+    document = read_scanner_calibration(path)
+    return {**describe_scanner(document), **_origin(document.provenance)}
 
 
 def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:
@@ -196,6 +239,10 @@ def _origin(provenance: Provenance) -> dict[str, Any]:
 
 
 def _folder(path: Path) -> dict[str, Any]:
+    if is_recording(path):
+        return describe_recording(path)
+    if (path / ARM_FILE).is_file():
+        return describe_touches(path)
     items = sorted(item for item in path.iterdir() if not item.name.startswith("."))
     if not items:
         raise FileFormatError("the folder is empty", where=str(path), remedy="name another folder")

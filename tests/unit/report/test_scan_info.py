@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan info`` knows recordings, scanners, arms, probes and probed points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.errors import FileFormatError
+from armscan.models.arm import thesis_arm
+from armscan.records.arm_track import ArmTrack
+from armscan.report.file_info import describe_files
+from armscan.report.summary import summary_json, summary_text
+from armscan.storage.arm_files import arm_model_toml
+from armscan.storage.probe_files import ProbeTip, write_probing
+from armscan.storage.scanner_files import scanner_document
+from calibration_documents import scanner_calibration
+from recording_folders import ARM, EXPOSURES, lab_folder
+
+
+def described(path: Path) -> dict[str, object]:
+    summary = describe_files([str(path)])
+    assert summary_text(summary) and summary_json(summary)
+    found: dict[str, object] = summary.data["items"][0]
+    return found
+
+
+def test_a_recording_is_counted_and_what_is_odd_is_said(tmp_path: Path) -> None:
+    views = [",view", ",p1", ",p1", ","]
+    table = [line + cell for line, cell in zip(EXPOSURES.splitlines(), views, strict=True)]
+    arm = ARM.replace("1500,901,1,400", "1500,,1,400")
+    folder = lab_folder(tmp_path, session=None, exposures="\n".join(table) + "\n", arm=arm)
+    for path in (folder, folder / "arm.csv", folder / "exposures.csv"):
+        found = described(path)
+        assert found["exposures"] == 3 and found["views"] == 2
+        assert (found["arm_samples"], found["arm_gaps"]) == (3, 1)
+        assert found["lasers"] == ["A", "B"]
+        assert found["cameras"] == ["8 x 6 px, 8 bits, mono"]
+        assert "no session.toml" in str(found["assumed"])
+        assert "1 of 3 samples" in str(found["warnings"])
+
+
+def test_a_simulated_recording_is_called_so(tmp_path: Path) -> None:
+    folder = lab_folder(tmp_path, session="simulated = true\n")
+    assert "simulated" in str(described(folder)["what"])
+
+
+@pytest.mark.parametrize("has_sensor", [True, False])
+def test_a_scanner(tmp_path: Path, has_sensor: bool) -> None:
+    path = tmp_path / "scanner.json"
+    path.write_bytes(scanner_document(scanner_calibration(has_sensor=has_sensor)))
+    found = described(path)
+    said = "2 light sheets" if has_sensor else "no images"
+    assert str(found["what"]).endswith(said)
+    assert str(found["translation_x_tool_mm"]).startswith("-149.9")
+    assert found["postures"] == 12
+
+
+def test_touches_probe_arm_and_probed_points(tmp_path: Path) -> None:
+    track = ArmTrack(
+        np.arange(4), np.tile(np.eye(3), (4, 1, 1)), 100.0 * np.eye(4, 3), np.ones(4, bool)
+    )
+    folder = tmp_path / "touches"
+    write_probing(folder, track, ProbeTip(np.array([0, 0.5, 60]), 6.0))
+    assert described(folder)["what"] == "touches of a probe, 4 samples"
+    assert described(folder / "probe.toml")["tip_diameter_mm"] == 6.0
+    arm = folder / "arm.toml"
+    arm.write_bytes(arm_model_toml(thesis_arm((300, 400, 300, 100), (20, 30, 20))))
+    assert described(arm)["longest_reach_mm"] == 1170.0
+    points = tmp_path / "plate.csv"
+    points.write_text("# point = tip-centre, tip_diameter_mm = 6\nx_mm,y_mm,z_mm\n1,2,3\n4,-5,6\n")
+    found = described(points)
+    assert found["what"] == "2 probed points, centres of the tip"
+    assert found["y_range_mm"] == [-5.0, 2.0]
+
+
+def test_other_tables_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.csv"
+    path.write_text("name,age\nx,3\n")
+    with pytest.raises(FileFormatError, match="no column is called x_mm"):
+        describe_files([str(path)])

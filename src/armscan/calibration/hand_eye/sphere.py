@@ -21,6 +21,7 @@ from armscan.calibration.hand_eye.conditioning import (
     refuse_few_postures,
     refuse_open_hand_eye,
 )
+from armscan.calibration.hand_eye.least_squares import LinearSolution
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.sphere_evidence import sphere_fit
@@ -34,6 +35,7 @@ from armscan.calibration.hand_eye.sphere_refine import (
     descend,
     free_columns,
     refine_with_noise,
+    solve_at,
     with_weights,
 )
 from armscan.calibration.hand_eye.sphere_residuals import (
@@ -44,17 +46,22 @@ from armscan.calibration.hand_eye.sphere_residuals import (
     sphere_nodes,
 )
 from armscan.calibration.hand_eye.sphere_sections import find_sections
-from armscan.calibration.hand_eye.sphere_start import start_candidates
+from armscan.calibration.hand_eye.sphere_start import is_apart, start_candidates
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 
 START_NODES = 6
 START_POINTS = 48
 """Of each stripe, for the search; the refinement takes all."""
+RIVAL_COST = 9.0
+"""Minima whose sum of squares is not larger by more than this factor are compared in earnest."""
+LIKELIER = 6.0
+"""Logarithm of the likelihood ratio from which one solution is preferred to another."""
+LEAST_RESIDUAL_MM = 1e-4
 NAMED_STRIPES = 3
 LOOSE_PART = 0.2
 """A combination known less well than this part of the diameter is not determined."""
-ROBUST_ROUNDS = 5
+ROBUST_ROUNDS = 10
 POSTURES_REMEDY = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
     "at another height"
@@ -99,20 +106,15 @@ def calibrate_on_sphere(
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    start = _search(sphere_nodes(thinned, START_NODES), radius, options)
-    if isinstance(start, FitFailure):
-        return start
+    starts = _search(sphere_nodes(thinned, START_NODES), radius, options)
+    if isinstance(starts, FitFailure):
+        return starts
     nodes = sphere_nodes(sections, options.nodes_per_stripe)
-    solution = _refine(nodes, start, options)
-    if solution is None:
-        return FitFailure(
-            "the postures do not determine hand-eye and sphere together", POSTURES_REMEDY
-        )
-    information = np.asarray(np.linalg.inv(solution.linear.covariance[:6, :6]))
-    conditioning = describe_conditioning(information)
-    refused = _refuse_postures(conditioning, diameter_mm)
-    if refused is not None:
-        return refused
+    best = _best(nodes, starts, options)
+    if isinstance(best, FitFailure):
+        return best
+    start, solution = best
+    conditioning = _conditioning(solution.linear)
     warnings = (*left_out, *conditioning_warnings(conditioning, n_postures, ""))
     given = replace(start, radius_mm=radius)
     return sphere_fit(nodes, solution, conditioning, given, warnings)
@@ -131,9 +133,12 @@ def _refuse_sections(
     )
 
 
-def _refuse_postures(conditioning: Conditioning, diameter_mm: float) -> FitFailure | None:
+def _refuse_postures(linear: LinearSolution | None, diameter_mm: float) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
+    if linear is None:
+        return FitFailure(f"the postures do not determine the hand-eye{cause}", POSTURES_REMEDY)
+    conditioning = _conditioning(linear)
     refused = refuse_open_hand_eye(conditioning, cause, POSTURES_REMEDY)
     if refused is None and conditioning.singular_values[-1] * LOOSE_PART * diameter_mm < 1.0:
         return FitFailure(
@@ -160,17 +165,20 @@ def _check_postures(stripes: Sequence[PosedStripe]) -> None:
 
 def _search(
     nodes: SphereNodes, radius_mm: float, options: SphereOptions
-) -> SphereState | FitFailure:
-    """Best of several minima of the plain sum of squares, refused where the data contradict."""
-    free = free_columns(options)
+) -> tuple[SphereState, ...] | FitFailure:
+    """Distinct minima of the plain sum of squares that are nearly the least, best first."""
     plain = np.eye(len(nodes))
     ends = []
     for start in start_candidates(nodes, radius_mm):
         state, cost, _ = descend(nodes, start, plain, np.arange(RADIUS_COLUMN))
         ends.append((cost, state))
     ends.sort(key=lambda pair: pair[0])
-    state, _, _ = descend(nodes, ends[0][1], plain, free)
-    typical = float(np.median(np.abs(place_on_sphere(nodes, state).residual_mm)))
+    limit = RIVAL_COST * (ends[0][0] + len(nodes) * LEAST_RESIDUAL_MM**2)
+    kept: list[SphereState] = []
+    for cost, state in ends:
+        if cost <= limit and all(is_apart(state, one) for one in kept):
+            kept.append(descend(nodes, state, plain, free_columns(options))[0])
+    typical = float(np.median(np.abs(place_on_sphere(nodes, kept[0]).residual_mm)))
     if typical > options.max_rms_mm:
         return FitFailure(
             f"no hand-eye puts the points on one sphere of {2.0 * radius_mm:g} mm diameter: they "
@@ -178,7 +186,38 @@ def _search(
             "check the convention of the arm's angles, the order of poses and profiles, the "
             "sphere's diameter, and that the sphere did not move",
         )
-    return state
+    refused = _refuse_postures(solve_at(nodes, kept[0], options), 2.0 * radius_mm)
+    return tuple(kept) if refused is None else refused
+
+
+def _best(
+    nodes: SphereNodes, starts: tuple[SphereState, ...], options: SphereOptions
+) -> tuple[SphereState, SphereSolution] | FitFailure:
+    """The likeliest of the refined minima, refused where another one is nearly as likely."""
+    found = [(start, _refine(nodes, start, options)) for start in starts]
+    solved = [(start, one) for start, one in found if one is not None]
+    if not solved:
+        return FitFailure(
+            "the postures do not determine hand-eye and sphere together", POSTURES_REMEDY
+        )
+    solved.sort(key=lambda pair: -pair[1].linear.log_likelihood)
+    best = solved[0]
+    refused = _refuse_postures(best[1].linear, 2.0 * best[0].radius_mm)
+    if refused is not None:
+        return refused
+    for _, other in solved[1:]:
+        lost = best[1].linear.log_likelihood - other.linear.log_likelihood
+        if lost < LIKELIER and is_apart(best[1].state, other.state):
+            return FitFailure(
+                "two quite different hand-eyes explain the stripes equally well: seen from the "
+                "sensor, the sphere's centre moved within one plane only",
+                "vary the stand-off too: nearer and farther by 15 % and more",
+            )
+    return best
+
+
+def _conditioning(linear: LinearSolution) -> Conditioning:
+    return describe_conditioning(np.asarray(np.linalg.inv(linear.covariance[:6, :6])))
 
 
 def _refine(

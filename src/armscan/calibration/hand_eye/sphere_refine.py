@@ -140,6 +140,17 @@ def refine_with_noise(
     return SphereSolution(state, placed, components, noise, linear, free, weights, is_settled)
 
 
+def solve_at(
+    nodes: SphereNodes, state: SphereState, options: SphereOptions
+) -> LinearSolution | None:
+    """Linear solution at a state whose residuals all count as the arm's; None if not solvable."""
+    placed = place_on_sphere(nodes, state)
+    weights = np.ones(len(nodes.postures))
+    components = noise_of_sphere(nodes, placed, options, weights)
+    total = total_covariance(components, _first_sigmas(components, placed))
+    return solve_linear(placed.residual_mm, placed.slopes[:, free_columns(options)], total)
+
+
 def noise_of_sphere(
     nodes: SphereNodes, placed: PlacedOnSphere, options: SphereOptions, weights: FloatArray
 ) -> tuple[NoiseComponent, ...]:
@@ -165,11 +176,14 @@ def _first_sigmas(components: tuple[NoiseComponent, ...], placed: PlacedOnSphere
 
 
 def with_weights(nodes: SphereNodes, solution: SphereSolution, limit: float) -> FloatArray:
-    """(K,) weights of the postures: below 1 where the pose errs by more than ``limit`` sigmas."""
+    """(K,) weights of the postures: below 1 where the pose errs by more than ``limit`` sigmas.
+
+    They fall with the fourth power, so that a gross error does not swell the arm's scatter.
+    """
     errors = np.array(
         [leave_out(nodes, solution, k).pose_sigmas for k in range(len(nodes.postures))]
     )
-    return np.asarray(np.minimum(1.0, (limit / np.maximum(errors, 1e-9)) ** 2))
+    return np.asarray(np.minimum(1.0, (limit / np.maximum(errors, 1e-9)) ** 4))
 
 
 @dataclass(frozen=True, slots=True)

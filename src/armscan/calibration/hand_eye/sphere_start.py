@@ -35,8 +35,7 @@ def start_candidates(nodes: SphereNodes, radius_mm: float) -> tuple[SphereState,
     found.sort(key=lambda pair: pair[0])
     kept: list[SphereState] = []
     for _, state in found:
-        turned = state.tool_from_sensor.rotation
-        if all(_angle(turned, one.tool_from_sensor.rotation) > APART_RAD for one in kept):
+        if all(is_apart(state, one) for one in kept):
             kept.append(state)
         if len(kept) == N_CANDIDATES:
             break
@@ -65,5 +64,7 @@ def _alternate(
     return float((misfit**2).sum()), state
 
 
-def _angle(one: FloatArray, other: FloatArray) -> float:
-    return float(np.arccos(np.clip(0.5 * (np.trace(one.T @ other) - 1.0), -1.0, 1.0)))
+def is_apart(one: SphereState, other: SphereState) -> bool:
+    """True for states whose sensors are turned differently."""
+    turn = one.tool_from_sensor.rotation.T @ other.tool_from_sensor.rotation
+    return float(np.arccos(np.clip(0.5 * (np.trace(turn) - 1.0), -1.0, 1.0))) > APART_RAD

@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hand-eye on a sphere in one least squares: truth, derivatives, scatter, refusals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
+from armscan.calibration.hand_eye.sphere_options import SphereOptions
+from armscan.calibration.hand_eye.sphere_residuals import (
+    N_COLUMNS,
+    SphereState,
+    place_on_sphere,
+    sphere_nodes,
+)
+from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from sphere_rig import (
+    DIAMETER_MM,
+    HAND_EYE,
+    POINT_NOISE_MM,
+    SHEET_NORMAL,
+    SphereRig,
+    turned_poses,
+)
+
+SEED = 5
+POSE_NOISE_MM = 0.02
+QUICK = SphereOptions(nodes_per_stripe=10)
+
+
+def error_of(fit: HandEyeFit) -> FloatArray:
+    """(6,) found minus true, in HAND_EYE_PARAMETER_NAMES."""
+    found = fit.calibration.tool_from_sensor
+    turn = vector_from_rotation(found.rotation @ HAND_EYE.rotation.T)
+    return np.concatenate([turn, found.translation_mm - HAND_EYE.translation_mm])
+
+
+def solved(result: HandEyeFit | FitFailure) -> HandEyeFit:
+    assert isinstance(result, HandEyeFit), result
+    return result
+
+
+@pytest.mark.parametrize("n_sheets", [1, 2])
+def test_exact_points_give_the_hand_eye_back(n_sheets: int) -> None:
+    other = rotation_from_vector(np.array([0.0, 0.0, 0.5])) @ SHEET_NORMAL
+    rig = SphereRig(normals=(SHEET_NORMAL, other)[:n_sheets])
+    stripes = rig.stripes(turned_poses(rig, 9), np.random.default_rng(SEED))
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
+    assert np.abs(error_of(fit)[:3]).max() < 1e-7
+    assert np.abs(error_of(fit)[3:]).max() < 1e-5
+    assert fit.calibration.rms_mm < 1e-6
+    assert fit.calibration.diagnostics is not None
+    assert fit.calibration.diagnostics.method == "sphere"
+    assert fit.calibration.n_exposures == fit.calibration.n_postures == 9
+
+
+def test_slopes_are_the_derivatives() -> None:
+    rig = SphereRig(pose_noise_mm=0.5)
+    stripes = rig.stripes(turned_poses(rig, 4), np.random.default_rng(SEED))
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, QUICK)
+    nodes = sphere_nodes(sections, 8)
+    state = SphereState(HAND_EYE, np.array([650.3, -170.0, 35.5]), 25.2, 1.01)
+    placed = place_on_sphere(nodes, state)
+    for column in range(N_COLUMNS):
+        step = np.zeros(N_COLUMNS)
+        step[column] = 1e-5
+        ahead = place_on_sphere(nodes, state.stepped(step)).residual_mm
+        behind = place_on_sphere(nodes, state.stepped(-step)).residual_mm
+        slope = (ahead - behind) / 2e-5
+        scale = max(1.0, np.abs(slope).max())
+        np.testing.assert_allclose(placed.slopes[:, column] / scale, slope / scale, atol=1e-6)
+
+
+def test_pose_slopes_are_the_derivatives_by_the_arms_pose() -> None:
+    rig = SphereRig()
+    stripe = rig.stripes(turned_poses(rig, 1), np.random.default_rng(SEED))[0]
+    state = SphereState(HAND_EYE, np.array([650.0, -170.5, 35.0]), 25.0)
+
+    def residual(moved: Pose) -> tuple[FloatArray, FloatArray, FloatArray]:
+        changed = replace(stripe, base_from_tool=moved)
+        sections, _ = find_sections([changed], 25.0, QUICK)
+        nodes = sphere_nodes(sections, 6)
+        placed = place_on_sphere(nodes, state)
+        return placed.residual_mm, placed.by_pose, placed.points_base_mm.mean(axis=0)
+
+    start = stripe.base_from_tool
+    _, slopes, middle = residual(start)
+    for k in range(3):
+        small = 1e-5 * np.eye(3)[k]
+        turn = rotation_from_vector(small)
+        shifted = [Pose(start.rotation, start.translation_mm + s * small) for s in (1, -1)]
+        ahead, behind = (residual(pose)[0] for pose in shifted)
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / 2e-5, atol=1e-6)
+        turned = [
+            Pose(r @ start.rotation, r @ (start.translation_mm - middle) + middle)
+            for r in (turn, turn.T)
+        ]
+        ahead, behind = (residual(pose)[0] for pose in turned)
+        np.testing.assert_allclose(slopes[:, 3 + k], (ahead - behind) / 2e-5, atol=1e-4)
+
+
+def test_errors_scatter_as_predicted() -> None:
+    """Pose noise common to a posture is estimated; errors over their covariance are chi-squared."""
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM, n_points=60)
+    poses = turned_poses(rig, 12)
+    generator = np.random.default_rng(SEED)
+    n_runs = 8
+    normalised, arms = [], []
+    for _ in range(n_runs):
+        fit = solved(calibrate_on_sphere(rig.stripes(poses, generator), DIAMETER_MM, QUICK))
+        error = error_of(fit)
+        normalised.append(error @ np.linalg.solve(fit.calibration.covariance, error))
+        arms.append(fit.calibration.arm_noise.position_mm)
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * n_runs) / n_runs
+    assert low < np.mean(normalised) < 1.15 * high
+    # 12 x 3 - 9 = 27 numbers tell the arm's noise: 14 % a run
+    assert np.mean(arms) == pytest.approx(POSE_NOISE_MM, rel=4.0 * 0.14 / np.sqrt(n_runs))
+
+
+def test_a_posture_that_contradicts_is_named_and_hardly_spoils_the_rest() -> None:
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
+    stripes = rig.stripes(turned_poses(rig, 14), np.random.default_rng(SEED))
+    wrong = stripes[4].base_from_tool
+    moved = Pose(wrong.rotation, wrong.translation_mm + np.array([0.4, -0.3, 0.3]))
+    stripes[4] = replace(stripes[4], base_from_tool=moved)
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
+    named = [text for text in fit.warnings if "contradicts the others" in text]
+    assert len(named) == 1
+    assert named[0].startswith("posture p4 ")
+    error = error_of(fit)
+    assert error @ np.linalg.solve(fit.calibration.covariance, error) < chi2.ppf(0.9999, 6)
+    assert fit.calibration.arm_noise.position_mm < 2.0 * POSE_NOISE_MM
+
+
+def test_leaving_a_posture_out_is_solving_without_it() -> None:
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
+    stripes = rig.stripes(turned_poses(rig, 8), np.random.default_rng(SEED))
+    options = replace(QUICK, arm_position_mm=POSE_NOISE_MM, posture_sigma=1e6)
+    every = solved(calibrate_on_sphere(stripes, DIAMETER_MM, options))
+    less = solved(calibrate_on_sphere(stripes[1:], DIAMETER_MM, options))
+    change = error_of(less) - error_of(every)
+    told = every.postures[0]
+    moved = float(np.linalg.norm(change[3:]))
+    assert told.left_out_translation_mm == pytest.approx(moved, rel=0.1)
+    turned = float(np.degrees(np.linalg.norm(change[:3])))
+    assert told.left_out_rotation_deg == pytest.approx(turned, rel=0.1)
+
+
+def test_an_error_of_the_sensor_moves_the_hand_eye_against_it() -> None:
+    """Points shifted by d in the Sensor frame are made good by t - R d."""
+    rig = SphereRig()
+    stripes = rig.stripes(turned_poses(rig, 8), np.random.default_rng(SEED))
+    shifts = np.broadcast_to(np.eye(3), (rig.n_points, 3, 3))
+    stripes = [replace(stripe, by_sensor=shifts) for stripe in stripes]
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
+    coupling = fit.calibration.sensor_coupling
+    assert coupling is not None
+    np.testing.assert_allclose(coupling[:3], 0.0, atol=1e-6)
+    np.testing.assert_allclose(coupling[3:], -HAND_EYE.rotation, atol=1e-4)
+
+
+def test_diameter_and_scale_are_solved_along() -> None:
+    rig = SphereRig(point_noise_mm=0.001)
+    stripes = rig.stripes(turned_poses(rig, 10), np.random.default_rng(SEED))
+    options = replace(QUICK, solve_diameter=True)
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 0.5, options))
+    text = dict(fit.reference)["Sphere's diameter, solved along"]
+    assert float(text.split()[0]) == pytest.approx(DIAMETER_MM, abs=0.005)
+    larger = [replace(stripe, points_mm=1.002 * stripe.points_mm) for stripe in stripes]
+    scaled = solved(calibrate_on_sphere(larger, DIAMETER_MM, replace(QUICK, solve_scale=True)))
+    scale = dict(scaled.reference)["Scale of the sensor's points"]
+    assert float(scale.split(",")[0]) == pytest.approx(1.0 / 1.002, abs=2e-4)
+
+
+def test_a_wrong_diameter_is_noticed() -> None:
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
+    stripes = rig.stripes(turned_poses(rig, 12), np.random.default_rng(SEED))
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM + 1.0, QUICK))
+    assert any("the points ask for a sphere of 50." in text for text in fit.warnings)
+    fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
+    assert not any("ask for" in text for text in fit.warnings)
+    small = calibrate_on_sphere(stripes, 0.6 * DIAMETER_MM, QUICK)
+    assert isinstance(small, FitFailure)
+    assert "no section of a sphere of 30 mm" in small.reason
+
+
+def test_postures_that_do_not_determine_the_hand_eye_are_refused() -> None:
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
+    generator = np.random.default_rng(SEED)
+    about_one_axis = [
+        rig.base_from_tool(np.array([turn, 0.0, 0.0]), height, 0.0)
+        for turn, height in zip(np.linspace(-0.6, 0.6, 10), np.resize([4, 9, 14], 10), strict=True)
+    ]
+    still = [rig.base_from_tool(np.zeros(3), 4.0 + k, 2.0 * k) for k in range(8)]
+    for poses in (about_one_axis, still):
+        failure = calibrate_on_sphere(rig.stripes(poses, generator), DIAMETER_MM, QUICK)
+        assert isinstance(failure, FitFailure)
+        assert "hardly turns, or about one axis only" in failure.reason
+    few = calibrate_on_sphere(rig.stripes(still[:2], generator), DIAMETER_MM, QUICK)
+    assert isinstance(few, FitFailure)
+    assert "2 postures" in few.reason
+
+
+def test_a_constant_stand_off_leaves_two_hand_eyes() -> None:
+    """Half a turn about the stripe, with the sphere on the other side of the sheet."""
+    rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
+    poses = turned_poses(rig, 12, depth_mm=0.0)
+    failure = calibrate_on_sphere(
+        rig.stripes(poses, np.random.default_rng(SEED)), DIAMETER_MM, QUICK
+    )
+    assert isinstance(failure, FitFailure)
+    assert "two quite different hand-eyes" in failure.reason
+    assert "vary the stand-off" in failure.remedy
+
+
+def test_postures_in_the_wrong_order_are_refused() -> None:
+    rig = SphereRig()
+    stripes = rig.stripes(turned_poses(rig, 10), np.random.default_rng(SEED))
+    mixed = [
+        replace(stripe, base_from_tool=other.base_from_tool)
+        for stripe, other in zip(stripes, stripes[1:] + stripes[:1], strict=True)
+    ]
+    failure = calibrate_on_sphere(mixed, DIAMETER_MM, QUICK)
+    assert isinstance(failure, FitFailure)
+    assert "convention of the arm's angles" in failure.remedy
+
+
+def test_bad_input() -> None:
+    rig = SphereRig()
+    stripes = rig.stripes(turned_poses(rig, 4), np.random.default_rng(SEED))
+    twice = [replace(stripe, posture="same") for stripe in stripes]
+    with pytest.raises(InputError, match="posture 'same' has different poses in p0 and p1"):
+        calibrate_on_sphere(twice, DIAMETER_MM)
+    with pytest.raises(OptionError, match="diameter in mm"):
+        calibrate_on_sphere(stripes, 0.05)
+    with pytest.raises(OptionError, match="give rad, not degrees"):
+        SphereOptions(arm_rotation_rad=1.0)
+    with pytest.raises(OptionError, match="nodes_per_stripe is 2"):
+        SphereOptions(nodes_per_stripe=2)

@@ -22,8 +22,8 @@ EXIT_INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``armscan`` and return its exit code.
 
-    0 means done, 2 that the input or the disk stood in the way (one sentence on standard error
-    says what to do), 130 that a person interrupted, 70 a bug.
+    0 means done, 1 that a check was made and not passed, 2 that the input or the disk stood in the
+    way (one sentence on standard error says what to do), 130 that a person interrupted, 70 a bug.
 
     Parameters
     ----------

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small scan of the plane Z = 0 of Base, drawn without the simulator: a line on dark ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from armscan.devices.scan_source import ScanSource
+from armscan.errors import FileFormatError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Base, Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.models.scanner import ArmNoise, HandEyeCalibration, ScannerCalibration
+from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
+from armscan.records.session import ExposureRow, Session
+from sheet_rig import PROVENANCE, THESIS_PLANE
+
+CAMERA = CameraModel(600.0, 600.0, 160.0, 120.0, np.zeros(5), 320, 240)
+TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.0, 0.0, 0.7], [41.0, 20.0, 110.0])
+PEAK, LINE_SIGMA_PX, GREY_NOISE = 180.0, 2.5, 2.0
+PERIOD_NS = 10_000_000
+
+
+def scanner(latency_ns: int = 0) -> ScannerCalibration:
+    """A pinhole camera and the thesis's printed sheet."""
+    normal = THESIS_PLANE[:3] / np.linalg.norm(THESIS_PLANE[:3])
+    along = np.cross(normal, [0.0, 0.0, 1.0])
+    along /= np.linalg.norm(along)
+    axes = np.stack([along, np.cross(normal, along), normal])
+    sheet = LightSheet(np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742]), axes, 20.0, np.zeros(5))
+    camera = CameraCalibration(
+        CAMERA, np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, np.array([0, 0, 319.0, 239.0]), PROVENANCE
+    )
+    sheets = (SheetCalibration("A", sheet, 0.01, 6, 600, (115.0, 160.0), True),)
+    hand_eye = HandEyeCalibration(
+        TOOL_FROM_SENSOR, np.zeros((6, 6)), None, ArmNoise(0.005, 2e-5), 0.007, 12, 12, 8000
+    )
+    sensor = SensorCalibration(camera, sheets, np.zeros((17, 17)), PROVENANCE)
+    return ScannerCalibration(sensor, hand_eye, PROVENANCE, latency_ns)
+
+
+def looking_down(y_mm: float, tilt_rad: float = 0.15) -> Pose[Base, Tool]:
+    """The tool with its camera 135 mm above the plane Z = 0 and the sheet near (0, y, 0)."""
+    down: Pose[Base, Sensor] = Pose.from_vectors([np.pi - tilt_rad, 0.0, 0.0], [0.0, 0.0, 0.0])
+    forward = down.rotation[:, 2] / -down.rotation[2, 2]
+    base_from_sensor: Pose[Base, Sensor] = Pose(
+        down.rotation, np.array([0.0, y_mm, 0.0]) - 135.0 * forward
+    )
+    return base_from_sensor @ TOOL_FROM_SENSOR.inverse()
+
+
+def line_image(base_from_tool: Pose[Base, Tool], rng: np.random.Generator) -> FloatArray:
+    """Where the sheet meets Z = 0, imaged by the pinhole: column by column, in float64."""
+    base_from_sensor = base_from_tool @ TOOL_FROM_SENSOR
+    up = base_from_sensor.rotation.T @ [0.0, 0.0, 1.0]
+    height = base_from_sensor.translation_mm[2]
+    columns = np.arange(CAMERA.width_px)
+    x = (columns - CAMERA.cx_px) / CAMERA.fx_px
+    # Both planes hold for p = Z (x, y, 1): eliminate Z, linear in y.
+    a, b, c, d = THESIS_PLANE
+    y = (d * (up[0] * x + up[2]) - height * (a * x + c)) / (height * b - d * up[1])
+    v = CAMERA.cy_px + CAMERA.fy_px * y
+    rows = np.arange(CAMERA.height_px)[:, None]
+    line = PEAK * np.exp(-0.5 * ((rows - v) / LINE_SIGMA_PX) ** 2)
+    return np.asarray(10.0 + line + rng.normal(0.0, GREY_NOISE, line.shape))
+
+
+@dataclass
+class FakeScan:
+    """A source whose images are drawn when asked for; ``broken`` rows cannot be read."""
+
+    rows: tuple[ExposureRow, ...]
+    arm: ArmTrack | None
+    truth: tuple[Pose[Base, Tool], ...]
+    session: Session = field(default_factory=Session)
+    broken: tuple[int, ...] = ()
+    lit: bool = True
+    name: str = "fake"
+    is_simulated: bool = False
+    reads: list[int] = field(default_factory=list)
+
+    def exposure(self, row: int) -> Exposure:
+        """Draw it."""
+        self.reads.append(row)
+        entry = self.rows[row]
+        if row in self.broken:
+            raise FileFormatError("the image is cut short", where=entry.source)
+        rng = np.random.default_rng(row)
+        is_lit = bool(entry.lasers) or not any(other.lasers for other in self.rows)
+        grey = (
+            line_image(self.truth[row], rng)
+            if is_lit
+            else 10.0 + rng.normal(0.0, GREY_NOISE, (CAMERA.height_px, CAMERA.width_px))
+        )
+        image = np.clip(np.round(grey), 0, 255).astype(np.uint8)
+        return Exposure(image, entry.source, lasers=entry.lasers, t_ns=entry.t_ns)
+
+
+def fake_scan(n: int = 6, step_mm: float = 1.0) -> FakeScan:
+    """A sweep along y, across the stripe, at even speed, one exposure half way between two samples of the arm."""
+    truth = tuple(looking_down(step_mm * k) for k in range(n))
+    samples = [looking_down(step_mm * (k - 0.5)) for k in range(n + 1)]
+    track = ArmTrack(
+        1_000_000_000 + np.arange(n + 1) * PERIOD_NS,
+        np.array([pose.rotation for pose in samples]),
+        np.array([pose.translation_mm for pose in samples]),
+        np.ones(n + 1, dtype=bool),
+    )
+    rows = tuple(
+        ExposureRow(k, int(track.t_ns[k]) + PERIOD_NS // 2, 0, f"images/{k}.png", ("A",))
+        for k in range(n)
+    )
+    return FakeScan(rows, track, truth)
+
+
+def with_rows(scan: FakeScan, changes: Sequence[dict[str, object]]) -> FakeScan:
+    """The scan with fields of its rows replaced, row by row."""
+    rows = tuple(replace(row, **change) for row, change in zip(scan.rows, changes, strict=True))
+    return replace(scan, rows=rows)
+
+
+def as_source(scan: FakeScan) -> ScanSource:
+    """The type checker's word that the fake is a source."""
+    return scan

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan of a known plane, with all that can be missing from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.errors import EstimationError, InputError, OptionError
+from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.progress import ProgressEvent
+from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.pipeline.scan_result import ScanExposureFate
+from armscan.reconstruction.normals import NormalOptions
+from armscan.reconstruction.volume import BaseBox
+from scan_fake import PERIOD_NS, FakeScan, as_source, fake_scan, looking_down, scanner, with_rows
+
+
+@pytest.fixture(scope="module")
+def device() -> ScannerCalibration:
+    return scanner()
+
+
+def test_the_plane_comes_back_in_base(device: ScannerCalibration) -> None:
+    """Noise 2 of 180 grey levels, line sigma 2.5 px: a few hundredths of a pixel, 0.22 mm/px."""
+    events: list[ProgressEvent] = []
+    result = measure_scan(as_source(fake_scan()), device, progress=events.append)
+    cloud = result.cloud
+    assert cloud.frame == "Base"
+    assert len(cloud) > 6 * 280
+    height = cloud.points_mm[:, 2]
+    noise = np.median(cloud.sigma_noise_mm)
+    assert abs(np.median(height)) < noise
+    assert np.sqrt(np.mean(height**2)) < 2.0 * noise
+    assert (cloud.sigma_mm >= 0.005).all(), "the arm's own 0.005 mm is part of every sigma"
+    np.testing.assert_array_equal(np.unique(cloud.exposure), np.arange(6))
+    assert cloud.exposure_sources[2] == "images/2.png"
+    middles = [np.median(cloud.points_mm[cloud.exposure == k, 1]) for k in range(6)]
+    np.testing.assert_allclose(np.diff(middles), 1.0, atol=0.05)
+    assert cloud.normals is not None
+    defined = cloud.normals.any(axis=1)
+    assert defined.mean() > 0.9
+    assert (cloud.normals[defined, 2] > 0.95).all()
+    assert result.poses.source == "time"
+    assert result.without_pose == ()
+    assert [event.done for event in events] == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_threads_and_volume_change_nothing_but_speed_and_extent(
+    device: ScannerCalibration,
+) -> None:
+    one = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None))
+    two = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, threads=2))
+    np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
+    assert one.cloud.normals is None
+    box = BaseBox(np.array([-100.0, -100.0, -1.0]), np.array([100.0, 2.6, 1.0]))
+    cut = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, volume=box))
+    inside = box.holds(one.cloud.points_mm)
+    np.testing.assert_array_equal(cut.cloud.points_mm, one.cloud.points_mm[inside])
+    assert sum(e.n_outside_volume for e in cut.exposures) == int((~inside).sum()) > 0
+    assert any("outside the volume" in warning for warning in cut.warnings)
+    assert cut.cloud.exposure.max() < len(cut.images) == 6
+
+
+def test_what_is_missing_is_counted_and_named(device: ScannerCalibration) -> None:
+    """A gap of the arm, an image that cannot be read, an exposure after the track."""
+    scan = fake_scan(8)
+    assert scan.arm is not None
+    known = np.ones(9, dtype=bool)
+    known[6] = False
+    late = with_rows(scan, [{}] * 7 + [{"t_ns": int(scan.arm.t_ns[-1]) + 1}])
+    result = measure_scan(
+        as_source(replace(late, arm=replace(scan.arm, is_known=known), broken=(2,))), device
+    )
+    fates = [exposure.fate for exposure in result.exposures]
+    placed, unreadable, no_pose = (
+        ScanExposureFate.PLACED,
+        ScanExposureFate.UNREADABLE,
+        ScanExposureFate.NO_POSE,
+    )
+    assert fates == [placed] * 2 + [unreadable] + [placed] * 2 + [no_pose] * 3
+    assert result.image_rows == (0, 1, 3, 4)
+    assert result.cloud.exposure_sources == tuple(f"images/{k}.png" for k in (0, 1, 3, 4))
+    assert [source for source, _ in result.without_pose] == [f"images/{k}.png" for k in (5, 6, 7)]
+    text = " ".join(result.warnings)
+    assert "3 of 8 exposures have no pose: 2 in a gap of the arm's samples, 1 after" in text
+    assert "1 of 8 images cannot be read: images/2.png: the image is cut short" in text
+    assert result.count(placed) == 4
+    height = result.cloud.points_mm[:, 2]
+    assert np.sqrt(np.mean(height**2)) < 2.0 * np.median(result.cloud.sigma_noise_mm)
+
+
+def test_exposures_are_not_read_for_nothing(device: ScannerCalibration) -> None:
+    """Laser-off rows are the background of their view, read once; others are left alone."""
+    scan = fake_scan(5)
+    changes = [
+        {"view": "a", "lasers": ()},
+        {"view": "a"},
+        {"view": "a"},
+        {"lasers": ()},
+        {},
+    ]
+    shown = with_rows(scan, changes)
+    result = measure_scan(as_source(shown), device, ScanOptions(normals=None))
+    assert sorted(shown.reads) == [0, 1, 2, 4]
+    assert [e.fate for e in result.exposures].count(ScanExposureFate.LASER_OFF) == 2
+    assert result.image_rows == (1, 2, 4)
+
+
+def test_without_names_of_lasers_all_are_taken_as_lit(device: ScannerCalibration) -> None:
+    scan = with_rows(fake_scan(3), [{"lasers": ()}] * 3)
+    result = measure_scan(as_source(scan), device, ScanOptions(normals=None))
+    assert len(result.images) == 3
+    assert any("no exposure names its lasers" in warning for warning in result.warnings)
+
+
+def test_latency_shifts_the_points_along_the_sweep() -> None:
+    """1 mm a period: a quarter of a period late is 0.25 mm."""
+    on_time = measure_scan(as_source(fake_scan(4)), scanner(), ScanOptions(normals=None)).cloud
+    late = measure_scan(
+        as_source(fake_scan(4)), scanner(PERIOD_NS // 4), ScanOptions(normals=None)
+    ).cloud
+    np.testing.assert_allclose(
+        late.points_mm - on_time.points_mm, np.tile([0, 0.25, 0], (len(late), 1)), atol=1e-9
+    )
+
+
+def test_a_wrong_hand_eye_does_not_lie_flat(device: ScannerCalibration) -> None:
+    """The test of the test: 1 degree about the sheet's normal moves points by 0.1 mm or more."""
+    wrong = replace(
+        device,
+        hand_eye=replace(
+            device.hand_eye,
+            tool_from_sensor=looking_down(0.0).inverse()
+            @ looking_down(0.0, 0.15 + np.radians(1.0))
+            @ device.hand_eye.tool_from_sensor,
+        ),
+    )
+    cloud = measure_scan(as_source(fake_scan(3)), wrong, ScanOptions(normals=None)).cloud
+    assert np.abs(cloud.points_mm[:, 2]).max() > 0.1
+
+
+def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> None:
+    scan = fake_scan(3)
+    with pytest.raises(InputError, match="no samples of the arm"):
+        measure_scan(as_source(replace(scan, arm=None)), device)
+    with pytest.raises(InputError, match="no camera"):
+        coupled = replace(device.hand_eye, sensor_coupling=None)
+        measure_scan(as_source(scan), replace(device, sensor=None, hand_eye=coupled))
+    with pytest.raises(EstimationError, match=r"could be measured: images/0\.png: the image"):
+        measure_scan(as_source(replace(scan, broken=(0, 1, 2))), device)
+    away = BaseBox(np.full(3, 900.0), np.full(3, 901.0))
+    with pytest.raises(EstimationError, match="outside the volume"):
+        measure_scan(as_source(scan), device, ScanOptions(volume=away))
+    with pytest.raises(InputError, match="cameras 0, 1"):
+        measure_scan(as_source(with_rows(scan, [{}, {"camera": 1}, {}])), device)
+    with pytest.raises(OptionError, match="threads"):
+        ScanOptions(threads=0)
+
+
+def test_ctrl_c_stops_the_scan(device: ScannerCalibration) -> None:
+    """The interrupt reaches the caller after the exposures at work, and no more are read."""
+    scan: FakeScan = fake_scan(6)
+
+    def interrupt(event: ProgressEvent) -> None:
+        if event.done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        measure_scan(as_source(scan), device, progress=interrupt)
+    assert scan.reads == [0, 1]
+
+
+def test_a_few_points_without_normal_are_normal(device: ScannerCalibration) -> None:
+    narrow = ScanOptions(normals=NormalOptions(radius_mm=0.6))
+    result = measure_scan(as_source(fake_scan(3)), device, narrow)
+    assert any("have no normal: within 0.6 mm" in warning for warning in result.warnings)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Profiles of a real sensor on a real robot: a sphere that is solved, a board that is refused."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.sphere_options import SphereOptions
+from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.calibration.hand_eye.sphere_two_step import TwoStepHandEye, calibrate_in_two_steps
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.euler import EulerConvention
+from armscan.geometry.fitting import Plane
+from armscan.geometry.rotation import nearest_rotation, vector_from_rotation
+from armscan.pipeline.profiles import (
+    calibrate_hand_eye_from_profiles,
+    posed_stripes_from_profiles,
+)
+from armscan.storage.profiles import read_profiles
+from armscan.storage.robot_poses import read_robot_poses
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))
+SPHERE, BOARD = DATA / "sphere_profiles", DATA / "plate_profiles"
+pytestmark = pytest.mark.skipif(
+    not (SPHERE.is_dir() and BOARD.is_dir()),
+    reason="test data not found: set ARMSCAN_DATA to the folder of sphere_profiles, plate_profiles",
+)
+DIAMETER_MM = 80.0
+ROBOT_MM = (0.10, 0.22)
+"""Scatter of the robot at the sphere, 0.9 m from its flange: 0.01 degrees of it make 0.16 mm."""
+
+
+def solve(euler: EulerConvention, diameter_mm: float = DIAMETER_MM) -> HandEyeFit | FitFailure:
+    poses = read_robot_poses(SPHERE / "RobPoses.rob", euler)
+    return calibrate_hand_eye_from_profiles(read_profiles([SPHERE]), poses, diameter_mm)
+
+
+@pytest.fixture(scope="module")
+def fit() -> HandEyeFit:
+    found = solve("extrinsic-xyz")
+    assert isinstance(found, HandEyeFit), found
+    return found
+
+
+@pytest.fixture(scope="module")
+def stripes() -> tuple[PosedStripe, ...]:
+    poses = read_robot_poses(SPHERE / "RobPoses.rob", "extrinsic-xyz")
+    return posed_stripes_from_profiles(read_profiles([SPHERE]), poses)
+
+
+@pytest.fixture(scope="module")
+def author() -> FloatArray:
+    text = (SPHERE / "calibration.sec").read_text("utf-8")
+    return np.array(json.loads(text)["Solution"]["HTM"])
+
+
+def test_the_robot_explains_the_residuals(fit: HandEyeFit) -> None:
+    """The profiles themselves are good to 0.01 mm; what is left is common to a posture."""
+    noise = fit.calibration.arm_noise
+    assert ROBOT_MM[0] < noise.position_mm < ROBOT_MM[1]
+    assert fit.calibration.rms_mm < ROBOT_MM[1]
+    within = [float(one.residual_mm.std()) for one in fit.stripes]
+    assert np.median(within) < 0.4 * noise.position_mm
+    asked = dict(fit.reference)["Diameter that the points ask for"].split()
+    assert abs(float(asked[0]) - DIAMETER_MM) < 3.0 * float(asked[-2])
+
+
+def test_it_says_how_well_it_is_known(fit: HandEyeFit) -> None:
+    calibration = fit.calibration
+    sigma = np.sqrt(np.diag(calibration.covariance))
+    assert 0.2 < sigma[3:].min() < sigma[3:].max() < 0.7
+    assert 0.05 < np.degrees(sigma[:3]).min() < np.degrees(sigma[:3]).max() < 0.4
+    assert calibration.diagnostics is not None
+    assert calibration.diagnostics.rank == 6
+    assert calibration.n_postures == 15
+    weak = [text.split()[0] for text in fit.warnings if "is weak: its arc" in text]
+    assert weak == ["p5.yml", "p6.yml"]
+    assert max(one.left_out_translation_mm for one in fit.postures) < 4.0 * sigma[3:].max()
+
+
+def test_the_authors_translation_lies_within_what_the_residuals_allow(
+    fit: HandEyeFit, author: FloatArray
+) -> None:
+    calibration = fit.calibration
+    apart = author[:3, 3] - calibration.tool_from_sensor.translation_mm
+    sigma = np.sqrt(np.diag(calibration.covariance))[3:]
+    assert (np.abs(apart) < 3.5 * sigma).all()
+    turn = author[:3, :3] @ calibration.tool_from_sensor.rotation.T
+    assert np.degrees(np.linalg.norm(vector_from_rotation(nearest_rotation(turn)))) < 1.5
+
+
+def test_the_authors_rotation_contradicts_the_shift_from_p1_to_p3(
+    fit: HandEyeFit, author: FloatArray, stripes: tuple[PosedStripe, ...]
+) -> None:
+    """Between them the tool only shifts, so that the section centre's path is the shift itself."""
+    pair = (stripes[0], stripes[2])
+    (first, last), _ = find_sections(pair, 0.5 * DIAMETER_MM, SphereOptions())
+    seen_z_mm = float(last.centre_mm[2] - first.centre_mm[2])
+    poses = [stripe.base_from_tool for stripe in pair]
+    np.testing.assert_allclose(poses[0].rotation, poses[1].rotation, atol=1e-4)
+    shift = poses[0].rotation.T @ (poses[0].translation_mm - poses[1].translation_mm)
+    ours = float((fit.calibration.tool_from_sensor.rotation.T @ shift)[2])
+    theirs = float((author[:3, :3].T @ shift)[2])
+    assert abs(ours - seen_z_mm) < ROBOT_MM[0]
+    assert abs(theirs - seen_z_mm) > 4.0 * ROBOT_MM[0]
+
+
+def test_two_steps_agree_with_one(fit: HandEyeFit, stripes: tuple[PosedStripe, ...]) -> None:
+    found = calibrate_in_two_steps(stripes, DIAMETER_MM)
+    assert isinstance(found, TwoStepHandEye), found
+    assert found.shifted == tuple(f"p{k}.yml" for k in range(1, 7))
+    apart = found.tool_from_sensor.translation_mm - fit.calibration.tool_from_sensor.translation_mm
+    sigma = np.sqrt(np.diag(fit.calibration.covariance))[3:]
+    assert (np.abs(apart) < 2.0 * sigma).all()
+    # three directions, each with the robot's scatter: 0.15 mm times the root of three
+    assert float(np.median(found.centre_misfit_mm)) < np.sqrt(3.0) * ROBOT_MM[1]
+    wrong = calibrate_in_two_steps(stripes, DIAMETER_MM, side=-found.side)
+    assert not isinstance(wrong, TwoStepHandEye) or wrong.centre_misfit_mm.max() > 5.0
+
+
+@pytest.mark.parametrize("euler", ["intrinsic-xyz", "intrinsic-zxz"])
+def test_the_wrong_convention_of_angles_is_noticed(euler: EulerConvention) -> None:
+    failure = solve(euler)
+    assert isinstance(failure, FitFailure)
+    assert "no hand-eye puts the points on one sphere" in failure.reason
+    assert "convention of the arm's angles" in failure.remedy
+
+
+def test_a_wrong_diameter_is_noticed() -> None:
+    found = solve("extrinsic-xyz", 81.0)
+    assert isinstance(found, HandEyeFit)
+    assert any("the points ask for a sphere of 80." in text for text in found.warnings)
+    assert isinstance(solve("extrinsic-xyz", 70.0), FitFailure)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_board_is_refused_whatever_its_plane(axis: int) -> None:
+    """Twelve postures, but only five orientations, tilted in one plane: the remedy says so."""
+    poses = read_robot_poses(BOARD / "rob2board.txt", "extrinsic-xyz")
+    stripes = posed_stripes_from_profiles(read_profiles([BOARD]), poses)
+    axes = np.roll(np.eye(3), axis - 2, axis=1)
+    plate = PlateReference(Plane(np.zeros(3), axes))
+    failure = calibrate_on_plate(stripes, plate, HandEyeOptions(solve_plate=True))
+    assert isinstance(failure, FitFailure)
+    assert "of the hand-eye's 6 parameters" in failure.reason
+    assert "tilt the head by 30 to 45 degrees in two or more directions" in failure.remedy

@@ -19,6 +19,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.storage.images import read_bytes
 
 INT64 = np.iinfo(np.int64)
+WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 
 
@@ -94,12 +95,22 @@ class CsvTable:
         FileFormatError
             Naming line and column of a cell that is no finite number.
         """
-        cells = zip(*(self.columns[name] for name in names), strict=True)
-        values = [
-            [self._float(cell, row, name, may_lack) for cell, name in zip(line, names, strict=True)]
-            for row, line in enumerate(cells)
-        ]
-        return np.array(values, dtype=np.float64).reshape(len(self), len(names))
+        columns = [self._column(name, may_lack) for name in names]
+        return np.array(columns, dtype=np.float64).reshape(len(names), len(self)).T
+
+    def _column(self, name: str, may_lack: bool) -> list[float]:
+        cells = self.columns[name]
+        values: list[float] = []
+        for row, cell in enumerate(cells):
+            value = _number(cell)
+            if not (math.isfinite(value) or (may_lack and math.isnan(value))):
+                raise FileFormatError(
+                    f"'{cell}' in column {name} is no number",
+                    where=self.place(row),
+                    remedy="correct it",
+                )
+            values.append(value)
+        return values
 
     def ints(self, name: str, missing: int | None = None) -> IntArray:
         """Return a column as whole numbers (N,).
@@ -120,28 +131,16 @@ class CsvTable:
         values = [self._int(cell, row, name, missing) for row, cell in cells]
         return np.array(values, dtype=np.int64)
 
-    def _float(self, cell: str, row: int, name: str, may_lack: bool) -> float:
-        try:
-            value = float(cell) if cell else math.nan
-        except ValueError:
-            value = math.inf
-        if math.isfinite(value) or (may_lack and math.isnan(value)):
-            return value
-        raise FileFormatError(
-            f"'{cell}' in column {name} is no number", where=self.place(row), remedy="correct it"
-        )
-
     def _int(self, cell: str, row: int, name: str, missing: int | None) -> int:
         if not cell and missing is not None:
             return missing
-        try:
-            value = int(cell)
-        except ValueError as error:
+        if not WHOLE_NUMBER.fullmatch(cell):
             raise FileFormatError(
                 f"'{cell}' in column {name} is no whole number",
                 where=self.place(row),
                 remedy="write all digits, without point or exponent",
-            ) from error
+            )
+        value = int(cell)
         if not INT64.min <= value <= INT64.max:
             raise FileFormatError(
                 f"{value} in column {name} needs more than 64 bits", where=self.place(row)
@@ -253,12 +252,16 @@ def _checked_header(header: list[str], where: str) -> list[str]:
     return header
 
 
-def _is_number(cell: str) -> bool:
+def _number(cell: str) -> float:
+    """Value of a cell; NaN for an empty one, infinite for what is no number."""
     try:
-        float(cell)
+        return float(cell) if cell else math.nan
     except ValueError:
-        return False
-    return True
+        return math.inf
+
+
+def _is_number(cell: str) -> bool:
+    return bool(cell) and math.isfinite(_number(cell))
 
 
 def _wrong_length(

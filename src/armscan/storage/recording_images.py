@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,7 +54,7 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
     )
 
 
-def setup_of_image(path: Path, setup: CameraSetup, stated: frozenset[str]) -> CameraSetup:
+def setup_of_image(path: Path, setup: CameraSetup, lacking: Sequence[str]) -> CameraSetup:
     """Complete what nobody said about a camera by one of its images.
 
     Parameters
@@ -62,20 +63,12 @@ def setup_of_image(path: Path, setup: CameraSetup, stated: frozenset[str]) -> Ca
         The image.
     setup
         What is known, defaults elsewhere.
-    stated
-        Names of the keys that somebody said.
+    lacking
+        Names of the fields that nobody said.
     """
-    bits = setup.bits_used if "bits_used" in stated or setup.align == "high" else None
+    bits = None if "bits_used" in lacking else setup.bits_used
     image = read_exposure(path, ImageOptions(bits, setup.align))
-    found: dict[str, Any] = {}
-    if "bits_used" not in stated and setup.align == "low":
-        found["bits_used"] = image.bits_used
-    if "colour" not in stated:
-        found["colour"] = image.colour
-    if setup.width_px is None:
-        found["width_px"] = image.width_px
-    if setup.height_px is None:
-        found["height_px"] = image.height_px
+    found: dict[str, Any] = {key: getattr(image, key) for key in lacking}
     return replace(setup, **found)
 
 

@@ -27,7 +27,8 @@ from armscan.storage.recording_images import read_recorded, setup_of_image
 from armscan.storage.recording_session import SESSION_FILE, SessionFile, read_session_file
 from armscan.storage.simulated import are_simulated
 
-CAMERA_KEYS = ("width_px", "height_px", "bits_used", "colour")
+SIZE_KEYS = ("width_px", "height_px")
+CAMERA_KEYS = (*SIZE_KEYS, "bits_used", "colour")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -225,7 +226,7 @@ def _odd(table: CsvTable, unknown: Mapping[str, tuple[str, ...]]) -> list[str]:
 def _cameras(
     folder: Path, rows: Sequence[ExposureRow], said: SessionFile
 ) -> tuple[tuple[CameraSetup, ...], list[str]]:
-    """Setups of all cameras: as said, the rest by the first image of each."""
+    """Setups of all cameras as said, what nobody said by the first image of each; and that."""
     count = max(row.camera for row in rows) + 1
     setups = said.session.cameras
     if setups and count > len(setups):
@@ -242,9 +243,10 @@ def _cameras(
             key.removeprefix(prefix) for key in said.stated if key.startswith(prefix)
         )
         first = next((row for row in rows if row.camera == number), None)
-        lacking = [key for key in CAMERA_KEYS if key not in stated]
+        # a camera that is described takes the format's defaults, one that is not its images'
+        lacking = [key for key in (CAMERA_KEYS if not setups else SIZE_KEYS) if key not in stated]
         if first is not None and lacking:
-            setup = setup_of_image(folder / first.source, setup, stated)
+            setup = setup_of_image(folder / first.source, setup, lacking)
             values = ", ".join(f"{key} {getattr(setup, key)}" for key in lacking)
             facts.append(f"camera {number} has {values}, as {first.source}")
         cameras.append(setup)

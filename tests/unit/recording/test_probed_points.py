@@ -65,7 +65,7 @@ def test_columns_are_found_by_name_and_marks_of_other_systems_do_no_harm(tmp_pat
         ("x_m,y_m,z_m\n1,2,3\n", "in metres"),
         ("x_mm,y_mm,z_mm\n0,0,0\n0.3,0,0\n0,0.4,0\n", "look like metres"),
         ("x_mm,y_mm,z_mm\n1,2,\n", "line 2: '' in column z_mm is no number"),
-        ("x_mm,y_mm,z_mm\n1,2,nan\n", "is no number"),
+        ("x_mm,y_mm,z_mm\n1,2,nan\n", "'nan' in column z_mm is no number"),
         ("x_mm,y_mm,z_mm\n1,5,2,5,3,5\n", "decimal point"),
         ("x_mm;y_mm;z_mm\n1;2;3\n", "not separated by commas"),
         ("x_mm,y_mm,z_mm\n1,2,3\n4,5", "may be cut"),

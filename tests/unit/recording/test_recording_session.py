@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.errors import FileFormatError, OptionError
+from armscan.errors import ArmscanError, FileFormatError, OptionError
 from armscan.records.sensor_window import SensorWindow
 from armscan.records.session import CameraSetup, Session
 from armscan.storage.recording_reader import read_recording
@@ -62,6 +62,30 @@ def test_without_a_session_the_columns_decide_and_all_is_said(tmp_path: Path) ->
         "width_px 8, height_px 6, bits_used 8, colour mono, as images/0.png",
     ):
         assert part in said
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "said"),
+    [((6, 8), np.uint16, "more than 8 bits hold"), ((6, 8, 3), np.uint8, "its camera is 'mono'")],
+)
+def test_a_camera_that_is_described_has_the_formats_defaults(
+    tmp_path: Path, shape: tuple[int, ...], kind: type[np.generic], said: str
+) -> None:
+    folder = lab_folder(tmp_path, session="[[camera]]\nwidth_px = 8\nheight_px = 6\n")
+    cv2.imwrite(
+        str(folder / "images/0.png"), np.full(shape, 256 if kind is np.uint16 else 9).astype(kind)
+    )
+    with pytest.raises(ArmscanError, match=said):
+        read_recording(folder).exposure(0)
+
+
+@pytest.mark.parametrize("ending", ["png", "bmp", "tif", "pgm", "jpg"])
+def test_every_format_of_images_is_read(tmp_path: Path, ending: str) -> None:
+    table = EXPOSURES.replace("0.png", f"0.{ending}")
+    folder = lab_folder(tmp_path, exposures=table)
+    flat = np.full((6, 8), 77, np.uint8)
+    cv2.imwrite(str(folder / f"images/0.{ending}"), flat)
+    np.testing.assert_array_equal(read_recording(folder).exposure(0).image, flat)
 
 
 def test_what_the_images_show_is_taken_where_nobody_said_it(tmp_path: Path) -> None:

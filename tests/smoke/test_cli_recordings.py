@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings on the command line: simulated ones, and damaged ones in one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from armscan.cli import main
+from recording_folders import ARM, EXPOSURES, SESSION, lab_folder
+
+
+def test_the_real_twin_probes_its_plate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "touches"
+    words = ["simulate", "thesis-single", "probing", "-o", str(folder), "--seed", "4"]
+    assert main(words) == 0
+    assert "armscan probe" in capsys.readouterr().out
+    assert json.loads((tmp_path / "touches.truth.json").read_text())["simulated"] is True
+    assert main(["info", str(folder), "--json"]) == 0
+    (item,) = json.loads(capsys.readouterr().out)["items"]
+    assert item["arm_samples"] >= 20 and item["arm_gaps"] == 0
+    assert main(words) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["thesis-double", "ball"], "no simulated head is called 'thesis-double'"),
+        (["thesis-single", "bell"], "'bell' is not one of"),
+        (["thesis-single", "ball", "--preset", "best"], "'best' is not one of"),
+        (["thesis-single", "ball", "--processes", "0"], "'--processes'"),
+    ],
+)
+def test_what_cannot_be_simulated_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    assert main(["simulate", *words, "-o", str(tmp_path / "scan")]) == 2
+    assert said in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+BAD = {
+    "swapped columns": ({"arm": ARM.replace("z_mm,qw", "qw,z_mm")}, "norm is 400"),
+    "duplicate times": ({"arm": ARM.replace("3500,", "1500,")}, "appears again"),
+    "metres": ({"arm": ARM.replace("_mm", "_m")}, "in metres"),
+    "no clock": ({"session": SESSION.replace("shared", "separate")}, "neither a shared clock"),
+    "lost image": ({"exposures": EXPOSURES.replace("1.png", "7.png")}, "do not exist"),
+    "wrong key": ({"session": SESSION.replace('"mono"', "7")}, "camera.0.colour"),
+    "cut": ({"arm": ARM[:-6]}, "may be cut"),
+    "empty": ({"exposures": ""}, "empty (0 bytes)"),
+    "other text": ({"exposures": b"\xff\xfe\x00x"}, "not UTF-8"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_recording_costs_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str
+) -> None:
+    files, said = BAD[case]
+    assert main(["info", str(lab_folder(tmp_path, **files))]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and said in err
+    assert err.startswith("error: ") and err.count("\n") == 1

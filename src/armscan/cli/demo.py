@@ -1,39 +1,52 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan demo``: the whole chain on rendered photographs, with the truth beside it."""
+"""``armscan demo``: the whole chain on rendered images, with the truth beside it."""
 
 from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import typer
 
 from armscan.cli.output import AsJson, progress_bar, show
 
-EXAMPLE = "\b\nExample:\n  armscan demo photos -o demo"
+EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
 
 
 class Scene(StrEnum):
     """What can be shown."""
 
+    SINGLE = "single"
     PHOTOS = "photos"
 
 
 def demo(
     scene: Annotated[
-        Scene, typer.Argument(help="photos: a camera, a line laser, a board and a bust.")
-    ] = Scene.PHOTOS,
+        Scene,
+        typer.Argument(
+            help="single: a line scanner on a measuring arm, with plate, ball, blocks and part; "
+            "photos: a camera, a line laser, a board and a bust."
+        ),
+    ] = Scene.SINGLE,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for photographs, results and pages.")
+        Path, typer.Option("-o", "--output", help="Folder for images, results and pages.")
     ] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Placement and noise of the photographs.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+    preset: Annotated[
+        str, typer.Option(help="Of the arm scanner: clean, thesis or harsh.")
+    ] = "thesis",
     as_json: AsJson = False,
 ) -> None:
-    """Render photographs, calibrate camera and laser, measure an object, state the errors."""
+    """Render images, calibrate from them, measure things, and state the errors."""
+    from armscan.devices.twin import Preset
     from armscan.report.demo_job import DemoRequest, run_photo_demo
+    from armscan.report.single_demo_job import SingleDemoRequest, run_single_demo
 
-    jobs = {Scene.PHOTOS: run_photo_demo}
     with progress_bar() as progress:
-        summary = jobs[scene](DemoRequest(output, seed), progress)
+        if scene is Scene.PHOTOS:
+            summary = run_photo_demo(DemoRequest(output, seed), progress)
+        else:
+            request = SingleDemoRequest(output, seed, cast(Preset, preset))
+            summary = run_single_demo(request, progress)
     show(summary, as_json=as_json)

@@ -9,18 +9,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
 
-from armscan.errors import OutputError
 from armscan.pipeline.photo_demo import PhotoErrors, compare_with_truth, render_photos
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.camera_job import CameraRequest, run_camera_calibration
 from armscan.report.cloud_job import CloudRequest, run_reconstruction
+from armscan.report.demo_folder import check_demo_folder
 from armscan.report.laser_job import LaserRequest, run_laser_calibration
 from armscan.report.numbers import significant, with_sigma
 from armscan.report.summary import Summary, Table, summary_json
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import read_sensor_calibration
 from armscan.storage.clouds import read_ply
-from armscan.storage.simulated import are_simulated
 
 T = TypeVar("T")
 
@@ -64,7 +63,7 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
     """
     folder = request.folder
     photos = folder / "photos"
-    _check_folder(folder)
+    check_demo_folder(folder, OWN_NAMES, photos / "camera")
     seconds: dict[str, float] = {}
     truth = _timed(seconds, "render", lambda: render_photos(photos, request.seed, progress))
     camera = CameraRequest(
@@ -114,22 +113,6 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
     )
     write_files({result: summary_json(summary).encode()}, is_overwriting=True)
     return summary
-
-
-def _check_folder(folder: Path) -> None:
-    """Refuse to write between files that are not an earlier demo's.
-
-    A demo is known by its rendered photographs.
-    """
-    found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    is_demo = are_simulated((folder / "photos" / "camera",))
-    foreign = [name for name in found if not is_demo or name not in OWN_NAMES]
-    if foreign:
-        raise OutputError(
-            f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
-            where=str(folder),
-            remedy="name a new or an empty folder",
-        )
 
 
 def _timed(seconds: dict[str, float], stage: str, work: Callable[[], T]) -> T:

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a calibrated single-line arm scanner measures of the twin's things, against their truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.devices.scan_source import ScanSource
+from armscan.devices.twin import TwinTruth
+from armscan.errors import EstimationError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.inspection.plane import inspect_plane
+from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
+from armscan.inspection.sphere import inspect_sphere
+from armscan.inspection.step import inspect_step
+from armscan.pipeline.progress import Progress
+from armscan.pipeline.reconstruct import reconstruct
+from armscan.pipeline.scan import measure_scan
+from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.single_calibration import Instrument, succeeded
+from armscan.records.cloud import PointCloud
+
+STILL_HEIGHT_MM = 20.0
+"""Height of the block of the scene ``still-step``, as in figure 5.19."""
+PART_REACH_MM = 1.0
+"""Points of the part's scan further than this from its surface lie on what stands around it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPart:
+    """A free-form part against its true surface.
+
+    Parameters
+    ----------
+    scan
+        The scan of it.
+    rows
+        (N,) rows, in its cloud, of the points within `PART_REACH_MM` of the true surface.
+    distance_mm
+        (N,) their signed distances from it.
+    n_elsewhere
+        Points further away.
+    normalised_rms
+        Root mean square of these distances over the stated sigma along the surface's normal.
+    """
+
+    scan: ScanReconstruction
+    rows: IntArray
+    distance_mm: FloatArray
+    n_elsewhere: int
+    normalised_rms: float
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square distance."""
+        return float(np.sqrt(np.mean(self.distance_mm**2)))
+
+    def fraction_within(self, limit_mm: float) -> float:
+        """Share of the points within a distance of the true surface."""
+        return float(np.mean(np.abs(self.distance_mm) <= limit_mm))
+
+
+def measure_plate(
+    source: ScanSource, instrument: Instrument, progress: Progress
+) -> tuple[ScanReconstruction, PlaneInspection]:
+    """Scan of the plate, and its points against the fitted and the probed plane.
+
+    Raises
+    ------
+    EstimationError
+        If no plane was found.
+    """
+    scan = measure_scan(source, instrument.scanner, progress=progress)
+    plane = inspect_plane(scan.cloud, instrument.plate.plane, reference_text="the probed plane")
+    return scan, succeeded(plane, source.name)
+
+
+def measure_ball(
+    source: ScanSource, instrument: Instrument, diameter_mm: float, progress: Progress
+) -> tuple[ScanReconstruction, SphereInspection]:
+    """Scan of the ball, and its points against fitted and nominal diameter; raises the same."""
+    scan = measure_scan(source, instrument.scanner, progress=progress)
+    return scan, succeeded(inspect_sphere(scan.cloud, diameter_mm), source.name)
+
+
+def measure_steps(
+    source: ScanSource, instrument: Instrument, heights_mm: tuple[float, ...], progress: Progress
+) -> tuple[StepInspection, ...]:
+    """Heights of gauge blocks through the arm; raises the same."""
+    cloud = measure_scan(source, instrument.scanner, progress=progress).cloud
+    return tuple(succeeded(inspect_step(cloud, height), source.name) for height in heights_mm)
+
+
+def measure_still_step(
+    source: ScanSource, instrument: Instrument, progress: Progress
+) -> StepInspection:
+    """Height of a block from one exposure, in the Sensor frame; raises the same."""
+    cloud = reconstruct([source.exposure(0)], instrument.sensor, progress=progress).cloud
+    return succeeded(inspect_step(cloud, STILL_HEIGHT_MM), source.name)
+
+
+def measure_part(
+    source: ScanSource, instrument: Instrument, truth: TwinTruth, progress: Progress
+) -> MeasuredPart:
+    """Scan of the free-form part, and its points against the true surface; raises the same."""
+    scan = measure_scan(source, instrument.scanner, progress=progress)
+    cloud = scan.cloud
+    distance = truth.part_distance_mm(cloud.points_mm)
+    rows = np.flatnonzero(np.abs(distance) <= PART_REACH_MM)
+    if len(rows) == 0:
+        raise EstimationError("no measured point lies on the part", where=source.name)
+    sigma = _sigma_along(cloud, truth, rows)
+    normalised = float(np.sqrt(np.mean((distance[rows] / sigma) ** 2)))
+    return MeasuredPart(scan, rows, distance[rows], len(cloud) - len(rows), normalised)
+
+
+def _sigma_along(cloud: PointCloud, truth: TwinTruth, rows: IntArray) -> FloatArray:
+    normals = truth.part_normals(cloud.points_mm[rows])
+    variance = np.einsum("ni,nij,nj->n", normals, cloud.covariance_mm2[rows], normals)
+    return np.asarray(np.sqrt(variance))

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo of a single-line scanner once more by hand, command by command."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from armscan.devices.twin import Twin
+from armscan.report.summary import Table
+
+
+def single_demo_commands(recordings: Path, twin: Twin) -> Table:
+    """Each step on the demo's recordings; results go to the current folder."""
+    target, truth = twin.target, twin.truth
+    laser = recordings / "laser" / "images"
+    lines = [
+        f"armscan calibrate camera {recordings / 'camera' / 'images'} --target {target} "
+        "-o camera.json",
+        f"armscan calibrate laser --camera camera.json --on {laser / 'on'} --off {laser / 'off'} "
+        f"--target {target} -o sensor.json",
+        f"armscan probe {recordings / 'probing'} -o plate.csv",
+        f"armscan calibrate hand-eye {recordings / 'hand-eye'} --sensor sensor.json "
+        "--plate plate.csv -o scanner.json",
+        *_measured(recordings, "plate", "plane plate.ply --plate plate.csv"),
+        *_measured(recordings, "ball", f"sphere ball.ply --diameter {truth.ball_diameter_mm:g}"),
+    ]
+    for k, height in enumerate(truth.step_heights_mm):
+        found = _measured(recordings, "steps", f"step steps.ply --height {height:g}")
+        lines += found if k == 0 else found[1:]
+    lines += [
+        f"armscan reconstruct {recordings / 'still-step' / 'images'} --sensor sensor.json "
+        "-o still.ply",
+        "armscan inspect step still.ply --height 20",
+        f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
+    ]
+    columns = ("The same, command by command",)
+    return Table(columns, tuple((line,) for line in lines))
+
+
+def _measured(recordings: Path, scene: str, inspection: str) -> list[str]:
+    return [
+        f"armscan reconstruct {recordings / scene} --scanner scanner.json -o {scene}.ply",
+        f"armscan inspect {inspection}",
+    ]

@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ``demo single`` found, for programs: the layout of ``summary.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray
+from armscan.inspection.results import Deviations, StepInspection
+from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.single_demo import SingleDemo
+from armscan.reconstruction.result import PointFate
+from armscan.report.hand_eye_numbers import total_covariance
+
+FRACTION_RULE = (
+    "shares count every measured point of the feature (up to 1 mm from it), those that its fit "
+    "left out included"
+)
+
+
+def demo_data(
+    demo: SingleDemo, *, head: str, seed: int, preset: str, seconds: Mapping[str, float]
+) -> dict[str, Any]:
+    """All figures; fractions are 0 to 1, lengths in mm, angles in degrees."""
+    return {
+        "kind": "demo",
+        "simulated": True,
+        "seed": seed,
+        "preset": preset,
+        "rule": FRACTION_RULE,
+        "heads": {head: {**head_data(demo), "seconds": dict(seconds)}},
+    }
+
+
+def head_data(demo: SingleDemo) -> dict[str, Any]:
+    """The figures of one head."""
+    scanner = demo.instrument.scanner
+    variance = np.diag(total_covariance(scanner))
+    errors = demo.errors.hand_eye
+    scans = (demo.plate_scan, demo.ball_scan, demo.part.scan)
+    sheets = demo.instrument.sensor.sheets
+    return {
+        "camera": [{"rms_px": demo.instrument.camera.rms_px}],
+        "sheets": [{"name": sheet.name, "rms_mm": sheet.rms_mm} for sheet in sheets],
+        "hand_eye": {
+            "rotation_error_deg": errors.rotation_deg,
+            "translation_error_mm": errors.translation_mm,
+            "sigma_rotation_deg": float(np.degrees(np.sqrt(variance[:3].sum()))),
+            "sigma_translation_mm": float(np.sqrt(variance[3:].sum())),
+            "normalised_error": errors.normalised,
+        },
+        "plate": {
+            **_shares(demo.plate.fitted, (0.03, 0.05, 0.08)),
+            "std_mm": demo.plate.fitted.value("std_mm"),
+            "reference": demo.plate.fitted.reference,
+        },
+        "sphere": {
+            **_shares(demo.ball.nominal, (0.03, 0.05, 0.08)),
+            "diameter_mm": demo.ball.diameter.value_mm,
+            "diameter_error_mm": demo.ball.diameter.value_mm - demo.ball.nominal_diameter_mm,
+            "reference": demo.ball.nominal.reference,
+        },
+        "steps": [
+            *(_step(step, "Base") for step in demo.steps),
+            _step(demo.still_step, "Sensor"),
+        ],
+        "part": {
+            "n_points": len(demo.part.distance_mm),
+            "rms_mm": demo.part.rms_mm,
+            "fraction_within_0p05mm": demo.part.fraction_within(0.05),
+            "normalised_rms": demo.part.normalised_rms,
+        },
+        "named_stripes_per_exposure": named_stripes(scans),
+        "points_per_exposure": points_per_exposure(scans),
+    }
+
+
+def named_stripes(scans: Sequence[ScanReconstruction]) -> float:
+    """Mean count of light sheets that gave a measured point, an exposure."""
+    counts = [
+        len(set(image.sheet[image.fate == int(PointFate.MEASURED)].tolist()))
+        for scan in scans
+        for image in scan.images
+    ]
+    return float(np.mean(counts))
+
+
+def points_per_exposure(scans: Sequence[ScanReconstruction]) -> float:
+    """Mean count of measured points, an exposure."""
+    counts = [image.count(PointFate.MEASURED) for scan in scans for image in scan.images]
+    return float(np.mean(counts))
+
+
+def fraction_within(values_mm: FloatArray, limit_mm: float) -> float:
+    """Share of values whose size is at most a limit."""
+    return float(np.mean(np.abs(values_mm) <= limit_mm))
+
+
+def _shares(deviations: Deviations, limits_mm: Sequence[float]) -> dict[str, Any]:
+    values = deviations.deviations_mm
+    shares = {
+        f"fraction_within_{limit:g}mm".replace(".", "p"): fraction_within(values, limit)
+        for limit in limits_mm
+    }
+    return {"n_points": len(values), **shares}
+
+
+def _step(step: StepInspection, frame: str) -> dict[str, Any]:
+    return {
+        "nominal_mm": step.nominal_height_mm,
+        "mean_mm": float(step.heights_mm.mean()),
+        "std_mm": float(step.heights_mm.std(ddof=1)),
+        "fitted_mm": step.height.value_mm,
+        "frame": frame,
+    }

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far repeated hand-eye calibrations scatter, against what each of them predicts (Table 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.euler import euler_from_rotations
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import nearest_rotation
+from armscan.models.scanner import HandEyeCalibration
+
+REPEAT_NAMES = ("theta_deg", "gamma_deg", "phi_deg", "x_mm", "y_mm", "z_mm")
+"""Order of all (6,) and (K, 6) arrays here: angles of eq. 2.69, then the translation in Tool."""
+CONFIDENCE = 0.95
+GIMBAL_SINE = 0.9999
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RepeatStudy:
+    """K hand-eyes of one head, calibrated anew each time.
+
+    Parameters
+    ----------
+    values
+        (K, 6) angles and translation of each.
+    mean
+        Mean rotation (the rotation nearest to the mean matrix) and mean translation.
+    std
+        (6,) standard deviation of one calibration, with K - 1 in the denominator.
+    predicted
+        (6,) root of the mean predicted variance; None where covariances are not known.
+    ratio_range
+        Range in which ``std / predicted`` falls in 95 % of studies of K calibrations, if the
+        prediction is right.
+    """
+
+    values: FloatArray
+    mean: Pose[Tool, Sensor]
+    std: FloatArray
+    predicted: FloatArray | None
+    ratio_range: tuple[float, float]
+
+    @property
+    def mean_values(self) -> FloatArray:
+        """(6,) angles of the mean rotation in degrees, and mean translation in mm."""
+        return _values(self.mean)
+
+    @property
+    def population_std(self) -> FloatArray:
+        """(6,) standard deviation with K in the denominator, as Table 4 prints it."""
+        n = len(self.values)
+        return np.asarray(self.std * np.sqrt((n - 1) / n))
+
+    @property
+    def ratio(self) -> FloatArray | None:
+        """(6,) observed over predicted standard deviation; None without prediction."""
+        return None if self.predicted is None else self.std / self.predicted
+
+    @property
+    def unlike_predicted(self) -> tuple[str, ...]:
+        """Names of the parameters whose scatter falls out of the range."""
+        ratio = self.ratio
+        if ratio is None:
+            return ()
+        low, high = self.ratio_range
+        return tuple(
+            name
+            for name, one in zip(REPEAT_NAMES, ratio.tolist(), strict=True)
+            if not low <= one <= high
+        )
+
+
+def study_repeats(calibrations: Sequence[HandEyeCalibration]) -> RepeatStudy | FitFailure:
+    """Compare the scatter of repeated calibrations with the standard deviations they state.
+
+    Parameters
+    ----------
+    calibrations
+        Two or more of one head; each with its covariance. The sensor's part of the covariance is
+        left out, as it is common to all calibrations with one sensor.
+    """
+    poses = [one.tool_from_sensor for one in calibrations]
+    return study_poses(poses, [one.covariance for one in calibrations])
+
+
+def study_poses(
+    poses: Sequence[Pose[Tool, Sensor]], covariances: Sequence[FloatArray] | None = None
+) -> RepeatStudy | FitFailure:
+    """As `study_repeats`, from hand-eyes alone.
+
+    Parameters
+    ----------
+    poses
+        ``tool_from_sensor`` of each calibration.
+    covariances
+        (6, 6) of each in the order of `armscan.models.scanner.HAND_EYE_PARAMETER_NAMES`, or None.
+
+    Raises
+    ------
+    InputError
+        If the counts differ.
+    """
+    n = len(poses)
+    if covariances is not None and len(covariances) != n:
+        raise InputError(f"{len(covariances)} covariances for {n} hand-eyes")
+    if n < 2:
+        return FitFailure(f"{n} calibration has no scatter", "calibrate two times or more")
+    rotation = nearest_rotation(np.sum([pose.rotation for pose in poses], axis=0))
+    shift = np.mean([pose.translation_mm for pose in poses], axis=0)
+    mean: Pose[Tool, Sensor] = Pose(rotation, shift)
+    if abs(rotation[0, 2]) > GIMBAL_SINE:
+        return FitFailure(
+            "the angles of eq. 2.69 are not unique: gamma is 90 degrees",
+            "compare rotation vectors instead",
+        )
+    centre = _values(mean)
+    values = np.array([_values(pose) for pose in poses])
+    values[:, :3] = centre[:3] + (values[:, :3] - centre[:3] + 180.0) % 360.0 - 180.0
+    predicted = None
+    if covariances is not None:
+        spread = [
+            angle_covariance(pose.rotation, covariance)
+            for pose, covariance in zip(poses, covariances, strict=True)
+        ]
+        predicted = np.sqrt(np.diag(np.mean(spread, axis=0)))
+    low, high = np.sqrt(chi2.ppf([0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE], n - 1) / (n - 1))
+    std = values.std(axis=0, ddof=1)
+    return RepeatStudy(values, mean, std, predicted, (float(low), float(high)))
+
+
+def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(6, 6) covariance of `REPEAT_NAMES` from that of the hand-eye's parameters.
+
+    With R = Rx(theta) Ry(gamma) Rz(phi) of eq. 2.69, turns of the three angles act about x, about
+    the turned y and about the twice turned z.
+
+    Parameters
+    ----------
+    rotation
+        (3, 3) of ``tool_from_sensor``; gamma not 90 degrees.
+    covariance
+        (6, 6) in the order of `armscan.models.scanner.HAND_EYE_PARAMETER_NAMES`.
+    """
+    theta = float(np.radians(_values(Pose(rotation, np.zeros(3)))[0]))
+    turned_y = np.array([0.0, np.cos(theta), np.sin(theta)])
+    axes = np.column_stack([[1.0, 0.0, 0.0], turned_y, rotation[:, 2]])
+    by_parameters = np.eye(6)
+    by_parameters[:3, :3] = np.degrees(np.linalg.inv(axes))
+    return np.asarray(by_parameters @ covariance @ by_parameters.T)
+
+
+def _values(pose: Pose[Tool, Sensor]) -> FloatArray:
+    angles = np.degrees(euler_from_rotations(pose.rotation, "intrinsic-xyz")[0])
+    return np.concatenate([angles, pose.translation_mm])

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scatter of repeated hand-eyes: Table 4 as printed, derivatives, and sound predictions."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from armscan.calibration.hand_eye.repeat_study import (
+    REPEAT_NAMES,
+    RepeatStudy,
+    angle_covariance,
+    study_poses,
+    study_repeats,
+)
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import nearest_rotation, rotation_from_vector
+from armscan.models.scanner import ArmNoise, HandEyeCalibration
+from thesis_instrument import MEAN_ROTATION, TABLE_4, TABLE_4_MEAN, TABLE_4_STD
+
+SEED = 3
+
+
+def pose(row: FloatArray) -> Pose[Tool, Sensor]:
+    rotation = Rotation.from_euler("XYZ", row[:3], degrees=True).as_matrix()
+    return Pose(rotation, row[3:])
+
+
+def solved(result: RepeatStudy | FitFailure) -> RepeatStudy:
+    assert isinstance(result, RepeatStudy), result
+    return result
+
+
+def test_table_4_is_reproduced() -> None:
+    """Its standard deviations divide by five; one calibration's own, by four, is 12 % larger."""
+    study = solved(study_poses([pose(row) for row in TABLE_4]))
+    np.testing.assert_allclose(study.values, TABLE_4, atol=1e-9)
+    # printed to three digits; the mean of matrices is the mean of such small turns to 1e-4 degrees
+    np.testing.assert_allclose(study.mean_values, TABLE_4_MEAN, atol=0.0011)
+    np.testing.assert_allclose(study.population_std, TABLE_4_STD, atol=0.00006)
+    np.testing.assert_allclose(study.std, TABLE_4_STD * np.sqrt(5 / 4), atol=0.00007)
+    # the printed mean matrix is nearly the first calibration's: 0.013 degrees off its own angles
+    np.testing.assert_allclose(study.mean.rotation, MEAN_ROTATION, atol=2.5e-4)
+    assert study.predicted is None
+    assert study.ratio is None
+    assert study.unlike_predicted == ()
+
+
+def test_angles_near_the_turn_of_phi_are_not_averaged_across_it() -> None:
+    rows = np.array([[10.0, 20.0, 179.9, 0, 0, 0], [10.0, 20.0, -179.9, 0, 0, 0]])
+    study = solved(study_poses([pose(row) for row in rows]))
+    assert abs(abs(study.mean_values[2]) - 180.0) < 1e-9
+    assert study.std[2] == pytest.approx(0.1 * np.sqrt(2.0))
+
+
+def test_angle_covariance_is_the_derivative() -> None:
+    start = pose(np.array([-21.4, -38.1, -122.6, 1.0, 2.0, 3.0]))
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        turned = Pose(rotation_from_vector(step) @ start.rotation, start.translation_mm)
+        both = solved(study_poses([start, turned]))
+        change = both.values[1] - both.values[0]
+        source = np.zeros((6, 6))
+        source[k, k] = 1e-12
+        found = angle_covariance(start.rotation, source)
+        np.testing.assert_allclose(found, np.outer(change, change), atol=1e-6 * np.abs(found).max())
+
+
+def test_sound_predictions_are_found_sound_and_bad_ones_named() -> None:
+    generator = np.random.default_rng(SEED)
+    true = pose(TABLE_4_MEAN)
+    root = np.diag([1e-3, 5e-4, 8e-4, 0.05, 0.02, 0.08])
+    root[3, 0] = 0.03
+    covariance = root @ root.T
+
+    def draw(stated: FloatArray) -> HandEyeCalibration:
+        error = root @ generator.normal(size=6)
+        turned = rotation_from_vector(error[:3]) @ true.rotation
+        moved = Pose(nearest_rotation(turned), true.translation_mm + error[3:])
+        return HandEyeCalibration(moved, stated, None, ArmNoise(0.01, 1e-5), 0.01, 12, 24, 1000)
+
+    study = solved(study_repeats([draw(covariance) for _ in range(200)]))
+    assert study.ratio is not None
+    # 200 repeats know a standard deviation to 5 %
+    np.testing.assert_allclose(study.ratio, 1.0, atol=4.0 * 0.05)
+    five = solved(study_repeats([draw(covariance / 100.0) for _ in range(12)]))
+    assert five.unlike_predicted == REPEAT_NAMES
+    assert five.ratio_range[0] < 1.0 < five.ratio_range[1]
+
+
+def test_refusals() -> None:
+    one = pose(TABLE_4[0])
+    assert isinstance(study_poses([one]), FitFailure)
+    with pytest.raises(InputError, match="1 covariances for 2"):
+        study_poses([one, one], [np.eye(6)])
+    gimbal = pose(np.array([0.0, 90.0, 0.0, 0.0, 0.0, 0.0]))
+    failure = study_poses([gimbal, gimbal])
+    assert isinstance(failure, FitFailure)
+    assert "gamma is 90 degrees" in failure.reason

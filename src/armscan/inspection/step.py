@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -121,15 +121,35 @@ def inspect_step(
         return start
     if float(start @ section.axes @ _upwards(selection)) < 0.0:
         start = -start
-    tolerance = steps.height_tolerance * height_mm
-    faces = find_levels(section.flat_mm, start, height_mm, tolerance, options)
+    lean, _ = _lean(section, start @ section.axes, normal)
+    section = _unbowed(section, start, lean)
+    # faces stand further apart within a sheet that leans
+    within = height_mm / math.cos(lean)
+    tolerance = steps.height_tolerance * within
+    faces = find_levels(section.flat_mm, start, within, tolerance, options)
     if isinstance(faces, FitFailure):
-        return faces
+        return _explained(faces, section, normal)
     search = _Search(selection, section, height_mm, steps)
     chosen = _fitted(search, faces)
     if isinstance(chosen, FitFailure):
         return chosen
     return _measured(search, chosen, *_lean(section, chosen.faces.normal @ section.axes, normal))
+
+
+def _unbowed(section: _Section, towards: FloatArray, lean: float) -> _Section:
+    """Points of a bowed sheet moved along the faces, on which they lie, into the sheet's plane."""
+    moved = section.flat_mm + math.tan(lean) * section.out_mm[:, None] * towards
+    return replace(section, flat_mm=moved)
+
+
+def _explained(failure: FitFailure, section: _Section, normal: FloatArray | None) -> FitFailure:
+    if section.sheet_normal is None or normal is not None:
+        return failure
+    return FitFailure(
+        f"{failure.reason}. These are distances within the light sheet of one exposure; in a sheet "
+        "that leans they are larger than the height",
+        "check the height, or give the faces' --normal if the sheet leans",
+    )
 
 
 def _section(selection: Selection) -> _Section | FitFailure:
@@ -223,9 +243,7 @@ def _measured(search: _Search, chosen: _Chosen, lean: float, rule: str) -> StepI
     full = math.cos(lean) * (chosen.faces.normal @ section.axes)
     if section.sheet_normal is not None:
         full = full + math.sin(lean) * section.sheet_normal
-    # along the full normal: what a bowed sheet adds out of its plane counts as well
     along = section.flat_mm @ chosen.faces.normal * math.cos(lean)
-    along = along + section.out_mm * math.sin(lean)
     low = float(along[chosen.is_lower & chosen.is_fitted].mean())
     height = float(along[chosen.is_upper & chosen.is_fitted].mean()) - low
     heights = along[chosen.is_upper] - low

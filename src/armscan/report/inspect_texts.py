@@ -34,6 +34,11 @@ NO_SIGMA = (
     "the cloud carries no standard deviations and no exposures, so it is not known how well the "
     "fit is determined"
 )
+STILL_SIGMA = (
+    "Sigma of the height",
+    "not known from one exposure: its error is the calibration's, which shifts both faces nearly "
+    "alike",
+)
 NARROW_CAP_DEG = 60.0
 MANY_OUTLIERS = 0.01
 FOREIGN_FRAME = "a frame that the file does not name"
@@ -167,7 +172,8 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
 def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     """Report of a step."""
     error = found.height.value_mm - found.nominal_height_mm
-    height = length_text(found.height)
+    is_still = len(np.unique(cloud.exposure[np.concatenate([found.lower, found.upper])])) == 1
+    height = f"{found.height.value_mm:.4f} mm" if is_still else length_text(found.height)
     mean, std = float(found.heights_mm.mean()), float(found.heights_mm.std(ddof=1))
     geometry = (
         ("Fitted height", height),
@@ -176,7 +182,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
         ("Heights of the points", f"mean {mean:.4f} mm, standard deviation {std:.4f} mm"),
         ("Normal", f"{_triple(found.normal, 6)}: {found.normal_rule}"),
         ("Points", f"{len(found.lower):,} on the lower face, {len(found.upper):,} on the upper"),
-        *_sigma_facts(found.height, "height"),
+        *((STILL_SIGMA,) if is_still else _sigma_facts(found.height, "height")),
     )
     both = np.concatenate([found.lower, found.upper])
     return InspectionReport(

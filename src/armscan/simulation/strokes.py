@@ -13,6 +13,9 @@ from armscan.simulation.sweep import Stroke
 
 HALF_WAY_DEG = -21.3
 """Tilt at which laser and camera lie equally far from the face's normal."""
+UPRIGHT_DEG = -42.6
+"""Tilt at which the light sheet stands along the face's normal: one exposure shows a height only
+then."""
 DEPTH_MM = 137.0
 """Middle of the depths that the scanning window sees."""
 
@@ -91,7 +94,7 @@ def still_step(bench: Bench) -> tuple[FloatArray, FloatArray, Aim]:
     """Face (3, 3), spot (3,) in Base and aim of one look at the higher block and the ground."""
     face, origin = bench.base_from_ground.rotation, bench.base_from_ground.translation_mm
     spot = _on(face, origin, STEP_CENTRES_MM[0]) + 10.0 * face[:, 2]
-    return face, spot, Aim(HALF_WAY_DEG, 0.0, 0.0, DEPTH_MM)
+    return face, spot, Aim(UPRIGHT_DEG, 0.0, 0.0, DEPTH_MM)
 
 
 def _on(face: FloatArray, origin_mm: FloatArray, place_mm: tuple[float, float]) -> FloatArray:

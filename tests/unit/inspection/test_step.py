@@ -80,6 +80,19 @@ def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:
         assert "leans by 5.000 degrees" in told.normal_rule
 
 
+def test_a_bowed_sheet_that_leans_does_not_bend_the_faces() -> None:
+    """Points lie on the faces AND on the bowed sheet: its bow must not tilt the fitted lines."""
+    lean = np.deg2rad(20.0)
+    points = profile(lean)
+    bow = 0.05 * (points[:, 0] / 30.0) ** 2 + 0.02 * (points[:, 0] / 30.0) ** 3
+    # along the faces, square to the stripe: a point leaves the plane y = 0 but not its face
+    points += np.outer(bow, [0.0, np.cos(lean), np.sin(lean)])
+    normal = np.array([0.0, np.sin(lean), -np.cos(lean)])
+    found = inspected(inspect_step(cloud_of(points, frame="Sensor"), HEIGHT_MM, normal=normal))
+    assert found.height.value_mm == pytest.approx(HEIGHT_MM, abs=5e-4)
+    assert found.fitted.value("std_mm") < 5e-4
+
+
 def test_an_error_of_the_given_normal_along_the_stripe_does_no_harm() -> None:
     """Only the lean is taken from it: 0.5 degrees about the sheet's normal change nothing."""
     turn = np.deg2rad(0.5)

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 LIMB_COLUMNS = 12
 MAX_STEPS = 2000
-"""A ray that grazes the body crawls along it; after so many steps it counts as passing."""
+"""A ray that has not met the body after so many steps counts as passing."""
+
+CLOSE_MM = 0.2
+"""Nearer than this the surface is taken for smooth: a ray may step further than its distance."""
+LEAST_STRIDE_MM = 0.02
+"""A ray that lies along the surface may cut under it by this much of its way, nanometres deep."""
 
 _INPUT = types.Array(types.float64, 2, "C", readonly=True)
 _RESULT = types.float64[::1]
@@ -86,6 +91,18 @@ def _crossed(
     return count, near, far
 
 
+@njit(types.float64(types.float64, types.float64), cache=True)
+def _stride(gap: float, slope: float) -> float:
+    """How far to go on from a gap that has shrunk by a part ``slope`` of the last stride."""
+    if gap < 0.0:
+        return gap / max(slope, 0.05)
+    if gap > CLOSE_MM:
+        return gap
+    if slope > 0.3:
+        return gap / min(slope, 1.0)
+    return max(2.0 * gap, LEAST_STRIDE_MM)
+
+
 @njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
 def march(
     rays: NDArray[np.float64],
@@ -106,6 +123,7 @@ def march(
         crossed = room[:count]
         t = max(t, 0.0)
         travelled[i] = np.inf
+        step, last_gap = 0.0, np.inf
         for _ in range(MAX_STEPS):
             if t > far:
                 break
@@ -113,7 +131,10 @@ def march(
             y = rays[i, 1] + t * rays[i, 4]
             z = rays[i, 2] + t * rays[i, 5]
             gap = _distance(x, y, z, limbs, crossed)
-            t += gap
-            if gap < tolerance:
-                travelled[i] = t
+            slope = (last_gap - gap) / step if step != 0.0 else 0.0
+            last_gap = gap
+            if abs(gap) < tolerance or (gap < 0.0 and step == 0.0):
+                travelled[i] = t + gap
                 break
+            step = _stride(gap, slope)
+            t += step

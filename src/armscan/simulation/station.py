@@ -13,17 +13,19 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, ImageArray, frozen_floats
 from armscan.geometry.frames import Base, Board, Sensor
 from armscan.geometry.poses import Points, Pose
-from armscan.simulation.band_light import PosedView, Region, band_light, look, to_pixels
+from armscan.simulation.band_light import band_light
 from armscan.simulation.board import PrintedBoard
 from armscan.simulation.board_photo import render_board
 from armscan.simulation.flat_pattern import FlatPattern
 from armscan.simulation.head import Head, Window
 from armscan.simulation.imaging import Imaging
 from armscan.simulation.light import LineLaser
+from armscan.simulation.region import Region, to_pixels
 from armscan.simulation.render import laser_band
 from armscan.simulation.scene import Lamp, Scene
 from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
 from armscan.simulation.shapes import Placed
+from armscan.simulation.sheet_light import PosedView, look
 from armscan.simulation.stripe_truth import find_stripe
 from armscan.simulation.surfaces import Surface
 from armscan.simulation.thing import Finish, Thing

@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The plate's plane from touches of a probe (eqs. 2.54 and 2.55)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from armscan.calibration.hand_eye.observations import PlateReference
+from armscan.calibration.hand_eye.plate_side import TAKEN_FOR_GRANTED, ProbeSide, face_towards
+from armscan.calibration.hand_eye.touch_outliers import find_outliers
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.fitting import Plane, fit_plane
+from armscan.models.probe_tip import compensate_tip
+from armscan.records.probing import ProbedPoints
+
+LEAST_WIDTH = 0.05
+"""Touches narrower than this part of their length leave the tilt about that length open."""
+LARGEST_RMS_MM = 1.0
+"""Touches that scatter more are not on one plane, or in another unit."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProbingOptions:
+    """How touches become a plane.
+
+    Parameters
+    ----------
+    side
+        Side of the plate that was touched; None to take it from where the arm was, and where
+        nobody knows that, ``+z``.
+    leave_out_outliers
+        Leave touches out that do not fit the others; else they are named only.
+    feature
+        Name of the points to use where the table names several features.
+    """
+
+    side: ProbeSide | None = None
+    leave_out_outliers: bool = False
+    feature: str = ""
+
+    def __post_init__(self) -> None:
+        if self.side is not None and self.side not in get_args(ProbeSide):
+            raise OptionError(
+                f"no side of a plate is called '{self.side}'",
+                where="--side",
+                remedy=f"choose one of: {', '.join(get_args(ProbeSide))}",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProbedPlate:
+    """A probed plate with its evidence.
+
+    Parameters
+    ----------
+    reference
+        The plane of the surface, its normal towards the probe.
+    surface_mm
+        (N, 3) points on the surface, all touches.
+    residual_mm
+        (N,) their signed distances from the plane.
+    outliers
+        Numbers of the touches that do not fit the others, from 0, worst first.
+    is_used
+        Whether each touch took part.
+    side_from
+        How the side of the probe was found, in words.
+    warnings
+        What is weak, in words.
+    """
+
+    reference: PlateReference
+    surface_mm: FloatArray
+    residual_mm: FloatArray
+    outliers: tuple[int, ...]
+    is_used: tuple[bool, ...]
+    side_from: str
+    warnings: tuple[str, ...]
+
+    @property
+    def flatness_mm(self) -> float:
+        """Largest minus smallest distance of the touches that took part."""
+        return float(np.ptp(self.residual_mm[list(self.is_used)]))
+
+
+def plate_from_probing(
+    probed: ProbedPoints,
+    towards_mm: FloatArray | None = None,
+    options: ProbingOptions | None = None,
+) -> PlateReference | FitFailure:
+    """`fit_probed_plate` without its evidence."""
+    fit = fit_probed_plate(probed, towards_mm, options)
+    return fit.reference if isinstance(fit, ProbedPlate) else fit
+
+
+def fit_probed_plate(
+    probed: ProbedPoints,
+    towards_mm: FloatArray | None = None,
+    options: ProbingOptions | None = None,
+) -> ProbedPlate | FitFailure:
+    """Fit a plane to the touches by total least squares and compensate the tip's radius.
+
+    Eq. 2.44's algebraic fit favours points near the origin; distances along the normal do not.
+
+    Parameters
+    ----------
+    probed
+        Points on the surface, or centres of the tip.
+    towards_mm
+        (3,) or (M, 3) places of the arm's tool in Base while it probed or scanned: their side is
+        the plate's face. None where not known.
+    options
+        Defaults if None.
+
+    Returns
+    -------
+    ProbedPlate or FitFailure
+        A failure for fewer than three points, points near one line, points on no plane, or an
+        unclear side.
+
+    Raises
+    ------
+    InputError
+        If several features are named and none was chosen.
+    """
+    options = options or ProbingOptions()
+    points = probed.points_mm[_rows_of_feature(probed, options)]
+    plane = _fit(points)
+    if isinstance(plane, FitFailure):
+        return plane
+    outliers = find_outliers(points)
+    is_used = np.ones(len(points), dtype=np.bool_)
+    if outliers and options.leave_out_outliers:
+        is_used[list(outliers)] = False
+        plane = _fit(points[is_used])
+        if isinstance(plane, FitFailure):
+            return plane
+    oriented = face_towards(plane.value, towards_mm, options.side)
+    if isinstance(oriented, FitFailure):
+        return oriented
+    facing, side_from = oriented
+    surface = compensate_tip(points, facing.normal, probed.tip_diameter_mm)
+    at = compensate_tip(facing.point_mm[None], facing.normal, probed.tip_diameter_mm)[0]
+    reference = PlateReference(
+        Plane(at, facing.axes),
+        plane.covariance if plane.degrees_of_freedom else None,
+        float(np.sqrt(np.mean(plane.residuals**2))),
+        int(is_used.sum()),
+        probed.source,
+        probed.tip_diameter_mm,
+    )
+    residual = reference.plane.distance_mm(surface)
+    warnings = _warnings(residual, outliers, options, side_from)
+    used = tuple(bool(value) for value in is_used)
+    return ProbedPlate(reference, surface, residual, outliers, used, side_from, warnings)
+
+
+def plate_from_coefficients(
+    coefficients: FloatArray,
+    towards_mm: FloatArray | None = None,
+    side: ProbeSide | None = None,
+    source: str = "",
+) -> PlateReference | FitFailure:
+    """The plate from ``A B C D`` of eq. 2.55, of any scale and sign.
+
+    The plane's own point is the foot of the mean of ``towards_mm``, or of Base's origin.
+
+    Raises
+    ------
+    InputError
+        If these are not four finite numbers or the normal is zero.
+    """
+    values = np.asarray(coefficients, dtype=np.float64)
+    length = float(np.linalg.norm(values[:3])) if values.shape == (4,) else 0.0
+    if not np.isfinite(values).all() or not length > 0.0:
+        raise InputError("a plane needs four finite numbers A, B, C, D and a normal", where=source)
+    normal, offset = values[:3] / length, values[3] / length
+    near = np.zeros(3) if towards_mm is None else np.atleast_2d(towards_mm).mean(axis=0)
+    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= np.linalg.norm(across)
+    foot = near - (normal @ near + offset) * normal
+    plane = Plane(foot, np.stack([across, np.cross(normal, across), normal]))
+    oriented = face_towards(plane, towards_mm, side)
+    if isinstance(oriented, FitFailure):
+        return oriented
+    return PlateReference(oriented[0], source=source)
+
+
+def _fit(points: FloatArray) -> Estimate[Plane] | FitFailure:
+    fit = fit_plane(points)
+    if isinstance(fit, FitFailure):
+        return fit
+    along = (points - fit.value.point_mm) @ fit.value.axes[:2].T
+    length, width = np.sqrt(np.mean(along**2, axis=0))
+    if width < LEAST_WIDTH * length:
+        return FitFailure(
+            f"the touches lie nearly on one line ({length:.1f} mm long, {width:.2f} mm wide)",
+            "touch the plate over its whole face",
+        )
+    rms = float(np.sqrt(np.mean(fit.residuals**2)))
+    if rms > LARGEST_RMS_MM:
+        return FitFailure(
+            f"the touches scatter by {rms:.3g} mm about their plane",
+            "give points of one flat face, in mm",
+        )
+    return fit
+
+
+def _rows_of_feature(probed: ProbedPoints, options: ProbingOptions) -> BoolArray:
+    names = sorted({name for name in probed.features if name})
+    if not options.feature and len(names) <= 1:
+        return np.ones(len(probed), dtype=np.bool_)
+    if options.feature not in names:
+        raise InputError(
+            f"the points belong to the features {', '.join(names) or 'of no name'}",
+            where=probed.source,
+            remedy="choose the one that is the plate",
+        )
+    return np.array([name == options.feature for name in probed.features], dtype=np.bool_)
+
+
+def _warnings(
+    residual: FloatArray, outliers: tuple[int, ...], options: ProbingOptions, side_from: str
+) -> tuple[str, ...]:
+    warnings = []
+    if len(residual) == 3:
+        warnings.append("three touches: nothing checks the plane, and its sigma is not known")
+    if outliers:
+        named = ", ".join(f"{row + 1} ({residual[row]:+.3f} mm)" for row in outliers)
+        what = "was left out" if options.leave_out_outliers else "took part: touch again there"
+        warnings.append(f"a touch does not fit the others and {what}: number {named}")
+    if TAKEN_FOR_GRANTED in side_from:
+        warnings.append(f"the side that was touched is {side_from}; --side says it")
+    return tuple(warnings)

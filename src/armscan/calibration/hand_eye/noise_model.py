@@ -116,9 +116,14 @@ def _same(labels: IntArray) -> FloatArray:
 
 
 def _alike(places_mm: FloatArray, length_mm: float) -> FloatArray:
-    """Correlation (N, N) of the flatness at (N, 2) places: Gaussian in their distance."""
-    apart = places_mm[:, None] - places_mm[None, :]
-    return np.asarray(np.exp(-0.5 * (apart**2).sum(axis=2) / length_mm**2))
+    """Correlation (N, N) of the flatness at (N, 2) places: Matern's of order 5/2.
+
+    Near zero it bends like ``exp(-d^2 / (2 length^2))``. A Gaussian supposes more smoothness than
+    any plate has and, given too long a length, takes whatever else is smooth for exactly known.
+    """
+    apart = np.linalg.norm(places_mm[:, None] - places_mm[None, :], axis=2)
+    scaled = apart * (np.sqrt(3.0) / length_mm)
+    return np.asarray((1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled))
 
 
 def _component(

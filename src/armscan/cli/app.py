@@ -20,6 +20,7 @@ from armscan.cli import (
     inspect_plane,
     inspect_sphere,
     inspect_step,
+    probe,
     reconstruct,
     simulate,
     verify,
@@ -27,7 +28,7 @@ from armscan.cli import (
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "calibrate", "reconstruct", "inspect", "verify"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "inspect", "verify"),
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -74,6 +75,7 @@ app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect, name="inspect")
 app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
 app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate)
+app.command("probe", epilog=probe.EXAMPLE)(probe.probe)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("verify", epilog=verify.EXAMPLE)(verify.verify)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Twin, TwinScene
+from armscan.geometry.arrays import FloatArray
 from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.pipeline.fewer_views import FewerViews
@@ -87,8 +88,9 @@ class SingleDemo:
         The ball, and its inspection.
     steps
         One inspection a gauge block, through the arm.
-    still_step
-        The block in one exposure, in Sensor.
+    still_step, still_normal
+        The block in one exposure, in Sensor; and the normal (3,) of its faces there, from the
+        arm's pose.
     part
         The free-form part.
     errors
@@ -104,6 +106,7 @@ class SingleDemo:
     ball: SphereInspection
     steps: tuple[StepInspection, ...]
     still_step: StepInspection
+    still_normal: FloatArray
     part: MeasuredPart
     errors: SingleErrors
     seconds: Mapping[str, float]
@@ -171,13 +174,24 @@ def run_single(
         "steps",
         lambda: measure_steps(scan_of("steps"), instrument, truth.step_heights_mm, progress),
     )
-    still = watch.timed(
-        "still_step", lambda: measure_still_step(scan_of("still-step"), instrument, progress)
+    still, still_normal = watch.timed(
+        "still_step",
+        lambda: measure_still_step(scan_of("still-step"), instrument, steps[0].normal, progress),
     )
     part = watch.timed("part", lambda: measure_part(scan_of("part"), instrument, truth, progress))
     errors = calibration_errors(twin, instrument)
     return SingleDemo(
-        instrument, plate_scan, plate, ball_scan, ball, steps, still, part, errors, watch.seconds
+        instrument,
+        plate_scan,
+        plate,
+        ball_scan,
+        ball,
+        steps,
+        still,
+        still_normal,
+        part,
+        errors,
+        watch.seconds,
     )
 
 

@@ -20,6 +20,7 @@ from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import measure_scan
 from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.pipeline.single_calibration import Instrument, succeeded
+from armscan.reconstruction.sync import exposure_poses
 from armscan.records.cloud import PointCloud
 
 STILL_HEIGHT_MM = 20.0
@@ -94,11 +95,34 @@ def measure_steps(
 
 
 def measure_still_step(
-    source: ScanSource, instrument: Instrument, progress: Progress
-) -> StepInspection:
-    """Height of a block from one exposure, in the Sensor frame; raises the same."""
+    source: ScanSource, instrument: Instrument, normal_base: FloatArray, progress: Progress
+) -> tuple[StepInspection, FloatArray]:
+    """Height of a block from one exposure, in the Sensor frame; raises the same.
+
+    Within the light sheet the faces stand further apart than the height if the sheet leans; how
+    far it leans follows from the arm's pose and the faces' direction in Base.
+
+    Parameters
+    ----------
+    source
+        One exposure.
+    instrument
+        The scanner.
+    normal_base
+        (3,) normal of the faces in Base, as the scan of the blocks gave it.
+    progress
+        Told of the exposure.
+
+    Returns
+    -------
+    step, normal_sensor
+        The inspection, and the normal (3,) in the Sensor frame that it rests on.
+    """
+    poses = exposure_poses(source.rows, source.arm, source.session.clock)
+    base_from_sensor = poses.pose(0) @ instrument.scanner.hand_eye.tool_from_sensor
+    normal = base_from_sensor.rotation.T @ normal_base
     cloud = reconstruct([source.exposure(0)], instrument.sensor, progress=progress).cloud
-    return succeeded(inspect_step(cloud, STILL_HEIGHT_MM), source.name)
+    return succeeded(inspect_step(cloud, STILL_HEIGHT_MM, normal=normal), source.name), normal
 
 
 def measure_part(

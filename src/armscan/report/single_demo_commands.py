@@ -6,11 +6,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from armscan.devices.twin import Twin
+from armscan.pipeline.single_demo import SingleDemo
 from armscan.report.summary import Table
 
 
-def single_demo_commands(recordings: Path, twin: Twin) -> Table:
+def single_demo_commands(recordings: Path, twin: Twin, demo: SingleDemo) -> Table:
     """Each step on the demo's recordings; results go to the current folder."""
+    normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
     target, truth = twin.target, twin.truth
     laser = recordings / "laser" / "images"
     lines = [
@@ -30,7 +32,7 @@ def single_demo_commands(recordings: Path, twin: Twin) -> Table:
     lines += [
         f"armscan reconstruct {recordings / 'still-step' / 'images'} --sensor sensor.json "
         "-o still.ply",
-        "armscan inspect step still.ply --height 20",
+        f"armscan inspect step still.ply --height 20 --normal={normal}",
         f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
     ]
     columns = ("The same, command by command",)

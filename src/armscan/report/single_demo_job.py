@@ -100,7 +100,7 @@ def _written(
 ) -> Summary:
     start = perf_counter()
     folder = request.folder
-    commands = single_demo_commands(folder / RECORDINGS, twin)
+    commands = single_demo_commands(folder / RECORDINGS, twin, demo)
     photographs: dict[str, Exposure] = {s: _photograph(scan) for s, scan in scans.items()}
     data = demo_data(demo, head=HEAD, seed=request.seed, preset=request.preset, seconds=seconds)
     head = data["heads"][HEAD]

@@ -27,12 +27,11 @@ def check_clock(
         arm's times.
     """
     where = str(folder / EXPOSURES_FILE)
-    known = [row.trigger_id for row in rows if row.trigger_id is not None]
-    of_arm: list[int] = [] if arm.trigger_ids is None else arm.trigger_ids.tolist()
-    common = set(known) & set(of_arm) - {NO_TRIGGER}
-    if common:
+    ids = {row.trigger_id for row in rows} - {None}
+    of_arm = set() if arm.trigger_ids is None else set(arm.trigger_ids.tolist()) - {NO_TRIGGER}
+    if ids & of_arm:
         return []
-    if known and arm.trigger_ids is not None:
+    if ids and of_arm:
         raise FileFormatError(
             "no trigger_id is in both tables",
             where=where,

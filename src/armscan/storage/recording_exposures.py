@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
@@ -16,6 +17,7 @@ from armscan.storage.csv_table import CsvTable
 EXPOSURES_FILE = "exposures.csv"
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
+DRIVE = re.compile(r"[A-Za-z]:")
 
 Columns = Mapping[str, tuple[str, ...]]
 
@@ -137,7 +139,7 @@ def repeated_files(rows: Sequence[ExposureRow]) -> list[str]:
 def is_inside(name: str) -> bool:
     """True for a relative path with ``/`` that does not leave the recording."""
     path = PurePosixPath(name)
-    has_other_marks = "\\" in name or ":" in name
+    has_other_marks = "\\" in name or DRIVE.match(name) is not None
     return bool(name) and not (path.is_absolute() or ".." in path.parts or has_other_marks)
 
 

@@ -103,6 +103,7 @@ BAD_EXPOSURES = {
     "path up": (EXPOSURES.replace("images/2", "../2"), "no path inside the recording"),
     "absolute path": (EXPOSURES.replace("images/2", "/images/2"), "no path inside"),
     "other separator": (EXPOSURES.replace("images/2", "images\\2"), "no path inside"),
+    "drive": (EXPOSURES.replace("images/2", "C:/images/2"), "no path inside"),
     "no name": (EXPOSURES.replace("images/2.png", ""), "no path inside"),
     "laser twice": (EXPOSURES.replace("A+B", "A+A"), "name a source twice"),
     "laser lacking": (EXPOSURES.replace("A+B", "A+"), "name a source twice or not at all"),
@@ -167,6 +168,22 @@ def test_bad_trigger_ids_are_refused(
         tmp_path, exposures=with_ids(EXPOSURES, of_exposures), arm=with_ids(ARM, of_arm)
     )
     assert said in message
+
+
+def test_ids_in_one_table_only_leave_it_to_the_clock(tmp_path: Path) -> None:
+    listed = exposures(
+        "0,1000,0,images/0.png,A,4",
+        "1,2000,0,images/1.png,A,5",
+        header=HEADER + ",trigger_id",
+    )
+    head, *lines = ARM.splitlines()
+    empty = table(f"{head},trigger_id", *(f"{line}," for line in lines))
+    for k, poses in enumerate((ARM, empty)):
+        scan = read_recording(lab_folder(tmp_path / str(k), exposures=listed, arm=poses))
+        assert scan.rows[1].trigger_id == 5
+    separate = SESSION.replace("shared", "separate")
+    message = refusal(tmp_path, exposures=listed, arm=empty, session=separate)
+    assert "neither a shared clock nor trigger ids" in message
 
 
 def test_neither_a_shared_clock_nor_ids_is_refused(tmp_path: Path) -> None:

@@ -117,6 +117,7 @@ class PlateRig:
     exposures_per_posture: int = 1
     points_per_stripe: int = 150
     bow_mm: float = 0.0
+    sheet_turn_rad: float = 0.0
     tool_from_sensor: Pose[Tool, Sensor] = TOOL_FROM_SENSOR
 
     @property
@@ -128,6 +129,15 @@ class PlateRig:
     @property
     def plane(self) -> Plane:
         return Plane(PLATE_CENTRE, self.plate_axes)
+
+    @property
+    def sheet(self) -> FloatArray:
+        """(4,) light sheet, or another one through (0, 0, 140), turned about the optical axis."""
+        sheet = SHEET / np.linalg.norm(SHEET[:3])
+        if not self.sheet_turn_rad:
+            return np.asarray(sheet)
+        normal = Rotation.from_rotvec([0.0, 0.0, self.sheet_turn_rad]).as_matrix() @ sheet[:3]
+        return np.array([*normal, -140.0 * normal[2]])
 
     def sensor_pose(self, k: int) -> tuple[FloatArray, FloatArray]:
         """Rotation and origin of the Sensor in Base at posture ``k``."""
@@ -145,7 +155,7 @@ class PlateRig:
     def stripe(self, k: int, surface: Surface) -> tuple[FloatArray, FloatArray]:
         """Points (N, 3) in Sensor and the unit vector within the sheet across the stripe."""
         rotation, origin = self.sensor_pose(k)
-        sheet = SHEET / np.linalg.norm(SHEET[:3])
+        sheet = self.sheet
         normal = rotation.T @ PLATE_NORMAL
         height = float(PLATE_NORMAL @ (PLATE_CENTRE - origin))
         along = np.cross(normal, sheet[:3])

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hand-eye on a plate: exact data, SciPy's optimum, leaving out, coupling to the sensor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_triangular
+from scipy.optimize import least_squares
+
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.plate_fit import fit_plate
+from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
+from armscan.calibration.hand_eye.plate_residuals import (
+    PlateState,
+    hand_eye_difference,
+    place_nodes,
+    step_hand_eye,
+)
+from armscan.calibration.hand_eye.plate_start import linear_hand_eye
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.geometry.arrays import FloatArray
+from plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
+
+NOISE = RigNoise()
+GIVEN = HandEyeOptions(
+    arm_position_mm=float(np.hypot(NOISE.posture_mm, NOISE.exposure_mm)),
+    arm_rotation_rad=float(np.hypot(NOISE.posture_rad, NOISE.exposure_rad)),
+    plate_flatness_mm=NOISE.flatness_mm,
+    stripe_noise_factor=1.0,
+)
+
+
+def _rig(count: int = 12, seed: int = 1, noise: RigNoise = NOISE) -> PlateRig:
+    return PlateRig(good_postures(count, np.random.default_rng(seed)), noise)
+
+
+def _fitted(
+    stripes: list[PosedStripe], plate: PlateReference, options: HandEyeOptions = GIVEN
+) -> HandEyeFit:
+    fit = calibrate_on_plate(stripes, plate, options)
+    assert isinstance(fit, HandEyeFit)
+    return fit
+
+
+def _error(fit: HandEyeFit) -> FloatArray:
+    return hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+
+
+@pytest.mark.parametrize("count", [5, 6, 12])
+def test_exact_stripes_give_the_exact_hand_eye(count: int) -> None:
+    fit = _fitted(*_rig(count, noise=SILENT).draw(0), HandEyeOptions())
+    assert np.abs(_error(fit)).max() < 1e-9
+    assert fit.calibration.rms_mm < 1e-9
+
+
+def test_a_bowed_sheet_spoils_the_start_but_not_the_result() -> None:
+    """The start takes the sheet for a plane; the refinement takes the points as they are."""
+    rig = replace(_rig(noise=SILENT), bow_mm=0.2)
+    stripes, plate = rig.draw(0)
+    fit = _fitted(stripes, plate, HandEyeOptions())
+    assert 1e-4 < np.abs(hand_eye_difference(fit.start, TOOL_FROM_SENSOR)).max() < 1.0
+    assert np.abs(_error(fit)).max() < 1e-6
+
+
+def test_two_crossed_sheets_are_used_together() -> None:
+    """Points of two sheets are not in one plane: all 12 unknowns of eq. 2.73 are determined."""
+    rig = _rig(6, noise=SILENT)
+    stripes, plate = rig.draw(0)
+    turned = replace(rig, sheet_turn_rad=0.5).draw(0)[0]
+    both = [
+        replace(
+            one,
+            points_mm=np.concatenate([one.points_mm, two.points_mm]),
+            noise_mm=np.concatenate([one.noise_mm, two.noise_mm]),
+            sheet=np.repeat([0, 1], [len(one), len(two)]),
+        )
+        for one, two in zip(stripes, turned, strict=True)
+    ]
+    nodes = condense(both, straight_stripes(both, GIVEN), 8)
+    start = linear_hand_eye(nodes, plate.plane)
+    assert start is not None
+    assert np.abs(hand_eye_difference(start, TOOL_FROM_SENSOR)).max() < 1e-8
+    assert np.abs(_error(_fitted(both, plate))).max() < 1e-8
+
+
+def test_the_refinement_stops_where_scipy_does() -> None:
+    """Independent oracle: whitened residuals handed to SciPy from another start."""
+    stripes, plate = _rig().draw(4)
+    nodes = condense(stripes, straight_stripes(stripes, GIVEN), GIVEN.nodes_per_stripe)
+    fit = fit_plate(nodes, plate, PlateState(TOOL_FROM_SENSOR, np.zeros(3)), GIVEN)
+    assert fit
+    root = np.linalg.cholesky(fit.total)
+
+    def whitened(step: FloatArray) -> FloatArray:
+        state = PlateState(step_hand_eye(TOOL_FROM_SENSOR, step), np.zeros(3))
+        residual = place_nodes(nodes, plate.plane, state).residual_mm
+        return np.asarray(solve_triangular(root, residual, lower=True))
+
+    start = np.array([2e-3, -1e-3, 3e-3, 0.2, -0.3, 0.1])
+    scale = np.array([1e-3] * 3 + [0.1] * 3)
+    found = least_squares(whitened, start, x_scale=scale, method="lm", xtol=1e-14, ftol=1e-14)
+    ours = hand_eye_difference(fit.refined.state.tool_from_sensor, TOOL_FROM_SENSOR)
+    assert np.abs((found.x - ours) / np.sqrt(np.diag(fit.linear.covariance))).max() < 1e-3
+    assert fit.refined.chi2 == pytest.approx(2.0 * found.cost, rel=1e-9)
+    np.testing.assert_allclose(
+        fit.linear.covariance, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-3, atol=1e-14
+    )
+
+
+def test_leaving_a_posture_out_is_predicted_without_solving_again() -> None:
+    stripes, plate = _rig().draw(5)
+    whole = _fitted(stripes, plate)
+    name = whole.postures[3].posture
+    rest = _fitted([s for s in stripes if s.posture != name], plate)
+    change = hand_eye_difference(
+        rest.calibration.tool_from_sensor, whole.calibration.tool_from_sensor
+    )
+    stated = whole.postures[3]
+    assert stated.left_out_rotation_deg == pytest.approx(
+        np.degrees(np.linalg.norm(change[:3])), rel=0.02
+    )
+    assert stated.left_out_translation_mm == pytest.approx(np.linalg.norm(change[3:]), rel=0.02)
+
+
+def test_the_coupling_is_what_a_changed_sensor_does() -> None:
+    """Derivative of the solution by the sensor's parameters, against solving with moved points."""
+    stripes, plate = _rig().draw(6)
+    by_shift = [
+        replace(s, by_sensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
+        for s in stripes
+    ]
+    fit = _fitted(by_shift, plate)
+    coupling = fit.calibration.sensor_coupling
+    assert coupling is not None
+    for k, step in enumerate(1e-3 * np.eye(3)):
+        moved = _fitted([replace(s, points_mm=s.points_mm + step) for s in stripes], plate)
+        change = hand_eye_difference(
+            moved.calibration.tool_from_sensor, fit.calibration.tool_from_sensor
+        )
+        np.testing.assert_allclose(coupling[:, k] * 1e-3, change, atol=2e-6)
+
+
+def test_errors_of_the_sensor_are_weighted_but_not_stated() -> None:
+    """A sensor that may be shifted makes the hand-eye no less certain: it shifts against it."""
+    stripes, plate = _rig().draw(6)
+    by_shift = [
+        replace(s, by_sensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
+        for s in stripes
+    ]
+    exact = _fitted(by_shift, plate)
+    fit = calibrate_on_plate(by_shift, plate, GIVEN, sensor_covariance=0.01 * np.eye(3))
+    assert isinstance(fit, HandEyeFit)
+    sigma = np.sqrt(np.diag(exact.calibration.covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.calibration.covariance)), sigma, rtol=1e-3)
+    assert np.abs(_error(fit) - _error(exact)).max() < 1e-2 * sigma.max()
+
+
+def test_a_plate_solved_along_needs_no_probing() -> None:
+    """With the plane free the offset of the given one does not matter."""
+    stripes, plate = _rig(noise=SILENT).draw(0)
+    plane = replace(plate.plane, point_mm=plate.plane.point_mm + 0.4 * plate.plane.normal)
+    fit = _fitted(stripes, replace(plate, plane=plane), HandEyeOptions(solve_plate=True))
+    assert np.abs(_error(fit)).max() < 1e-8
+    found = fit.calibration.plate
+    assert found is not None
+    assert abs(float(found.distance_mm(plate.plane.point_mm[None])[0])) < 1e-8

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thesis's equations as printed, and what one light sheet leaves open in them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate_equations import (
+    design_rows,
+    hand_eye_unknowns,
+    objective,
+    plane_in_tool,
+    rotation_from_angles,
+)
+from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
+from armscan.calibration.hand_eye.plate_residuals import (
+    PlateState,
+    place_nodes,
+    shifted_plane,
+    step_hand_eye,
+)
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Base, Tool
+from armscan.geometry.poses import Points, Pose
+from plate_rig import PLATE_CENTRE, PLATE_NORMAL, SILENT, TOOL_FROM_SENSOR, PlateRig, good_postures
+
+POSE: Pose[Base, Tool] = Pose.from_vectors([0.4, -0.2, 1.1], [300.0, -120.0, 80.0])
+PLANE = np.array([*PLATE_NORMAL, -float(PLATE_NORMAL @ PLATE_CENTRE)])
+STEP = np.array([1e-3, -2e-3, 5e-4, 0.1, -0.2, 0.3])
+
+
+def _nodes(noise_seed: int = 3) -> tuple[PlateNodes, PlateRig]:
+    rig = PlateRig(good_postures(8, np.random.default_rng(noise_seed)))
+    stripes, _ = rig.draw(noise_seed)
+    options = HandEyeOptions()
+    return condense(stripes, straight_stripes(stripes, options), 6), rig
+
+
+def test_a_point_is_as_far_from_the_plane_in_tool_as_in_base() -> None:
+    """Eqs. 2.57 and 2.58: a point keeps its distance when both are brought into Tool."""
+    points: Points[Tool] = Points(np.random.default_rng(0).normal(size=(5, 3)) * 50.0)
+    in_base = (POSE @ points).xyz_mm @ PLANE[:3] + PLANE[3]
+    tool = plane_in_tool(PLANE, POSE)
+    np.testing.assert_allclose(points.xyz_mm @ tool[:3] + tool[3], in_base, atol=1e-10)
+
+
+def test_printed_angles_give_the_printed_product() -> None:
+    """Eq. 2.69 is Rx(theta) Ry(gamma) Rz(phi), as SciPy builds it."""
+    angles = (0.3, -0.7, 1.9)
+    expected = Rotation.from_euler("XYZ", angles).as_matrix()
+    np.testing.assert_allclose(rotation_from_angles(*angles), expected, atol=1e-15)
+
+
+def test_rows_times_unknowns_are_the_distance_from_the_plate() -> None:
+    points = np.random.default_rng(1).normal(size=(4, 3)) * 30.0 + [0.0, 0.0, 140.0]
+    tool = plane_in_tool(PLANE, POSE)
+    rows = design_rows(tool, points)
+    misclosure = rows @ hand_eye_unknowns(TOOL_FROM_SENSOR) + tool[3]
+    placed = (POSE @ TOOL_FROM_SENSOR @ Points(points)).xyz_mm
+    np.testing.assert_allclose(misclosure, placed @ PLANE[:3] + PLANE[3], atol=1e-9)
+
+
+def test_the_objective_is_the_sum_of_squared_residuals() -> None:
+    """Eq. 2.76 and the residuals that the refinement uses are the same numbers."""
+    nodes, rig = _nodes()
+    off = step_hand_eye(TOOL_FROM_SENSOR, STEP)
+    residual = place_nodes(nodes, rig.plane, PlateState(off, np.zeros(3))).residual_mm
+    poses: list[Pose[Base, Tool]] = [
+        Pose(r, t) for r, t in zip(nodes.rotations, nodes.translations_mm, strict=True)
+    ]
+    points = [nodes.points_mm[nodes.stripe == k] for k in range(len(poses))]
+    total = objective(rig.plane.coefficients, poses, points, off)
+    np.testing.assert_allclose(total, residual @ residual, rtol=1e-10)
+
+
+def test_twelve_unknowns_have_rank_nine_and_the_nine_are_enough() -> None:
+    """FINDINGS: points of one flat sheet satisfy its equation, so three columns are dependent."""
+    rig = PlateRig(good_postures(12, np.random.default_rng(5)), SILENT)
+    stripes, _ = rig.draw(0)
+    rows = np.concatenate(
+        [design_rows(plane_in_tool(PLANE, s.base_from_tool), s.points_mm) for s in stripes]
+    )
+    singular = np.linalg.svd(rows / np.linalg.norm(rows, axis=0), compute_uv=False)
+    assert int((singular > 1e-9 * singular[0]).sum()) == 9
+
+
+def test_residuals_differentiate_as_stated() -> None:
+    nodes, rig = _nodes()
+    state = PlateState(step_hand_eye(TOOL_FROM_SENSOR, STEP), np.array([1e-3, -2e-3, 0.2]))
+    placed = place_nodes(nodes, rig.plane, state)
+
+    def at(step: FloatArray) -> FloatArray:
+        return place_nodes(nodes, rig.plane, state.stepped(step)).residual_mm
+
+    stated = np.concatenate([placed.by_hand_eye, placed.by_plane], axis=1)
+    for k, size in enumerate([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 2 + [1e-4]):
+        step = np.zeros(9)
+        step[k] = size
+        numeric = (at(step) - at(-step)) / (2.0 * size)
+        scale = max(float(np.abs(numeric).max()), 1.0)
+        np.testing.assert_allclose(stated[:, k], numeric, atol=1e-7 * scale)
+
+
+def test_a_shifted_plane_is_the_plane_of_the_residuals() -> None:
+    """The plane that a report shows is the one that the residuals were measured from."""
+    nodes, rig = _nodes()
+    shift = np.array([2e-3, -1e-3, 0.3])
+    placed = place_nodes(nodes, rig.plane, PlateState(TOOL_FROM_SENSOR, shift))
+    plane = shifted_plane(rig.plane, shift)
+    np.testing.assert_allclose(
+        plane.distance_mm(placed.points_base_mm), placed.residual_mm, atol=2e-6
+    )

@@ -75,7 +75,7 @@ def reach(
         wish = settings.comfort * (preferred_rad - joints)
         ease = wish - jacobian.T @ np.linalg.solve(weights, jacobian @ wish)
         is_there = LEVER_MM * size < settings.tolerance_mm
-        if is_there and float(np.abs(ease).max()) < 1e-6:
+        if is_there and float(np.abs(ease).max()) < 1e-5:
             return joints
         step = step + ease
         joints = joints + step * min(1.0, settings.max_turn_rad / float(np.abs(step).max()))
@@ -90,10 +90,9 @@ def _error_and_jacobian(
     arm: ScrewArm, joints_rad: FloatArray, goal: Pose[Base, Tool]
 ) -> tuple[FloatArray, FloatArray]:
     """What is missing (6,), turn over shift, and its derivative (6, 7); shifts over `LEVER_MM`."""
-    pose = arm.pose(joints_rad)
-    axes, points = arm.turned_axes(joints_rad[None])
+    pose, axes, points = arm.pose_and_axes(joints_rad)
     turn = vector_from_rotation(goal.rotation @ pose.rotation.T)
     shift = (goal.translation_mm - pose.translation_mm) / LEVER_MM
-    lever = (pose.translation_mm - points[0]) / LEVER_MM
-    jacobian = np.concatenate([axes[0], np.cross(axes[0], lever)], axis=1).T
+    lever = (pose.translation_mm - points) / LEVER_MM
+    jacobian = np.concatenate([axes, np.cross(axes, lever)], axis=1).T
     return np.concatenate([turn, shift]), jacobian

@@ -46,7 +46,7 @@ def hand_eye_scene(instrument: Instrument, rng: np.random.Generator) -> Recorded
 
 def still_step_scene(instrument: Instrument, rng: np.random.Generator) -> Recorded:
     """One look at the higher gauge block and the ground beside it."""
-    face, spot, aim = still_step(instrument.bench)
+    face, spot, aim = still_step(instrument.bench, instrument.head)
     middle = sheet_middle_mm(instrument.head, aim.depth_mm)
     pose = sensor_over(face, spot, aim, middle)
     window = instrument.head.scan_window

@@ -75,10 +75,16 @@ class ScrewArm:
         rotations, translations = self.transforms(np.asarray(joints_rad)[None])
         return Pose(rotations[0], translations[0])
 
-    def turned_axes(self, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Directions (N, 7, 3) and points (N, 7, 3) in mm of the axes at angles (N, 7)."""
-        _, _, axes, points = self._chain(joints_rad)
-        return axes, points
+    def pose_and_axes(
+        self, joints_rad: FloatArray
+    ) -> tuple[Pose[Base, Tool], FloatArray, FloatArray]:
+        """Pose at angles (7,), and the turned axes: directions (7, 3) and points (7, 3) in mm."""
+        rotation, translation, axes, points = self._chain(np.asarray(joints_rad)[None])
+        pose: Pose[Base, Tool] = Pose(
+            rotation[0] @ self.rest.rotation,
+            rotation[0] @ self.rest.translation_mm + translation[0],
+        )
+        return pose, axes[0], points[0]
 
     def _chain(
         self, joints_rad: FloatArray

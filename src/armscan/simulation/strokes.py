@@ -8,6 +8,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.simulation.aim import Aim
+from armscan.simulation.head import Head
 from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_CENTRES_MM, Bench
 from armscan.simulation.sweep import Stroke
 
@@ -90,11 +91,18 @@ def part_strokes(bench: Bench) -> list[Stroke]:
     return strokes
 
 
-def still_step(bench: Bench) -> tuple[FloatArray, FloatArray, Aim]:
-    """Face (3, 3), spot (3,) in Base and aim of one look at the higher block and the ground."""
+def still_step(bench: Bench, head: Head) -> tuple[FloatArray, FloatArray, Aim]:
+    """Face (3, 3), spot (3,) in Base and aim of one look at the higher block and the ground.
+
+    The head is squared to the block, the laser's middle ray upright: from one stripe alone a
+    height is known only in the sheet.
+    """
     face, origin = bench.base_from_ground.rotation, bench.base_from_ground.translation_mm
     spot = _on(face, origin, STEP_CENTRES_MM[0]) + 10.0 * face[:, 2]
-    return face, spot, Aim(UPRIGHT_DEG, 0.0, 0.0, DEPTH_MM)
+    ray = head.lasers[0].rays(np.zeros(1))[0]
+    upright = -np.degrees(np.arcsin(ray[1]))
+    aside = np.degrees(np.arctan2(ray[0], ray[2]))
+    return face, spot, Aim(float(upright), float(aside), 0.0, DEPTH_MM)
 
 
 def _on(face: FloatArray, origin_mm: FloatArray, place_mm: tuple[float, float]) -> FloatArray:

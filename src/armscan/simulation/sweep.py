@@ -20,7 +20,7 @@ from armscan.simulation.sheet_middle import sheet_middle_mm
 CAMERA_CLOCK_NS = 12_500_000
 SLOWEST_MM_S, FASTEST_MM_S = 24.0, 72.0
 """Of the progress along the stroke; what the hand adds stays within 20-80 mm/s."""
-_KNOT_S = 0.04
+_KNOT_S = 0.06
 _MARGIN_S = 0.12
 _FINE_S = 0.002
 

@@ -47,15 +47,14 @@ def test_screws_agree_with_the_chain_of_link_matrices():
 def test_turned_axes_are_the_instantaneous_screws():
     arm = bent_arm(nominal_arm(), 0.01, 1.0, np.random.default_rng(2))
     joints, step = np.random.default_rng(3).uniform(-1.0, 1.0, 7), 1e-6
-    axes, points = arm.turned_axes(joints[None])
-    here = arm.pose(joints)
+    here, axes, points = arm.pose_and_axes(joints)
     for i in range(7):
         ahead, behind = (arm.pose(joints + sign * step * np.eye(7)[i]) for sign in (1, -1))
         turn = vector_from_rotation(ahead.rotation @ behind.rotation.T) / (2 * step)
         speed = (ahead.translation_mm - behind.translation_mm) / (2 * step)
-        np.testing.assert_allclose(turn, axes[0, i], atol=1e-8)
-        lever = here.translation_mm - points[0, i]
-        np.testing.assert_allclose(speed, np.cross(axes[0, i], lever), atol=1e-5)
+        np.testing.assert_allclose(turn, axes[i], atol=1e-8)
+        lever = here.translation_mm - points[i]
+        np.testing.assert_allclose(speed, np.cross(axes[i], lever), atol=1e-5)
 
 
 def test_the_inverse_reaches_and_keeps_the_elbow():
@@ -68,9 +67,9 @@ def test_the_inverse_reaches_and_keeps_the_elbow():
         assert np.abs(found.translation_mm - wanted.translation_mm).max() < 1e-7
         assert np.abs(found.rotation - wanted.rotation).max() < 1e-9
         # Among all elbows the nearest to the preferred one: no step along the free motion helps.
-        axes, points = arm.turned_axes(joints[None])
-        lever = found.translation_mm - points[0]
-        free = np.linalg.svd(np.concatenate([axes[0], np.cross(axes[0], lever)], 1).T)[2][6]
+        _, axes, points = arm.pose_and_axes(joints)
+        lever = found.translation_mm - points
+        free = np.linalg.svd(np.concatenate([axes, np.cross(axes, lever)], 1).T)[2][6]
         assert abs(free @ (joints - COMFORTABLE_RAD)) < 1e-4
 
 

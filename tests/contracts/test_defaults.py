@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
 from armscan.pipeline.reconstruct import ReconstructOptions
@@ -42,6 +43,11 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         "preset": SimulateOptions().preset,
         "seed": SimulateOptions().seed,
         "processes": SimulateOptions().processes,
+    },
+    ("probe",): {
+        "side": ProbingOptions().side,
+        "feature": ProbingOptions().feature,
+        "leave_out": ProbingOptions().leave_out_outliers,
     },
     ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
 }

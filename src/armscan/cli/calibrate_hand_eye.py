@@ -12,6 +12,7 @@ import typer
 
 from armscan.cli.image_arguments import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption
 from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.probe import Side
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -43,8 +44,9 @@ def hand_eye(
         str, typer.Option(help="The plate as A,B,C,D in Base, mm, in place of --plate.")
     ] = "",
     side: Annotated[
-        str, typer.Option(help="Direction x,y,z from which the plate was probed; empty finds it.")
-    ] = "",
+        Side | None,
+        typer.Option(help="Where the plate's face looks, roughly; left out, to the arm's tool."),
+    ] = None,
     solve_plate: Annotated[
         bool,
         typer.Option("--solve-plate", help="Solve the plate along; a rough plane is enough then."),
@@ -111,7 +113,7 @@ def hand_eye(
         euler=check_convention(euler),
         plate=plate,
         plane=plane,
-        side=side,
+        side=None if side is None else side.value,
         sphere_diameter_mm=sphere_diameter,
         arm=arm,
         options=HandEyeOptions(

@@ -7,23 +7,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
-import numpy as np
-
 from armscan.calibration.hand_eye.observations import PlateReference
+from armscan.calibration.hand_eye.probed_plate import plate_from_probing
 from armscan.calibration.laser.result import LaserFit
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Probing, TwinScene
 from armscan.errors import EstimationError
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import Plane, fit_plane
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
-from armscan.models.probe_tip import compensate_tip, tip_centres, tool_from_probe
+from armscan.models.probe_tip import tip_centres, tool_from_probe
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.hand_eye import HandEyeRun
 from armscan.pipeline.laser import calibrate_sheets_from_exposures
 from armscan.pipeline.progress import Progress
 from armscan.records.exposure import Exposure
+from armscan.records.probing import ProbedPoints
 from armscan.vision.targets.definition import Target
 
 T = TypeVar("T")
@@ -97,21 +96,18 @@ def calibrate_sheets_of(
 
 
 def plate_of(probing: Probing) -> PlateReference:
-    """Plane of the probed plate, the tip compensated; the plate faces up.
+    """Plane of the probed plate, the tip compensated on the side where the tool was.
 
     Raises
     ------
     EstimationError
         If the touches determine no plane.
     """
-    centres = tip_centres(probing.arm, tool_from_probe(probing.tool_from_probe_mm))
-    fit = succeeded(fit_plane(centres), "probing")
-    found = fit.value
-    axes = found.axes if found.normal[2] > 0.0 else np.diag([1.0, -1.0, -1.0]) @ found.axes
-    plane = Plane(compensate_tip(found.point_mm[None], axes[2], probing.tip_diameter_mm)[0], axes)
-    rms = float(np.sqrt(np.mean(fit.residuals**2)))
-    return PlateReference(
-        plane, fit.covariance, rms, len(centres), "probing", probing.tip_diameter_mm
+    track = probing.arm
+    centres = tip_centres(track, tool_from_probe(probing.tool_from_probe_mm))
+    points = ProbedPoints(centres, probing.tip_diameter_mm, source="probing")
+    return succeeded(
+        plate_from_probing(points, track.translations_mm[track.is_known]), points.source
     )
 
 

@@ -10,22 +10,28 @@ from pathlib import Path
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.errors import OptionError
+from armscan.calibration.hand_eye.probed_plate import (
+    ProbedPlate,
+    ProbingOptions,
+    fit_probed_plate,
+    plate_from_coefficients,
+)
+from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.inspection.plane import plane_from_coefficients
+from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.hand_eye import HandEyeScanOptions, ObservedStripes, observe_stripes
 from armscan.pipeline.profiles import posed_stripes_from_profiles
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.reconstruct import ReconstructOptions
 from armscan.records.exposure import Exposure
+from armscan.records.probing import ProbedPoints
 from armscan.report.hand_eye_request import HandEyeRequest
-from armscan.report.plate_file import read_plate
 from armscan.report.stripe_figures import MAX_PICTURES, evenly_chosen
 from armscan.storage.arm_files import read_arm_model
 from armscan.storage.calibration_files import read_sensor_calibration
 from armscan.storage.image_paths import expand_paths
-from armscan.storage.probed_points import parse_plane
+from armscan.storage.probed_points import parse_plane, read_points_or_plane
 from armscan.storage.profiles import read_profiles
 from armscan.storage.recording_arm import ARM_FILE
 from armscan.storage.recording_exposures import EXPOSURES_FILE
@@ -104,7 +110,7 @@ def _from_recordings(
     arm = None if request.arm is None else read_arm_model(request.arm)
     recordings = tuple(read_recording(folder, arm) for folder in request.scans)
     sensor = read_sensor_calibration(sensor_file)
-    plate = None if request.is_sphere else read_reference(request, _middle_of(recordings))
+    plate, notes = _reference(request, _tool_places(recordings))
     options = HandEyeScanOptions(
         hand_eye=request.options, measure=ReconstructOptions(stripes=request.stripes)
     )
@@ -120,7 +126,7 @@ def _from_recordings(
         plate,
         tuple(path for path in files if path.exists()),
         any(recording.is_simulated for recording in recordings) or are_simulated([sensor_file]),
-        tuple(text for r in recordings for text in (*r.warnings, *r.session.assumed)),
+        (*notes, *(text for r in recordings for text in (*r.warnings, *r.session.assumed))),
         recordings,
     )
 
@@ -132,12 +138,11 @@ def _from_profiles(request: HandEyeRequest) -> HandEyeInputs:
     profiles = read_profiles(files)
     poses = read_robot_poses(request.poses, request.euler)
     stripes = posed_stripes_from_profiles(profiles, poses)
-    middle = np.mean([pose.translation_mm for pose in poses], axis=0)
-    plate = None if request.is_sphere else read_reference(request, middle)
+    plate, notes = _reference(request, np.array([pose.translation_mm for pose in poses]))
     named = [*files, request.poses, request.plate]
     seen = ObservedStripes(stripes, (), (), ())
     return HandEyeInputs(
-        (("profiles", seen),), None, plate, tuple(p for p in named if p), False, ()
+        (("profiles", seen),), None, plate, tuple(p for p in named if p), False, notes
     )
 
 
@@ -145,36 +150,54 @@ def _profile_files(name: str) -> tuple[Path, ...]:
     return (Path(name),) if Path(name).is_dir() else expand_paths([name])
 
 
-def read_reference(request: HandEyeRequest, near_mm: FloatArray) -> PlateReference:
-    """The plate of a request.
+def _reference(
+    request: HandEyeRequest, towards_mm: FloatArray
+) -> tuple[PlateReference | None, tuple[str, ...]]:
+    return (None, ()) if request.is_sphere else read_reference(request, towards_mm)
+
+
+def read_reference(
+    request: HandEyeRequest, towards_mm: FloatArray
+) -> tuple[PlateReference, tuple[str, ...]]:
+    """The plate of a request, and what is weak about it.
 
     Parameters
     ----------
     request
         With a file of the plate, or its plane.
-    near_mm
-        (3,) a place of the arm's tool: it is on the side that is scanned.
+    towards_mm
+        (M, 3) places of the arm's tool: they are on the side that is scanned.
 
     Raises
     ------
     ArmscanError
-        If it is neither.
+        If it is neither, or its points determine no plane.
     """
-    if request.plate is not None:
-        return read_plate(request.plate, near_mm)
-    plane = plane_from_coefficients(parse_plane(request.plane, "--plane"), near_mm)
-    return PlateReference(plane, source="--plane")
+    where = "--plane" if request.plate is None else str(request.plate)
+    if request.plate is None:
+        found: ProbedPoints | FloatArray = parse_plane(request.plane, where)
+    else:
+        found = read_points_or_plane(request.plate)
+    known = towards_mm if len(towards_mm) else None
+    if isinstance(found, ProbedPoints):
+        probed = fit_probed_plate(found, known, ProbingOptions(side=request.side))
+        if isinstance(probed, ProbedPlate):
+            return probed.reference, probed.warnings
+        raise EstimationError(probed.reason, where=where, remedy=probed.remedy)
+    plate = plate_from_coefficients(found, known, request.side, where)
+    if isinstance(plate, FitFailure):
+        raise EstimationError(plate.reason, where=where, remedy=plate.remedy)
+    return plate, ()
 
 
-def _middle_of(recordings: Sequence[FolderRecording]) -> FloatArray:
-    """(3,) mean place of the arm's tool."""
+def _tool_places(recordings: Sequence[FolderRecording]) -> FloatArray:
+    """(M, 3) places of the arm's tool."""
     places = [
         recording.arm.translations_mm[recording.arm.is_known]
         for recording in recordings
         if recording.arm is not None
     ]
-    known = np.concatenate(places) if places else np.zeros((0, 3))
-    return np.asarray(known.mean(axis=0)) if len(known) else np.zeros(3)
+    return np.concatenate(places) if places else np.zeros((0, 3))
 
 
 def _prefix(recording: FolderRecording, n_recordings: int) -> str:

@@ -27,11 +27,11 @@ from armscan.report.hand_eye_numbers import (
     total_covariance,
 )
 from armscan.report.hand_eye_page import hand_eye_page, posture_table
-from armscan.report.hand_eye_repeat import repeat_tables
+from armscan.report.hand_eye_repeat import repeat_blocks
 from armscan.report.hand_eye_request import HandEyeRequest
 from armscan.report.numbers import sentence
 from armscan.report.outputs import document_and_page
-from armscan.report.page import render_page
+from armscan.report.page import Text, render_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.provenance import new_provenance
@@ -73,7 +73,7 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
         fit,
         scanner,
         (files.document, files.page),
-        repeats,
+        [block for block in repeats if isinstance(block, Table)],
         is_simulated=inputs.is_simulated,
     )
 
@@ -97,11 +97,11 @@ def calibrated(
     return fit
 
 
-def _repeats(inputs: HandEyeInputs, request: HandEyeRequest) -> tuple[Table, ...]:
+def _repeats(inputs: HandEyeInputs, request: HandEyeRequest) -> tuple[Table | Text, ...]:
     if len(inputs.groups) < 2:
         return ()
     fits = [calibrated(seen.stripes, inputs, request, name) for name, seen in inputs.groups]
-    return repeat_tables([name for name, _ in inputs.groups], fits)
+    return repeat_blocks([name for name, _ in inputs.groups], fits)
 
 
 def _input_warnings(inputs: HandEyeInputs) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ from armscan.report.hand_eye_numbers import (
 from armscan.report.hand_eye_scene import posture_scene
 from armscan.report.numbers import sentence, significant
 from armscan.report.origin import footer, origin_section
-from armscan.report.page import Card, Facts, Gallery, Page, Section, Text
+from armscan.report.page import Block, Card, Facts, Gallery, Page, Section, Text
 from armscan.report.stripe_gallery import stripe_gallery
 from armscan.report.summary import Table
 
@@ -43,7 +43,7 @@ def hand_eye_page(
     images: Sequence[ReconstructedImage] = (),
     exposures: Mapping[str, Exposure] | None = None,
     *,
-    repeats: Sequence[Table] = (),
+    repeats: Sequence[Block] = (),
     is_simulated: bool = False,
 ) -> Page:
     """Lay out the report.
@@ -61,7 +61,7 @@ def hand_eye_page(
     exposures
         The images by source name; those that are missing are not shown.
     repeats
-        Tables of a repeat study, shown after the result.
+        A repeat study, shown after the result.
     is_simulated
         True if the images were rendered.
     """

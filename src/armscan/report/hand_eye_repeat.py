@@ -5,36 +5,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
+from armscan.calibration.hand_eye.repeat_study import study_repeats
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.report.hand_eye_numbers import hand_eye_numbers
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.report.page import Text
 from armscan.report.summary import Table
 
 COLUMNS = ("calibration", "θ °", "γ °", "φ °", "tx mm", "ty mm", "tz mm")
 
 
-def repeat_tables(names: Sequence[str], fits: Sequence[HandEyeFit]) -> tuple[Table, ...]:
-    """Angles of eq. 2.69 and translation of each calibration, their mean and standard deviation.
+def repeat_blocks(names: Sequence[str], fits: Sequence[HandEyeFit]) -> tuple[Table, Text]:
+    """Angles of eq. 2.69 and translation of each calibration, and how far they scatter.
 
-    The last line is what the calibrations themselves expect: the root mean square of their stated
-    sigmas, the sensor's share left out, since all share the sensor.
+    Parameters
+    ----------
+    names
+        One a calibration.
+    fits
+        The calibrations, two or more, of one sensor.
     """
-    numbers = [hand_eye_numbers(fit.calibration, fit.calibration.covariance) for fit in fits]
-    angles = np.degrees(np.unwrap(np.radians([item.euler_deg for item in numbers]), axis=0))
-    values = np.hstack([angles, [item.translation_mm for item in numbers]])
-    stated = np.hstack(
-        [
-            [item.euler_sigma_deg for item in numbers],
-            [item.translation_sigma_mm for item in numbers],
-        ]
+    study = study_repeats([fit.calibration for fit in fits])
+    if isinstance(study, FitFailure):
+        return Table(COLUMNS, ()), Text(study.reason)
+    rows = [_row(name, row, 3) for name, row in zip(names, study.values, strict=True)]
+    rows.append(_row("mean", study.mean_values, 3))
+    rows.append(_row("standard deviation", study.std, 4))
+    if study.predicted is not None:
+        rows.append(_row("predicted", study.predicted, 4))
+    low, high = study.ratio_range
+    text = (
+        "One calibration from each recording. The standard deviation is that of one calibration, "
+        f"n - 1 = {len(fits) - 1} in the denominator; the prediction is what the calibrations "
+        "state themselves, the sensor's share left out, as all have one sensor. If it is right, "
+        f"their ratio falls between {low:.2f} and {high:.2f} in 95 % of such studies."
     )
-    rows = [_row(name, row, 3) for name, row in zip(names, values, strict=True)]
-    rows.append(_row("mean", values.mean(axis=0), 3))
-    rows.append(_row("standard deviation", values.std(axis=0, ddof=1), 4))
-    rows.append(_row("stated sigma", np.sqrt(np.mean(stated**2, axis=0)), 4))
-    return (Table(COLUMNS, tuple(rows), "One calibration each (as Table 4)"),)
+    if study.unlike_predicted:
+        text += f" It does not for {', '.join(study.unlike_predicted)}."
+    return Table(COLUMNS, tuple(rows), "One calibration each (as Table 4)"), Text(text)
 
 
-def _row(name: str, values: np.ndarray, decimals: int) -> tuple[str, ...]:
+def _row(name: str, values: FloatArray, decimals: int) -> tuple[str, ...]:
     return (name, *(f"{value:.{decimals}f}" for value in values))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.calibration.hand_eye.sphere_options import SphereOptions
 from armscan.errors import OptionError
 from armscan.geometry.euler import EulerConvention
@@ -38,8 +39,7 @@ class HandEyeRequest:
     plane
         ``A,B,C,D`` of the plate in Base; empty for none.
     side
-        Direction in Base from which the plate was probed and is scanned, as ``x,y,z``; empty to
-        find it.
+        Axis of Base along which the plate's face looks; None to take it from where the arm was.
     sphere_diameter_mm
         Diameter of the sphere in place of a plate; None for a plate.
     arm
@@ -71,7 +71,7 @@ class HandEyeRequest:
     euler: EulerConvention = "extrinsic-xyz"
     plate: Path | None = None
     plane: str = ""
-    side: str = ""
+    side: ProbeSide | None = None
     sphere_diameter_mm: float | None = None
     arm: Path | None = None
     options: HandEyeOptions = field(default_factory=HandEyeOptions)

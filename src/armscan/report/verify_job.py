@@ -124,10 +124,10 @@ def checks_table(checks: tuple[Check, ...]) -> Table:
     rows = tuple(
         (
             check.name,
-            _mm(check.error_mm),
-            _mm(check.predicted_mm),
-            f"{_mm(check.limit_mm)} ({check.limit_rule})",
-            f"{_mm(check.uncertainty_mm)} ({check.uncertainty_rule})",
+            _value(check, check.error),
+            _value(check, check.predicted),
+            f"{_value(check, check.limit)} ({check.limit_rule})",
+            f"{_value(check, check.uncertainty)} ({check.uncertainty_rule})",
             check.verdict,
         )
         for check in checks
@@ -212,8 +212,8 @@ def _report(request: VerifyRequest, result: Verification, measured: Measured) ->
         *(
             Card(
                 f"E: {check.name.split(',')[0].split('(')[0].strip()}",
-                _mm(check.error_mm),
-                f"limit {_mm(check.limit_mm)}: {check.verdict}",
+                _value(check, check.error),
+                f"limit {_value(check, check.limit)}: {check.verdict}",
             )
             for check in result.checks
         ),
@@ -243,8 +243,8 @@ def _summary(
     lines = tuple(
         (
             check.name.split(",")[0].split("(")[0].strip(),
-            f"E {_mm(check.error_mm)}, limit {_mm(check.limit_mm)} ({check.limit_rule}), "
-            f"U {_mm(check.uncertainty_mm)}: {check.verdict}",
+            f"E {_value(check, check.error)}, limit {_value(check, check.limit)} ({check.limit_rule}), "
+            f"U {_value(check, check.uncertainty)}: {check.verdict}",
         )
         for check in result.checks
     )
@@ -262,11 +262,12 @@ def _summary(
             "checks": [
                 {
                     "name": check.name,
-                    "error_mm": check.error_mm,
-                    "predicted_sigma_mm": check.predicted_mm,
-                    "limit_mm": check.limit_mm,
+                    "unit": check.unit,
+                    "error": check.error,
+                    "predicted_sigma": check.predicted,
+                    "limit": check.limit,
                     "limit_rule": check.limit_rule,
-                    "uncertainty_mm": check.uncertainty_mm,
+                    "uncertainty": check.uncertainty,
                     "uncertainty_rule": check.uncertainty_rule,
                     "verdict": check.verdict,
                 }
@@ -277,5 +278,5 @@ def _summary(
     )
 
 
-def _mm(value: float) -> str:
-    return significant(value, "mm", 2)
+def _value(check: Check, value: float) -> str:
+    return significant(value, check.unit, 2)

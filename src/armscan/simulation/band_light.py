@@ -44,7 +44,7 @@ def band_light(
             if not is_lit[outer].any():
                 continue
             fine = sum((_fine(sheet, outer) for sheet in sheets[1:]), _fine(sheets[0], outer))
-            fine *= np.float32(1.0 / len(sheets)) * _grain(fine.shape, speckle, rng)
+            fine *= np.float32(1.0 / len(sheets)) * speckle_piece(fine.shape, speckle, rng)
             blurred = blur_image(fine, SUBPIXELS * camera.blur_sigma_px)
             size = (fine.shape[1] // SUBPIXELS, fine.shape[0] // SUBPIXELS)
             tile = cv2.resize(blurred, size, interpolation=cv2.INTER_AREA)
@@ -80,7 +80,7 @@ def _finer(image: Image32) -> Image32:
     return np.asarray(finer, dtype=np.float32)
 
 
-def _grain(shape: tuple[int, ...], speckle: Speckle, rng: np.random.Generator) -> Image32:
+def speckle_piece(shape: tuple[int, ...], speckle: Speckle, rng: np.random.Generator) -> Image32:
     """Speckle of a tile: a random piece of one large field."""
     if speckle.contrast == 0.0:
         return np.ones(shape, np.float32)

@@ -145,7 +145,8 @@ def _fine_reflectance(
     near_edge[is_on_print] |= pattern.edge_distance_mm(x[is_on_print], y[is_on_print]) < reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
-    fine = np.repeat(np.repeat(tone, SUBPIXELS, axis=0), SUBPIXELS, axis=1)
+    size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
+    fine = np.asarray(cv2.resize(tone, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
     rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
     for start in range(0, len(rows), _CHUNK):
         v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]

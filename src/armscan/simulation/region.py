@@ -63,3 +63,9 @@ def between_nodes(nodes: Image32, step_px: int) -> Image32:
 def to_pixels(nodes: Image32, region: Region) -> Image32:
     """(H, W) values of a region's pixels between those of its coarse grid."""
     return between_nodes(nodes, COARSE_STEP_PX)[: region.height_px, : region.width_px]
+
+
+def enlarged(cells: NDArray[np.uint8], step_px: int) -> NDArray[np.uint8]:
+    """(step H, step W) pixels that bear the value of their cell (H, W)."""
+    size = (step_px * cells.shape[1], step_px * cells.shape[0])
+    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)

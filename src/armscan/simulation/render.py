@@ -145,8 +145,8 @@ def pixels_near_sheet(reach: FloatArray) -> BoolArray:
     high = np.where(np.isnan(corners), -np.inf, corners).max(axis=0)
     cells = ((low <= BAND_SIGMAS) & (high >= -BAND_SIGMAS)).astype(np.uint8)
     cells = cv2.dilate(cells, np.ones((3, 3), np.uint8))
-    band = np.repeat(np.repeat(cells, COARSE_STEP_PX, axis=0), COARSE_STEP_PX, axis=1)
-    return np.asarray(band > 0)
+    size = (COARSE_STEP_PX * cells.shape[1], COARSE_STEP_PX * cells.shape[0])
+    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _corners(grid: FloatArray) -> FloatArray:

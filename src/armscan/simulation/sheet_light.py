@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.simulation.light import LineLaser
 from armscan.simulation.optics import RenderCamera
-from armscan.simulation.region import Image32, Region, between_nodes, to_pixels
+from armscan.simulation.region import Image32, Region, between_nodes, enlarged, to_pixels
 from armscan.simulation.render import BAND_SIGMAS, COARSE_STEP_PX, SUBPIXELS, pixels_near_sheet
 from armscan.simulation.scene import FAINTEST, Hits, Scene
 from armscan.simulation.stripe_truth import camera_rays
@@ -129,7 +129,7 @@ class _Tracer:
         found = self._shade(_STRIDE_PX * rows, _STRIDE_PX * columns)
         coarse_reach[rows, columns], coarse_peak[rows, columns] = found
         rough = _jumps(coarse_reach, coarse_peak, _STRIDE_PX) | _bends(coarse_reach)
-        is_rough = np.repeat(np.repeat(rough.astype(np.uint8), _STRIDE_PX, 0), _STRIDE_PX, 1)
+        is_rough = enlarged(rough.astype(np.uint8), _STRIDE_PX)
         reach[:] = between_nodes(coarse_reach, _STRIDE_PX)
         peak[:] = between_nodes(coarse_peak, _STRIDE_PX)
         exact = np.nonzero((cv2.dilate(is_rough, _SQUARE) > 0) & near)
@@ -177,7 +177,7 @@ def _rough_cells(reach: Image32, surface: IntArray) -> BoolArray:
     differs = cv2.dilate(marks, square) != cv2.erode(marks, square)
     bends = np.abs(cv2.Laplacian(reach, cv2.CV_32F)) > _SLACK_SIGMAS
     rough = cv2.dilate((differs | bends | (surface < 0)).astype(np.uint8), square)[:-1, :-1]
-    return np.asarray(np.kron(rough, np.ones((COARSE_STEP_PX, COARSE_STEP_PX), np.uint8)) > 0)
+    return enlarged(np.asarray(rough, dtype=np.uint8), COARSE_STEP_PX) > 0
 
 
 def shade(

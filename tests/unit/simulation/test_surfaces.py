@@ -162,3 +162,28 @@ def test_impossible_limbs_are_refused() -> None:
         Body((Limb((0, 0, 0), (0, 1, 0), 1.0, 1.0, is_hollow=True),), POSE)
     with pytest.raises(InputError, match="sphere of radius"):
         Sphere(np.zeros(3), -1.0)
+
+
+def test_rays_along_a_body_neither_stop_before_it_nor_cut_through_it() -> None:
+    """Rays that nearly touch: where they must hit is known from dense samples of the distance."""
+    pose: Pose[Sensor, Part] = Pose(np.eye(3), np.zeros(3))
+    body = Body(
+        (Limb((-30, 0, 0), (30, 0, 0), 9.0, 12.0), Limb((5, 6, 4), (9, 8, 6), 7, 7, 9)), pose
+    )
+    rng = np.random.default_rng(4)
+    origins = np.column_stack(
+        [np.full(400, -150.0), rng.uniform(-2, 22, 400), rng.uniform(6, 18, 400)]
+    )
+    directions = np.tile([1.0, 0.0, 0.0], (400, 1)) + 0.02 * rng.standard_normal((400, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    travelled = body.intersect(origins, directions)
+    along = np.arange(90.0, 210.0, 0.02)
+    n_hits = 0
+    for origin, direction, reached in zip(origins, directions, travelled, strict=True):
+        gaps = body.distance_mm(origin + along[:, None] * direction)
+        before = gaps[along < min(reached, along[-1]) - 0.02]
+        assert before.min() > -1e-4
+        if np.isfinite(reached):
+            n_hits += 1
+            assert abs(body.distance_mm((origin + reached * direction)[None])[0]) < HIT_MM
+    assert 100 < n_hits < 380

@@ -67,11 +67,18 @@ def measured_length(
     return MeasuredLength(value_mm, max(known, default=math.nan), propagated)
 
 
-def influence(fit: FitLinearised) -> FloatArray:
-    """(N, 3) derivative of the length by each point's error, up to the sign of all."""
+def exposure_blocks(exposure: IntArray, most: int) -> tuple[IntArray, int]:
+    """(N,) number of the block of neighbouring exposures that each point is in, and their count."""
+    number = np.unique(exposure, return_inverse=True)[1].astype(np.int64)
+    n = int(number.max()) + 1 if len(number) else 0
+    blocks = min(n, most)
+    return (number * blocks // n if n else number), blocks
+
+
+def influence_along(fit: FitLinearised) -> FloatArray:
+    """(N,) derivative of the length by each point's error along its direction, up to one sign."""
     information = fit.jacobian.T @ fit.jacobian
-    weight = fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters)
-    return np.asarray(weight[:, None] * fit.directions)
+    return np.asarray(fit.jacobian @ np.linalg.solve(information, fit.length_by_parameters))
 
 
 def _jackknife_mm(fit: FitLinearised, block: IntArray, n_blocks: int) -> float:
@@ -103,7 +110,7 @@ def _propagated_mm(
     covariance = cloud.covariance_mm2[rows]
     if not covariance.any():
         return math.nan
-    by_point = influence(fit)
+    by_point = influence_along(fit)[:, None] * fit.directions
     pull = np.stack([np.bincount(exposure, by_point[:, k], n) for k in range(3)], axis=1)
     count = np.bincount(exposure, minlength=n)
     variance = float((by_point**2).sum(axis=1) @ (cloud.sigma_noise_mm[rows] ** 2))

@@ -37,35 +37,38 @@ class Check:
     ----------
     name
         What was tested, in words.
-    error_mm
+    unit
+        Of the numbers: mm, or sigma.
+    error
         E.
-    predicted_mm
+    predicted
         Standard deviation of E that the calibration's covariance predicts.
-    limit_mm, limit_rule
+    limit, limit_rule
         MPE and where it comes from.
-    uncertainty_mm, uncertainty_rule
+    uncertainty, uncertainty_rule
         U and what it holds.
     verdict
         By `RULE`.
     """
 
     name: str
-    error_mm: float
-    predicted_mm: float
-    limit_mm: float
+    unit: str
+    error: float
+    predicted: float
+    limit: float
     limit_rule: str
-    uncertainty_mm: float
+    uncertainty: float
     uncertainty_rule: str
     verdict: Verdict
 
 
-def judge(error_mm: float, limit_mm: float, uncertainty_mm: float) -> Verdict:
+def judge(error: float, limit: float, uncertainty: float) -> Verdict:
     """Apply `RULE`; what is not known is inconclusive."""
-    if not (math.isfinite(error_mm) and math.isfinite(limit_mm) and math.isfinite(uncertainty_mm)):
+    if not (math.isfinite(error) and math.isfinite(limit) and math.isfinite(uncertainty)):
         return "inconclusive"
-    if abs(error_mm) <= limit_mm - uncertainty_mm:
+    if abs(error) <= limit - uncertainty:
         return "still valid"
-    return "not valid" if abs(error_mm) > limit_mm + uncertainty_mm else "inconclusive"
+    return "not valid" if abs(error) > limit + uncertainty else "inconclusive"
 
 
 def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
@@ -111,11 +114,12 @@ def check_size(
         limit, rule = mpe_mm, "given"
     return Check(
         name=name,
-        error_mm=error_mm,
-        predicted_mm=sigma_calibration_mm,
-        limit_mm=limit,
+        unit="mm",
+        error=error_mm,
+        predicted=sigma_calibration_mm,
+        limit=limit,
         limit_rule=rule,
-        uncertainty_mm=u,
+        uncertainty=u,
         uncertainty_rule="the reference's expanded uncertainty and twice the standard deviation "
         "that this scan's own scatter causes",
         verdict=judge(error_mm, limit, u),
@@ -155,11 +159,12 @@ def check_spread(
     limit = LIMIT_SIGMAS * predicted
     return Check(
         name="disagreement of exposures (rms of each one's mean distance from the fitted surface)",
-        error_mm=error,
-        predicted_mm=predicted,
-        limit_mm=limit,
+        unit="mm",
+        error=error,
+        predicted=predicted,
+        limit=limit,
         limit_rule=f"{LIMIT_SIGMAS:g} standard deviations that the points' covariances predict",
-        uncertainty_mm=0.0,
+        uncertainty=0.0,
         uncertainty_rule="none: no nominal value takes part",
         verdict=judge(error, limit, 0.0),
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,17 +13,27 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cleaning import Region
+from armscan.inspection.consistency import StandardDistances, check_consistency
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.plane import inspect_plane, linearised_plane
 from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
 from armscan.inspection.sphere import inspect_sphere, linearised_sphere
-from armscan.inspection.uncertainty import FitLinearised, influence
-from armscan.inspection.verdict import Check, Verdict, check_size, check_spread, worst
+from armscan.inspection.uncertainty import FitLinearised, influence_along
+from armscan.inspection.verdict import (
+    COVERAGE,
+    Check,
+    Verdict,
+    check_size,
+    check_spread,
+    worst,
+)
 from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.distance_errors import (
+    distance_by_arm,
+    distance_by_calibration,
+    distance_by_plate,
+)
 from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.reconstruction.place import place_with_jacobian
-from armscan.reconstruction.result import PointFate
-from armscan.reconstruction.triangulate import sensor_columns, triangulate_stripe
 from armscan.records.cloud import PointCloud
 
 NO_POSES = (
@@ -109,16 +119,19 @@ def verify_on_ball(
         raise EstimationError(found.reason, remedy=found.remedy)
     used = found.rows[found.is_fitted]
     fit = linearised_sphere(found.sphere, cloud.points_mm[used])
-    sigma = _calibration_sigma_mm(measured, used, fit, found.diameter)
-    size = check_size(
+    u_radius = options.reference_u_mm / COVERAGE / 2.0
+    standard = _Standard(
+        distance_mm=fit.residuals_mm + found.sphere.radius_mm - diameter_mm / 2.0,
+        by_place=-fit.directions,
+        by_standard=np.full((len(used), 1), -u_radius),
+    )
+    return _judged(
+        _Evidence(measured, used, fit, found.diameter, standard),
+        found,
         "diameter, fitted minus nominal (P_Size.Sph.All of ISO 10360-8)",
         found.diameter.value_mm - diameter_mm,
-        sigma,
-        _scan_sigma_mm(found.diameter),
-        reference_u_mm=options.reference_u_mm,
-        mpe_mm=options.mpe_mm,
+        options,
     )
-    return _judged(measured, size, fit, used, found)
 
 
 def verify_on_plate(
@@ -146,40 +159,94 @@ def verify_on_plate(
         raise EstimationError(found.reason, remedy=found.remedy)
     offset = found.offset or MeasuredLength(math.nan, math.nan, math.nan)
     used = found.rows[found.is_fitted]
-    fit = linearised_plane(found.plane, cloud.points_mm[used])
-    place = check_size(
+    points = cloud.points_mm[used]
+    standard = _Standard(
+        distance_mm=plate.plane.distance_mm(points),
+        by_place=np.zeros((len(used), 0)),
+        by_standard=distance_by_plate(plate, points),
+    )
+    u = max(options.reference_u_mm, COVERAGE * _plate_sigma_mm(plate, found))
+    unknown = () if plate.covariance is not None else ("the plate's own uncertainty is not known",)
+    return _judged(
+        _Evidence(measured, used, linearised_plane(found.plane, points), offset, standard),
+        found,
         "height of the scanned plane over the probed one, at the middle of the points",
         offset.value_mm,
-        _calibration_sigma_mm(measured, used, fit, offset),
-        _scan_sigma_mm(offset),
-        reference_u_mm=max(options.reference_u_mm, 2.0 * _plate_sigma_mm(plate, found)),
-        mpe_mm=options.mpe_mm,
+        replace(options, reference_u_mm=u),
+        warnings=unknown,
     )
-    unknown = () if plate.covariance is not None else ("the plate's own uncertainty is not known",)
-    return _judged(measured, place, fit, used, found, warnings=unknown)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Standard:
+    """Distances (N,) from the standard and what they depend on besides the calibration."""
+
+    distance_mm: FloatArray
+    by_place: FloatArray
+    by_standard: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What the checks look at: the fit's points, the fitted length, the standard."""
+
+    measured: Measured
+    used: IntArray
+    fit: FitLinearised
+    length: MeasuredLength
+    standard: _Standard
 
 
 def _judged(
-    measured: Measured,
-    first: Check,
-    fit: FitLinearised,
-    used: IntArray,
+    evidence: _Evidence,
     found: SphereInspection | PlaneInspection,
+    name: str,
+    error_mm: float,
+    options: VerifyOptions,
     *,
     warnings: tuple[str, ...] = (),
 ) -> Verification:
-    cloud = measured.cloud
+    cloud, used, fit = evidence.measured.cloud, evidence.used, evidence.fit
+    scan, scanner = evidence.measured.scan, evidence.measured.scanner
+    exposure = cloud.exposure[used]
     variance = np.einsum("ni,nij,nj->n", fit.directions, cloud.covariance_mm2[used], fit.directions)
-    spread = check_spread(fit.residuals_mm, variance, cloud.exposure[used])
-    checks = (first,) if spread is None else (first, spread)
-    if spread is None:
-        warnings = (*warnings, "too few exposures to see whether they agree")
-    if measured.scan is None:
+    sigma_mm = evidence.length.sigma_propagated_mm
+    consistency = None
+    if scan is not None and scanner is not None:
+        directions = np.zeros((len(cloud), 3))
+        directions[used] = fit.directions
+        effect = distance_by_calibration(scan, scanner, directions)[used]
+        gradient = effect.T @ influence_along(fit)
+        sigma_mm = math.sqrt(max(0.0, float(gradient @ scanner.covariance @ gradient)))
+        s = evidence.standard
+        others = np.hstack(
+            [
+                s.by_standard,
+                distance_by_arm(cloud, used, fit.directions, scanner.hand_eye.arm_noise),
+            ]
+        )
+        consistency = check_consistency(
+            StandardDistances(
+                s.distance_mm, effect, scanner.covariance, s.by_place, others, exposure
+            )
+        )
+    else:
         warnings = (*warnings, NO_POSES)
+    size = check_size(
+        name,
+        error_mm,
+        sigma_mm,
+        _scan_sigma_mm(evidence.length),
+        reference_u_mm=options.reference_u_mm,
+        mpe_mm=options.mpe_mm,
+    )
+    spread = check_spread(fit.residuals_mm, variance, exposure)
+    checks = tuple(check for check in (size, consistency, spread) if check is not None)
+    if spread is None or (scan is not None and consistency is None):
+        warnings = (*warnings, "too few exposures to see whether they agree")
     if not variance.any():
         warnings = (*warnings, "the cloud carries no standard deviations to compare with")
-    verdict = worst(tuple(check.verdict for check in checks))
-    return Verification(checks, verdict, found, warnings)
+    return Verification(checks, worst(tuple(c.verdict for c in checks)), found, warnings)
 
 
 def _scan_sigma_mm(length: MeasuredLength) -> float:
@@ -191,65 +258,4 @@ def _scan_sigma_mm(length: MeasuredLength) -> float:
 
 def _plate_sigma_mm(plate: PlateReference, found: PlaneInspection) -> float:
     """Standard deviation of the probed plane's height at the middle of the scanned points."""
-    if plate.covariance is None:
-        return 0.0
-    away = (found.plane.point_mm - plate.plane.point_mm) @ plate.plane.axes.T
-    lever = np.array([away[0], away[1], 1.0])
-    return math.sqrt(max(0.0, float(lever @ plate.covariance @ lever)))
-
-
-def _calibration_sigma_mm(
-    measured: Measured, used: IntArray, fit: FitLinearised, length: MeasuredLength
-) -> float:
-    """Standard deviation of a fitted length by the calibration alone, as its document says."""
-    if measured.scan is None or measured.scanner is None:
-        return length.sigma_propagated_mm
-    pulls = np.zeros((len(measured.cloud), 3))
-    pulls[used] = influence(fit)
-    return calibration_sigma_mm(measured.scan, measured.scanner, pulls)
-
-
-def calibration_sigma_mm(
-    scan: ScanReconstruction, scanner: ScannerCalibration, pulls: FloatArray
-) -> float:
-    """Standard deviation of a length by the joint covariance of sensor and hand-eye.
-
-    Parameters
-    ----------
-    scan
-        Points of the whole scan, none cut off by a working volume.
-    scanner
-        The calibration that made them.
-    pulls
-        (N, 3) derivative of the length by each point of ``scan.cloud``.
-
-    Raises
-    ------
-    EstimationError
-        If the scanner has no camera, or points of the scan were cut off.
-    """
-    sensor = scanner.sensor
-    if sensor is None:
-        raise EstimationError("this scanner has no camera", remedy="verify a cloud instead")
-    n = len(sensor.parameter_names)
-    gradient = np.zeros(n + 6)
-    order = np.argsort(scan.cloud.exposure, kind="stable")
-    ends = np.searchsorted(scan.cloud.exposure[order], np.arange(len(scan.images) + 1))
-    for k, image in enumerate(scan.images):
-        own = pulls[order[ends[k] : ends[k + 1]]]
-        if not own.any():
-            continue
-        sheets = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
-        stripe = triangulate_stripe(image.profile, sheets, sensor)
-        if len(stripe.row) != len(own):
-            raise EstimationError("points of the scan were cut off before the check")
-        pose = scan.poses.pose(scan.image_rows[k])
-        placed = place_with_jacobian(stripe.points_mm, pose, scanner.hand_eye.tool_from_sensor)
-        turned = own @ placed.by_sensor_point
-        for sheet in np.unique(stripe.sheet):
-            on = stripe.sheet == sheet
-            gradient[sensor_columns(sensor, int(sheet))] += np.einsum(
-                "ni,nip->p", turned[on], stripe.by_sensor[on]
-            )
-        gradient[n:] += np.einsum("ni,nip->p", own, placed.by_hand_eye)
-    return math.sqrt(max(0.0, float(gradient @ scanner.covariance @ gradient)))
+    return float(np.linalg.norm(distance_by_plate(plate, found.plane.point_mm[None, :])))

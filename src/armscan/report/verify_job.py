@@ -243,8 +243,8 @@ def _summary(
     lines = tuple(
         (
             check.name.split(",")[0].split("(")[0].strip(),
-            f"E {_value(check, check.error)}, limit {_value(check, check.limit)} ({check.limit_rule}), "
-            f"U {_value(check, check.uncertainty)}: {check.verdict}",
+            f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
+            f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
         )
         for check in result.checks
     )

@@ -13,7 +13,8 @@ from armscan.cli.image_arguments import BitsAlign, BitsUsed, LaserColourOption, 
 from armscan.cli.output import AsJson, Force, progress_bar, show
 
 EXAMPLE = (
-    "\b\nExample:\n"
+    "\b\nExamples:\n"
+    "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
     "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
     "      --sheet A -o cloud.ply"
 )
@@ -24,13 +25,18 @@ def reconstruct(
     images: Annotated[
         list[str],
         typer.Argument(
-            help="Images with the laser on: files, folders, patterns.", show_default=False
+            help="A recording's folder; or images with the laser on: files, folders, patterns.",
+            show_default=False,
         ),
     ],
     sensor: Annotated[
         Path,
         typer.Option(
-            "--sensor", "--scanner", help="Calibration of camera and sheets.", show_default=False
+            "--sensor",
+            "--scanner",
+            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
+            "the Sensor frame.",
+            show_default=False,
         ),
     ],
     background: Annotated[
@@ -45,6 +51,14 @@ def reconstruct(
             show_default=False,
         ),
     ] = None,
+    volume: Annotated[
+        str,
+        typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm."),
+    ] = "",
+    arm: Annotated[
+        Path | None,
+        typer.Option(help="arm.toml, for recordings of joint angles.", show_default=False),
+    ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
     ] = Path("cloud.ply"),
@@ -55,10 +69,11 @@ def reconstruct(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure points in the Sensor frame from images of laser lines on objects."""
+    """Measure points from a recording of a scan, or from images of laser lines on objects."""
     from armscan.pipeline.reconstruct import ReconstructOptions
     from armscan.reconstruction.choose_sheet import DepthRange
-    from armscan.report.cloud_job import CloudRequest, run_reconstruction
+    from armscan.report.cloud_job import CloudRequest
+    from armscan.report.scan_job import run_measurement
     from armscan.storage.image_options import Alignment, ImageOptions
     from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
 
@@ -76,9 +91,11 @@ def reconstruct(
             sheet=sheet,
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
+        volume=volume,
+        arm=arm,
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:
-        summary = run_reconstruction(request, progress)
+        summary = run_measurement(request, progress)
     show(summary, as_json=as_json)

@@ -9,9 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from armscan.errors import InputError
+from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.reconstruct import ReconstructOptions, reconstruct
+from armscan.pipeline.scan_images import ScanImages
 from armscan.reconstruction.result import Reconstruction
+from armscan.records.exposure import Exposure
 from armscan.report.cloud_page import cloud_page, fate_table
 from armscan.report.numbers import sentence, significant
 from armscan.report.outputs import cloud_outputs
@@ -24,6 +28,8 @@ from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import read_exposures
 from armscan.storage.provenance import new_provenance
+from armscan.storage.recording_reader import is_recording, read_recording
+from armscan.storage.scanner_files import is_scanner_document, read_scanner_calibration
 from armscan.storage.simulated import are_simulated
 
 
@@ -34,9 +40,9 @@ class CloudRequest:
     Parameters
     ----------
     sensor
-        The sensor's calibration ``sensor.json``.
+        The sensor's calibration ``sensor.json``, or a ``scanner.json``.
     images
-        Images with the laser on: files, folders or patterns.
+        Images with the laser on: files, folders or patterns; or a recording's folder.
     background
         The same views without laser, one for each, or none.
     output
@@ -45,6 +51,10 @@ class CloudRequest:
         Of stripes, depths and sheet.
     image_options
         How pixels are read.
+    volume
+        Part of Base to measure in a recording, ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all.
+    arm
+        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
     is_overwriting
         Replace results that exist.
     command
@@ -57,6 +67,8 @@ class CloudRequest:
     output: Path
     options: ReconstructOptions = field(default_factory=ReconstructOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
+    volume: str = ""
+    arm: Path | None = None
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
 
@@ -71,10 +83,9 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
         then.
     """
     files = cloud_outputs(request.output, is_overwriting=request.is_overwriting)
-    sensor = read_sensor_calibration(request.sensor)
-    images = expand_paths(request.images)
-    background = expand_paths(request.background) if request.background else ()
-    exposures = read_exposures((*images, *background), request.image_options)
+    sensor = _sensor(request.sensor)
+    read = _read_images(request)
+    images, background, exposures = read.images, read.background, read.exposures
     result = reconstruct(
         exposures[: len(images)],
         sensor,
@@ -101,6 +112,54 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     written = (files.document, files.page)
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
     return cloud_summary(result, written, losses, is_simulated=is_simulated)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """Files with laser and without, and their exposures, those with laser first."""
+
+    images: tuple[Path, ...]
+    background: tuple[Path, ...]
+    exposures: tuple[Exposure, ...]
+
+
+def _read_images(request: CloudRequest) -> _Images:
+    """Images of files and folders, or the exposures of one recording."""
+    folder = Path(request.images[0]) if len(request.images) == 1 else None
+    if folder is not None and is_recording(folder) and not request.background:
+        return _of_recording(folder)
+    images = expand_paths(request.images)
+    background = expand_paths(request.background) if request.background else ()
+    exposures = read_exposures((*images, *background), request.image_options)
+    return _Images(images, background, tuple(exposures))
+
+
+def _of_recording(folder: Path) -> _Images:
+    recording = read_recording(folder)
+    scan = ScanImages(recording)
+    pairs = [scan.pair(row) for row in np.flatnonzero(scan.is_lit).tolist()]
+    on = [exposure for exposure, _ in pairs]
+    off = [background for _, background in pairs if background is not None]
+    if len(off) < len(on):
+        off = []
+    return _Images(
+        tuple(folder / exposure.source for exposure in on),
+        tuple(folder / exposure.source for exposure in off),
+        (*on, *off),
+    )
+
+
+def _sensor(path: Path) -> SensorCalibration:
+    if not is_scanner_document(path):
+        return read_sensor_calibration(path)
+    sensor = read_scanner_calibration(path).sensor
+    if sensor is None:
+        raise InputError(
+            "this scanner delivers points itself: it has no camera and no light sheets",
+            where=str(path),
+            remedy="name the document of a scanner with a camera",
+        )
+    return sensor
 
 
 def cloud_summary(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -28,10 +28,25 @@ def scan_page(
     scan: ScanReconstruction,
     exposures: Mapping[str, Exposure],
     provenance: Provenance,
+    notes: Sequence[str] = (),
     *,
     is_simulated: bool = False,
 ) -> Page:
-    """Lay out the report; arguments as `armscan.report.cloud_page.cloud_page`."""
+    """Lay out the report.
+
+    Parameters
+    ----------
+    scan
+        The scan.
+    exposures
+        Images by source name; those that are missing are not shown.
+    provenance
+        How the cloud came to be.
+    notes
+        What is odd about the recording, in words.
+    is_simulated
+        True if the images were rendered.
+    """
     cloud = scan.cloud
     sections = [
         Section("The cloud", (Gallery((figures.cloud_view(cloud),), 560),)),
@@ -49,7 +64,7 @@ def scan_page(
         title="Scan in Base",
         subtitle=f"{len(cloud):,} points from {len(scan.images)} exposures of a moving arm",
         cards=_cards(scan),
-        warnings=tuple(sentence(warning) for warning in scan.warnings),
+        warnings=tuple(sentence(warning) for warning in (*notes, *scan.warnings)),
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),

@@ -32,7 +32,7 @@ from armscan.storage.calibration_bodies import (
 from armscan.storage.calibration_files import observations_body, validated_document
 from armscan.storage.calibration_schema import SCANNER_SCHEMA
 from armscan.storage.images import read_bytes
-from armscan.storage.json_text import json_bytes
+from armscan.storage.json_text import json_bytes, parse_json
 from armscan.storage.scanner_schema import (
     ArmNoiseBody,
     CouplingBody,
@@ -72,6 +72,17 @@ def scanner_document(
         provenance=provenance_body(calibration.provenance),
     )
     return json_bytes(document.model_dump(mode="json", by_alias=True))
+
+
+def is_scanner_document(path: Path) -> bool:
+    """True if a file says that it is a scanner's document; it need not be whole.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing or no JSON.
+    """
+    return bool(parse_json(read_bytes(path), str(path)).get("schema") == SCANNER_SCHEMA)
 
 
 def read_scanner_calibration(path: Path) -> ScannerCalibration:

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time that placing a scan takes, besides extracting its stripes.
+
+Command: ``OMP_NUM_THREADS=1 python benchmarks/scan_speed.py [repeats]`` (default 15; seed 0).
+
+Median milliseconds of processor time over the repeats, one thread:
+
+- *triangulate*: 3000 stripe points of one exposure, with the derivatives of their covariance;
+- *place*: the same points in Base with full covariance;
+- *poses*: 2000 exposures looked up by time among 20,000 samples of the arm;
+- *normals*: 200,000 points of a plate, and of a ball, scanned in 200 lines;
+- *arm forward*, *arm Jacobian*: 10,000 joint vectors of seven axes; Jacobian by 28 parameters.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+import placing_rig as rig
+from armscan.geometry.arrays import FloatArray
+from armscan.models.arm import thesis_arm
+from armscan.models.arm_forward import forward, parameter_jacobian
+from armscan.reconstruction.normals import estimate_normals
+from armscan.reconstruction.place import place_stripe, prepare_placing
+from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import triangulate_stripe
+from armscan.records.arm_track import ArmTrack
+from armscan.records.session import ExposureRow
+from sheet_rig import thesis_rig
+
+ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
+RNG = np.random.default_rng(0)
+
+
+def median_ms(work: Callable[[], object], repeats: int) -> float:
+    """Median time of a piece of work, after one that is not counted."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return 1e3 * float(np.median(times))
+
+
+def surface(is_ball: bool) -> FloatArray:
+    """200,000 points in 200 lines on a plate or on a ball's cap."""
+    x, y = np.meshgrid(np.linspace(-12.0, 12.0, 1000), np.linspace(-12.0, 12.0, 200))
+    z = np.sqrt(17.48**2 - x**2 - y**2) if is_ball else np.zeros_like(x)
+    points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    return np.asarray(points + RNG.normal(0.0, 0.01, points.shape))
+
+
+def track(n: int = 20_000) -> ArmTrack:
+    """A moving arm, 1000 samples a second."""
+    joints = RNG.uniform(-1.0, 1.0, 7) + 1e-4 * np.cumsum(RNG.normal(size=(n, 7)), axis=0)
+    return ArmTrack(np.arange(n) * 1_000_000, *forward(ARM, joints), np.ones(n, dtype=bool))
+
+
+def main() -> None:
+    repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 15
+    scanner = rig.scanner()
+    placing = prepare_placing(scanner)
+    sensor = rig.sensor_of(thesis_rig().camera, rig.sheets())
+    pixels = np.stack([np.linspace(200.0, 1800.0, 3000), np.full(3000, 700.0)], axis=1)
+    profile, sheet = rig.profile_at(pixels), np.zeros(3000, dtype=np.int64)
+    stripe = triangulate_stripe(profile, sheet, sensor)
+    samples = track()
+    times = np.sort(RNG.integers(0, int(samples.t_ns[-1]), 2000))
+    rows = [ExposureRow(k, int(t), 0, f"{k}.png") for k, t in enumerate(times)]
+    joints = RNG.uniform(-3.0, 3.0, (10_000, 7))
+    plate, ball = surface(is_ball=False), surface(is_ball=True)
+    seen = np.tile([0.0, 0.0, 150.0], (len(plate), 1))
+    few = max(1, repeats // 5)
+    table: list[tuple[str, Callable[[], object], int]] = [
+        ("triangulate 3000", lambda: triangulate_stripe(profile, sheet, sensor), repeats),
+        ("place 3000", lambda: place_stripe(stripe, profile, rig.BASE_FROM_TOOL, placing), repeats),
+        ("poses 2000", lambda: exposure_poses(rows, samples), repeats),
+        ("normals 200,000 plate", lambda: estimate_normals(plate, seen), few),
+        ("normals 200,000 ball", lambda: estimate_normals(ball, seen), few),
+        ("arm forward 10,000", lambda: forward(ARM, joints), repeats),
+        ("arm Jacobian 10,000", lambda: parameter_jacobian(ARM, joints), few),
+    ]
+    for name, work, count in table:
+        print(f"{name:24} {median_ms(work, count):10.2f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -4,9 +4,9 @@
 Command: ``OMP_NUM_THREADS=1 python benchmarks/render_speed.py [seeds]`` (default 3: seeds 1 to 3).
 
 Each row is one kind of image of the head thesis-single, standing still, or moving with three poses
-over the exposure; the processor time is the best of four. The bias is the mean over seeds and columns of the
-light's centroid less the true centre, without speckle and sensor noise; on curved things the light
-itself is lopsided (a ball of 17.5 mm: 0.016 px), so it is given for the plate only.
+over the exposure; the processor time is the best of four. The bias is the mean over seeds and
+columns of the light's centroid less the true centre, without speckle and sensor noise; on curved
+things the light itself is lopsided (a ball of 17.5 mm: 0.016 px), so it is given for the plate only.
 """
 
 from __future__ import annotations

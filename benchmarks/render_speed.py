@@ -6,7 +6,7 @@ Command: ``OMP_NUM_THREADS=1 python benchmarks/render_speed.py [seeds]`` (defaul
 Each row is one kind of image of the head thesis-single, standing still, or moving with three poses
 over the exposure; the processor time is the best of four. The bias is the mean over seeds and
 columns of the light's centroid less the true centre, without speckle and sensor noise; on curved
-things the light itself is lopsided (a ball of 17.5 mm: 0.016 px), so it is given for the plate only.
+things the light itself is lopsided (a ball of 17.5 mm: 0.016 px), so only the plate has it.
 """
 
 from __future__ import annotations

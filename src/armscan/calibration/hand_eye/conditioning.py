@@ -109,4 +109,9 @@ def conditioning_warnings(
             f"the hand-eye is badly determined (condition {conditioning.condition:.0f}, good is "
             f"below {MAX_CONDITION:.0f}){cause}; least known: {conditioning.weakest}"
         )
+    elif cause:
+        warnings.append(
+            f"the postures are less varied than they should be{cause}; least known: "
+            f"{conditioning.weakest}"
+        )
     return tuple(warnings)

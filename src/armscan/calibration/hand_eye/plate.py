@@ -23,6 +23,7 @@ from armscan.calibration.hand_eye.plate_checks import (
     agreement_warnings,
     explain_misfit,
     point_warnings,
+    refuse_other_plane,
 )
 from armscan.calibration.hand_eye.plate_fit import hand_eye_information, plane_after
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
@@ -88,6 +89,10 @@ def calibrate_on_plate(
     checked = fit_without_wrong_postures(nodes, plate, start, options)
     if isinstance(checked, FitFailure):
         return checked
+    disagreement = refuse_other_plane(checked.nodes, plate, checked.fit, options)
+    if isinstance(disagreement, FitFailure):
+        return disagreement
+    checked = replace(checked, warnings=(*checked.warnings, *disagreement))
     return _result(stripes, kept, plate, options, start=start, checked=checked)
 
 

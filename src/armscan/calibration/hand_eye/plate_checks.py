@@ -4,14 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
-from armscan.calibration.hand_eye.least_squares import solve_linear
+from armscan.calibration.hand_eye.conditioning import GOOD_POSTURES
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate_fit import PlateFit
+from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
 from armscan.calibration.hand_eye.plate_result import sigma_of
 from armscan.calibration.hand_eye.plate_search import Start
@@ -24,6 +25,10 @@ DISAGREEING = 1e-3
 MIN_DISAGREEMENT_MM = 0.02
 LARGE_ARM_MM = 0.1
 REJECTED_SHARE = 0.2
+PROBE_AGAIN = (
+    "probe the plate again, from the side that is scanned and after its last move, or solve the "
+    "plate along"
+)
 
 
 def explain_misfit(
@@ -39,8 +44,7 @@ def explain_misfit(
         return FitFailure(
             f"{fact}; with the plate's plane left free it is {free.typical_mm:.3f} mm, and the "
             f"plane then lies {offset_in_words(free.offset_mm, free.tilt_deg, plate)}",
-            "probe the plate again, from the side that is scanned and after its last move, or "
-            "solve the plate along",
+            PROBE_AGAIN,
         )
     readings = find_readings(nodes, plate.plane, start.typical_mm)
     if readings:
@@ -50,19 +54,44 @@ def explain_misfit(
         )
     return FitFailure(
         fact,
-        "check that every exposure has its own pose, that the plate was neither moved nor "
-        "exchanged between probing and scanning, and that the sensor's calibration is this one",
+        "check the rotation convention of the poses, that every exposure has its own pose, that "
+        "the plate was neither moved nor exchanged between probing and scanning, and that the "
+        "sensor's calibration is this one",
     )
+
+
+def refuse_other_plane(
+    nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
+) -> FitFailure | tuple[str, ...]:
+    """Compare the probed plane with the one that the scan alone gives: refuse, or warn of it."""
+    state = fit.refined.state
+    if options.solve_plate or len(nodes.used_postures) < GOOD_POSTURES:
+        return ()
+    free = fit_plate(nodes, plate, state, replace(options, solve_plate=True))
+    if isinstance(free, FitFailure):
+        return ()
+    prior = np.zeros((3, 3)) if plate.covariance is None else plate.covariance
+    difference, spread = free.refined.state.plane, free.covariance[6:, 6:] + prior
+    statistic = float(difference @ np.linalg.solve(spread, difference))
+    probability = float(chi2_distribution.sf(statistic, 3))
+    middle = -fit.refined.placed.by_plane.mean(axis=0)
+    offset_mm = float(middle @ difference)
+    sigma_mm = float(np.sqrt(middle @ spread @ middle))
+    if probability > DISAGREEING or abs(offset_mm) < MIN_DISAGREEMENT_MM:
+        return ()
+    tilt_deg = float(np.degrees(np.hypot(difference[0], difference[1])))
+    fact = (
+        f"probed plane and scan disagree (probability {probability:.1g}): the plane solved along "
+        f"lies {offset_in_words(offset_mm, tilt_deg, plate)} (+- {sigma_mm:.3f} mm)"
+    )
+    return FitFailure(fact, PROBE_AGAIN) if abs(offset_mm) > options.max_rms_mm else (fact,)
 
 
 def agreement_warnings(
     nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
 ) -> tuple[str, ...]:
-    """Warn of a plane that the scan contradicts, of a plate seen from behind, of a bad arm."""
+    """Warn of a plate seen from behind, and of an arm that scatters much."""
     warnings = []
-    disagreement = None if options.solve_plate else _disagreement(nodes, plate, fit)
-    if disagreement is not None:
-        warnings.append(disagreement)
     pose = fit.refined.state.tool_from_sensor
     cameras = nodes.rotations @ pose.translation_mm + nodes.translations_mm
     if float(np.median(plate.plane.distance_mm(cameras))) < 0.0:
@@ -78,30 +107,6 @@ def agreement_warnings(
             "sensor calibration or a plate that moved looks the same"
         )
     return tuple(warnings)
-
-
-def _disagreement(nodes: PlateNodes, plate: PlateReference, fit: PlateFit) -> str | None:
-    """Compare the probed plane with the one that the scan alone gives."""
-    placed = fit.refined.placed
-    prior = np.zeros((3, 3)) if plate.covariance is None else plate.covariance
-    own = fit.total - placed.by_plane @ prior @ placed.by_plane.T
-    slopes = np.concatenate([placed.by_hand_eye, placed.by_plane], axis=1)
-    free = solve_linear(placed.residual_mm, slopes, own)
-    if free is None:
-        return None
-    difference, spread = free.step[6:], free.covariance[6:, 6:] + prior
-    statistic = float(difference @ np.linalg.solve(spread, difference))
-    probability = float(chi2_distribution.sf(statistic, 3))
-    middle = -placed.by_plane.mean(axis=0)
-    offset_mm = float(middle @ difference)
-    sigma_mm = float(np.sqrt(middle @ spread @ middle))
-    if probability > DISAGREEING or abs(offset_mm) < MIN_DISAGREEMENT_MM:
-        return None
-    tilt_deg = float(np.degrees(np.hypot(difference[0], difference[1])))
-    return (
-        f"probed plane and scan disagree (probability {probability:.1g}): the plane solved along "
-        f"lies {offset_in_words(offset_mm, tilt_deg, plate)}, +- {sigma_mm:.3f} mm"
-    )
 
 
 def point_warnings(

@@ -23,6 +23,8 @@ LEAST_FOR_SUBSETS = 8
 N_ROTATIONS = 240
 N_DESCENTS = 25
 SAME_DEG = 1.0
+IMPOSSIBLE_MM = 1e3
+"""Counted against a hand-eye that puts the camera behind the plate."""
 GROSS_RATIO = 8.0
 GROSS_MM = 0.05
 """A posture is wrong if its distance from the plate exceeds both this and `GROSS_RATIO` times the
@@ -105,6 +107,7 @@ def _has_wrong(rms: FloatArray) -> bool:
 
 def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[Tool, Sensor]]:
     """Solutions of random subsets of postures, the best few of them refined."""
+    nodes = _thinned(nodes)
     random = np.random.default_rng(0)
     found: list[tuple[float, Pose[Tool, Sensor]]] = []
     for _ in range(N_SUBSETS):
@@ -116,6 +119,16 @@ def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[
             found.append((float(np.nanmedian(_rms(nodes, plate, pose))), pose))
     found.sort(key=lambda item: item[0])
     return [pose for _, pose in found[:3]]
+
+
+def _thinned(nodes: PlateNodes) -> PlateNodes:
+    """First, middle and last node of every stripe."""
+    piece = np.unique(np.column_stack([nodes.stripe, nodes.sheet]), axis=0, return_inverse=True)[1]
+    kept = np.zeros(len(nodes), dtype=np.bool_)
+    for number in range(int(piece.max()) + 1):
+        own = np.flatnonzero(piece == number)
+        kept[own[[0, len(own) // 2, -1]]] = True
+    return nodes.select(kept)
 
 
 def _descend(
@@ -130,21 +143,42 @@ def _descend(
 
 def _from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[list[Pose[Tool, Sensor]], int]:
     """Descend from rotations all over; also count distinct solutions that are about as good."""
+    nodes = _thinned(nodes)
     rotations = Rotation.random(N_ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
     normals, constants = plate_in_tool(nodes, plate)
     turned = np.einsum("kij,nj->kni", rotations, nodes.points_mm)
     heights = np.einsum("kni,ni->kn", turned, normals) + constants
     translations = -heights @ np.linalg.pinv(normals, rcond=1e-6).T
     rotations, translations = _descend_all(nodes, plate, rotations, translations, N_DESCENTS)
-    residual = _residuals(nodes, plate, rotations, translations)
-    rms = np.sqrt((residual**2).mean(axis=1))
+    rms = np.sqrt((_residuals(nodes, plate, rotations, translations) ** 2).mean(axis=1))
+    rms += IMPOSSIBLE_MM * _views_from_behind(nodes, plate, rotations, translations)
     order = np.argsort(rms)
     best = rotations[order[0]]
-    close = order[rms[order] <= max(3.0 * rms[order[0]], 0.02)]
-    turn = np.einsum("kij,ij->k", rotations[close], best)
-    angle_deg = np.degrees(np.arccos(np.clip(0.5 * (turn - 1.0), -1.0, 1.0)))
+    n_rivals, seen = 0, [best]
+    for k in order[rms[order] <= max(3.0 * rms[order[0]], 0.02)]:
+        if all(_apart_deg(rotations[k], other) > SAME_DEG for other in seen):
+            seen.append(rotations[k])
+            n_rivals += 1
     pose: Pose[Tool, Sensor] = Pose(best, translations[order[0]])
-    return [pose], int((angle_deg > SAME_DEG).sum())
+    return [pose], n_rivals
+
+
+def _views_from_behind(
+    nodes: PlateNodes, plate: Plane, rotations: FloatArray, translations: FloatArray
+) -> FloatArray:
+    """(K,) share of the stripes for which a hand-eye puts the camera behind the plate.
+
+    Where all stripes pass one point of the sheet, a hand-eye turned by half a turn explains them
+    as well as the true one, but puts the camera now before the plate and now behind it.
+    """
+    cameras = np.einsum("sij,kj->ksi", nodes.rotations, translations) + nodes.translations_mm
+    heights = (cameras - plate.point_mm) @ plate.normal
+    return np.asarray((heights < 0.0).mean(axis=1))
+
+
+def _apart_deg(rotation: FloatArray, other: FloatArray) -> float:
+    cosine = 0.5 * (float((rotation * other).sum()) - 1.0)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
 def _residuals(

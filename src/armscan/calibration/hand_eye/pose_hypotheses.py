@@ -11,6 +11,7 @@ import numpy as np
 
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
 from armscan.calibration.hand_eye.plate_search import find_start
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
 from armscan.geometry.fitting import Plane
 
@@ -53,11 +54,12 @@ def _readings(nodes: PlateNodes) -> Iterator[tuple[str, str, PlateNodes]]:
         angles = euler_from_rotations(rotations, read)
         for meant in names:
             if meant != read:
-                yield (
-                    f"if the angles were read as {read}, reading them as {meant}",
-                    f"give the rotation convention {meant}",
-                    nodes.moved(rotations_from_euler(angles, meant), translations),
-                )
+                for branch in (angles, _other_branch(angles, read)):
+                    yield (
+                        f"if the angles were read as {read}, reading them as {meant}",
+                        f"give the rotation convention {meant}",
+                        nodes.moved(rotations_from_euler(branch, meant), translations),
+                    )
     back = rotations.transpose(0, 2, 1)
     yield (
         "taking the poses as tool_from_base",
@@ -83,3 +85,10 @@ def _readings(nodes: PlateNodes) -> Iterator[tuple[str, str, PlateNodes]]:
             "check that no exposure and no pose is missing or doubled",
             nodes.moved(np.roll(rotations, shift, axis=0), np.roll(translations, shift, axis=0)),
         )
+
+
+def _other_branch(angles_rad: FloatArray, convention: EulerConvention) -> FloatArray:
+    """The other three angles (N, 3) of the same rotations."""
+    first, middle, last = angles_rad.T
+    turned = -middle if convention == "intrinsic-zxz" else np.pi - middle
+    return np.column_stack([first + np.pi, turned, last + np.pi])

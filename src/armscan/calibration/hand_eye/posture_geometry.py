@@ -10,6 +10,9 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.fitting import Plane
 
 ALIKE_DEG = 3.0
+SMALL_DEG = 8.0
+FLAT_RATIO = 0.15
+"""Spread of the normals off their plane over that within it, below which they are in one plane."""
 SAME_STAND_OFF = 0.03
 """Standard deviation of the stand-off over its mean, below which it counts as constant."""
 REMEDY = (
@@ -22,22 +25,25 @@ def common_to_postures(nodes: PlateNodes, plate: Plane) -> str:
     """Say what keeps the postures from being independent; empty if nothing does.
 
     The plate's normals in Tool decide: without turning, or turning about the normal only, they
-    are all alike; with tilts in one azimuth only they lie in a plane.
+    are all alike; with tilts in one azimuth only they lie in a plane through the origin.
     """
     first = [int(np.flatnonzero(nodes.posture == k)[0]) for k in nodes.used_postures]
     rotations = nodes.rotations[nodes.stripe[first]]
     normals = np.einsum("pij,i->pj", rotations, plate.normal)
     spread = np.linalg.svd(normals - normals.mean(axis=0), compute_uv=False) / np.sqrt(len(normals))
-    limit = np.radians(ALIKE_DEG)
+    through_origin = np.linalg.svd(normals, compute_uv=False) / np.sqrt(len(normals))
+    tilt_deg = float(np.degrees(np.hypot(spread[0], spread[1])))
     causes = []
-    if spread[0] < limit:
+    if tilt_deg < ALIKE_DEG:
         turn_deg = _largest_turn_deg(rotations)
         causes.append(
             "the arm never turned, it only shifted"
             if turn_deg < ALIKE_DEG
             else "the arm turned about the plate's normal only"
         )
-    elif spread[1] < limit:
+    elif tilt_deg < SMALL_DEG:
+        causes.append(f"the head was hardly tilted (by {tilt_deg:.0f} deg, root mean square)")
+    elif through_origin[2] < FLAT_RATIO * spread[0]:
         causes.append("the head was tilted in one azimuth plane only")
     stand_off = np.array(
         [

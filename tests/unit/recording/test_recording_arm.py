@@ -173,19 +173,20 @@ def test_metres_are_refused(tmp_path: Path) -> None:
     assert "look like metres" in refusal(tmp_path, arm=poses(PATH_MM / 1000, TURNS))
 
 
-@pytest.mark.parametrize("case", ["arm", "stage", "turntable", "tripod"])
+@pytest.mark.parametrize("case", ["arm", "stage", "turntable", "gimbal", "tripod"])
 def test_no_recording_in_millimetres_is_taken_for_metres(tmp_path: Path, case: str) -> None:
-    """A stage of 5 mm travel does not turn, a table turns about one axis, a tripod not at all."""
+    """A stage does not turn, a table turns about one axis, a gimbal stays where it is."""
     about_z = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 2], [0, 0, 3]])
     positions, vectors = {
         "arm": (PATH_MM, TURNS),
         "stage": (PATH_MM / 1000, 0 * TURNS),
         "turntable": (PATH_MM / 500, about_z),
+        "gimbal": (np.tile([5.0, 0, 0], (4, 1)), TURNS),
         "tripod": (0 * PATH_MM, 0 * TURNS),
     }[case]
     scan = read_recording(lab_folder(tmp_path, arm=poses(positions, vectors)))
     is_warned = any("are they in metres?" in warning for warning in scan.warnings)
-    assert is_warned == (case in ("stage", "turntable"))
+    assert is_warned == (case in ("stage", "turntable", "gimbal"))
 
 
 def test_unknown_columns_of_the_arm_are_kept_and_warned_of(tmp_path: Path) -> None:

@@ -224,6 +224,10 @@ def test_a_recording_says_itself_that_it_is_simulated(tmp_path: Path) -> None:
     assert are_simulated([folder / "images/0.png"])
     assert are_simulated([folder / "images/on/0.png"])
     assert not are_simulated([tmp_path / "other.png"])
+    silent = lab_folder(tmp_path / "c")
+    assert not read_recording(silent).is_simulated
+    (tmp_path / "c" / "truth.json").write_text('{"simulated": true}')
+    assert read_recording(silent).is_simulated
     real = lab_folder(tmp_path / "b", session="simulated = false\n" + SESSION)
     assert not read_recording(real).is_simulated
     (real / "session.toml").write_text("simulated = tru")

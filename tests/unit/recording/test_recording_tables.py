@@ -93,6 +93,7 @@ BAD_EXPOSURES = {
     "column missing": (EXPOSURES.replace(",lasers", ",laser"), "'laser' may be 'lasers'"),
     "cut line": (EXPOSURES[:-12], "line 4: 4 cells, but the header has 5; the file may be cut"),
     "duplicate index": (EXPOSURES.replace("2,3000", "1,3000"), "line 4: index 1 appears again"),
+    "index of two cameras": (EXPOSURES.replace("2,3000,0", "1,3000,1"), "index 1 appears again"),
     "times go back": (EXPOSURES.replace("2,3000", "2,1500"), "camera 0 goes back from 2000"),
     "time repeated": (EXPOSURES.replace("2,3000", "2,2000"), "camera 0 repeats 2000"),
     "time in seconds": (EXPOSURES.replace("3000", "3.5"), "'3.5' in column t_ns is no whole"),

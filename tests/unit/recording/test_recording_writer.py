@@ -120,6 +120,7 @@ def test_touches_of_a_probe_come_back(tmp_path: Path) -> None:
     )
     tip = ProbeTip(np.array([0.1, -0.2, 61 / 3]), 5.9987)
     write_probing(tmp_path / "touches", track, tip, is_simulated=True)
+    assert "\n7,,,,,,,\n" in (tmp_path / "touches/arm.csv").read_text()
     found, notes = read_arm_track(tmp_path / "touches")
     np.testing.assert_array_equal(found.translations_mm[[0, 2]], track.translations_mm[[0, 2]])
     assert found.is_known.tolist() == [True, False, True]

@@ -23,8 +23,8 @@ AMBIGUOUS_SIGMAS = 4.0
 """Two centres are told apart only if the worse one costs this many standard deviations more."""
 RIVAL_COST_RATIO = 4.0
 """A centre that costs this many times more than the best one is no rival."""
-START_SAMPLES = 300
-START_POINTS = 2000
+START_SAMPLES = 150
+START_POINTS = 500
 ROUNDS_OF_REJECTION = 20
 NORMAL_MAD = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
@@ -341,9 +341,6 @@ def _least_median(points: FloatArray, radius: float | None) -> tuple[FloatArray,
     centres = np.linalg.solve(system[is_solvable], right)[:, :, 0]
     sizes = np.linalg.norm(sample[is_solvable, 0] - centres, axis=1)
     judges = points[:: max(n // START_POINTS, 1)]
-    medians = np.zeros(len(centres))
-    for k, centre in enumerate(centres):
-        distance = np.linalg.norm(judges - centre, axis=1) - sizes[k]
-        medians[k] = float(np.median(np.abs(distance)))
-    best = int(np.argmin(medians))
+    reach = np.sqrt(((judges[None] - centres[:, None]) ** 2).sum(axis=2))
+    best = int(np.argmin(np.median(np.abs(reach - sizes[:, None]), axis=1)))
     return centres[best], float(sizes[best]) if radius is None else radius

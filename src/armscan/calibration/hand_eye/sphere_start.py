@@ -17,7 +17,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import nearest_rotation
 
-ROUNDS = 25
+ROUNDS = 12
 N_CANDIDATES = 6
 APART_RAD = 0.05
 

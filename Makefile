@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 
 .PHONY: demo test check unit clean
 demo: $(STAMP)
-	$(BIN)/armscan demo photos -o demo
+	$(BIN)/armscan demo single -o demo
 
 test: check unit
 

@@ -8,6 +8,7 @@ import numpy as np
 from armscan.models.calibration import SensorCalibration
 from armscan.records.cloud import PointCloud
 from armscan.report.drawing import ACCENT, PALETTE, chart_markup, new_figure, raster_markup, styled
+from armscan.report.numbers import significant
 from armscan.report.page import Picture
 from armscan.report.scene import SceneDots, ramp_colours, ramp_markup, scene_markup
 
@@ -22,9 +23,9 @@ def cloud_view(cloud: PointCloud) -> Picture:
     dots = SceneDots(cloud.points_mm[::step], ramp_colours(sigma_um, low, high))
     is_z_up = cloud.frame != "Sensor"
     scene = scene_markup([dots], [], [], "Measured points in space", is_z_up=is_z_up)
-    shown = f" Every {step}th point is shown." if step > 1 else ""
+    shown = f" One point in {step} is shown." if step > 1 else ""
     return Picture(
-        ramp_markup(f"sigma {low:.0f} µm", f"{high:.0f} µm") + scene,
+        ramp_markup(f"sigma {significant(low)} µm", f"{significant(high)} µm") + scene,
         title=f"Points in space ({cloud.frame} frame)",
         caption="Colour is each point's standard deviation along its worst direction, "
         f"{'stripe noise, arm' if is_z_up else 'stripe noise'} and calibration together. "

@@ -120,7 +120,7 @@ def deviation_view(
     shown = deviations_mm[::step]
     limit = max(float(np.percentile(np.abs(deviations_mm), 98)), 1e-6)
     dots = SceneDots(points_mm[::step], _diverging(shown, limit))
-    every = f" Every {step}th point is shown." if step > 1 else ""
+    every = f" One point in {step} is shown." if step > 1 else ""
     return Picture(
         _diverging_ramp(limit) + scene_markup([dots], [], [], title, is_z_up=frame != "Sensor"),
         title=f"{title} ({frame} frame)",

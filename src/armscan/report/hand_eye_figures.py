@@ -48,7 +48,9 @@ def residuals_by_posture(fit: HandEyeFit) -> Picture:
         axes.set_xticks(range(len(fit.postures)), [p.posture for p in fit.postures])
         axes.set_xlabel("posture")
         axes.set_ylabel("distance from the reference, µm")
-        reach = 1.1 * max(float(np.percentile(np.abs(_all_residuals(fit)), 99.8)) * 1000.0, 1e-3)
+        widest = max(2.0 * _sigma_of_mean(posture) for posture in fit.postures)
+        largest = float(np.percentile(np.abs(_all_residuals(fit)), 99.8))
+        reach = 1.1 * max(1000.0 * widest, 1000.0 * largest, 1e-3)
         axes.set_ylim(-reach, reach)
     return Picture(
         raster_markup(figure, "Residuals by posture"),

@@ -111,7 +111,9 @@ def _cards(scan: ScanReconstruction) -> tuple[Card, ...]:
         Card(
             "Exposures placed",
             str(len(scan.images)),
-            f"{len(scan.without_pose)} had no pose of the arm",
+            f"{len(scan.without_pose)} had no pose of the arm"
+            if scan.without_pose
+            else "each with a pose of the arm",
         ),
         Card(
             "Extent", " × ".join(f"{value:.0f}" for value in size) + " mm", "along X, Y, Z of Base"

@@ -30,8 +30,7 @@ def single_demo_commands(recordings: Path, twin: Twin, demo: SingleDemo) -> Tabl
         found = _measured(recordings, "steps", f"step steps.ply --height {height:g}")
         lines += found if k == 0 else found[1:]
     lines += [
-        f"armscan reconstruct {recordings / 'still-step' / 'images'} --sensor sensor.json "
-        "-o still.ply",
+        f"armscan reconstruct {recordings / 'still-step'} --sensor sensor.json -o still.ply",
         f"armscan inspect step still.ply --height 20 --normal={normal}",
         f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
     ]

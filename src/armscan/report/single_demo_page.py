@@ -10,7 +10,12 @@ from armscan.pipeline.single_demo import SingleDemo
 from armscan.records.exposure import Exposure
 from armscan.report import cloud_figures
 from armscan.report import hand_eye_figures as hand_eye_charts
-from armscan.report.deviation_figures import deviation_histogram, deviation_view, height_histogram
+from armscan.report.deviation_figures import (
+    deviation_histogram,
+    deviation_view,
+    height_histogram,
+    share_text,
+)
 from armscan.report.drawing import photo_markup
 from armscan.report.hand_eye_numbers import hand_eye_facts, hand_eye_numbers, total_covariance
 from armscan.report.hand_eye_page import posture_table
@@ -57,8 +62,8 @@ def single_demo_page(
     scanner = demo.instrument.scanner
     fit = demo.instrument.hand_eye.fit
     return Page(
-        title="A single-line scanner on a measuring arm: calibrated and used",
-        subtitle="Everything below was measured on rendered images and a simulated arm; the "
+        title="A line scanner on a measuring arm",
+        subtitle="Calibrated and used. Everything below was measured on rendered images and a simulated arm; the "
         "simulator's truth was looked at only afterwards.",
         cards=_cards(head),
         warnings=tuple(sentence(f"hand-eye: {warning}") for warning in fit.warnings),
@@ -91,7 +96,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Plate: within ±0.05 mm",
             "97.9 % of 83,210 points",
-            f"{100.0 * plate['fraction_within_0p05mm']:.2f} % of {plate['n_points']:,} points "
+            f"{share_text(100.0 * plate['fraction_within_0p05mm'])} of {plate['n_points']:,} points "
             f"({plate['reference']} plane)",
         ),
         (
@@ -102,7 +107,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Ball: within ±0.05 mm",
             "95.54 % of 179,427 points",
-            f"{100.0 * ball['fraction_within_0p05mm']:.2f} % of {ball['n_points']:,} points "
+            f"{share_text(100.0 * ball['fraction_within_0p05mm'])} of {ball['n_points']:,} points "
             f"({ball['reference']} radius)",
         ),
     ]
@@ -188,13 +193,13 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
     return (
         Card(
             "Plate",
-            f"{100.0 * plate['fraction_within_0p05mm']:.2f} % in ±0.05 mm",
+            f"{share_text(100.0 * plate['fraction_within_0p05mm'])} in ±0.05 mm",
             f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
         Card(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
-            f"error of the diameter; {100.0 * ball['fraction_within_0p05mm']:.2f} % in ±0.05 mm",
+            f"error of the diameter; {share_text(100.0 * ball['fraction_within_0p05mm'])} in ±0.05 mm",
         ),
         Card(
             "Step, one exposure",
@@ -211,7 +216,7 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
         Card(
             "Free-form part",
             f"{1000.0 * head['part']['rms_mm']:.1f} µm rms",
-            f"{100.0 * head['part']['fraction_within_0p05mm']:.2f} % in ±0.05 mm of the truth",
+            f"{share_text(100.0 * head['part']['fraction_within_0p05mm'])} in ±0.05 mm of the truth",
         ),
     )
 

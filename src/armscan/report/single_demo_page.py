@@ -63,8 +63,8 @@ def single_demo_page(
     fit = demo.instrument.hand_eye.fit
     return Page(
         title="A line scanner on a measuring arm",
-        subtitle="Calibrated and used. Everything below was measured on rendered images and a simulated arm; the "
-        "simulator's truth was looked at only afterwards.",
+        subtitle="Calibrated and used. Everything below was measured on rendered images and a "
+        "simulated arm; the simulator's truth was looked at only afterwards.",
         cards=_cards(head),
         warnings=tuple(sentence(f"hand-eye: {warning}") for warning in fit.warnings),
         sections=(
@@ -96,8 +96,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Plate: within ±0.05 mm",
             "97.9 % of 83,210 points",
-            f"{share_text(100.0 * plate['fraction_within_0p05mm'])} of {plate['n_points']:,} points "
-            f"({plate['reference']} plane)",
+            f"{_within(plate)} of {plate['n_points']:,} points ({plate['reference']} plane)",
         ),
         (
             "Ball of 34.96 mm: diameter",
@@ -107,8 +106,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Ball: within ±0.05 mm",
             "95.54 % of 179,427 points",
-            f"{share_text(100.0 * ball['fraction_within_0p05mm'])} of {ball['n_points']:,} points "
-            f"({ball['reference']} radius)",
+            f"{_within(ball)} of {ball['n_points']:,} points ({ball['reference']} radius)",
         ),
     ]
     for step in head["steps"]:
@@ -176,6 +174,10 @@ def seconds_table(seconds: Mapping[str, float]) -> Table:
     return Table(("stage", "seconds"), tuple(rows))
 
 
+def _within(figures: Mapping[str, Any]) -> str:
+    return share_text(100.0 * figures["fraction_within_0p05mm"])
+
+
 def _sigmas(length: float, n_parameters: int) -> str:
     return f"{length:.1f} ({n_parameters**0.5:.1f} is usual for {n_parameters} numbers)"
 
@@ -193,13 +195,13 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
     return (
         Card(
             "Plate",
-            f"{share_text(100.0 * plate['fraction_within_0p05mm'])} in ±0.05 mm",
+            f"{_within(plate)} in ±0.05 mm",
             f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
         Card(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
-            f"error of the diameter; {share_text(100.0 * ball['fraction_within_0p05mm'])} in ±0.05 mm",
+            f"error of the diameter; {_within(ball)} in ±0.05 mm",
         ),
         Card(
             "Step, one exposure",
@@ -216,7 +218,7 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
         Card(
             "Free-form part",
             f"{1000.0 * head['part']['rms_mm']:.1f} µm rms",
-            f"{share_text(100.0 * head['part']['fraction_within_0p05mm'])} in ±0.05 mm of the truth",
+            f"{_within(head['part'])} in ±0.05 mm of the truth",
         ),
     )
 

@@ -117,3 +117,24 @@ def test_what_cannot_be_inspected_gets_one_sentence(
         "inspect", "plane", ball, "--plane", "0,0,1,0", "--plate", plate
     )
     assert "there is no such file" in fails("inspect", "plane", tmp_path / "absent.ply")
+
+
+def test_the_daily_check_ends_with_its_verdict(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Fails
+) -> None:
+    """The ball is 0.02 mm too large: within a given limit of 0.05, beyond one of 0.01."""
+    page = tmp_path / "verify.html"
+    words = ["verify", str(clouds / "ball.ply"), "--ball", "34.96"]
+    assert main([*words, "--mpe", "0.05", "-o", str(page)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("Scanner verified: still valid")
+    assert "passed if |E| is at most MPE - U" in out
+    assert "the calibration may be used" in page.read_text(encoding="utf-8")
+    assert main([*words, "--mpe", "0.01", "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "not valid"
+    assert found["checks"][0]["error"] == pytest.approx(0.02, abs=0.003)
+    assert main([*words, "--mpe", "0.02", "--uncertainty", "0.01"]) == 1
+    assert "inconclusive" in capsys.readouterr().out
+    assert "either --ball DIAMETER or --plate FILE" in fails("verify", clouds / "ball.ply")
+    assert "give --scanner" in fails("verify", tmp_path, "--ball", 34.96)

@@ -15,7 +15,10 @@ from armscan.inspection.verdict import Check, judge
 
 MAX_BLOCKS = 24
 MIN_BLOCKS = 10
-SMALLEST_SINGULAR = 1e-6
+LEAST_EFFECT = 0.1
+"""A combination of parameters takes part if one standard deviation of it moves the points by this
+part of their scatter. Weaker ones would be told from the points' own noise alone: it moves the
+derivatives as well."""
 CONFIDENCE = 0.9973
 """Probability that a valid calibration passes; 3 standard deviations in one dimension."""
 
@@ -39,6 +42,8 @@ class StandardDistances:
         standard's own, and the arm's, which neighbouring exposures share.
     exposure
         (N,) number of each point's exposure, in order of time.
+    scatter_mm
+        Root mean square distance of the points from the surface that fits them best.
     """
 
     distance_mm: FloatArray
@@ -47,6 +52,7 @@ class StandardDistances:
     by_place: FloatArray
     by_others: FloatArray
     exposure: IntArray
+    scatter_mm: float
 
 
 def check_consistency(data: StandardDistances) -> Check | None:
@@ -60,7 +66,8 @@ def check_consistency(data: StandardDistances) -> Check | None:
     Returns
     -------
     Check
-        None if there are too few exposures, or the hand-eye has no covariance.
+        None if there are too few exposures, or if nothing that the calibration leaves open shows
+        in this scan.
     """
     scaled = _scaled_hand_eye(data)
     block, n_blocks = exposure_blocks(data.exposure, MAX_BLOCKS)
@@ -69,11 +76,13 @@ def check_consistency(data: StandardDistances) -> Check | None:
     place = np.linalg.qr(data.by_place)[0] if data.by_place.shape[1] else data.by_place
     free = scaled - place @ (place.T @ scaled)
     left, size, _ = np.linalg.svd(free, full_matrices=False)
-    kept = size > SMALLEST_SINGULAR * size[0]
+    centred = data.distance_mm - place @ (place.T @ data.distance_mm)
+    kept = size > LEAST_EFFECT * data.scatter_mm * math.sqrt(len(centred))
+    if not kept.any():
+        return None
     estimator = (left[:, kept] / size[kept]).T
     correction = estimator @ data.distance_mm
-    remaining = data.distance_mm - place @ (place.T @ data.distance_mm)
-    remaining = remaining - left[:, kept] @ (left[:, kept].T @ remaining)
+    remaining = centred - left[:, kept] @ (left[:, kept].T @ centred)
     expected = _expected(data, estimator) + _scatter(estimator, remaining, block, n_blocks)
     square = float(correction @ np.linalg.solve(expected, correction))
     freedom = int(kept.sum())

@@ -227,7 +227,13 @@ def _judged(
         )
         consistency = check_consistency(
             StandardDistances(
-                s.distance_mm, effect, scanner.covariance, s.by_place, others, exposure
+                s.distance_mm,
+                effect,
+                scanner.covariance,
+                s.by_place,
+                others,
+                exposure,
+                float(np.sqrt(np.mean(fit.residuals_mm**2))),
             )
         )
     else:

@@ -11,7 +11,7 @@ from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import fit_plane
+from armscan.geometry.fitting import Plane, fit_plane
 from armscan.inspection.plane import plane_from_coefficients
 from armscan.records.probing import ProbedPoints
 from armscan.storage.probed_points import read_points_or_plane
@@ -49,4 +49,8 @@ def _fitted(found: ProbedPoints, path: Path) -> PlateReference:
     if isinstance(fit, FitFailure):
         raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)
     rms = float(np.sqrt(np.mean(fit.residuals**2)))
-    return PlateReference(fit.value, fit.covariance, rms, len(found), str(path))
+    plane = fit.value
+    # heights over the plate count upwards; its covariance is diagonal and stays
+    if plane.normal[int(np.argmax(np.abs(plane.normal)))] < 0.0:
+        plane = Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
+    return PlateReference(plane, fit.covariance, rms, len(found), str(path))

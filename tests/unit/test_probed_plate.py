@@ -61,12 +61,20 @@ def test_the_surface_is_half_a_diameter_below_the_centres() -> None:
         assert np.linalg.det(plate.plane.axes) > 0.0
 
 
+def plate_of(probed: ProbedPoints, towards_mm: FloatArray) -> PlateReference:
+    plate = plate_from_probing(probed, towards_mm)
+    assert isinstance(plate, PlateReference)
+    return plate
+
+
 def test_from_the_other_side_the_face_is_the_other_one() -> None:
     """A plate touched from below: normal turned, and the surface above the centres."""
     below = FRAME.translation_mm - 150.0 * NORMAL
     plate = plate_from_probing(tip_points(), below)
     assert isinstance(plate, PlateReference)
     np.testing.assert_allclose(plate.plane.normal, -NORMAL, atol=1e-12)
+    for found in (plate.plane, plate_of(tip_points(), 99 * NORMAL + FRAME.translation_mm).plane):
+        assert np.linalg.det(found.axes) == pytest.approx(1.0), "right-handed either way up"
     top = FRAME.translation_mm + TIP_MM * NORMAL
     assert plate.plane.distance_mm(top[None])[0] == pytest.approx(0.0, abs=1e-9)
     asked = plate_from_probing(tip_points(), None, ProbingOptions(side="-z"))

@@ -186,6 +186,18 @@ def test_points_that_a_sensor_delivered() -> None:
         place_delivered_points(points, noise, rig.BASE_FROM_TOOL, prepare_placing(rig.scanner()))
 
 
+def test_combinations_known_a_thousand_times_better_are_kept() -> None:
+    """Errors that cancel but for 1e-4 of their size: the factor must not cut them off."""
+    mixing = np.linalg.qr(np.random.default_rng(3).normal(size=(6, 6)))[0]
+    units = np.array([1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.02])
+    tight = mixing @ np.diag(np.geomspace(1e-8, 1.0, 6)) @ mixing.T * np.outer(units, units)
+    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=tight)
+    (factor,) = prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye)).factors
+    combination = mixing[:, 0] / units
+    variance = float(((combination @ factor) ** 2).sum())
+    assert variance == pytest.approx(1e-8, rel=1e-3)
+
+
 def test_a_covariance_that_is_none_is_refused() -> None:
     broken = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
     hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=broken)

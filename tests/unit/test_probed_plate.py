@@ -134,6 +134,16 @@ def test_a_touch_that_slipped_is_named_and_left_out_on_demand() -> None:
     assert without.residual_mm[5] == pytest.approx(0.15, abs=4.0 * NOISE_MM)
 
 
+def test_a_lonely_touch_that_slipped_pulls_the_plane_but_is_named() -> None:
+    """Far from the others its residual is small, being what the plane follows most."""
+    rng = np.random.default_rng(6)
+    flat = np.column_stack([rng.uniform(-10, 10, (12, 2)), NOISE_MM * rng.normal(size=12)])
+    points = np.concatenate([flat, [[100.0, 60.0, 0.8]]])
+    assert find_outliers(points) == (12,)
+    good = np.concatenate([flat, [[100.0, 60.0, 0.0]]])
+    assert find_outliers(good) == ()
+
+
 def test_good_touches_are_seldom_named() -> None:
     """At most one in a hundred plates by its rule: of 200, more than 7 come once in 1000."""
     n_named = sum(bool(find_outliers(touches(10, NOISE_MM, seed=k))) for k in range(200))

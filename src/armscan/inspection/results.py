@@ -115,11 +115,11 @@ class MeasuredLength:
     value_mm
         The length.
     sigma_scatter_mm
-        Standard deviation from what differs between exposures (jackknife over them); NaN where
-        there are too few.
+        Standard deviation from what differs between exposures (jackknife over them, and over
+        blocks of neighbours: the larger); NaN where there are too few.
     sigma_propagated_mm
         Standard deviation from the points' own covariances, errors being common to an exposure
-        and independent between exposures; NaN where the cloud carries none.
+        or to a block of neighbouring ones (the larger); NaN where the cloud carries none.
     """
 
     value_mm: float

@@ -16,7 +16,8 @@ MIN_BLOCKS = 4
 """Fewest exposures whose differences say anything about their scatter."""
 
 COARSE_BLOCKS = 12
-"""Consecutive exposures are also taken together in this many blocks, as neighbours err alike."""
+"""Consecutive exposures are also taken together in this many blocks, as neighbours err alike: an
+arm by its posture, a calibration by the direction from which it looks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,14 +58,18 @@ def measured_length(
     rows
         (N,) rows in the cloud of the points of the fit.
     """
-    exposure = np.unique(cloud.exposure[rows], return_inverse=True)[1].astype(np.int64)
-    n = int(exposure.max()) + 1 if len(exposure) else 0
-    scatter = [_jackknife_mm(fit, exposure, n)]
+    numbers = cloud.exposure[rows]
+    n = len(np.unique(numbers))
+    groups = [exposure_blocks(numbers, n)]
     if n >= 2 * COARSE_BLOCKS:
-        scatter.append(_jackknife_mm(fit, exposure * COARSE_BLOCKS // n, COARSE_BLOCKS))
-    known = [sigma for sigma in scatter if math.isfinite(sigma)]
-    propagated = _propagated_mm(fit, cloud, rows, exposure, n)
-    return MeasuredLength(value_mm, max(known, default=math.nan), propagated)
+        groups.append(exposure_blocks(numbers, COARSE_BLOCKS))
+    scatter = [_jackknife_mm(fit, block, count) for block, count in groups]
+    propagated = [_propagated_mm(fit, cloud, rows, block, count) for block, count in groups]
+    return MeasuredLength(value_mm, _largest(scatter), _largest(propagated))
+
+
+def _largest(sigmas: list[float]) -> float:
+    return max((sigma for sigma in sigmas if math.isfinite(sigma)), default=math.nan)
 
 
 def exposure_blocks(exposure: IntArray, most: int) -> tuple[IntArray, int]:
@@ -101,9 +106,9 @@ def _jackknife_mm(fit: FitLinearised, block: IntArray, n_blocks: int) -> float:
 
 
 def _propagated_mm(
-    fit: FitLinearised, cloud: PointCloud, rows: IntArray, exposure: IntArray, n: int
+    fit: FitLinearised, cloud: PointCloud, rows: IntArray, block: IntArray, n: int
 ) -> float:
-    """Each exposure is shifted as a whole by an error of its points' mean covariance.
+    """Each block is shifted as a whole by an error of its points' mean covariance.
 
     The stripes' own noise, which is independent from point to point, comes on top.
     """
@@ -111,11 +116,11 @@ def _propagated_mm(
     if not covariance.any():
         return math.nan
     by_point = influence_along(fit)[:, None] * fit.directions
-    pull = np.stack([np.bincount(exposure, by_point[:, k], n) for k in range(3)], axis=1)
-    count = np.bincount(exposure, minlength=n)
+    pull = np.stack([np.bincount(block, by_point[:, k], n) for k in range(3)], axis=1)
+    count = np.bincount(block, minlength=n)
     variance = float((by_point**2).sum(axis=1) @ (cloud.sigma_noise_mm[rows] ** 2))
     for i in range(3):
         for j in range(3):
-            mean = np.bincount(exposure, covariance[:, i, j], n) / count
+            mean = np.bincount(block, covariance[:, i, j], n) / count
             variance += float((pull[:, i] * mean) @ pull[:, j])
     return math.sqrt(max(variance, 0.0))

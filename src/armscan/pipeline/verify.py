@@ -38,7 +38,7 @@ from armscan.records.cloud import PointCloud
 
 NO_POSES = (
     "a cloud does not tell how an error of the hand-eye acts on it, so errors are taken as "
-    "independent from exposure to exposure; give the recording for a sharper check"
+    "independent between blocks of exposures; give the recording for a sharper check"
 )
 
 

@@ -273,7 +273,7 @@ def _sigma_facts(length: MeasuredLength, name: str) -> tuple[tuple[str, str], ..
         (
             f"Sigma of the {name} propagated",
             f"{significant(length.sigma_propagated_mm, 'mm')}: from the points' covariances, "
-            "errors being common to an exposure and independent between exposures",
+            "errors being common to an exposure, or to a block of neighbours: the larger",
         ),
         (
             "Not in either",

@@ -49,11 +49,11 @@ def test_the_diameters_sigma_is_its_scatter_over_repeats() -> None:
 
 def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
     """An exposure that crosses both faces shifts both: the height's sigma is far below its own."""
-    clean, exposure = block_stripes(20.0, n_points=200)
+    clean, exposure = block_stripes(20.0, 20, 200)
     heights = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
-        points = clean + rng.normal(0.0, 0.02, (40, 3))[exposure]
+        points = clean + rng.normal(0.0, 0.02, (20, 3))[exposure]
         points[:, 2] += rng.normal(0.0, NOISE_MM, len(points))
         found = inspect_step(cloud_of(points, exposure, sigma_mm=0.02, noise_mm=NOISE_MM), 20.0)
         assert not isinstance(found, FitFailure)
@@ -71,16 +71,22 @@ def test_a_cloud_without_exposures_or_covariances_has_no_sigma() -> None:
     assert math.isnan(found.diameter.sigma_mm)
 
 
-def test_blocks_of_neighbouring_exposures_count_where_they_err_alike() -> None:
-    """48 exposures in runs of 4 that err alike: the jackknife must not take them for 48."""
-    rng = np.random.default_rng(4)
-    outward = ball_stripes(48, 20)
-    exposure = np.repeat(np.arange(48), 20)
-    alike = np.repeat(rng.normal(0.0, ARM_MM, (12, 3)), 4, axis=0)
-    points = RADIUS_MM * outward + alike[exposure]
-    found = inspect_sphere(cloud_of(points, exposure, sigma_mm=ARM_MM), 2 * RADIUS_MM)
-    assert not isinstance(found, FitFailure)
-    assert found.diameter.sigma_scatter_mm > 1.3 * found.diameter.sigma_propagated_mm
+def test_neighbouring_exposures_that_err_alike_are_not_counted_as_many() -> None:
+    """48 exposures in 12 runs of 4 that err alike: taken singly, sigma would be half of it."""
+    outward, exposure = ball_stripes(48, 12), np.repeat(np.arange(48), 12)
+    found = []
+    for seed in range(30):
+        alike = np.repeat(np.random.default_rng(seed).normal(0.0, ARM_MM, (12, 3)), 4, axis=0)
+        cloud = cloud_of(RADIUS_MM * outward + alike[exposure], exposure, sigma_mm=ARM_MM)
+        ball = inspect_sphere(cloud, 2 * RADIUS_MM)
+        assert not isinstance(ball, FitFailure)
+        found.append(ball.diameter)
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    limit = 1.0 + 3.3 / math.sqrt(2 * 30)
+    propagated = found[0].sigma_propagated_mm
+    assert 1.0 / limit < scatter / propagated < limit
+    jackknife = float(np.sqrt(np.mean([item.sigma_scatter_mm**2 for item in found])))
+    assert 0.75 / limit < scatter / jackknife < limit
 
 
 @pytest.mark.parametrize("n", [1, 3])

@@ -123,4 +123,4 @@ def test_a_head_that_has_moved_on_a_plate(
     assert correction.unit == "sigma"
     given = verify_on_plate(Measured(scan.cloud), PLATE, VerifyOptions(mpe_mm=1.0))
     assert given.checks[0].verdict == "still valid"
-    assert any("independent from exposure to exposure" in text for text in given.warnings)
+    assert any("independent between blocks of exposures" in text for text in given.warnings)

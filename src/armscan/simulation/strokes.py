@@ -20,7 +20,8 @@ then."""
 DEPTH_MM = 137.0
 """Middle of the depths that the scanning window sees."""
 
-BALL_TILTS_DEG = (4.0, 36.0, 40.0, 34.0, 40.0, 36.0, 38.0)
+_OVER_BALL_DEG = -26.0
+BALL_TILTS_DEG = (4.0, 26.0, 30.0, 24.0, 30.0, 26.0, 28.0)
 BALL_AZIMUTHS_DEG = (0.0, 15.0, 75.0, 135.0, 195.0, 255.0, 315.0)
 _BALL_WAY_MM = 25.0
 _PART_WAYS = ((-14.0, -25.0, 40.0), (-5.0, -6.0, 45.0), (5.0, 6.0, 50.0), (14.0, 25.0, 42.0))
@@ -50,7 +51,7 @@ def ball_strokes(bench: Bench) -> list[Stroke]:
         face = _leaning(tilt, azimuth)
         middle = bench.ball.centre_mm + _BALL_HEIGHT * 0.5 * BALL_DIAMETER_MM * face[:, 2]
         way = (-1.0) ** k * 0.5 * _BALL_WAY_MM * face[:, 1]
-        aim = Aim(HALF_WAY_DEG, 0.0, 0.0, DEPTH_MM)
+        aim = Aim(_OVER_BALL_DEG, 0.0, 0.0, DEPTH_MM)
         strokes.append(Stroke(face, middle - way, middle + way, aim, 30.0 + 2.0 * k, 10))
     return strokes
 

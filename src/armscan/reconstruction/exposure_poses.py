@@ -109,6 +109,13 @@ class ExposurePoses:
         ]
         return ", ".join(parts)
 
+    @property
+    def how(self) -> str:
+        """How poses were found, in words."""
+        if self.source == "trigger":
+            return "by trigger id"
+        return f"by time, between samples up to {self.max_gap_ns / 1e6:g} ms apart"
+
     def pose(self, row: int) -> Pose[Base, Tool]:
         """Pose of one exposure.
 

@@ -145,6 +145,7 @@ def scan_summary(
     facts = (
         ("points", f"{len(cloud)} in the {cloud.frame} frame"),
         ("exposures", exposures),
+        ("poses", scan.poses.how),
         ("sigma", f"{significant(median)} mm median, 95 % below {significant(high)} mm"),
         *(
             (axis, f"{low:.2f} to {top:.2f} mm")
@@ -168,6 +169,7 @@ def scan_summary(
             "low_corner_mm": low_corner.tolist(),
             "high_corner_mm": high_corner.tolist(),
             "poses_by": scan.poses.source,
+            "max_gap_ns": scan.poses.max_gap_ns,
             "exposures": {fate.name.lower(): count for fate, count in counts.items()},
             "without_pose": [{"source": name, "reason": why} for name, why in scan.without_pose],
             "hand_eye_of": scanner.provenance.document_id,

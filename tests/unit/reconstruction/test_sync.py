@@ -94,6 +94,7 @@ def test_neighbours_too_far_apart_are_not_bridged() -> None:
     assert exposure_poses(wanted, holed).fate.tolist() == [PoseFate.FOUND, PoseFate.GAP]
     wide = exposure_poses(wanted, holed, options=SyncOptions(max_gap_ns=40 * MS))
     assert wide.has_pose.all()
+    assert wide.how == "by time, between samples up to 40 ms apart"
     narrow = exposure_poses(wanted, holed, options=SyncOptions(max_gap_ns=40 * MS - 1))
     assert not narrow.has_pose[1]
     with pytest.raises(OptionError, match="largest gap"):
@@ -120,7 +121,7 @@ def test_trigger_ids_win_over_times() -> None:
     """The ids are shuffled against time on purpose; a clock of its own does not matter then."""
     track = steady_track(trigger_ids=np.array([7, -1, 3, 5, 4, -1, 6, 8, 9, 10, 11]))
     poses = exposure_poses(rows([5, 6, 7, 8], [3, 7, 99, None]), track, clock="separate")
-    assert poses.source == "trigger"
+    assert poses.how == "by trigger id"
     assert poses.sample[:2].tolist() == [2, 0]
     np.testing.assert_array_equal(poses.translations_mm[:2], track.translations_mm[[2, 0]])
     assert poses.fate[2:].tolist() == [PoseFate.UNKNOWN_TRIGGER, PoseFate.NO_TRIGGER]

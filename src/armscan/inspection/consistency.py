@@ -88,7 +88,9 @@ def check_consistency(data: StandardDistances) -> Check | None:
     freedom = int(kept.sum())
     error, limit = math.sqrt(max(square, 0.0)), math.sqrt(float(chi2.ppf(CONFIDENCE, freedom)))
     return Check(
-        name="hand-eye correction that this scan asks for, over its expected covariance",
+        name="hand-eye correction",
+        definition="correction of the hand-eye that would fit this scan to the standard best, over "
+        "its expected standard deviation (Mahalanobis distance)",
         unit="sigma",
         error=error,
         predicted=math.sqrt(freedom),

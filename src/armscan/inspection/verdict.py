@@ -35,8 +35,8 @@ class Check:
 
     Parameters
     ----------
-    name
-        What was tested, in words.
+    name, definition
+        What was tested, in a few words and exactly.
     unit
         Of the numbers: mm, or sigma.
     error
@@ -52,6 +52,7 @@ class Check:
     """
 
     name: str
+    definition: str
     unit: str
     error: float
     predicted: float
@@ -79,6 +80,7 @@ def worst(verdicts: tuple[Verdict, ...]) -> Verdict:
 
 def check_size(
     name: str,
+    definition: str,
     error_mm: float,
     sigma_calibration_mm: float,
     sigma_scan_mm: float,
@@ -90,7 +92,7 @@ def check_size(
 
     Parameters
     ----------
-    name
+    name, definition
         What it is.
     error_mm
         Measured minus nominal.
@@ -114,6 +116,7 @@ def check_size(
         limit, rule = mpe_mm, "given"
     return Check(
         name=name,
+        definition=definition,
         unit="mm",
         error=error_mm,
         predicted=sigma_calibration_mm,
@@ -158,7 +161,9 @@ def check_spread(
     error, predicted = float(np.sqrt(np.mean(mean**2))), float(np.sqrt(variance.mean()))
     limit = LIMIT_SIGMAS * predicted
     return Check(
-        name="disagreement of exposures (rms of each one's mean distance from the fitted surface)",
+        name="disagreement of exposures",
+        definition="root mean square, over exposures, of the mean distance of their points from "
+        "the fitted surface",
         unit="mm",
         error=error,
         predicted=predicted,

@@ -128,7 +128,7 @@ def verify_on_ball(
     return _judged(
         _Evidence(measured, used, fit, found.diameter, standard),
         found,
-        "diameter, fitted minus nominal (P_Size.Sph.All of ISO 10360-8)",
+        ("diameter", "fitted minus nominal diameter (P_Size.Sph.All of ISO 10360-8)"),
         found.diameter.value_mm - diameter_mm,
         options,
     )
@@ -170,7 +170,7 @@ def verify_on_plate(
     return _judged(
         _Evidence(measured, used, linearised_plane(found.plane, points), offset, standard),
         found,
-        "height of the scanned plane over the probed one, at the middle of the points",
+        ("height", "of the scanned plane over the probed one, at the middle of the points"),
         offset.value_mm,
         replace(options, reference_u_mm=u),
         warnings=unknown,
@@ -200,7 +200,7 @@ class _Evidence:
 def _judged(
     evidence: _Evidence,
     found: SphereInspection | PlaneInspection,
-    name: str,
+    names: tuple[str, str],
     error_mm: float,
     options: VerifyOptions,
     *,
@@ -239,7 +239,7 @@ def _judged(
     else:
         warnings = (*warnings, NO_POSES)
     size = check_size(
-        name,
+        *names,
         error_mm,
         sigma_mm,
         _scan_sigma_mm(evidence.length),

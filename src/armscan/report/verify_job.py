@@ -107,7 +107,12 @@ def run_verification(
             options=(request.options, request.inspection),
             warnings=report.warnings,
         )
-        first = (Section("Verdict", (Text(verdict_sentence(result)), checks_table(result.checks))),)
+        blocks = (
+            Text(verdict_sentence(result)),
+            checks_table(result.checks),
+            definitions_table(result.checks),
+        )
+        first = (Section("Verdict", blocks),)
         page = inspection_page(report, provenance, is_simulated=is_simulated, first=first)
         write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
         written = (request.output,)
@@ -126,14 +131,22 @@ def checks_table(checks: tuple[Check, ...]) -> Table:
             check.name,
             _value(check, check.error),
             _value(check, check.predicted),
-            f"{_value(check, check.limit)} ({check.limit_rule})",
-            f"{_value(check, check.uncertainty)} ({check.uncertainty_rule})",
+            _value(check, check.limit),
+            _value(check, check.uncertainty),
             check.verdict,
         )
         for check in checks
     )
-    heads = ("check", "E", "predicted sigma", "limit MPE", "uncertainty U", "verdict")
-    return Table(heads, rows, "", (3, 4, 5))
+    heads = ("check", "error E", "predicted sigma", "limit MPE", "uncertainty U", "verdict")
+    return Table(heads, rows, "", (5,))
+
+
+def definitions_table(checks: tuple[Check, ...]) -> Table:
+    """What the numbers of the checks are."""
+    rows = tuple(
+        (check.name, check.definition, check.limit_rule, check.uncertainty_rule) for check in checks
+    )
+    return Table(("check", "E is", "MPE is", "U holds"), rows, "", (1, 2, 3))
 
 
 def _check(request: VerifyRequest) -> None:
@@ -211,7 +224,7 @@ def _report(request: VerifyRequest, result: Verification, measured: Measured) ->
         Card("Verdict", result.verdict, ADVICE[result.verdict]),
         *(
             Card(
-                f"E: {check.name.split(',')[0].split('(')[0].strip()}",
+                check.name.capitalize(),
                 _value(check, check.error),
                 f"limit {_value(check, check.limit)}: {check.verdict}",
             )
@@ -242,7 +255,7 @@ def _summary(
 ) -> Summary:
     lines = tuple(
         (
-            check.name.split(",")[0].split("(")[0].strip(),
+            check.name,
             f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
             f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
         )
@@ -262,6 +275,7 @@ def _summary(
             "checks": [
                 {
                     "name": check.name,
+                    "definition": check.definition,
                     "unit": check.unit,
                     "error": check.error,
                     "predicted_sigma": check.predicted,

@@ -43,14 +43,14 @@ def test_one_failure_fails_all_and_one_open_question_leaves_all_open() -> None:
 
 
 def test_the_default_limit_is_three_predicted_sigmas_beyond_u() -> None:
-    check = check_size("x", 0.031, 0.01, 0.004, reference_u_mm=0.006)
+    check = check_size("x", "y", 0.031, 0.01, 0.004, reference_u_mm=0.006)
     assert check.uncertainty == pytest.approx(0.01)
     assert check.limit == pytest.approx(0.04)
     assert check.verdict == "inconclusive"
-    given = check_size("x", 0.031, 0.01, 0.004, reference_u_mm=0.006, mpe_mm=0.05)
+    given = check_size("x", "y", 0.031, 0.01, 0.004, reference_u_mm=0.006, mpe_mm=0.05)
     assert (given.limit, given.limit_rule, given.verdict) == (0.05, "given", "still valid")
     with pytest.raises(InputError, match="limit of 0"):
-        check_size("x", 0.0, 0.01, 0.004, mpe_mm=0.0)
+        check_size("x", "y", 0.0, 0.01, 0.004, mpe_mm=0.0)
 
 
 def test_exposures_that_disagree_more_than_they_may() -> None:

@@ -15,8 +15,10 @@ from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
+from armscan.inspection.options import InspectionOptions, StepOptions
 from armscan.pipeline.reconstruct import ReconstructOptions
 from armscan.pipeline.simulate import SimulateOptions
+from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.storage.image_options import ImageOptions
 from armscan.vision.stripe.options import StripeOptions
@@ -26,6 +28,7 @@ STRIPES = {
     "laser_colour": StripeOptions().laser_colour,
 }
 IMAGES = {"bits_used": ImageOptions().bits_used, "bits_align": ImageOptions().align}
+FEATURE = {"feature_mm": InspectionOptions().feature_mm}
 EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
     ("calibrate", "camera"): {
         "distortion": CameraOptions().distortion,
@@ -48,6 +51,14 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         "side": ProbingOptions().side,
         "feature": ProbingOptions().feature,
         "leave_out": ProbingOptions().leave_out_outliers,
+    },
+    ("inspect", "plane"): FEATURE,
+    ("inspect", "sphere"): FEATURE,
+    ("inspect", "step"): {**FEATURE, "margin": StepOptions().margin_mm},
+    ("verify",): {
+        **FEATURE,
+        "mpe": VerifyOptions().mpe_mm,
+        "uncertainty": VerifyOptions().reference_u_mm,
     },
     ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
 }

@@ -17,6 +17,9 @@ from armscan.records.cloud import PointCloud
 
 S = TypeVar("S")
 MAX_ROUNDS = 20
+SMALLEST_EXTENT_MM = 2.0
+"""Points that all lie this near to each other are taken for metres."""
+
 ROBUST_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -80,8 +83,14 @@ def select(
     Raises
     ------
     InputError
-        If fewer than ``min_points`` are left.
+        If fewer than ``min_points`` are left, or the cloud looks like metres.
     """
+    extent = float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0))) if len(cloud) else 0.0
+    if len(cloud) >= min_points and extent < SMALLEST_EXTENT_MM:
+        raise InputError(
+            f"all {len(cloud)} points lie within {extent:.3g} mm: these look like metres",
+            remedy="multiply the coordinates by 1000",
+        )
     if region is None:
         rows = np.arange(len(cloud))
     else:

@@ -108,8 +108,8 @@ def test_input_without_the_ball_is_refused_in_words() -> None:
     assert isinstance(wrong, FitFailure)
     assert "25.4" in wrong.reason
     assert "lie on one of 34.9" in wrong.reason
-    in_metres = inspect_sphere(cloud_of(points / 1000.0), DIAMETER_MM)
-    assert isinstance(in_metres, FitFailure)
+    with pytest.raises(InputError, match="look like metres"):
+        inspect_sphere(cloud_of(points / 1000.0), DIAMETER_MM)
     flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
     box = np.concatenate([flat, flat[:, [0, 2, 1]], flat[:, [2, 1, 0]]])
     for shape in (flat, box):

@@ -91,14 +91,14 @@ CAMERA_PLACES: tuple[Place, ...] = (
 )
 
 LASER_PLACES: tuple[StripePlace, ...] = (
-    StripePlace(-6, 3, 1, -9.0, 117),
-    StripePlace(-22, 10, -2, 12.0, 124),
-    StripePlace(6, -12, 3, 14.0, 131),
-    StripePlace(-26, -8, 2, -16.0, 138),
-    StripePlace(-8, 20, -5, -17.0, 145),
-    StripePlace(2, -20, 6, 18.0, 150),
-    StripePlace(-20, 5, 3, -18.0, 157),
-    StripePlace(18, 2, 0, 17.0, 163),
+    StripePlace(-6, 3, 1, -12.0, 117),
+    StripePlace(-22, 10, -2, 15.0, 124),
+    StripePlace(6, -12, 3, 17.0, 131),
+    StripePlace(-26, -8, 2, -19.0, 138),
+    StripePlace(-8, 20, -5, -20.0, 145),
+    StripePlace(2, -20, 6, 21.0, 150),
+    StripePlace(-20, 5, 3, -24.0, 157),
+    StripePlace(18, 2, 0, 24.0, 164),
 )
 """Near and far on both sides: the target is half as wide as the stripe."""
 
@@ -153,7 +153,7 @@ def _shot(row: ExposureRow, target: Target, settings: ExposureSettings) -> Shot:
 
 
 def _held(head: Head, place: Place, rng: np.random.Generator) -> Target:
-    """Target near a place, moved away until all of it is in view."""
+    """Target near a place, moved away until all marks are in view."""
     jitter = rng.uniform(-1.0, 1.0, 6)
     rotation = _rotation(place, jitter[:3])
     size = np.array([head.camera.width_px, head.camera.height_px])
@@ -168,7 +168,7 @@ def _held(head: Head, place: Place, rng: np.random.Generator) -> Target:
 
 
 def _held_in_sheet(head: Head, place: StripePlace, rng: np.random.Generator) -> Target:
-    """Target whose plane the stripe meets at a depth, slid within it until all is in view."""
+    """Target that the stripe meets at a depth, slid in its plane until all marks are in view."""
     jitter = rng.uniform(-1.0, 1.0, 5)
     rotation = _rotation(place, jitter[:3])
     depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[3])
@@ -213,6 +213,8 @@ def _is_in_view(head: Head, target: Target) -> bool:
 
 
 def _corners_mm() -> FloatArray:
-    """(4, 3) corners of the printed board, in Board."""
+    """(4, 3) corners around all marks, in Board; the blank rim may leave the image."""
     x_min, y_min, x_max, y_max = PATTERN.extent_board_mm
+    rim = PATTERN.pitch_mm - PATTERN.diameter_mm
+    x_min, y_min, x_max, y_max = x_min + rim, y_min + rim, x_max - rim, y_max - rim
     return np.array([[x_min, y_min, 0], [x_max, y_min, 0], [x_max, y_max, 0], [x_min, y_max, 0.0]])

@@ -136,30 +136,6 @@ def counts_table(counts: PointCounts) -> Table:
     )
 
 
-def deviations_data(deviations: Deviations) -> dict[str, Any]:
-    """Deviations' statistics for programs, with their definitions."""
-    return {
-        "reference": deviations.reference,
-        "counted_from": deviations.reference_text,
-        "points": deviations.points_text,
-        **{item.key: item.value for item in deviations.statistics},
-        "definitions": {item.key: item.definition for item in deviations.statistics},
-    }
-
-
-def counts_data(counts: PointCounts) -> dict[str, Any]:
-    """Counts for programs."""
-    return {
-        "n_given": counts.n_given,
-        "n_region": counts.n_region,
-        "n_feature": counts.n_feature,
-        "n_fitted": counts.n_fitted,
-        "n_outliers": counts.n_outliers,
-        "feature_rule": counts.feature_rule,
-        "fit_rule": counts.fit_rule,
-    }
-
-
 def _value(deviations: Deviations, k: int) -> str:
     item = deviations.statistics[k]
     if item.unit == "%":

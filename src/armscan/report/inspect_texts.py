@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,8 @@ from armscan.report.deviation_figures import (
     height_histogram,
     share_text,
 )
-from armscan.report.inspect_page import InspectionReport, counts_data, deviations_data
+from armscan.report.inspect_data import plane_data, sphere_data, step_data
+from armscan.report.inspect_page import InspectionReport
 from armscan.report.numbers import significant, with_sigma
 from armscan.report.page import Card, Picture
 
@@ -84,21 +84,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         counts=found.counts,
         geometry=tuple(geometry),
         warnings=_warnings(found.counts, cloud),
-        data={
-            "feature": "plane",
-            "points": counts_data(found.counts),
-            "fitted": {
-                "plane": found.plane.coefficients.tolist(),
-                **deviations_data(found.fitted),
-            },
-            "nominal": None
-            if found.nominal is None
-            else {
-                "offset": None if found.offset is None else length_data(found.offset),
-                "tilt_mrad": found.tilt_mrad,
-                **deviations_data(found.nominal),
-            },
-        },
+        data=plane_data(found),
     )
 
 
@@ -151,21 +137,7 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         counts=found.counts,
         geometry=geometry,
         warnings=tuple(warnings),
-        data={
-            "feature": "sphere",
-            "points": counts_data(found.counts),
-            "diameter_error_mm": error,
-            "fitted": {
-                "diameter": length_data(found.diameter),
-                "centre_mm": found.sphere.centre_mm.tolist(),
-                "seen_cap_deg": found.seen_cap_deg,
-                **deviations_data(found.fitted),
-            },
-            "nominal": {
-                "diameter_mm": found.nominal_diameter_mm,
-                **deviations_data(found.nominal),
-            },
-        },
+        data=sphere_data(found),
     )
 
 
@@ -226,23 +198,7 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
         counts=found.counts,
         geometry=geometry,
         warnings=_warnings(found.counts, cloud),
-        data={
-            "feature": "step",
-            "points": counts_data(found.counts),
-            "height_error_mm": error,
-            "fitted": {
-                "height": length_data(found.height),
-                "normal": found.normal.tolist(),
-                "normal_from": found.normal_rule,
-                **deviations_data(found.fitted),
-            },
-            "nominal": {
-                "height_mm": found.nominal_height_mm,
-                "mean_height_mm": mean,
-                "std_height_mm": std,
-                **deviations_data(found.nominal),
-            },
-        },
+        data=step_data(found),
     )
 
 
@@ -251,16 +207,6 @@ def length_text(length: MeasuredLength) -> str:
     if math.isnan(length.sigma_mm):
         return f"{length.value_mm:.4f} mm"
     return with_sigma(length.value_mm, length.sigma_mm, "mm")
-
-
-def length_data(length: MeasuredLength) -> dict[str, Any]:
-    """A length for programs."""
-    return {
-        "value_mm": length.value_mm,
-        "sigma_mm": length.sigma_mm,
-        "sigma_scatter_mm": length.sigma_scatter_mm,
-        "sigma_propagated_mm": length.sigma_propagated_mm,
-    }
 
 
 def _sigma_facts(length: MeasuredLength, name: str) -> tuple[tuple[str, str], ...]:

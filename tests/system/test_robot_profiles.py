@@ -136,10 +136,12 @@ def test_the_wrong_convention_of_angles_is_noticed(euler: EulerConvention) -> No
 
 
 def test_a_wrong_diameter_is_noticed() -> None:
-    found = solve("extrinsic-xyz", 81.0)
-    assert isinstance(found, HandEyeFit)
-    assert any("the points ask for a sphere of 80." in text for text in found.warnings)
-    assert isinstance(solve("extrinsic-xyz", 70.0), FitFailure)
+    found = solve("extrinsic-xyz", 80.4)
+    assert isinstance(found, HandEyeFit), found
+    assert any("the points ask for a sphere of" in text for text in found.warnings)
+    failure = solve("extrinsic-xyz", 82.0)
+    assert isinstance(failure, FitFailure)
+    assert failure.reason.endswith("80.1 mm would fit")
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

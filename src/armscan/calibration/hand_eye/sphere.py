@@ -58,6 +58,8 @@ RIVAL_COST = 9.0
 LIKELIER = 6.0
 """Logarithm of the likelihood ratio from which one solution is preferred to another."""
 LEAST_RESIDUAL_MM = 1e-4
+LIKELY_DIAMETER = 0.2
+"""Part of the diameter by which it may have been mistaken."""
 NAMED_STRIPES = 3
 LOOSE_PART = 0.2
 """A combination known less well than this part of the diameter is not determined."""
@@ -101,8 +103,9 @@ def calibrate_on_sphere(
     sections, left_out = find_sections(stripes, radius, options)
     n_postures = len({section.stripe.posture for section in sections})
     refused = _refuse_sections(len(sections), left_out, diameter_mm)
-    if refused is None:
-        refused = refuse_few_postures(n_postures)
+    few = refuse_few_postures(n_postures)
+    if refused is None and few is not None:
+        refused = FitFailure(few.reason, POSTURES_REMEDY)
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
@@ -178,16 +181,32 @@ def _search(
     for cost, state in ends:
         if cost <= limit and all(is_apart(state, one) for one in kept):
             kept.append(descend(nodes, state, plain, free_columns(options))[0])
-    typical = float(np.median(np.abs(place_on_sphere(nodes, kept[0]).residual_mm)))
-    if typical > options.max_rms_mm:
-        return FitFailure(
-            f"no hand-eye puts the points on one sphere of {2.0 * radius_mm:g} mm diameter: they "
-            f"stay {typical:.2f} mm away (median)",
-            "check the convention of the arm's angles, the order of poses and profiles, the "
-            "sphere's diameter, and that the sphere did not move",
-        )
+    if _typical_mm(nodes, kept[0]) > options.max_rms_mm:
+        return _refuse_misfit(nodes, kept[0], options)
     refused = _refuse_postures(solve_at(nodes, kept[0], options), 2.0 * radius_mm)
     return tuple(kept) if refused is None else refused
+
+
+def _typical_mm(nodes: SphereNodes, state: SphereState) -> float:
+    return float(np.median(np.abs(place_on_sphere(nodes, state).residual_mm)))
+
+
+def _refuse_misfit(nodes: SphereNodes, state: SphereState, options: SphereOptions) -> FitFailure:
+    """Say how far the points stay from any sphere, and whether another diameter would do."""
+    typical = _typical_mm(nodes, state)
+    reason = (
+        f"no hand-eye puts the points on one sphere of {2.0 * state.radius_mm:g} mm diameter: "
+        f"they stay {typical:.2f} mm away (median)"
+    )
+    freed, _, _ = descend(nodes, state, np.eye(len(nodes)), np.arange(RADIUS_COLUMN + 1))
+    is_better = _typical_mm(nodes, freed) < min(0.5 * typical, options.max_rms_mm)
+    if is_better and abs(freed.radius_mm / state.radius_mm - 1.0) < LIKELY_DIAMETER:
+        reason += f"; {2.0 * freed.radius_mm:.1f} mm would fit"
+    return FitFailure(
+        reason,
+        "check the convention of the arm's angles, the order of poses and profiles, the "
+        "sphere's diameter, and that the sphere did not move",
+    )
 
 
 def _best(
@@ -202,6 +221,8 @@ def _best(
         )
     solved.sort(key=lambda pair: -pair[1].linear.log_likelihood)
     best = solved[0]
+    if _typical_mm(nodes, best[1].state) > options.max_rms_mm:
+        return _refuse_misfit(nodes, best[1].state, options)
     refused = _refuse_postures(best[1].linear, 2.0 * best[0].radius_mm)
     if refused is not None:
         return refused

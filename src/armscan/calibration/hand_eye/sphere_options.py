@@ -52,7 +52,7 @@ class SphereOptions:
     min_points: int = 20
     min_arc_deg: float = 20.0
     same_rotation_deg: float = 0.1
-    max_rms_mm: float = 1.0
+    max_rms_mm: float = 0.5
 
     def __post_init__(self) -> None:
         for name in ("arm_position_mm", "arm_rotation_rad"):

@@ -18,6 +18,7 @@ from armscan.geometry.fitting import Plane, fit_plane
 LARGEST_SECTION = 1.05
 """Largest radius of a section over the sphere's: beyond it, something else was seen."""
 SMALLEST_SECTION = 0.05
+METRES = 0.002
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,20 +124,18 @@ def _find_section(
     sphere_radius_mm: float,
     options: SphereOptions,
 ) -> Section | str:
-    if plane is None or len(rows) < options.min_points:
+    if len(rows) < options.min_points:
         return f"{len(rows)} points, fewer than {options.min_points}"
+    if plane is None:
+        return "its points and those of all others of the sheet lie on one line"
     flat = (stripe.points_mm[rows] - plane.point_mm) @ plane.axes[:2].T
     fit = fit_circle(flat, outlier_sigmas=options.outlier_sigma)
     if isinstance(fit, FitFailure):
         return fit.reason
     circle = fit.value
-    if circle.radius_mm > LARGEST_SECTION * sphere_radius_mm:
-        return (
-            f"its section has a radius of {circle.radius_mm:.2f} mm, more than the sphere's "
-            f"{sphere_radius_mm:g} mm"
-        )
-    if circle.radius_mm < SMALLEST_SECTION * sphere_radius_mm:
-        return f"its section has a radius of {circle.radius_mm:.2f} mm only"
+    unlike = _unlike_sphere(circle.radius_mm, sphere_radius_mm)
+    if unlike:
+        return unlike
     kept = _inliers(fit.residuals, fit.degrees_of_freedom + 3)
     turn, along = _along_arc(flat[kept], circle.centre_mm)
     if len(along) < options.min_points or turn < options.min_arc_deg:
@@ -153,6 +152,20 @@ def _find_section(
         turn,
         len(rows) - int(kept.sum()),
     )
+
+
+def _unlike_sphere(radius_mm: float, sphere_radius_mm: float) -> str:
+    """Why a circle of that radius is no section of the sphere, or nothing."""
+    if radius_mm > LARGEST_SECTION * sphere_radius_mm:
+        return (
+            f"its section has a radius of {radius_mm:.2f} mm, more than the sphere's "
+            f"{sphere_radius_mm:g} mm"
+        )
+    if radius_mm < METRES * sphere_radius_mm:
+        return f"its section has a radius of {radius_mm:.3g} mm: are the points in metres?"
+    if radius_mm < SMALLEST_SECTION * sphere_radius_mm:
+        return f"its section has a radius of {radius_mm:.3g} mm only"
+    return ""
 
 
 def _inliers(residuals: FloatArray, count: int) -> BoolArray:

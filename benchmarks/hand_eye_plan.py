@@ -105,9 +105,8 @@ def main() -> None:
     exchanges = parser.parse_args().exchanges
     head = build_head(seed=1)
     rng = np.random.default_rng(1)
-    print(
-        "plan (head seed 1)      turns x y z, deg          shifts x y z, mm          scan point, mm"
-    )
+    heads = ("plan", "turns x y z, deg", "shifts x y z, mm", "scan point, mm", "cost, mm")
+    print("{:<22} {:<25} {:<25} {:<25} {}".format(*heads), "(head and draws: seed 1)")
     show("the twin's", head, PLAN)
     for k in range(4):
         show(f"random {k + 1}", head, tuple(drawn(rng) for _ in PLAN))

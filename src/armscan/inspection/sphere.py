@@ -86,7 +86,10 @@ def _settled(
         is_feature = chosen
         fit = fit_robustly(points[chosen], sphere, _sphere, Sphere.distance_mm, options)
         if isinstance(fit, FitFailure):
-            return fit
+            return FitFailure(
+                f"there is no ball of {diameter_mm:g} mm: {fit.reason}",
+                "check the diameter, or show where the ball is with --region",
+            )
         sphere, is_fitted = fit
         misfit = 2.0 * sphere.radius_mm - diameter_mm
         if abs(misfit) > LARGEST_MISFIT * diameter_mm:

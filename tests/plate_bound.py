@@ -61,19 +61,22 @@ def plain_least_squares(
 ) -> tuple[FloatArray, FloatArray]:
     """Minimum of eq. 2.76 by SciPy: its (6,) error and the (6, 6) covariance it would state."""
     truth = TOOL_FROM_SENSOR
-    turned = [s.points_mm @ truth.rotation.T for s in stripes]
+    turned = np.concatenate([s.points_mm @ truth.rotation.T for s in stripes])
+    count = [len(s) for s in stripes]
+    rotations = np.array([s.base_from_tool.rotation for s in stripes])
+    normals = np.repeat(rotations.transpose(0, 2, 1) @ plate.plane.normal, count, axis=0)
+    heights = [plate.plane.distance_mm(s.base_from_tool.translation_mm[None])[0] for s in stripes]
+    height = np.repeat(heights, count)
 
     def residuals(x: FloatArray) -> FloatArray:
-        turn = Rotation.from_rotvec(x[:3]).as_matrix()
-        parts = []
-        for stripe, points in zip(stripes, turned, strict=True):
-            tool = points @ turn.T + truth.translation_mm + x[3:]
-            pose = stripe.base_from_tool
-            parts.append(plate.plane.distance_mm(tool @ pose.rotation.T + pose.translation_mm))
-        return np.concatenate(parts)
+        moved = turned @ Rotation.from_rotvec(x[:3]).as_matrix().T + truth.translation_mm + x[3:]
+        return np.asarray(np.einsum("ni,ni->n", moved, normals) + height)
+
+    def slopes(x: FloatArray) -> FloatArray:
+        return np.concatenate([np.cross(turned, normals), normals], axis=1)
 
     scale = np.array([1e-2] * 3 + [1.0] * 3)
-    found = least_squares(residuals, np.zeros(6), x_scale=scale, method="lm")
+    found = least_squares(residuals, np.zeros(6), jac=slopes, x_scale=scale, method="lm")
     variance = 2.0 * found.cost / (len(found.fun) - 6)
     return np.asarray(found.x), np.asarray(variance * np.linalg.inv(found.jac.T @ found.jac))
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,7 @@ from armscan.calibration.hand_eye.plate import calibrate_on_plate
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.scan_source import ScanSource
 from armscan.errors import OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
@@ -24,7 +25,6 @@ from armscan.pipeline.reconstruct import ReconstructOptions, measure_exposure
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, triangulate_stripe
-from armscan.records.exposure import Exposure
 from armscan.records.session import ExposureRow
 
 STAGE = "stripes of the postures"
@@ -138,61 +138,49 @@ def calibrate_hand_eye_from_scan(
         If no exposure has a pose, or the sheet of a stripe is ambiguous.
     """
     options = options or HandEyeScanOptions()
-    seen = observe_stripes(source, sensor, options, progress=progress)
-    fit = calibrate_on_plate(seen.stripes, plate, options.hand_eye)
-    if isinstance(fit, FitFailure):
-        return fit
-    return HandEyeRun(fit, seen.stripes, seen.images, seen.not_used, seen.warnings)
-
-
-def observe_stripes(
-    source: ScanSource,
-    sensor: SensorCalibration,
-    options: HandEyeScanOptions,
-    *,
-    progress: Progress = silent,
-) -> ObservedStripes:
-    """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
-
-    Whatever reference the stripes lie on: a plate or a sphere.
-    """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
-    is_lit = [bool(row.lasers) for row in source.rows]
-    if not any(is_lit):
-        is_lit = [True] * len(source.rows)
-    dark = {row.view: k for k, row in enumerate(source.rows) if not is_lit[k] and row.view}
-    not_used = [
-        (row.source, "the arm gave no pose for it")
-        for k, row in enumerate(source.rows)
-        if is_lit[k] and not poses.has_pose[k]
-    ]
-    rows = np.flatnonzero(np.array(is_lit) & poses.has_pose)
-    chosen = _spread(rows, options.max_exposures)
-    warnings = list(poses.warnings)
-    if len(chosen) < len(rows):
-        warnings.append(f"{len(chosen)} of {len(rows)} exposures were used, evenly spread")
+    is_lit = _lit(source.rows)
+    chosen = _spread(np.flatnonzero(is_lit & poses.has_pose), options.max_exposures)
     postures, merged = _postures(
         [source.rows[k] for k in chosen], [poses.pose(int(k)) for k in chosen]
     )
-    warnings += merged
     stripes: list[PosedStripe] = []
     images: list[ReconstructedImage] = []
+    not_used = [
+        (source.rows[k].source, "the arm gave no pose for it")
+        for k in np.flatnonzero(is_lit & ~poses.has_pose)
+    ]
     for done, (k, posture) in enumerate(zip(chosen, postures, strict=True)):
-        exposure = source.exposure(int(k))
-        progress(ProgressEvent(STAGE, done, len(chosen), exposure.source))
-        partner = dark.get(source.rows[k].view) if source.rows[k].view else None
-        background = None if partner is None else source.exposure(partner)
-        image = _measure(exposure, background, sensor, options)
+        progress(ProgressEvent(STAGE, done, len(chosen), source.rows[k].source))
+        image = _measure(source, int(k), is_lit, sensor, options.measure)
         if image.count(PointFate.MEASURED) < options.hand_eye.min_points:
-            not_used.append((exposure.source, "no stripe was measured in it"))
+            not_used.append((source.rows[k].source, "no stripe was measured in it"))
             continue
         images.append(image)
         stripes.append(posed_stripe(image, sensor, posture, poses.pose(int(k))))
     progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
+    fit = calibrate_on_plate(stripes, plate, options.hand_eye, sensor_covariance=sensor.covariance)
+    if isinstance(fit, FitFailure):
+        return fit
+    n_posed = int((is_lit & poses.has_pose).sum())
+    warnings = (*poses.warnings, *_left_out(len(chosen), n_posed, not_used), *merged)
+    return HandEyeRun(fit, tuple(stripes), tuple(images), tuple(not_used), warnings)
+
+
+def _lit(rows: Sequence[ExposureRow]) -> BoolArray:
+    """(N,) True for exposures with a laser; for all of them where no lasers are named."""
+    is_lit = np.array([bool(row.lasers) for row in rows], dtype=np.bool_)
+    return is_lit if is_lit.any() else np.ones(len(rows), dtype=np.bool_)
+
+
+def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    warnings = []
+    if n_chosen < n_posed:
+        warnings.append(f"{n_chosen} of {n_posed} exposures were used, evenly spread")
     if not_used:
         named = ", ".join(f"{name} ({reason})" for name, reason in not_used[:4])
         warnings.append(f"{len(not_used)} exposures were not used: {named}")
-    return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), tuple(warnings))
+    return tuple(warnings)
 
 
 def posed_stripe(
@@ -237,13 +225,19 @@ def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> Float
 
 
 def _measure(
-    exposure: Exposure,
-    background: Exposure | None,
+    source: ScanSource,
+    row: int,
+    is_lit: BoolArray,
     sensor: SensorCalibration,
-    options: HandEyeScanOptions,
+    options: ReconstructOptions,
 ) -> ReconstructedImage:
+    """Stripes of one exposure; one of the same view without laser serves as background."""
+    exposure = source.exposure(row)
     check_sizes([exposure], sensor.camera.camera)
-    return measure_exposure((exposure, background), sensor, options.measure)
+    view = source.rows[row].view
+    dark = [k for k in np.flatnonzero(~is_lit) if view and source.rows[k].view == view]
+    background = source.exposure(int(dark[0])) if dark else None
+    return measure_exposure((exposure, background), sensor, options)
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:

@@ -16,7 +16,7 @@ from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
 from armscan.calibration.hand_eye.plate_result import sigma_of
 from armscan.calibration.hand_eye.plate_search import Start
-from armscan.calibration.hand_eye.pose_hypotheses import find_readings
+from armscan.calibration.hand_eye.pose_hypotheses import find_reading
 from armscan.calibration.hand_eye.probed_side import find_free_plane, offset_in_words
 from armscan.geometry.arrays import BoolArray
 from armscan.geometry.estimate import FitFailure
@@ -46,11 +46,10 @@ def explain_misfit(
             f"plane then lies {offset_in_words(free.offset_mm, free.tilt_deg, plate)}",
             PROBE_AGAIN,
         )
-    readings = find_readings(nodes, plate.plane, start.typical_mm)
-    if readings:
+    reading = find_reading(nodes, plate.plane, start.typical_mm)
+    if reading is not None:
         return FitFailure(
-            f"{fact}; {readings[0].words} would leave {readings[0].typical_mm:.3f} mm",
-            readings[0].remedy,
+            f"{fact}; {reading.words} would leave {reading.typical_mm:.3f} mm", reading.remedy
         )
     return FitFailure(
         fact,

@@ -19,7 +19,7 @@ from armscan.geometry.estimate import FitFailure
 
 MAX_WRONG_SHARE = 0.34
 LEAST_LEFT = 6
-SUSPECT_PROBABILITY = 1e-2
+SUSPECT_PROBABILITY = 0.2
 WRONG_PROBABILITY = 1e-5
 """Probability, among as many postures, of a shift and slope like those of the posture."""
 

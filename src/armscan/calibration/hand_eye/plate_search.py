@@ -107,7 +107,7 @@ def _has_wrong(rms: FloatArray) -> bool:
 
 def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[Tool, Sensor]]:
     """Solutions of random subsets of postures, the best few of them refined."""
-    nodes = _thinned(nodes)
+    nodes = thinned(nodes)
     random = np.random.default_rng(0)
     found: list[tuple[float, Pose[Tool, Sensor]]] = []
     for _ in range(N_SUBSETS):
@@ -121,7 +121,7 @@ def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[
     return [pose for _, pose in found[:3]]
 
 
-def _thinned(nodes: PlateNodes) -> PlateNodes:
+def thinned(nodes: PlateNodes) -> PlateNodes:
     """First, middle and last node of every stripe."""
     piece = np.unique(np.column_stack([nodes.stripe, nodes.sheet]), axis=0, return_inverse=True)[1]
     kept = np.zeros(len(nodes), dtype=np.bool_)
@@ -143,7 +143,7 @@ def _descend(
 
 def _from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[list[Pose[Tool, Sensor]], int]:
     """Descend from rotations all over; also count distinct solutions that are about as good."""
-    nodes = _thinned(nodes)
+    nodes = thinned(nodes)
     rotations = Rotation.random(N_ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
     normals, constants = plate_in_tool(nodes, plate)
     turned = np.einsum("kij,nj->kni", rotations, nodes.points_mm)

@@ -10,7 +10,7 @@ from typing import get_args
 import numpy as np
 
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
-from armscan.calibration.hand_eye.plate_search import find_start
+from armscan.calibration.hand_eye.plate_search import find_start, thinned
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
 from armscan.geometry.fitting import Plane
@@ -29,8 +29,8 @@ class Reading:
     typical_mm: float
 
 
-def find_readings(nodes: PlateNodes, plate: Plane, typical_mm: float) -> tuple[Reading, ...]:
-    """Readings of the same poses that the stripes agree with, the best first.
+def find_reading(nodes: PlateNodes, plate: Plane, typical_mm: float) -> Reading | None:
+    """First other reading of the same poses that the stripes agree with; None if there is none.
 
     Parameters
     ----------
@@ -39,12 +39,11 @@ def find_readings(nodes: PlateNodes, plate: Plane, typical_mm: float) -> tuple[R
     typical_mm
         What they leave as read.
     """
-    found = []
-    for words, remedy, moved in _readings(nodes):
+    for words, remedy, moved in _readings(thinned(nodes)):
         left = find_start(moved, plate).typical_mm
         if left < BETTER * typical_mm:
-            found.append(Reading(words, remedy, left))
-    return tuple(sorted(found, key=lambda reading: reading.typical_mm))
+            return Reading(words, remedy, left)
+    return None
 
 
 def _readings(nodes: PlateNodes) -> Iterator[tuple[str, str, PlateNodes]]:

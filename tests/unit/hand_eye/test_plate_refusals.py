@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Postures, poses, planes and points that are wrong: refused or warned of in words that help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.errors import OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.euler import euler_from_rotations, rotations_from_euler
+from armscan.geometry.fitting import Plane
+from armscan.geometry.frames import Base, Tool
+from armscan.geometry.poses import Pose
+from plate_rig import (
+    PLATE_NORMAL,
+    SILENT,
+    TOOL_FROM_SENSOR,
+    PlateRig,
+    Postures,
+    good_postures,
+)
+
+N = 12
+ARM_MM = 0.0053
+Repose = Callable[[Pose[Base, Tool]], Pose[Base, Tool]]
+
+
+def _scan() -> tuple[list[PosedStripe], PlateReference]:
+    return PlateRig(good_postures(N, np.random.default_rng(1))).draw(1)
+
+
+def _reposed(stripes: list[PosedStripe], change: Repose) -> list[PosedStripe]:
+    return [replace(s, base_from_tool=change(s.base_from_tool)) for s in stripes]
+
+
+def _raised(plate: PlateReference, by_mm: float) -> PlateReference:
+    point = plate.plane.point_mm + by_mm * plate.plane.normal
+    return replace(plate, plane=Plane(point, plate.plane.axes))
+
+
+def _error_mm(fit: HandEyeFit | FitFailure) -> float:
+    assert isinstance(fit, HandEyeFit)
+    found = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    return float(np.linalg.norm(found[3:]))
+
+
+def _postures(tilt_deg: np.ndarray, azimuth: np.ndarray, roll: np.ndarray) -> Postures:
+    place = np.random.default_rng(2).uniform(-80.0, 80.0, (N, 2))
+    return Postures(np.radians(tilt_deg), azimuth, roll, np.full(N, 140.0), place)
+
+
+ROUND = 2.0 * np.pi * np.arange(N) / N
+SWING = np.linspace(-40.0, 40.0, N)
+
+
+@pytest.mark.parametrize(
+    ("postures", "cause"),
+    [
+        (_postures(np.full(N, 20.0), np.ones(N), np.zeros(N)), "never turned"),
+        (_postures(np.zeros(N), np.zeros(N), ROUND), "about the plate's normal only"),
+    ],
+)
+def test_postures_that_leave_parameters_open_are_refused(postures: Postures, cause: str) -> None:
+    """FINDINGS 5: without turning against the plate the system has rank 2 or 3."""
+    fit = calibrate_on_plate(*PlateRig(postures).draw(0))
+    assert isinstance(fit, FitFailure)
+    assert cause in fit.reason and "of the hand-eye's 6 parameters" in fit.reason
+    assert "tilt the head" in fit.remedy
+
+
+def test_one_azimuth_plane_is_solved_and_warned_of() -> None:
+    """The nine linear unknowns are not determined at a fixed stand-off, the six are."""
+    rig = PlateRig(_postures(SWING, np.zeros(N), np.zeros(N)), SILENT)
+    fit = calibrate_on_plate(*rig.draw(0))
+    assert _error_mm(fit) < 1e-6
+    assert isinstance(fit, HandEyeFit)
+    assert any("one azimuth plane only" in w and "stand-off" in w for w in fit.warnings)
+
+
+def test_two_azimuth_planes_are_better_conditioned_than_one() -> None:
+    one = calibrate_on_plate(*PlateRig(_postures(SWING, np.zeros(N), np.zeros(N))).draw(0))
+    azimuth = np.repeat([0.0, np.pi / 2.0], N // 2)
+    two = calibrate_on_plate(*PlateRig(_postures(SWING, azimuth, np.zeros(N))).draw(0))
+    assert isinstance(one, HandEyeFit) and isinstance(two, HandEyeFit)
+    conditions = [fit.calibration.diagnostics for fit in (one, two)]
+    assert conditions[0] is not None and conditions[1] is not None
+    assert conditions[0].condition > 3.0 * conditions[1].condition
+
+
+@pytest.mark.parametrize(("count", "is_refused"), [(2, True), (5, False)])
+def test_few_postures_are_refused_or_warned_of(count: int, is_refused: bool) -> None:
+    rig = PlateRig(good_postures(count, np.random.default_rng(4)))
+    fit = calibrate_on_plate(*rig.draw(0))
+    assert isinstance(fit, FitFailure) is is_refused
+    words = fit.reason if isinstance(fit, FitFailure) else " ".join(fit.warnings)
+    assert f"{count} postures" in words
+
+
+def _euler(pose: Pose[Base, Tool]) -> Pose[Base, Tool]:
+    angles = euler_from_rotations(pose.rotation[None], "intrinsic-xyz")
+    return Pose(rotations_from_euler(angles, "extrinsic-xyz")[0], pose.translation_mm)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (_euler, "reading them as intrinsic-xyz would leave 0.00"),
+        (lambda pose: Pose(pose.rotation, 1e-3 * pose.translation_mm), "translations in metres"),
+        (lambda pose: pose.inverse(), "taking the poses as tool_from_base"),
+    ],
+)
+def test_misread_poses_are_refused_with_the_reading_that_fits(change: Repose, words: str) -> None:
+    stripes, plate = _scan()
+    fit = calibrate_on_plate(_reposed(stripes, change), plate)
+    assert isinstance(fit, FitFailure)
+    assert "no hand-eye fits" in fit.reason and words in fit.reason and fit.remedy
+
+
+def test_poses_shifted_by_one_exposure_are_recognised() -> None:
+    stripes, plate = _scan()
+    poses = [s.base_from_tool for s in stripes]
+    shifted = [
+        replace(s, base_from_tool=pose)
+        for s, pose in zip(stripes, poses[1:] + poses[:1], strict=True)
+    ]
+    fit = calibrate_on_plate(shifted, plate)
+    assert isinstance(fit, FitFailure)
+    assert "the pose of the one before it" in fit.reason
+
+
+def test_swapped_poses_are_named_and_left_out() -> None:
+    stripes, plate = _scan()
+    swapped = list(stripes)
+    swapped[3] = replace(stripes[3], base_from_tool=stripes[7].base_from_tool)
+    swapped[7] = replace(stripes[7], base_from_tool=stripes[3].base_from_tool)
+    fit = calibrate_on_plate(swapped, plate)
+    assert _error_mm(fit) < 5.0 * ARM_MM
+    assert isinstance(fit, HandEyeFit)
+    named = next(w for w in fit.warnings if "left out 2 postures" in w)
+    assert "posture03" in named and "posture07" in named
+    assert fit.calibration.n_postures == N - 2
+
+
+def test_a_slightly_wrong_pose_is_left_out_too() -> None:
+    """Eight sigmas of the arm: far too little for the start, plain against the others' scatter."""
+    stripes, plate = _scan()
+    pose = stripes[4].base_from_tool
+    raised = pose.translation_mm + 8.0 * ARM_MM * PLATE_NORMAL
+    moved: Pose[Base, Tool] = Pose(pose.rotation, raised)
+    wrong = [*stripes[:4], replace(stripes[4], base_from_tool=moved), *stripes[5:]]
+    fit = calibrate_on_plate(wrong, plate)
+    assert isinstance(fit, HandEyeFit)
+    assert any("posture04" in w and "worse than their scatter" in w for w in fit.warnings)
+
+
+def test_good_data_are_not_warned_of() -> None:
+    fit = calibrate_on_plate(*_scan())
+    assert isinstance(fit, HandEyeFit)
+    assert fit.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("offset_mm", "what"), [(6.0, "the tip's diameter"), (3.0, "the tip's radius")]
+)
+def test_a_plate_probed_on_the_wrong_side_is_refused(offset_mm: float, what: str) -> None:
+    stripes, plate = _scan()
+    fit = calibrate_on_plate(stripes, replace(_raised(plate, offset_mm), tip_diameter_mm=6.0))
+    assert isinstance(fit, FitFailure)
+    assert what in fit.reason and "below the probed one" in fit.reason
+
+
+def test_a_plate_that_sank_is_warned_of_with_its_distance() -> None:
+    stripes, plate = _scan()
+    fit = calibrate_on_plate(stripes, _raised(plate, 0.15))
+    assert isinstance(fit, HandEyeFit)
+    warning = next(w for w in fit.warnings if "disagree" in w)
+    distance = float(warning.split("lies ")[1].split(" mm")[0])
+    assert distance == pytest.approx(0.15, abs=0.06)
+
+
+def test_a_plate_seen_from_behind_is_warned_of() -> None:
+    stripes, plate = _scan()
+    turned = Plane(plate.plane.point_mm, plate.plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
+    fit = calibrate_on_plate(stripes, replace(plate, plane=turned))
+    assert isinstance(fit, HandEyeFit)
+    assert any("points away from the scanner" in w for w in fit.warnings)
+
+
+def test_points_beyond_the_plate_are_left_out_and_counted() -> None:
+    """A third of every stripe lies on the table, 12 mm under the plate."""
+    stripes, plate = _scan()
+    spoiled = []
+    for stripe in stripes:
+        points = stripe.points_mm.copy()
+        points[:50] += 12.0 * np.array([0.0, 0.68, 0.73])
+        spoiled.append(replace(stripe, points_mm=points))
+    fit = calibrate_on_plate(spoiled, plate)
+    assert _error_mm(fit) < 6.0 * ARM_MM
+    assert isinstance(fit, HandEyeFit)
+    assert fit.calibration.n_points == pytest.approx(N * 100, abs=2 * N)
+    assert any("are not on straight stripes" in w for w in fit.warnings)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [{"arm_rotation_rad": 0.5}, {"plate_flatness_mm": -1.0}, {"nodes_per_stripe": 1}],
+)
+def test_impossible_options_are_refused(option: dict[str, float]) -> None:
+    with pytest.raises(OptionError):
+        HandEyeOptions(**option)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the hand-eye on a plate against what is stated, and against the bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from armscan.calibration.hand_eye.least_squares import solve_linear
+from armscan.calibration.hand_eye.noise_model import NoiseComponent
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.variance_components import estimate_noise
+from armscan.geometry.arrays import FloatArray
+from plate_bound import cramer_rao, plain_least_squares
+from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
+
+NOISE = RigNoise()
+N_RUNS = 30
+GIVEN = HandEyeOptions(
+    arm_position_mm=float(np.hypot(NOISE.posture_mm, NOISE.exposure_mm)),
+    arm_rotation_rad=float(np.hypot(NOISE.posture_rad, NOISE.exposure_rad)),
+    plate_flatness_mm=NOISE.flatness_mm,
+    stripe_noise_factor=1.0,
+)
+
+
+def _runs(rig: PlateRig, options: HandEyeOptions, first: int) -> tuple[FloatArray, FloatArray]:
+    """Errors (N_RUNS, 6) and their normalised squares."""
+    errors, squares = [], []
+    for seed in range(first, first + N_RUNS):
+        fit = calibrate_on_plate(*rig.draw(seed), options)
+        assert isinstance(fit, HandEyeFit)
+        error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+        errors.append(error)
+        squares.append(float(error @ np.linalg.solve(fit.calibration.covariance, error)))
+    return np.array(errors), np.array(squares)
+
+
+def test_errors_reach_the_bound_and_the_stated_covariance() -> None:
+    """Ratio to the Cramer-Rao bound <= 1.15; limits are those of 30 runs at 99.9 %."""
+    rig = PlateRig(good_postures(12, np.random.default_rng(3)))
+    errors, squares = _runs(rig, GIVEN, 100)
+    bound = cramer_rao(rig)
+    against_bound = np.einsum("ri,ij,rj->r", errors, np.linalg.inv(bound), errors).sum()
+    assert against_bound < 1.15**2 * chi2.ppf(0.999, 6 * N_RUNS)
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * N_RUNS)
+    assert low < squares.sum() < high
+    plain, stated = plain_least_squares(*rig.draw(100))
+    assert plain @ np.linalg.solve(stated, plain) > 10.0 * chi2.ppf(0.95, 6)
+
+
+def test_estimated_scatter_is_right_and_so_is_the_covariance() -> None:
+    rig = PlateRig(good_postures(12, np.random.default_rng(3)))
+    _, squares = _runs(rig, HandEyeOptions(), 500)
+    n_inside = int((squares < chi2.ppf(0.95, 6)).sum())
+    assert n_inside >= 24, "fewer than 1 in 1000 draws of 30 with 95 % each"
+    fit = calibrate_on_plate(*rig.draw(1))
+    assert isinstance(fit, HandEyeFit)
+    diagnostics = fit.calibration.diagnostics
+    assert diagnostics is not None and diagnostics.is_noise_estimated
+    arm_mm = float(np.hypot(NOISE.posture_mm, NOISE.exposure_mm))
+    assert 0.4 * arm_mm < fit.calibration.arm_noise.position_mm < 2.5 * arm_mm
+
+
+def test_a_worse_arm_is_noticed() -> None:
+    """All errors five times as large: the stated covariance grows with them."""
+    postures = good_postures(12, np.random.default_rng(3))
+    sigmas = []
+    for factor in (1.0, 5.0):
+        fit = calibrate_on_plate(*PlateRig(postures, NOISE.scaled(factor)).draw(2))
+        assert isinstance(fit, HandEyeFit)
+        sigmas.append(np.sqrt(np.diag(fit.calibration.covariance)))
+    ratio = sigmas[1] / sigmas[0]
+    assert (ratio > 2.5).all() and (ratio < 7.0).all()
+
+
+def test_several_exposures_tell_their_own_part_from_the_postures() -> None:
+    noise = replace(NOISE, exposure_mm=0.01)
+    rig = PlateRig(good_postures(12, np.random.default_rng(3)), noise, exposures_per_posture=3)
+    fit = calibrate_on_plate(*rig.draw(1))
+    assert isinstance(fit, HandEyeFit)
+    assert 0.006 < fit.calibration.arm_noise.exposure_position_mm < 0.016
+    assert fit.calibration.n_postures == 12 and fit.calibration.n_exposures == 36
+
+
+def test_restricted_likelihood_of_repeats_is_the_sample_variance() -> None:
+    """One mean, independent noise: REML gives the sum of squares over n - 1 (hand computed)."""
+    residual = np.random.default_rng(0).normal(size=30) * 0.02
+    component = NoiseComponent("noise", np.eye(30), 0.01, True, 1e3)
+    found = estimate_noise(residual, np.ones((30, 1)), (component,), np.zeros((30, 30)))
+    np.testing.assert_allclose(found.sigmas[0], residual.std(ddof=1), rtol=1e-3)
+    np.testing.assert_allclose(found.log_covariance[0, 0], 1.0 / (2.0 * 29.0), rtol=1e-3)
+
+
+def test_the_likelihood_is_highest_at_the_estimate() -> None:
+    """Score and likelihood belong together: no neighbour in any direction is more likely."""
+    rng = np.random.default_rng(1)
+    group = np.repeat(np.arange(10), 4)
+    same = (group[:, None] == group[None, :]).astype(np.float64)
+    residual = 0.03 * rng.normal(size=10)[group] + 0.01 * rng.normal(size=40)
+    slopes = np.column_stack([np.ones(40), rng.normal(size=40)])
+    components = (
+        NoiseComponent("group", same, 0.01, True, 1e3),
+        NoiseComponent("own", np.eye(40), 0.02, True, 1e3),
+    )
+    found = estimate_noise(residual, slopes, components, np.zeros((40, 40)))
+
+    def likelihood(sigmas: FloatArray) -> float:
+        total = sigmas[0] ** 2 * same + sigmas[1] ** 2 * np.eye(40)
+        solution = solve_linear(residual, slopes, total)
+        assert solution is not None
+        return solution.log_likelihood
+
+    best = likelihood(found.sigmas)
+    for step in (np.array([0.02, 0.0]), np.array([0.0, 0.02])):
+        for sign in (-1.0, 1.0):
+            assert likelihood(found.sigmas * np.exp(sign * step)) < best

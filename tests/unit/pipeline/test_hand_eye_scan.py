@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From drawn images of stripes on a plate, with the arm's track, to the hand-eye."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.devices.scan_source import ScanSource
+from armscan.errors import InputError, OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import (
+    CameraCalibration,
+    Provenance,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.pipeline.hand_eye import (
+    HandEyeRun,
+    HandEyeScanOptions,
+    calibrate_hand_eye_from_scan,
+)
+from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
+from armscan.records.session import ExposureRow, Session
+from plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
+
+WIDTH, HEIGHT, FOCAL_PX = 640, 480, 1000.0
+LINE_SIGMA_PX = 2.0
+DEPTH_PER_PX_MM = 0.19
+"""Of the light sheet at 140 mm, with this camera."""
+CENTRE_NOISE_PX = 0.1
+BY_HAND = Provenance("by hand", "", "", (), ())
+RIG = PlateRig(good_postures(8, np.random.default_rng(1)), SILENT)
+
+
+def _sensor() -> SensorCalibration:
+    model = CameraModel(FOCAL_PX, FOCAL_PX, 319.5, 239.5, np.zeros(5), WIDTH, HEIGHT)
+    covered = np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0])
+    camera = CameraCalibration(model, np.eye(9) * 1e-12, True, 0.0, 0.1, 9, 99, covered, BY_HAND)
+    normal = SHEET[:3] / np.linalg.norm(SHEET[:3])
+    along = np.cross(normal, [0.0, 0.0, 1.0])
+    along /= np.linalg.norm(along)
+    middle = np.array([0.0, 4.15, 140.0])
+    middle -= (normal @ middle + SHEET[3] / np.linalg.norm(SHEET[:3])) * normal
+    axes = np.stack([along, np.cross(normal, along), normal])
+    sheet = LightSheet(middle, axes, 30.0, np.zeros(5))
+    calibrated = SheetCalibration("A", sheet, 0.0, 6, 999, (110.0, 175.0), True)
+    return SensorCalibration(camera, (calibrated,), 1e-12 * np.eye(17), BY_HAND)
+
+
+def _image(points_mm: np.ndarray, seed: int) -> np.ndarray:
+    """A line as the camera sees it, drawn column by column."""
+    pixels = points_mm[:, :2] / points_mm[:, 2:] * FOCAL_PX + [319.5, 239.5]
+    order = np.argsort(pixels[:, 0])
+    columns = np.arange(WIDTH)
+    centre = np.interp(columns, pixels[order, 0], pixels[order, 1], -1e3, -1e3)
+    away = np.arange(HEIGHT)[:, None] - centre[None, :]
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, (HEIGHT, WIDTH))
+    line = 180.0 * np.exp(-0.5 * (away / LINE_SIGMA_PX) ** 2)
+    return np.clip(line + 10.0 + noise, 0.0, 255.0).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class DrawnScan:
+    """A scan of drawn stripes: every posture ``repeats`` times, one after the other."""
+
+    repeats: int = 1
+    views: bool = True
+    is_first_known: bool = True
+    has_arm: bool = True
+    name: str = "drawn"
+    session: Session = field(default_factory=Session)
+    is_simulated: bool = True
+
+    @property
+    def rows(self) -> tuple[ExposureRow, ...]:
+        count = self.repeats * len(RIG.postures)
+        return tuple(
+            ExposureRow(
+                k, 1_000_000 * k, 0, f"image{k}", ("A",), k, self._view(k) if self.views else None
+            )
+            for k in range(count)
+        )
+
+    @property
+    def arm(self) -> ArmTrack | None:
+        if not self.has_arm:
+            return None
+        rows = self.rows
+        poses = [RIG.reported_pose(k // self.repeats, np.zeros(6)) for k in range(len(rows))]
+        known = np.ones(len(rows), dtype=np.bool_)
+        known[0] = self.is_first_known
+        return ArmTrack(
+            np.array([row.t_ns for row in rows]),
+            np.array([pose.rotation for pose in poses]),
+            np.array([pose.translation_mm for pose in poses]),
+            known,
+            np.arange(len(rows)),
+        )
+
+    def exposure(self, row: int) -> Exposure:
+        flat = Surface(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1))
+        points, _ = RIG.stripe(row // self.repeats, flat)
+        meta = self.rows[row]
+        return Exposure(
+            _image(points, row),
+            meta.source,
+            lasers=meta.lasers,
+            t_ns=meta.t_ns,
+            trigger_id=meta.trigger_id,
+            view=meta.view,
+        )
+
+    def _view(self, k: int) -> str:
+        return f"posture {k // self.repeats}"
+
+
+def _run(source: ScanSource, options: HandEyeScanOptions | None = None) -> HandEyeRun:
+    _, plate = RIG.draw(0)
+    run = calibrate_hand_eye_from_scan(source, _sensor(), plate, options)
+    assert isinstance(run, HandEyeRun)
+    return run
+
+
+def test_images_and_poses_give_the_hand_eye() -> None:
+    """A stripe's plane is known to its noise over the root of its points; ten times that is far."""
+    run = _run(DrawnScan(repeats=2))
+    error = hand_eye_difference(run.fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    limit_mm = 10.0 * CENTRE_NOISE_PX * DEPTH_PER_PX_MM / np.sqrt(400.0)
+    assert np.abs(error[3:]).max() < 3.0 * limit_mm
+    assert np.abs(error[:3]).max() < limit_mm / 33.0
+    assert run.fit.calibration.n_postures == 8
+    assert run.fit.calibration.n_exposures == 16
+    coupling = run.fit.calibration.sensor_coupling
+    assert coupling is not None and coupling.shape == (6, 17)
+    assert len(run.images) == len(run.stripes) == 16
+    assert run.warnings == ()
+
+
+def test_without_views_exposures_at_one_place_are_one_posture() -> None:
+    run = _run(DrawnScan(repeats=2, views=False))
+    assert run.fit.calibration.n_postures == 8
+    assert any("count as one posture" in warning for warning in run.warnings)
+
+
+def test_a_moving_scan_has_a_posture_an_exposure() -> None:
+    run = _run(DrawnScan(views=False))
+    assert run.fit.calibration.n_postures == run.fit.calibration.n_exposures == 8
+
+
+def test_an_exposure_without_pose_is_named_and_left_out() -> None:
+    run = _run(DrawnScan(is_first_known=False))
+    assert run.not_used == (("image0", "the arm gave no pose for it"),)
+    assert run.fit.calibration.n_postures == 7
+
+
+def test_a_long_scan_is_thinned_evenly_and_says_so() -> None:
+    run = _run(DrawnScan(repeats=2), HandEyeScanOptions(max_exposures=8))
+    assert len(run.stripes) == 8
+    assert any("8 of 16 exposures" in warning for warning in run.warnings)
+    with pytest.raises(OptionError):
+        HandEyeScanOptions(max_exposures=2)
+
+
+def test_a_scan_without_arm_or_without_stripes_says_so() -> None:
+    _, plate = RIG.draw(0)
+    with pytest.raises(InputError, match="no samples of the arm"):
+        calibrate_hand_eye_from_scan(DrawnScan(has_arm=False), _sensor(), plate)
+    behind = replace(_sensor().sheets[0], depth_range_mm=(1000.0, 1010.0))
+    sensor = replace(_sensor(), sheets=(behind,))
+    failure = calibrate_hand_eye_from_scan(DrawnScan(), sensor, plate)
+    assert isinstance(failure, FitFailure)
+    assert "0 postures" in failure.reason

@@ -138,6 +138,26 @@ def calibrate_hand_eye_from_scan(
         If no exposure has a pose, or the sheet of a stripe is ambiguous.
     """
     options = options or HandEyeScanOptions()
+    seen = observe_stripes(source, sensor, options, progress=progress)
+    fit = calibrate_on_plate(
+        seen.stripes, plate, options.hand_eye, sensor_covariance=sensor.covariance
+    )
+    if isinstance(fit, FitFailure):
+        return fit
+    return HandEyeRun(fit, seen.stripes, seen.images, seen.not_used, seen.warnings)
+
+
+def observe_stripes(
+    source: ScanSource,
+    sensor: SensorCalibration,
+    options: HandEyeScanOptions,
+    *,
+    progress: Progress = silent,
+) -> ObservedStripes:
+    """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
+
+    Whatever reference the stripes lie on: a plate or a sphere.
+    """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
     is_lit = _lit(source.rows)
     chosen = _spread(np.flatnonzero(is_lit & poses.has_pose), options.max_exposures)
@@ -159,12 +179,9 @@ def calibrate_hand_eye_from_scan(
         images.append(image)
         stripes.append(posed_stripe(image, sensor, posture, poses.pose(int(k))))
     progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
-    fit = calibrate_on_plate(stripes, plate, options.hand_eye, sensor_covariance=sensor.covariance)
-    if isinstance(fit, FitFailure):
-        return fit
     n_posed = int((is_lit & poses.has_pose).sum())
     warnings = (*poses.warnings, *_left_out(len(chosen), n_posed, not_used), *merged)
-    return HandEyeRun(fit, tuple(stripes), tuple(images), tuple(not_used), warnings)
+    return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
 
 
 def _lit(rows: Sequence[ExposureRow]) -> BoolArray:

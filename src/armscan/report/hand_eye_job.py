@@ -91,7 +91,8 @@ def calibrated(
     if request.sphere_diameter_mm is not None:
         fit = calibrate_on_sphere(stripes, request.sphere_diameter_mm, request.sphere_options)
     elif inputs.plate is not None:
-        fit = calibrate_on_plate(stripes, inputs.plate, request.options)
+        known = None if inputs.sensor is None else inputs.sensor.covariance
+        fit = calibrate_on_plate(stripes, inputs.plate, request.options, sensor_covariance=known)
     if isinstance(fit, FitFailure):
         raise EstimationError(fit.reason, where=name, remedy=fit.remedy)
     return fit

@@ -61,6 +61,7 @@ def head_data(demo: SingleDemo) -> dict[str, Any]:
             **_shares(demo.ball.nominal, (0.03, 0.05, 0.08)),
             "diameter_mm": demo.ball.diameter.value_mm,
             "diameter_error_mm": demo.ball.diameter.value_mm - demo.ball.nominal_diameter_mm,
+            "diameter_sigma_mm": demo.ball.diameter.sigma_mm,
             "reference": demo.ball.nominal.reference,
         },
         "steps": [

@@ -20,6 +20,10 @@ MAX_ROUNDS = 20
 SMALLEST_EXTENT_MM = 2.0
 """Points that all lie this near to each other are taken for metres."""
 
+LEAST_CONCENTRATION = 0.5
+"""Part of the feature's points that must lie within the search band of the surface that was found:
+a shape that merely passes through the feature's shell spreads evenly over it instead."""
+
 ROBUST_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 

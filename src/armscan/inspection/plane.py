@@ -11,7 +11,14 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Plane, fit_plane
-from armscan.inspection.cleaning import Region, Selection, fit_robustly, outlier_rule, select
+from armscan.inspection.cleaning import (
+    LEAST_CONCENTRATION,
+    Region,
+    Selection,
+    fit_robustly,
+    outlier_rule,
+    select,
+)
 from armscan.inspection.histogram import describe_deviations
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.results import MeasuredLength, PlaneInspection, PointCounts
@@ -125,6 +132,14 @@ def _inspected(
     if isinstance(fit, FitFailure):
         return fit
     plane, is_fitted = fit
+    near = np.abs(plane.distance_mm(points)) <= options.search_band_mm
+    if reference is None and float(near.mean()) < LEAST_CONCENTRATION:
+        return FitFailure(
+            f"there is no flat face: at the best place for one, only {int(near.sum())} of "
+            f"{len(near)} points within {options.feature_mm:g} mm of its plane lie within "
+            f"{options.search_band_mm:g} mm",
+            "show where the face is with --region, or give the plane it should be",
+        )
     towards = start if reference is not None else _towards_sensor(cloud, feature, plane)
     plane = _facing(plane, towards)
     near_text = reference_text if reference is not None else "the face that most points lie near"

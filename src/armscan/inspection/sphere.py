@@ -11,7 +11,14 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.sphere import Sphere, fit_sphere
-from armscan.inspection.cleaning import Region, Selection, fit_robustly, outlier_rule, select
+from armscan.inspection.cleaning import (
+    LEAST_CONCENTRATION,
+    Region,
+    Selection,
+    fit_robustly,
+    outlier_rule,
+    select,
+)
 from armscan.inspection.histogram import describe_deviations
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.results import PointCounts, SphereInspection
@@ -23,10 +30,6 @@ LARGEST_MISFIT = 0.02
 """Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball."""
 
 SETTLING_ROUNDS = 3
-
-LEAST_CONCENTRATION = 0.5
-"""Part of the feature's points that must lie within the search band of a ball's surface: any shape
-that happens to pass through the feature's shell spreads evenly over it instead."""
 
 
 def inspect_sphere(

@@ -109,6 +109,15 @@ def test_the_fitted_normal_points_to_the_scanned_side() -> None:
         assert found.plane.normal[2] == pytest.approx(sign)
 
 
+def test_a_curved_surface_is_no_flat_face_but_may_be_compared_with_a_plane() -> None:
+    points = GRID + np.outer(0.02 * (GRID[:, 0] - 9.5) ** 2, [0.0, 0.0, 1.0])
+    failure = inspect_plane(cloud_of(points))
+    assert isinstance(failure, FitFailure)
+    assert "there is no flat face" in failure.reason
+    found = inspected(inspect_plane(cloud_of(points), given_plane(0.0, 0.0, 1.0, 0.0)))
+    assert found.nominal is not None
+
+
 def test_input_without_a_plane_is_refused_in_words() -> None:
     with pytest.raises(InputError, match="the cloud holds 0 points; an inspection needs 30"):
         inspect_plane(cloud_of(np.zeros((0, 3))))

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors against the truth, by hand; views of a scan that stay together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from armscan.errors import OptionError
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector
+from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.fewer_views import FewerViews
+from armscan.pipeline.truth_errors import hand_eye_errors
+from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
+from armscan.records.session import ExposureRow, Session
+from hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
+from sheet_rig import PROVENANCE
+
+
+def test_hand_eye_errors_are_in_the_form_of_its_covariance() -> None:
+    # one sigma of a rotation about Tool's x, and two of a shift along z: length sqrt(1 + 4)
+    hand_eye = fake_fit()[0].calibration
+    sigma = np.sqrt(np.diag(hand_eye.covariance))
+    turned = rotation_from_vector(np.array([sigma[0], 0.0, 0.0])) @ TOOL_FROM_SENSOR.rotation
+    moved = TOOL_FROM_SENSOR.translation_mm + np.array([0.0, 0.0, 2.0 * sigma[5]])
+    found = replace(hand_eye, tool_from_sensor=Pose(turned, moved))
+    scanner = ScannerCalibration(None, found, PROVENANCE)
+    errors = hand_eye_errors(scanner, TOOL_FROM_SENSOR)
+    assert errors.rotation_deg == pytest.approx(np.degrees(sigma[0]), rel=1e-6)
+    assert errors.translation_mm == pytest.approx(2.0 * sigma[5])
+    assert errors.normalised == pytest.approx(np.sqrt(5.0), rel=1e-6)
+
+
+@dataclass
+class Rows:
+    rows: tuple[ExposureRow, ...]
+    name: str = "scan"
+    session: Session = field(default_factory=Session)
+    arm: ArmTrack | None = None
+    is_simulated: bool = False
+
+    def exposure(self, row: int) -> Exposure:
+        return Exposure(np.zeros((2, 2), np.uint8), self.rows[row].source)
+
+
+def scan_of(views: list[str | None]) -> Rows:
+    return Rows(tuple(ExposureRow(k, k, 0, f"{k}.png", view=v) for k, v in enumerate(views)))
+
+
+def test_exposures_of_a_view_stay_together_and_the_ends_are_kept() -> None:
+    few = FewerViews(scan_of(["a", "a", "b", "b", "c", "c", "d", "d", "e", "e"]), 3)
+    assert [row.view for row in few.rows] == ["a", "a", "c", "c", "e", "e"]
+    assert [few.exposure(k).source for k in range(6)] == [row.source for row in few.rows]
+
+
+def test_exposures_without_view_are_views_of_their_own() -> None:
+    few = FewerViews(scan_of([None] * 7), 4)
+    assert [row.index for row in few.rows] == [0, 2, 4, 6]
+    assert len(FewerViews(scan_of([None] * 3), 9).rows) == 3
+
+
+def test_no_view_at_all_is_refused() -> None:
+    with pytest.raises(OptionError, match="keep at least one"):
+        FewerViews(scan_of([None]), 0)

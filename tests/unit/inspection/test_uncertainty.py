@@ -16,9 +16,9 @@ from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
 ARM_MM = 0.008
 NOISE_MM = 0.004
-N_RUNS = 60
+N_RUNS = 40
 SPREAD_LIMIT = 1.0 + 3.3 / math.sqrt(2 * N_RUNS)
-"""Ratio of a standard deviation from 60 runs to the true one: 99.9 % below (normal errors)."""
+"""Ratio of a standard deviation from 40 runs to the true one: 99.9 % below (normal errors)."""
 
 
 def ball_diameter(seed: int) -> MeasuredLength:
@@ -51,7 +51,7 @@ def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
     """An exposure that crosses both faces shifts both: the height's sigma is far below its own."""
     clean, exposure = block_stripes(20.0, 20, 200)
     heights = []
-    for seed in range(30):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         points = clean + rng.normal(0.0, 0.02, (20, 3))[exposure]
         points[:, 2] += rng.normal(0.0, NOISE_MM, len(points))
@@ -60,7 +60,7 @@ def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
         heights.append(found.height)
     scatter = float(np.std([item.value_mm for item in heights], ddof=1))
     propagated = float(np.mean([item.sigma_propagated_mm for item in heights]))
-    limit = 1.0 + 3.3 / math.sqrt(2 * 30)
+    limit = 1.0 + 3.3 / math.sqrt(2 * 20)
     assert 1.0 / limit < scatter / propagated < limit
 
 
@@ -75,14 +75,14 @@ def test_neighbouring_exposures_that_err_alike_are_not_counted_as_many() -> None
     """48 exposures in 12 runs of 4 that err alike: taken singly, sigma would be half of it."""
     outward, exposure = ball_stripes(48, 12), np.repeat(np.arange(48), 12)
     found = []
-    for seed in range(30):
+    for seed in range(20):
         alike = np.repeat(np.random.default_rng(seed).normal(0.0, ARM_MM, (12, 3)), 4, axis=0)
         cloud = cloud_of(RADIUS_MM * outward + alike[exposure], exposure, sigma_mm=ARM_MM)
         ball = inspect_sphere(cloud, 2 * RADIUS_MM)
         assert not isinstance(ball, FitFailure)
         found.append(ball.diameter)
     scatter = float(np.std([item.value_mm for item in found], ddof=1))
-    limit = 1.0 + 3.3 / math.sqrt(2 * 30)
+    limit = 1.0 + 3.3 / math.sqrt(2 * 20)
     propagated = found[0].sigma_propagated_mm
     assert 1.0 / limit < scatter / propagated < limit
     jackknife = float(np.sqrt(np.mean([item.sigma_scatter_mm**2 for item in found])))

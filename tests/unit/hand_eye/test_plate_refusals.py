@@ -217,3 +217,18 @@ def test_points_beyond_the_plate_are_left_out_and_counted() -> None:
 def test_impossible_options_are_refused(option: dict[str, float]) -> None:
     with pytest.raises(OptionError):
         HandEyeOptions(**option)
+
+
+def test_a_refusal_also_says_that_the_stripes_are_not_straight() -> None:
+    """Bowed stripes of a bad sensor are named beside whatever else is wrong."""
+    stripes, plate = PlateRig(
+        _postures(np.full(N, 20.0), np.ones(N), np.zeros(N)), points_per_stripe=150
+    ).draw(0)
+    along = np.linspace(-1.0, 1.0, 150)
+    bowed = [
+        replace(s, points_mm=s.points_mm + np.outer(4.0 * np.abs(along), [0.0, 0.68, 0.73]))
+        for s in stripes
+    ]
+    fit = calibrate_on_plate(bowed, plate)
+    assert isinstance(fit, FitFailure)
+    assert "are not on straight stripes" in fit.reason

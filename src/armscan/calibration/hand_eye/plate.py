@@ -85,7 +85,8 @@ def calibrate_on_plate(
     start = find_start(nodes, plate.plane)
     refusal = _refuse_start(nodes, plate, start, options)
     if refusal is not None:
-        return refusal
+        also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept, options))
+        return FitFailure(refusal.reason + also, refusal.remedy)
     checked = fit_without_wrong_postures(nodes, plate, start, options)
     if isinstance(checked, FitFailure):
         return checked

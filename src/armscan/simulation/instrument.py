@@ -35,9 +35,9 @@ class Mechanics:
 
 MECHANICS: dict[Preset, Mechanics] = {
     "clean": Mechanics(ArmErrors(0.01, 0.0, 0.0, 0.0, 0.0), ProbeErrors(0.0, 0.0, 0.0)),
-    "thesis": Mechanics(ArmErrors(0.9, 1.3, 0.7, 0.3, 0.001), ProbeErrors(0.0015, 0.0015, 0.0005)),
+    "thesis": Mechanics(ArmErrors(1.0, 1.0, 0.5, 0.25, 0.001), ProbeErrors(0.0015, 0.0015, 0.0005)),
     "harsh": Mechanics(
-        ArmErrors(2.3, 3.3, 1.8, 0.8, 0.0025),
+        ArmErrors(2.7, 2.7, 1.3, 0.7, 0.0025),
         ProbeErrors(0.003, 0.004, 0.001),
         Unsteadiness(tilt_deg=2.5, depth_mm=1.5, aside_mm=2.0, speed=0.4),
         exposure_s=2e-3,

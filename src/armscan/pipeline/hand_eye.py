@@ -52,7 +52,7 @@ class HandEyeScanOptions:
     hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
     measure: ReconstructOptions = field(default_factory=ReconstructOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
-    max_exposures: int = 300
+    max_exposures: int = 200
 
     def __post_init__(self) -> None:
         if self.max_exposures < 3:

@@ -13,7 +13,7 @@ from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.straight_points import find_straight_points
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 
-MAX_NODES = 1500
+MAX_NODES = 600
 LEAST_NODES = 3
 
 

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo of the arm scanner with few exposures: files, figures, errors within their sigmas."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from armscan.pipeline.single_demo import SingleOptions
+from armscan.report.single_demo_job import HEAD, OWN_NAMES, SingleDemoRequest, run_single_demo
+from armscan.report.summary import Summary
+from armscan.storage.clouds import read_ply
+from armscan.storage.recording_reader import read_recording
+from armscan.storage.scanner_files import read_scanner_calibration
+
+FEW = SingleOptions(
+    {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}
+)
+CHI_6_IN_999 = math.sqrt(22.46)
+"""Length of six standard normal numbers that one in a thousand exceeds."""
+
+
+@dataclass(frozen=True)
+class Done:
+    folder: Path
+    summary: Summary
+    head: Any
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
+    folder = tmp_path_factory.mktemp("single") / "demo"
+    summary = run_single_demo(SingleDemoRequest(folder, seed=3, options=FEW, processes=1))
+    content = json.loads((folder / "summary.json").read_text("utf-8"))
+    return Done(folder, summary, content["heads"][HEAD])
+
+
+def test_everything_is_written_and_nothing_else(demo: Done) -> None:
+    assert {path.name for path in demo.folder.iterdir()} == OWN_NAMES
+    scanner = read_scanner_calibration(demo.folder / "scanner.json")
+    assert scanner.provenance.parent_ids == (scanner.sensor.provenance.document_id,)
+    assert read_ply(demo.folder / "cloud.ply").frame == "Base"
+    recording = read_recording(demo.folder / "recordings" / "hand-eye")
+    assert recording.is_simulated
+    assert len({row.view for row in recording.rows}) == 7
+
+
+def test_the_summary_has_the_layout_that_programs_rely_on(demo: Done) -> None:
+    content = json.loads((demo.folder / "summary.json").read_text("utf-8"))
+    assert content["simulated"] is True
+    assert (content["seed"], content["preset"]) == (3, "thesis")
+    head = demo.head
+    assert set(head["camera"][0]) == {"rms_px"}
+    assert set(head["sheets"][0]) == {"name", "rms_mm"}
+    assert {"rotation_error_deg", "translation_error_mm"} < set(head["hand_eye"])
+    assert {"sigma_rotation_deg", "sigma_translation_mm"} < set(head["hand_eye"])
+    within = {"n_points", "fraction_within_0p05mm", "reference"}
+    assert within | {"fraction_within_0p08mm"} < set(head["plate"])
+    assert within | {"diameter_mm", "diameter_error_mm"} < set(head["sphere"])
+    for step in head["steps"]:
+        assert {"nominal_mm", "mean_mm", "std_mm", "frame"} <= set(step)
+    assert {"rms_mm", "fraction_within_0p05mm"} <= set(head["part"])
+    assert head["named_stripes_per_exposure"] == pytest.approx(1.0, abs=0.1)
+    assert head["points_per_exposure"] > 300
+    assert all(value >= 0.0 for value in head["seconds"].values())
+    assert not [key for key in _keys(content) if "." in key]
+    assert (head["plate"]["reference"], head["sphere"]["reference"]) == ("fitted", "nominal")
+
+
+def _keys(content: Any) -> list[str]:
+    if isinstance(content, list):
+        return [key for item in content for key in _keys(item)]
+    if isinstance(content, dict):
+        return [*content, *(key for item in content.values() for key in _keys(item))]
+    return []
+
+
+def test_the_hand_eye_errs_as_its_covariance_says(demo: Done) -> None:
+    hand_eye = demo.head["hand_eye"]
+    assert hand_eye["normalised_error"] < CHI_6_IN_999
+    assert hand_eye["sigma_translation_mm"] < 0.2
+
+
+def test_things_measure_what_they_are(demo: Done) -> None:
+    head = demo.head
+    assert head["plate"]["fraction_within_0p05mm"] > 0.995
+    sphere = head["sphere"]
+    assert abs(sphere["diameter_error_mm"]) < 4.0 * sphere["diameter_sigma_mm"] < 0.4
+    # with so few images an order worse than the whole demo; a wrong frame or sign errs by far more
+    for step in head["steps"]:
+        assert step["mean_mm"] == pytest.approx(step["nominal_mm"], abs=0.03)
+        assert step["std_mm"] < 0.015
+    assert head["part"]["rms_mm"] < 0.05
+
+
+def test_the_page_shows_the_chain_and_says_that_it_is_simulated(demo: Done) -> None:
+    page = (demo.folder / "report.html").read_text("utf-8")
+    assert "simulated data" in page
+    for scene in ("camera", "hand-eye", "still-step"):
+        assert f'<p class="figure-title">{scene}</p>' in page
+    assert page.count("<canvas") == 3
+    for word in ("5.12", "5.14", "5.19", "97.9 %", "armscan calibrate hand-eye"):
+        assert word in page

@@ -40,7 +40,8 @@ SINGLE_SHEET = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
 _SOURCE_MM = np.array([0.0, -124.8, 0.0])
 _AIM_MM = 140.0
 _HALF_ANGLE_RAD = 0.32
-_SKEW_RAD = 0.06
+_SKEW_RAD = 0.035
+"""Bows the line by 0.12 mm over the 72 mm field, 0.16 % of its length: what line lenses do."""
 _THICKNESS_MM = 0.075
 _DIVERGENCE_RAD = 4.3e-4
 """Far field of a 405 nm beam of that waist."""

@@ -6,12 +6,14 @@ Help texts show a default, so the command line repeats it; here the two are held
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
@@ -20,8 +22,16 @@ from armscan.pipeline.reconstruct import ReconstructOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
+from armscan.report.hand_eye_request import HandEyeRequest
+from armscan.report.single_demo_job import SingleDemoRequest
 from armscan.storage.image_options import ImageOptions
 from armscan.vision.stripe.options import StripeOptions
+
+
+def default_of(request: type[Any], name: str) -> Any:
+    """Default of one field of a request."""
+    return {field.name: field.default for field in fields(request)}[name]
+
 
 STRIPES = {
     "stripe_method": StripeOptions().method,
@@ -59,6 +69,19 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         **FEATURE,
         "mpe": VerifyOptions().mpe_mm,
         "uncertainty": VerifyOptions().reference_u_mm,
+    },
+    ("calibrate", "hand-eye"): {
+        "arm_position_mm": HandEyeOptions().arm_position_mm,
+        "arm_rotation_deg": HandEyeOptions().arm_rotation_rad,
+        "plate_flatness_mm": HandEyeOptions().plate_flatness_mm,
+        "solve_plate": HandEyeOptions().solve_plate,
+        "euler": default_of(HandEyeRequest, "euler"),
+        "side": default_of(HandEyeRequest, "side"),
+        **STRIPES,
+    },
+    ("demo",): {
+        "seed": default_of(SingleDemoRequest, "seed"),
+        "preset": default_of(SingleDemoRequest, "preset"),
     },
     ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
 }

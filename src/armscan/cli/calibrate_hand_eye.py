@@ -10,9 +10,9 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption
+from armscan.cli import hand_eye_arguments as given
+from armscan.cli.image_arguments import LaserColourOption, StripeMethodOption
 from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.probe import Side
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -26,71 +26,25 @@ EXAMPLE = (
 
 def hand_eye(
     *,
-    scans: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            help="Folders of recordings; several are calibrated one by one and together.",
-            show_default=False,
-        ),
-    ] = None,
-    sensor: Annotated[
-        Path | None, typer.Option(help="Calibration of camera and sheets.", show_default=False)
-    ] = None,
-    plate: Annotated[
-        Path | None,
-        typer.Option(help="Probed points of the plate, or its A,B,C,D.", show_default=False),
-    ] = None,
-    plane: Annotated[
-        str, typer.Option(help="The plate as A,B,C,D in Base, mm, in place of --plate.")
-    ] = "",
-    side: Annotated[
-        Side | None,
-        typer.Option(help="Where the plate's face looks, roughly; left out, to the arm's tool."),
-    ] = None,
-    solve_plate: Annotated[
-        bool,
-        typer.Option("--solve-plate", help="Solve the plate along; a rough plane is enough then."),
-    ] = False,
-    sphere_diameter: Annotated[
-        float | None,
-        typer.Option(
-            help="A sphere of this diameter, mm, in place of a plate.", show_default=False
-        ),
-    ] = None,
-    profiles: Annotated[
-        list[str] | None,
-        typer.Option(help="Profiles of a sensor that delivers points, one a posture; repeatable."),
-    ] = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(help="Table of the robot's poses, one a profile.", show_default=False),
-    ] = None,
-    euler: Annotated[
-        str,
-        typer.Option(
-            help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz."
-        ),
-    ] = "extrinsic-xyz",
-    arm: Annotated[
-        Path | None,
-        typer.Option(help="arm.toml, for recordings of joint angles.", show_default=False),
-    ] = None,
-    arm_position_mm: Annotated[
-        float | None, typer.Option(help="Scatter of the arm, mm an axis; left out, estimated.")
-    ] = None,
-    arm_rotation_deg: Annotated[
-        float | None, typer.Option(help="Scatter of its orientation; left out, from the position.")
-    ] = None,
-    plate_flatness_mm: Annotated[
-        float | None, typer.Option(help="Scatter of the plate's surface; left out, estimated.")
-    ] = None,
+    scans: given.Scans = None,
+    sensor: given.Sensor = None,
+    plate: given.Plate = None,
+    plane: given.PlaneText = "",
+    side: given.PlateSide = None,
+    solve_plate: given.SolvePlate = False,
+    sphere_diameter: given.SphereDiameter = None,
+    profiles: given.Profiles = None,
+    poses: given.Poses = None,
+    euler: given.Euler = "extrinsic-xyz",
+    arm: given.Arm = None,
+    arm_position_mm: given.ArmPosition = None,
+    arm_rotation_deg: given.ArmRotation = None,
+    plate_flatness_mm: given.PlateFlatness = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
     ] = Path("scanner.json"),
     stripe_method: StripeMethodOption = "fit",
     laser_colour: LaserColourOption = "auto",
-    bits_used: BitsUsed = None,
-    bits_align: BitsAlign = "low",
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -100,7 +54,6 @@ def hand_eye(
     from armscan.geometry.euler import check_convention
     from armscan.report.hand_eye_job import run_hand_eye_calibration
     from armscan.report.hand_eye_request import HandEyeRequest
-    from armscan.storage.image_options import Alignment, ImageOptions
     from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
 
     rotation_rad = None if arm_rotation_deg is None else math.radians(arm_rotation_deg)
@@ -129,7 +82,6 @@ def hand_eye(
             method=cast(StripeMethod, stripe_method),
             laser_colour=cast(LaserColour, laser_colour),
         ),
-        image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
     )

@@ -11,7 +11,6 @@ from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.calibration.hand_eye.sphere_options import SphereOptions
 from armscan.errors import OptionError
 from armscan.geometry.euler import EulerConvention
-from armscan.storage.image_options import ImageOptions
 from armscan.vision.stripe.options import StripeOptions
 
 
@@ -50,8 +49,6 @@ class HandEyeRequest:
         Of the plate and of the sphere method.
     stripes
         Of stripe extraction.
-    image_options
-        How pixels are read where the recording does not say.
     is_overwriting
         Replace results that exist.
     command
@@ -77,7 +74,6 @@ class HandEyeRequest:
     options: HandEyeOptions = field(default_factory=HandEyeOptions)
     sphere_options: SphereOptions = field(default_factory=SphereOptions)
     stripes: StripeOptions = field(default_factory=StripeOptions)
-    image_options: ImageOptions = field(default_factory=ImageOptions)
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
 

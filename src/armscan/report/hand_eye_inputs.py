@@ -108,6 +108,7 @@ def _from_recordings(
     request: HandEyeRequest, sensor_file: Path, progress: Progress
 ) -> HandEyeInputs:
     arm = None if request.arm is None else read_arm_model(request.arm)
+    _refuse_repeated(request.scans)
     recordings = tuple(read_recording(folder, arm) for folder in request.scans)
     sensor = read_sensor_calibration(sensor_file)
     plate, notes = _reference(request, _tool_places(recordings))
@@ -129,6 +130,17 @@ def _from_recordings(
         (*notes, *(text for r in recordings for text in (*r.warnings, *r.session.assumed))),
         recordings,
     )
+
+
+def _refuse_repeated(folders: Sequence[Path]) -> None:
+    """Names of postures begin with those of their recordings, so these must differ."""
+    names = [folder.resolve().name for folder in folders]
+    for name in names:
+        if names.count(name) > 1:
+            raise OptionError(
+                f"{names.count(name)} recordings are called '{name}'",
+                remedy="name each recording once, and give their folders different names",
+            )
 
 
 def _from_profiles(request: HandEyeRequest) -> HandEyeInputs:

@@ -16,18 +16,19 @@ from armscan.report.deviation_figures import (
     height_histogram,
     share_text,
 )
-from armscan.report.drawing import photo_markup
+from armscan.report.drawing import Marks, photo_markup
 from armscan.report.hand_eye_numbers import hand_eye_facts, hand_eye_numbers, total_covariance
 from armscan.report.hand_eye_page import posture_table
 from armscan.report.hand_eye_scene import posture_scene
 from armscan.report.numbers import sentence, significant
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.single_demo_data import FRACTION_RULE
+from armscan.report.stripe_figures import sheet_colour
 from armscan.report.summary import Table
 
 SCENE_TEXTS = {
     "camera": "the circle grid, to calibrate the camera",
-    "laser": "the laser on the grid, to calibrate the light sheet",
+    "laser": "the laser on the grid (its points marked), to calibrate the light sheet",
     "hand-eye": "a posture over the flat plate, to calibrate the hand-eye",
     "plate": "the plate again, scanned by hand",
     "ball": "the ball",
@@ -69,7 +70,7 @@ def single_demo_page(
         warnings=tuple(sentence(f"hand-eye: {warning}") for warning in fit.warnings),
         sections=(
             Section("Against the thesis", (comparison_table(head), Text(_rule_text()))),
-            Section("What the camera saw", (_photographs(photographs),)),
+            Section("What the camera saw", (_photographs(demo, photographs),)),
             Section(
                 "Where the sensor sits on the arm",
                 (
@@ -223,18 +224,17 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
     )
 
 
-def _photographs(photographs: Mapping[str, Exposure]) -> Gallery:
-    return Gallery(
-        tuple(
-            Picture(
-                photo_markup(exposure, (), f"Rendered image: {SCENE_TEXTS[scene]}", longest_px=900),
-                SCENE_TEXTS[scene],
-                scene,
-            )
-            for scene, exposure in photographs.items()
-        ),
-        300,
-    )
+def _photographs(demo: SingleDemo, photographs: Mapping[str, Exposure]) -> Gallery:
+    """One image a scene; on the bright target the found stripe is marked, else it is lost there."""
+    found = {image.source: image.profile for image in demo.instrument.laser.images}
+    pictures = []
+    for scene, exposure in photographs.items():
+        profile = found.get(exposure.source) if scene == "laser" else None
+        marks = [] if profile is None else [Marks(profile.points_px, sheet_colour(0), "dot", 5.0)]
+        alt = f"Rendered image: {SCENE_TEXTS[scene]}"
+        markup = photo_markup(exposure, marks, alt, longest_px=900)
+        pictures.append(Picture(markup, SCENE_TEXTS[scene], scene))
+    return Gallery(tuple(pictures), 300)
 
 
 def _hand_eye_charts(demo: SingleDemo) -> tuple[Picture, ...]:

@@ -39,7 +39,7 @@ app = typer.Typer(
     epilog=(
         "\b\nFirst steps:\n"
         "  armscan doctor                is everything installed?\n"
-        "  armscan demo photos -o demo   the whole chain on rendered photographs\n"
+        "  armscan demo single -o demo   a simulated arm scanner: calibrate, scan, inspect\n"
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n"
         "  armscan COMMAND -h            options, and an example that works"
     ),

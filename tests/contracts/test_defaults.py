@@ -107,4 +107,4 @@ def test_the_depth_margin_that_texts_name_is_the_default() -> None:
     assert f"Without it {text};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())
-    assert f"`--depth-margin` times its width at either end ({text} unless said)" in words
+    assert f"up to X times its width at either end ({text} unless said)" in words

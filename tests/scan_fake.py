@@ -104,7 +104,10 @@ class FakeScan:
 
 
 def fake_scan(n: int = 6, step_mm: float = 1.0) -> FakeScan:
-    """A sweep along y, across the stripe, at even speed, one exposure half way between two samples of the arm."""
+    """A sweep along y, across the stripe, at even speed.
+
+    Each exposure lies half way between two samples of the arm.
+    """
     truth = tuple(looking_down(step_mm * k) for k in range(n))
     samples = [looking_down(step_mm * (k - 0.5)) for k in range(n + 1)]
     track = ArmTrack(

@@ -20,8 +20,8 @@ from armscan.calibration.laser.result import PointUse
 from armscan.cli import main
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.photo_demo import PhotoErrors
-from armscan.pipeline.truth_errors import SheetErrors
 from armscan.pipeline.progress import Progress
+from armscan.pipeline.truth_errors import SheetErrors
 from armscan.report import demo_job
 from armscan.report.demo_job import DemoRequest, run_photo_demo
 from armscan.simulation.photo_set import PhotoSetOptions, render_photo_set

@@ -40,7 +40,8 @@ class CirclePattern:
     """Grid of discs, ``diameter_mm`` across; an asymmetric grid shifts odd rows by one pitch.
 
     As in OpenCV, ``pitch_mm`` of an asymmetric grid is the distance between rows, and half the
-    distance between neighbours in a row.
+    distance between neighbours in a row. ``misplaced_mm`` holds, row by row, by how much each disc
+    missed its place (x, y) when it was made; empty for an exact print.
     """
 
     columns: int
@@ -50,6 +51,13 @@ class CirclePattern:
     is_asymmetric: bool = False
     is_light_on_dark: bool = False
     margin_mm: float | None = None
+    misplaced_mm: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.misplaced_mm) not in (0, self.columns * self.rows):
+            raise InputError(
+                f"{len(self.misplaced_mm)} displacements for {self.columns * self.rows} discs"
+            )
 
     @property
     def marks_board_mm(self) -> FloatArray:
@@ -60,7 +68,9 @@ class CirclePattern:
             for row in range(self.rows)
             for column in range(self.columns)
         ]
-        return np.array(marks)
+        centres = np.array(marks)
+        centres[:, :2] += self._shifts_mm
+        return centres
 
     @property
     def extent_board_mm(self) -> tuple[float, float, float, float]:
@@ -91,7 +101,16 @@ class CirclePattern:
         column = np.clip(np.rint((x_mm - shift) / self._step_mm), 0, self.columns - 1)
         dx = x_mm - shift - column * self._step_mm
         dy = y_mm - row * self.pitch_mm
+        if self.misplaced_mm:
+            missed = self._shifts_mm[(row * self.columns + column).astype(np.int64)]
+            dx, dy = dx - missed[..., 0], dy - missed[..., 1]
         return np.asarray(dx * dx + dy * dy)
+
+    @property
+    def _shifts_mm(self) -> FloatArray:
+        if not self.misplaced_mm:
+            return np.zeros((self.columns * self.rows, 2))
+        return np.array(self.misplaced_mm)
 
 
 @dataclass(frozen=True, slots=True)

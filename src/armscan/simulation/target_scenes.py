@@ -6,7 +6,7 @@ No arm takes part, so Base is the Sensor frame here and the target moves.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -115,17 +115,25 @@ _SLIDES, _ASIDES = 41, 11
 _INTERVAL_NS = 2_000_000_000
 
 
-def camera_shots(head: Head, rng: np.random.Generator) -> tuple[Shot, ...]:
+def made_target(sigma_mm: float, rng: np.random.Generator) -> CirclePattern:
+    """The target with every circle a little off its place, as a maker delivers it."""
+    if sigma_mm == 0.0:
+        return PATTERN
+    missed = sigma_mm * rng.standard_normal((PATTERN.columns * PATTERN.rows, 2))
+    return replace(PATTERN, misplaced_mm=tuple((float(x), float(y)) for x, y in missed))
+
+
+def camera_shots(head: Head, pattern: CirclePattern, rng: np.random.Generator) -> tuple[Shot, ...]:
     """The target at all `CAMERA_PLACES`, each a little off as by hand."""
     settings = ExposureSettings(head.full_window, room_light=head.imaging.target_light)
     shots = []
     for k, place in enumerate(CAMERA_PLACES):
         row = ExposureRow(k, _INTERVAL_NS * (k + 1), 0, f"images/{k + 1:02d}.png")
-        shots.append(_shot(row, _held(head, place, rng), settings))
+        shots.append(_shot(row, _held(head, pattern, place, rng), settings))
     return tuple(shots)
 
 
-def laser_shots(head: Head, rng: np.random.Generator) -> tuple[Shot, ...]:
+def laser_shots(head: Head, pattern: CirclePattern, rng: np.random.Generator) -> tuple[Shot, ...]:
     """The target at all `LASER_PLACES`, each with the laser on in dim light, then without it."""
     light = head.imaging.target_light
     names = tuple(laser.name for laser in head.lasers)
@@ -133,7 +141,7 @@ def laser_shots(head: Head, rng: np.random.Generator) -> tuple[Shot, ...]:
     unlit = ExposureSettings(head.full_window, room_light=light)
     shots = []
     for k, place in enumerate(LASER_PLACES):
-        target = _held_in_sheet(head, place, rng)
+        target = _held_in_sheet(head, pattern, place, rng)
         for j, (state, settings) in enumerate((("on", lit), ("off", unlit))):
             row = ExposureRow(
                 2 * k + j,
@@ -152,7 +160,7 @@ def _shot(row: ExposureRow, target: Target, settings: ExposureSettings) -> Shot:
     return Shot(row, Station((_BACKGROUND,), target, _LAMP), here, settings)
 
 
-def _held(head: Head, place: Place, rng: np.random.Generator) -> Target:
+def _held(head: Head, pattern: CirclePattern, place: Place, rng: np.random.Generator) -> Target:
     """Target near a place, moved away until all marks are in view."""
     jitter = rng.uniform(-1.0, 1.0, 6)
     rotation = _rotation(place, jitter[:3])
@@ -161,13 +169,15 @@ def _held(head: Head, place: Place, rng: np.random.Generator) -> Target:
     ray = np.array([*head.camera.rays(share * size), 1.0])
     depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[5])
     while True:
-        target = _with_middle(rotation, depth * ray)
+        target = _with_middle(pattern, rotation, depth * ray)
         if _is_in_view(head, target):
             return target
         depth *= 1.01
 
 
-def _held_in_sheet(head: Head, place: StripePlace, rng: np.random.Generator) -> Target:
+def _held_in_sheet(
+    head: Head, pattern: CirclePattern, place: StripePlace, rng: np.random.Generator
+) -> Target:
     """Target that the stripe meets at a depth, slid in its plane until all marks are in view."""
     jitter = rng.uniform(-1.0, 1.0, 5)
     rotation = _rotation(place, jitter[:3])
@@ -177,7 +187,7 @@ def _held_in_sheet(head: Head, place: StripePlace, rng: np.random.Generator) -> 
         aside = _in_plane(rotation, on_stripe, share * (place.aside_mm + jitter[4]), on_stripe[1])
         inward = _in_plane(rotation, on_stripe, aside[0], 0.0)
         for slide in np.linspace(0.0, 1.0, _SLIDES):
-            target = _with_middle(rotation, aside + slide * (inward - aside))
+            target = _with_middle(pattern, rotation, aside + slide * (inward - aside))
             if _is_in_view(head, target):
                 return target
     raise InputError(f"the target at {depth:.0f} mm is larger than the camera's view")
@@ -199,10 +209,10 @@ def _in_plane(rotation: FloatArray, point_mm: FloatArray, x_mm: float, y_mm: flo
     return np.array([x_mm, y_mm, rest / normal[2]])
 
 
-def _with_middle(rotation: FloatArray, middle_mm: FloatArray) -> Target:
+def _with_middle(pattern: CirclePattern, rotation: FloatArray, middle_mm: FloatArray) -> Target:
     """Target whose middle is at a point (3,)."""
     middle = np.append(PATTERN.marks_board_mm.mean(axis=0)[:2], 0.0)
-    return Target(PATTERN, Pose(rotation, middle_mm - rotation @ middle))
+    return Target(pattern, Pose(rotation, middle_mm - rotation @ middle))
 
 
 def _is_in_view(head: Head, target: Target) -> bool:

@@ -76,7 +76,8 @@ class SimulatedInstrument:
         noise = (self.seed, _NOISE, number)
         head = self.instrument.head
         if scene in ("camera", "laser"):
-            shots = camera_shots(head, rng) if scene == "camera" else laser_shots(head, rng)
+            shots_of = camera_shots if scene == "camera" else laser_shots
+            shots = shots_of(head, self.instrument.target, rng)
             return TwinScan(name, "calibration", head, shots, None, noise)
         shots, track = self._with_arm(scene, rng)
         kind: SessionKind = "calibration" if scene == "hand-eye" else "scan"

@@ -84,6 +84,7 @@ class InstrumentTruth:
             "seed": self.seed,
             "camera_parameters": self.camera_parameters.tolist(),
             "sheet_points_sensor_mm": self.sheet_points_mm.tolist(),
+            "target_marks_board_mm": self.instrument.target.marks_board_mm.tolist(),
             "tool_from_sensor": _pose(self.tool_from_sensor),
             "plate_plane_base": self.plate_plane.tolist(),
             "base_from_plate": _pose(bench.base_from_plate),

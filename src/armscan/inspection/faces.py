@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
@@ -15,6 +15,7 @@ from armscan.inspection.options import InspectionOptions
 BIN_MM = 0.1
 MAX_PEAKS = 60
 MAX_EXTENT_MM = 1e5
+LEAST_INSIDE = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,9 +133,11 @@ def away_from_ends(
     stripe
         (N,) number of the stripe that each point is of, None for points without stripes.
     margin_mm
-        Left out: points this near, seen along the normal, to a point off the face; and of each
-        run of a stripe on the face (points with no gap wider than the margin) this much at
-        either end.
+        Left out: points this near, seen along the normal, to a point off the face; of each run
+        of a stripe on the face (points with no gap wider than the margin) this much at either
+        end; and in a cloud this much along the face's outline, where a stripe that lies along an
+        edge is half on the face only. A face of few stripes, more than half of which would go
+        with its outline, keeps it.
     """
     kept = is_face.copy()
     if margin_mm == 0.0:
@@ -149,7 +152,21 @@ def away_from_ends(
         kept[is_face] &= ~np.isfinite(nearest)
     if stripe is not None:
         kept[is_face] &= _inner(flat[is_face], stripe[is_face], margin_mm)
+    if flat.shape[1] == 2:
+        kept[is_face] &= _off_outline(flat[is_face], margin_mm)
     return kept
+
+
+def _off_outline(flat: FloatArray, margin_mm: float) -> BoolArray:
+    """(N,) points (N, 2) that are further than a margin inside the outline of them all."""
+    try:
+        sides = ConvexHull(flat).equations
+    except (QhullError, ValueError):
+        return np.ones(len(flat), dtype=np.bool_)
+    is_inside = (flat @ sides[:, :2].T + sides[:, 2]).max(axis=1) <= -margin_mm
+    if is_inside.mean() < LEAST_INSIDE:
+        return np.ones(len(flat), dtype=np.bool_)
+    return np.asarray(is_inside)
 
 
 def _inner(flat: FloatArray, stripe: IntArray, margin_mm: float) -> BoolArray:

@@ -58,8 +58,8 @@ class StepOptions:
     ----------
     margin_mm
         Points this near to an end of their face are left out: along each stripe its runs on the
-        face are shortened by it, and so is everything this near to points off the face, seen
-        along the normal.
+        face are shortened by it, and left out is all that lies this near to points off the face,
+        seen along the normal, or to the face's outline in a cloud of many stripes.
     height_tolerance
         Faces are searched up to this part of the nominal height from it.
     """

@@ -282,8 +282,8 @@ def _counts(search: _Search, chosen: _Chosen) -> PointCounts:
         n_feature=int(chosen.is_lower.sum() + chosen.is_upper.sum()),
         n_fitted=int(chosen.is_fitted.sum()),
         feature_rule=f"points within {search.thickness_mm:g} mm of either face, without "
-        f"{search.steps.margin_mm:g} mm at the ends of each stripe's runs and next to points off "
-        "the face",
+        f"{search.steps.margin_mm:g} mm at the ends of each stripe's runs, along the outline and "
+        "next to points off the face",
         fit_rule=outlier_rule(search.selection.options),
     )
 

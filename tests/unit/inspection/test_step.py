@@ -57,12 +57,22 @@ def test_margins_keep_away_from_edges_corners_and_what_stands_about() -> None:
     # the block's first and last point along each stripe lie up to 0.24 mm inside its edges
     assert x.min() >= 7.0
     assert x.max() <= 23.0
-    # its outermost stripes, at y = 11 and 29, are 1 mm from stripes on the table at 10 and 30
-    assert (y.min(), y.max()) == (12.0, 28.0)
+    # its outline are its outermost stripes, at y = 11 and 29
+    assert (y.min(), y.max()) == (13.0, 27.0)
     low = points[found.lower]
     beside = (low[:, 1] > 10) & (low[:, 1] < 30)
     assert low[beside & (low[:, 0] < 15), 0].max() <= 3.1
     assert low[beside & (low[:, 0] > 15), 0].min() >= 30.0
+
+
+def test_a_stripe_along_an_edge_is_half_on_the_face_only_and_takes_no_part() -> None:
+    points, exposure = block_stripes(HEIGHT_MM)
+    along_edge = (points[:, 1] == 11.0) & (points[:, 2] > 10.0)
+    assert along_edge.sum() > 50
+    pulled = points.copy()
+    pulled[along_edge, 2] -= np.linspace(0.0, 0.18, int(along_edge.sum()))
+    found = inspected(inspect_step(cloud_of(pulled, exposure), HEIGHT_MM))
+    assert float(np.ptp(found.heights_mm)) < 1e-6
 
 
 def test_one_exposure_is_as_high_as_its_lean_lets_it_be() -> None:

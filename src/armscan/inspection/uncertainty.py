@@ -15,9 +15,9 @@ from armscan.records.cloud import PointCloud
 MIN_BLOCKS = 4
 """Fewest exposures whose differences say anything about their scatter."""
 
-COARSE_BLOCKS = 12
-"""Consecutive exposures are also taken together in this many blocks, as neighbours err alike: an
-arm by its posture, a calibration by the direction from which it looks."""
+COARSE_BLOCKS = (12, 6)
+"""Consecutive exposures are also taken together in these counts of blocks, as neighbours err alike:
+an arm by its posture over a whole stroke, a calibration by the direction from which it looks."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,8 +61,7 @@ def measured_length(
     numbers = cloud.exposure[rows]
     n = len(np.unique(numbers))
     groups = [exposure_blocks(numbers, n)]
-    if n >= 2 * COARSE_BLOCKS:
-        groups.append(exposure_blocks(numbers, COARSE_BLOCKS))
+    groups += [exposure_blocks(numbers, most) for most in COARSE_BLOCKS if n >= 2 * most]
     scatter = [_jackknife_mm(fit, block, count) for block, count in groups]
     propagated = [_propagated_mm(fit, cloud, rows, block, count) for block, count in groups]
     return MeasuredLength(value_mm, _largest(scatter), _largest(propagated))
@@ -110,10 +109,11 @@ def _propagated_mm(
 ) -> float:
     """Each block is shifted as a whole by an error of its points' mean covariance.
 
-    The stripes' own noise, which is independent from point to point, comes on top.
+    The stripes' own noise, which is independent from point to point, comes on top. NaN for a
+    single block: an error of the sensor stretches the one exposure, and a shift cannot tell.
     """
     covariance = cloud.covariance_mm2[rows]
-    if not covariance.any():
+    if n < 2 or not covariance.any():
         return math.nan
     by_point = influence_along(fit)[:, None] * fit.directions
     pull = np.stack([np.bincount(block, by_point[:, k], n) for k in range(3)], axis=1)

@@ -38,7 +38,7 @@ def distance_by_arm(
     posture, which changes little from one to the next.
     """
     points = cloud.points_mm[rows]
-    block, n_blocks = exposure_blocks(cloud.exposure[rows], COARSE_BLOCKS)
+    block, n_blocks = exposure_blocks(cloud.exposure[rows], COARSE_BLOCKS[0])
     count = np.bincount(block, minlength=n_blocks)[:, None]
     middle = np.stack([np.bincount(block, points[:, k], n_blocks) for k in range(3)], 1) / count
     turns = np.cross(points - middle[block], directions)

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import MeasuredLength
@@ -36,14 +35,19 @@ def ball_diameter(seed: int) -> MeasuredLength:
 
 
 def test_the_diameters_sigma_is_its_scatter_over_repeats() -> None:
-    """Taking points for independent would make it 5 times too small."""
+    """Taking points for independent would make it 5 times too small.
+
+    Blocks of neighbouring exposures are taken to err alike as well, which these do not: the sigma
+    may be larger for it, up to the square root of a block's length, never smaller.
+    """
     found = [ball_diameter(seed) for seed in range(N_RUNS)]
     scatter = float(np.std([item.value_mm for item in found], ddof=1))
     propagated = float(np.mean([item.sigma_propagated_mm for item in found]))
     jackknife = float(np.sqrt(np.mean([item.sigma_scatter_mm**2 for item in found])))
-    assert 1.0 / SPREAD_LIMIT < scatter / propagated < SPREAD_LIMIT
+    longest_block = 16 / 6
+    assert 1.0 / (SPREAD_LIMIT * math.sqrt(longest_block)) < scatter / propagated < SPREAD_LIMIT
     # a jackknife is biased upwards, the more so the fewer the exposures
-    assert 0.85 / SPREAD_LIMIT < scatter / jackknife < SPREAD_LIMIT
+    assert 0.6 / SPREAD_LIMIT < scatter / jackknife < SPREAD_LIMIT
     assert found[0].sigma_mm == max(found[0].sigma_scatter_mm, found[0].sigma_propagated_mm)
 
 
@@ -62,6 +66,29 @@ def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
     propagated = float(np.mean([item.sigma_propagated_mm for item in heights]))
     limit = 1.0 + 3.3 / math.sqrt(2 * 20)
     assert 1.0 / limit < scatter / propagated < limit
+
+
+def test_exposures_of_a_whole_stroke_that_err_alike_are_not_counted_as_many() -> None:
+    """48 exposures in 6 strokes that err alike: the sigma is that of 6, not of 48 or 12."""
+    outward, exposure = ball_stripes(48, 12), np.repeat(np.arange(48), 12)
+    found = []
+    for seed in range(20):
+        alike = np.repeat(np.random.default_rng(seed).normal(0.0, ARM_MM, (6, 3)), 8, axis=0)
+        cloud = cloud_of(RADIUS_MM * outward + alike[exposure], exposure, sigma_mm=ARM_MM)
+        ball = inspect_sphere(cloud, 2 * RADIUS_MM)
+        assert not isinstance(ball, FitFailure)
+        found.append(ball.diameter)
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    limit = 1.0 + 3.3 / math.sqrt(2 * 20)
+    assert 1.0 / limit < scatter / found[0].sigma_propagated_mm < limit
+
+
+def test_one_exposure_states_no_sigma() -> None:
+    """An error of the sensor stretches it, which a shift of the whole cannot tell."""
+    points = RADIUS_MM * ball_stripes(12, 30)
+    found = inspect_sphere(cloud_of(points, np.zeros(len(points), dtype=np.int64)), 2 * RADIUS_MM)
+    assert not isinstance(found, FitFailure)
+    assert math.isnan(found.diameter.sigma_mm)
 
 
 def test_a_cloud_without_exposures_or_covariances_has_no_sigma() -> None:
@@ -89,10 +116,9 @@ def test_neighbouring_exposures_that_err_alike_are_not_counted_as_many() -> None
     assert 0.75 / limit < scatter / jackknife < limit
 
 
-@pytest.mark.parametrize("n", [1, 3])
-def test_too_few_exposures_say_nothing_of_their_scatter(n: int) -> None:
+def test_too_few_exposures_say_nothing_of_their_scatter() -> None:
     points = RADIUS_MM * ball_stripes(12, 30)
-    exposure = np.repeat(np.arange(12) * n // 12, 30)
+    exposure = np.repeat(np.arange(12) * 3 // 12, 30)
     found = inspect_sphere(cloud_of(points, exposure), 2 * RADIUS_MM)
     assert not isinstance(found, FitFailure)
     assert math.isnan(found.diameter.sigma_scatter_mm)

@@ -48,7 +48,7 @@ def tracks(draw: st.DrawFn, has_triggers: bool) -> ArmTrack:
         rotations = Rotation.random(n, rng=rng).as_matrix()
         positions, measured = rng.uniform(-2000.0, 2000.0, (n, 3)), None
     first = draw(st.integers(-(2**62), 2**61))
-    times = first + np.cumsum(rng.integers(1, 10**9, n))
+    times = first + np.cumsum(rng.integers(10, 10**9, n))
     ids = rng.permutation(50)[:n] if has_triggers else None
     return ArmTrack(times, rotations, positions, is_known, ids, measured)
 
@@ -66,6 +66,7 @@ def scans(draw: st.DrawFn) -> MemoryScan:
         window = SensorWindow(draw(st.integers(0, 3000)), draw(st.integers(0, 3000)))
         cameras.append(CameraSetup(width, height, window, bits, "low", draw(colours)))
     start = 0 if track is None else int(track.t_ns[0])
+    apart = 1 if track is None else int(track.t_ns[-1] - track.t_ns[0]) // 4
     for k in range(draw(st.integers(1, 4))):
         camera = draw(st.integers(0, len(cameras) - 1))
         setup = cameras[camera]
@@ -78,7 +79,7 @@ def scans(draw: st.DrawFn) -> MemoryScan:
         rows.append(
             ExposureRow(
                 3 * k,
-                start + k,
+                start + k * apart,
                 camera,
                 f"images/{k}.png",
                 tuple(lasers),
@@ -154,7 +155,8 @@ def test_write_then_read_gives_the_same(scan: MemoryScan, cell: str) -> None:
         first, second, third = (Path(name) / part for part in ("1", "2", "3"))
         write_recording(first, scan, arm=ARM)
         once = read_recording(first)
-        assert once.warnings == () or not scan.arm or not scan.arm.is_known.all()
+        odd = [text for text in once.warnings if "between the same two samples" not in text]
+        assert not odd or not scan.arm or not scan.arm.is_known.all()
         assert_same_scan(once, scan)
         kept = with_unknown_columns(once, cell)
         write_recording(second, kept)

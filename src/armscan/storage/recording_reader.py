@@ -113,7 +113,9 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
         track, form, arm_unknown = found.track, found.form, dict(found.extra)
         warnings += [*_odd(arm_csv, arm_unknown), *found.warnings]
         assumed += _assumed_of_arm(found, said)
-        assumed += check_clock(rows, track, said, folder)
+        of_clock, odd_times = check_clock(rows, track, said, folder)
+        assumed += of_clock
+        warnings += odd_times
     cameras, facts = _cameras(folder, rows, said)
     session = replace(said.session, cameras=cameras, pose_form=form, assumed=(*assumed, *facts))
     warnings += _odd_head(folder, session.head)

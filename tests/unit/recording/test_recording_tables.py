@@ -197,6 +197,88 @@ def test_times_of_another_unit_are_noticed_by_their_range(tmp_path: Path) -> Non
     assert "within the arm's times" in refusal(tmp_path, arm=text)
 
 
+def track_text(period_ns: int, last_ns: int) -> str:
+    times = range(0, last_ns + 1, period_ns)
+    return table(
+        ARM.splitlines()[0], *(f"{t},{900 + k},0,400,1,0,0,0" for k, t in enumerate(times))
+    )
+
+
+def listed_at(*times: int, view: str = "") -> str:
+    lines = (f"{k},{t},0,images/{k}.png,A,{view}" for k, t in enumerate(times))
+    return exposures(*lines, header=HEADER + ",view")
+
+
+MS, S = 10**6, 10**9
+
+
+@pytest.mark.parametrize(
+    ("times", "factor"),
+    [
+        ((1_000_000, 5_000_000, 9_000_000), "1,000 times"),
+        ((1_000, 5_000, 9_000), "1,000,000 times"),
+        ((1, 5, 9), "1,000,000,000 times"),
+    ],
+)
+def test_times_of_another_unit_that_hit_the_first_samples_are_refused(
+    tmp_path: Path, times: tuple[int, ...], factor: str
+) -> None:
+    """Exposures at 1, 5, 9 s in us, ms and s beside an arm's samples every 10 ms for 10 s."""
+    message = refusal(tmp_path, exposures=listed_at(*times), arm=track_text(10 * MS, 10 * S))
+    assert "exposures.csv were " + factor in message
+
+
+def test_an_arm_in_another_unit_is_refused_though_its_start_hits_an_exposure(
+    tmp_path: Path,
+) -> None:
+    message = refusal(
+        tmp_path, exposures=listed_at(0, 5 * S, 9 * S), arm=track_text(10_000, 10 * MS)
+    )
+    assert "arm.csv were 1,000 times" in message
+
+
+@pytest.mark.parametrize(
+    ("times", "view"),
+    [
+        ((5 * S,), ""),
+        ((5 * MS,), ""),
+        ((5 * S, 5 * S + 5 * MS, 5 * S + 20 * MS), ""),
+        ((S, 5 * S, 9 * S), ""),
+        ((5 * S, 5 * S + MS, 5 * S + 2 * MS), "p1"),
+    ],
+)
+def test_a_still_exposure_or_a_burst_beside_a_long_track_is_no_other_unit(
+    tmp_path: Path, times: tuple[int, ...], view: str
+) -> None:
+    scan = read_recording(
+        lab_folder(
+            tmp_path, exposures=listed_at(*times, view=view), arm=track_text(10 * MS, 10 * S)
+        )
+    )
+    assert scan.warnings == ()
+
+
+def test_a_burst_at_the_start_of_a_long_track_is_asked_about(tmp_path: Path) -> None:
+    scan = read_recording(
+        lab_folder(
+            tmp_path,
+            exposures=listed_at(MS, 5 * MS, 9 * MS, view="still"),
+            arm=track_text(10 * MS, 10 * S),
+        )
+    )
+    assert "are both in nanoseconds?" in scan.warnings[0] and len(scan.warnings) == 1
+
+
+def test_several_exposures_between_two_samples_are_warned_of(tmp_path: Path) -> None:
+    scan = read_recording(
+        lab_folder(
+            tmp_path, exposures=listed_at(12 * S, 13 * S, 14 * S), arm=track_text(5 * S, 20 * S)
+        )
+    )
+    (warning,) = scan.warnings
+    assert f"3 exposures fall between the same two samples of the arm (t_ns {10 * S} and" in warning
+
+
 def test_without_an_arm_no_clock_is_needed(tmp_path: Path) -> None:
     scan = read_recording(
         lab_folder(tmp_path, arm=None, session=SESSION.replace("shared", "separate"))

@@ -11,6 +11,7 @@ import pytest
 
 from armscan.errors import OutputError
 from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.atomic_folder import check_new_folder, new_folder
 
 
 def test_files_are_written_together(tmp_path: Path) -> None:
@@ -76,3 +77,35 @@ def test_read_only_folder(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(OutputError, match="may not be written"):
         check_outputs([tmp_path / "a"])
+
+
+def test_files_beside_a_folder_are_there_when_it_appears(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An interrupt after they are written, before the rename, leaves neither."""
+    seen = []
+    rename = Path.rename
+
+    def look(path: Path, target: Path) -> Path:
+        seen.append((tmp_path / "scan.truth.json").read_bytes())
+        if len(seen) == 1:
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", look)
+    beside = {tmp_path / "scan.truth.json": b"true"}
+    with pytest.raises(KeyboardInterrupt), new_folder(tmp_path / "scan", beside):
+        pass
+    assert seen == [b"true"] and list(tmp_path.iterdir()) == []
+    with new_folder(tmp_path / "scan", beside) as partial:
+        (partial / "a").write_bytes(b"1")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan", "scan.truth.json"]
+
+
+@pytest.mark.parametrize("name", [".", "", "sub/..", "/"])
+def test_the_current_folder_and_a_root_are_not_made_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="name a new folder"):
+        check_new_folder(Path(name))

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
 from armscan.errors import OutputError
+from armscan.storage.atomic import write_files
 
 
 def check_new_folder(folder: Path) -> None:
@@ -18,13 +19,20 @@ def check_new_folder(folder: Path) -> None:
     Raises
     ------
     OutputError
-        If it holds something, or the one above does not exist.
+        If it holds something, is the current folder or a root, or the one above does not exist.
     """
+    target = folder.resolve()
+    if target in (Path.cwd(), Path(target.anchor)):
+        raise OutputError(
+            "the folder itself is made anew, which the current folder and a root cannot be",
+            where=str(folder),
+            remedy="name a new folder, as scan",
+        )
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(
             "this exists and is not empty", where=str(folder), remedy="name a new folder"
         )
-    parent = folder.resolve().parent
+    parent = target.parent
     if not parent.is_dir():
         raise OutputError(
             "there is no such folder to write to", where=str(parent), remedy="create it first"
@@ -32,7 +40,7 @@ def check_new_folder(folder: Path) -> None:
 
 
 @contextmanager
-def new_folder(folder: Path) -> Iterator[Path]:
+def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iterator[Path]:
     """Give a folder of another name to write into; it gets its name when the block has ended.
 
     If the block raises or is interrupted, nothing is left of it.
@@ -41,6 +49,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
     ----------
     folder
         Must not exist, or be empty.
+    beside
+        Files outside the folder that belong to it; written when it is complete, just before it
+        gets its name, so that it is never seen without them.
 
     Raises
     ------
@@ -53,9 +64,14 @@ def new_folder(folder: Path) -> Iterator[Path]:
     try:
         partial.mkdir()
         yield partial
-        if target.exists():
-            target.rmdir()
-        partial.rename(target)
+        write_files(beside or {})
+        try:
+            if target.exists():
+                target.rmdir()
+            partial.rename(target)
+        except BaseException:
+            _remove(beside or {})
+            raise
     except OSError as error:
         raise OutputError(
             f"nothing was written ({error.strerror or error})",
@@ -64,3 +80,9 @@ def new_folder(folder: Path) -> Iterator[Path]:
         ) from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _remove(files: Iterable[Path]) -> None:
+    for path in files:
+        with suppress(OSError):
+            path.unlink()

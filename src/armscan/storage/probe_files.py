@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,8 +95,11 @@ def write_probing(
     *,
     is_simulated: bool = False,
     arm: ArmModel | None = None,
+    beside: Mapping[Path, bytes] | None = None,
 ) -> None:
     """Write touches as a folder: ``arm.csv`` with a sample a touch, ``probe.toml``, a session.
+
+    Files ``beside`` it appear with it; see `new_folder`.
 
     Raises
     ------
@@ -104,7 +108,7 @@ def write_probing(
     """
     session = Session(cameras=(), is_simulated=is_simulated)
     columns = arm_columns(track, session.pose_form, session.rotation, {})
-    with new_folder(folder) as partial:
+    with new_folder(folder, beside) as partial:
         (partial / ARM_FILE).write_bytes(csv_bytes(columns))
         (partial / PROBE_FILE).write_bytes(probe_tip_toml(tip))
         (partial / SESSION_FILE).write_bytes(session_toml(session))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
@@ -37,6 +37,7 @@ def write_recording(
     names: Sequence[str] | None = None,
     encoded: Iterable[bytes] | None = None,
     arm: ArmModel | None = None,
+    beside: Mapping[Path, bytes] | None = None,
 ) -> None:
     """Write a scan as a folder recording.
 
@@ -59,6 +60,8 @@ def write_recording(
         (N,) the images' PNG files, where they were made already; see `encoded_png`.
     arm
         Geometry that turns joint angles into poses.
+    beside
+        Files outside the folder that appear with it; see `new_folder`.
 
     Raises
     ------
@@ -70,7 +73,7 @@ def write_recording(
     session = written_session(source)
     rows = _named(source, names)
     contents = _contents(source, session) if encoded is None else encoded
-    with new_folder(folder) as partial:
+    with new_folder(folder, beside) as partial:
         for done, (row, content) in enumerate(zip(rows, contents, strict=True), start=1):
             path = partial / row.source
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,8 @@ from armscan.storage.images import read_bytes
 
 INT64 = np.iinfo(np.int64)
 WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+")
+NAN = re.compile(r"[-+]?nan", re.IGNORECASE)
+DECIMAL = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 
 
@@ -107,7 +109,8 @@ class CsvTable:
                 raise FileFormatError(
                     f"'{cell}' in column {name} is no number",
                     where=self.place(row),
-                    remedy="correct it",
+                    remedy="write it as -12.5 or 1.25e-3"
+                    + (", or leave it empty where it is not known" if may_lack else ""),
                 )
             values.append(value)
         return values
@@ -143,7 +146,9 @@ class CsvTable:
         value = int(cell)
         if not INT64.min <= value <= INT64.max:
             raise FileFormatError(
-                f"{value} in column {name} needs more than 64 bits", where=self.place(row)
+                f"{value} in column {name} needs more than 64 bits",
+                where=self.place(row),
+                remedy="write fewer digits; times are whole nanoseconds",
             )
         return value
 
@@ -229,7 +234,11 @@ def _cells(line: str, where: str) -> list[str]:
     try:
         return [cell.strip() for cell in next(csv.reader([line], strict=True))]
     except csv.Error as error:
-        raise FileFormatError(f"the line cannot be split ({error})", where=where) from error
+        raise FileFormatError(
+            f"the line cannot be split ({error})",
+            where=where,
+            remedy='close every quotation mark, and write " inside quotes twice',
+        ) from error
 
 
 def _checked_header(header: list[str], where: str) -> list[str]:
@@ -253,11 +262,10 @@ def _checked_header(header: list[str], where: str) -> list[str]:
 
 
 def _number(cell: str) -> float:
-    """Value of a cell; NaN for an empty one, infinite for what is no number."""
-    try:
-        return float(cell) if cell else math.nan
-    except ValueError:
-        return math.inf
+    """Value of a cell; NaN for an empty one and ``nan``, infinite for what is no number."""
+    if not cell or NAN.fullmatch(cell):
+        return math.nan
+    return float(cell) if DECIMAL.fullmatch(cell) else math.inf
 
 
 def _is_number(cell: str) -> bool:

@@ -100,7 +100,9 @@ def _from_yaml(text: str, where: str) -> FloatArray:
     words = found[1].replace(",", " ").split()
     if len(words) % 3:
         raise FileFormatError(
-            f"scan_line holds {len(words)} numbers, not three a point", where=where
+            f"scan_line holds {len(words)} numbers, not three a point",
+            where=where,
+            remedy="write x, y, z of each point one after the other; the file may be cut",
         )
     return np.array([_number(word, where) for word in words]).reshape(-1, 3)
 
@@ -112,4 +114,6 @@ def _number(word: str, where: str) -> float:
     try:
         return float(word)
     except ValueError as error:
-        raise FileFormatError(f"'{word}' in scan_line is no number", where=where) from error
+        raise FileFormatError(
+            f"'{word}' in scan_line is no number", where=where, remedy="write it as -12.5 or .Nan"
+        ) from error

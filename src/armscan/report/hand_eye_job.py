@@ -88,10 +88,12 @@ def calibrated(
     EstimationError
         If they do not determine it.
     """
+    known = None if inputs.sensor is None else inputs.sensor.covariance
     if request.sphere_diameter_mm is not None:
-        fit = calibrate_on_sphere(stripes, request.sphere_diameter_mm, request.sphere_options)
+        fit = calibrate_on_sphere(
+            stripes, request.sphere_diameter_mm, request.sphere_options, sensor_covariance=known
+        )
     elif inputs.plate is not None:
-        known = None if inputs.sensor is None else inputs.sensor.covariance
         fit = calibrate_on_plate(stripes, inputs.plate, request.options, sensor_covariance=known)
     if isinstance(fit, FitFailure):
         raise EstimationError(fit.reason, where=name, remedy=fit.remedy)

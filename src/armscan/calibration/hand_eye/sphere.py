@@ -48,6 +48,7 @@ from armscan.calibration.hand_eye.sphere_residuals import (
 from armscan.calibration.hand_eye.sphere_sections import find_sections
 from armscan.calibration.hand_eye.sphere_start import is_apart, start_candidates
 from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 
 START_NODES = 6
@@ -71,7 +72,11 @@ POSTURES_REMEDY = (
 
 
 def calibrate_on_sphere(
-    stripes: Sequence[PosedStripe], diameter_mm: float, options: SphereOptions = DEFAULT_OPTIONS
+    stripes: Sequence[PosedStripe],
+    diameter_mm: float,
+    options: SphereOptions = DEFAULT_OPTIONS,
+    *,
+    sensor_covariance: FloatArray | None = None,
 ) -> HandEyeFit | FitFailure:
     """Find the hand-eye from stripes on a sphere that does not move.
 
@@ -83,12 +88,14 @@ def calibrate_on_sphere(
         Of the sphere.
     options
         Rejection, noise, and what is solved along.
+    sensor_covariance
+        As of `armscan.calibration.hand_eye.plate.calibrate_on_plate`: weighted, but not stated.
 
     Returns
     -------
     HandEyeFit
         With method "sphere"; covariance from the scatter of the arm's pose (common to a posture)
-        and of the sensor, both estimated from the residuals unless given.
+        and of the stripe, both estimated from the residuals unless given.
 
     Raises
     ------
@@ -112,7 +119,7 @@ def calibrate_on_sphere(
     starts = _search(sphere_nodes(thinned, START_NODES), radius, options)
     if isinstance(starts, FitFailure):
         return starts
-    nodes = sphere_nodes(sections, options.nodes_per_stripe)
+    nodes = sphere_nodes(sections, options.nodes_per_stripe, sensor_covariance)
     best = _best(nodes, starts, options)
     if isinstance(best, FitFailure):
         return best

@@ -10,7 +10,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from armscan.calibration.hand_eye.conditioning import Conditioning
 from armscan.calibration.hand_eye.least_squares import solve_linear
-from armscan.calibration.hand_eye.noise_model import arm_noise, total_covariance
+from armscan.calibration.hand_eye.noise_model import arm_noise
 from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, StripeResidual
 from armscan.calibration.hand_eye.sphere_refine import LeftOutPosture, SphereSolution, leave_out
 from armscan.calibration.hand_eye.sphere_residuals import (
@@ -18,6 +18,7 @@ from armscan.calibration.hand_eye.sphere_residuals import (
     SCALE_COLUMN,
     SphereNodes,
     SphereState,
+    residual_by_sensor,
 )
 from armscan.calibration.hand_eye.variance_components import covariance_over_noise
 from armscan.geometry.arrays import FloatArray
@@ -35,9 +36,12 @@ SHORT_ARC = 0.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
+    """``covariance`` (F, F) of all unknowns, and without the sensor's part (`own_covariance`)."""
+
     nodes: SphereNodes
     solution: SphereSolution
     covariance: FloatArray
+    own_covariance: FloatArray
     left_out: tuple[LeftOutPosture, ...]
     postures: tuple[PostureResult, ...]
 
@@ -60,13 +64,15 @@ def sphere_fit(
     warnings
         What was noticed before.
     """
-    nothing = np.zeros((len(nodes), len(nodes)))
+    residual, by_sensor = solution.placed.residual_mm, solution.by_sensor
     covariance = covariance_over_noise(
-        solution.placed.residual_mm, solution.slopes, solution.components, nothing, solution.noise
+        residual, solution.slopes, solution.components, by_sensor, solution.noise
     )
+    gain = solution.linear.gain
+    own_covariance = covariance - gain @ by_sensor @ gain.T
     left_out = tuple(leave_out(nodes, solution, k) for k in range(len(nodes.postures)))
     postures = tuple(_posture(nodes, solution, k, one) for k, one in enumerate(left_out))
-    evidence = _Evidence(nodes, solution, covariance, left_out, postures)
+    evidence = _Evidence(nodes, solution, covariance, own_covariance, left_out, postures)
     return HandEyeFit(
         _calibration(evidence, conditioning),
         start.tool_from_sensor,
@@ -98,7 +104,7 @@ def _calibration(evidence: _Evidence, conditioning: Conditioning) -> HandEyeCali
     points = solution.placed.point_residual_mm
     return HandEyeCalibration(
         tool_from_sensor=solution.state.tool_from_sensor,
-        covariance=evidence.covariance[:6, :6],
+        covariance=evidence.own_covariance[:6, :6],
         sensor_coupling=_coupling(nodes, solution),
         arm_noise=arm_noise(solution.components, solution.noise.sigmas),
         rms_mm=float(np.sqrt(np.mean(points**2))),
@@ -111,15 +117,8 @@ def _calibration(evidence: _Evidence, conditioning: Conditioning) -> HandEyeCali
 
 def _coupling(nodes: SphereNodes, solution: SphereSolution) -> FloatArray | None:
     """(6, P) derivative of the hand-eye by the sensor's parameters, where the points carry it."""
-    slopes = []
-    for section in nodes.sections:
-        by_sensor = section.stripe.by_sensor
-        if by_sensor is None:
-            return None
-        slopes.append(by_sensor[section.rows])
-    by_sensor = np.concatenate(slopes)
-    along = np.einsum("ni,nip->np", solution.placed.normals_sensor, by_sensor)
-    return np.asarray(-solution.linear.gain[:6] @ nodes.mean(along))
+    by_sensor = residual_by_sensor(nodes, solution.placed)
+    return None if by_sensor is None else -solution.linear.gain[:6] @ by_sensor
 
 
 def _posture(
@@ -129,8 +128,9 @@ def _posture(
     points = np.flatnonzero(np.repeat(nodes.posture, nodes.count) == posture)
     residual = solution.placed.point_residual_mm[points]
     share = nodes.count[own] / nodes.count[own].sum()
-    covariance = total_covariance(solution.components, solution.noise.sigmas)[np.ix_(own, own)]
-    mean_sigma = float(np.sqrt(share @ covariance @ share))
+    slopes = solution.slopes[own]
+    spread = solution.total[np.ix_(own, own)] - slopes @ solution.linear.covariance @ slopes.T
+    mean_sigma = float(np.sqrt(max(share @ spread @ share, 1e-18)))
     sources = {nodes.sections[k].stripe.source for k in nodes.section[own]}
     return PostureResult(
         posture=nodes.postures[posture],
@@ -191,9 +191,8 @@ def _reference(evidence: _Evidence, diameter_mm: float) -> tuple[tuple[str, str]
 def diameter_asked(solution: SphereSolution) -> tuple[float, float]:
     """Diameter that the points themselves ask for, and its standard deviation, both in mm."""
     columns = np.union1d(solution.free, [RADIUS_COLUMN])
-    covariance = total_covariance(solution.components, solution.noise.sigmas)
     freed = solve_linear(
-        solution.placed.residual_mm, solution.placed.slopes[:, columns], covariance
+        solution.placed.residual_mm, solution.placed.slopes[:, columns], solution.total
     )
     if freed is None:
         return 2.0 * solution.state.radius_mm, float("inf")

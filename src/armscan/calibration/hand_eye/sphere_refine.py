@@ -22,6 +22,7 @@ from armscan.calibration.hand_eye.sphere_residuals import (
     PlacedOnSphere,
     SphereNodes,
     SphereState,
+    covariance_by_sensor,
     place_on_sphere,
 )
 from armscan.calibration.hand_eye.variance_components import NoiseEstimate, estimate_noise
@@ -46,6 +47,9 @@ class SphereSolution:
         All unknowns, and the points placed with them.
     components, noise
         Causes of scatter and their standard deviations.
+    by_sensor, total
+        (M, M) covariance of the residuals by the sensor's calibration, which errs alike in all
+        postures, and by everything.
     linear
         Linearised at the minimum, in the free columns.
     free
@@ -60,6 +64,8 @@ class SphereSolution:
     placed: PlacedOnSphere
     components: tuple[NoiseComponent, ...]
     noise: NoiseEstimate
+    by_sensor: FloatArray
+    total: FloatArray
     linear: LinearSolution
     free: IntArray
     posture_weights: FloatArray
@@ -119,25 +125,27 @@ def refine_with_noise(
     """Minimise and estimate the scatter in turn; None where the postures leave unknowns open."""
     free = free_columns(options)
     state, sigmas, is_settled = start, None, False
-    nothing = np.zeros((len(nodes), len(nodes)))
     for _ in range(ROUNDS):
         placed = place_on_sphere(nodes, state)
         components = noise_of_sphere(nodes, placed, options, weights)
+        by_sensor = covariance_by_sensor(nodes, placed)
         slopes = placed.slopes[:, free]
         if sigmas is None:
             sigmas = _first_sigmas(components, placed)
-        noise = estimate_noise(placed.residual_mm, slopes, components, nothing, sigmas)
+        noise = estimate_noise(placed.residual_mm, slopes, components, by_sensor, sigmas)
         change = float(np.abs(np.log((noise.sigmas + 1e-12) / (sigmas + 1e-12))).max())
         sigmas = noise.sigmas
-        covariance = total_covariance(components, sigmas)
-        state, _, is_settled = descend(nodes, state, covariance, free)
+        total = total_covariance(components, sigmas) + by_sensor
+        state, _, is_settled = descend(nodes, state, total, free)
         if change < NOISE_SETTLED:
             break
     placed = place_on_sphere(nodes, state)
-    linear = solve_linear(placed.residual_mm, placed.slopes[:, free], covariance)
+    linear = solve_linear(placed.residual_mm, placed.slopes[:, free], total)
     if linear is None:
         return None
-    return SphereSolution(state, placed, components, noise, linear, free, weights, is_settled)
+    return SphereSolution(
+        state, placed, components, noise, by_sensor, total, linear, free, weights, is_settled
+    )
 
 
 def solve_at(
@@ -154,7 +162,7 @@ def solve_at(
 def noise_of_sphere(
     nodes: SphereNodes, placed: PlacedOnSphere, options: SphereOptions, weights: FloatArray
 ) -> tuple[NoiseComponent, ...]:
-    """Causes of scatter: the arm's pose, common to a posture, and the sensor node by node."""
+    """Causes of scatter: the arm's pose, common to a posture, and the stripe node by node."""
     same = (nodes.posture[:, None] == nodes.posture[None, :]) / weights[nodes.posture][:, None]
     shift = same * (placed.by_pose[:, :3] @ placed.by_pose[:, :3].T)
     turn = same * (placed.by_pose[:, 3:] @ placed.by_pose[:, 3:].T)

@@ -62,7 +62,11 @@ class SphereNodes:
     section, posture
         (M,) indices of each node's section and posture.
     sigma_mm
-        (M,) standard deviation of a node's mean residual by the sensor alone.
+        (M,) standard deviation of a node's mean residual by the stripe's own noise.
+    by_sensor
+        (N, 3, P) derivative of the points by the sensor's parameters; None where not known.
+    sensor_covariance
+        (P, P) of the sensor's parameters; None where it is taken as exact.
     """
 
     sections: tuple[Section, ...]
@@ -74,6 +78,8 @@ class SphereNodes:
     section: IntArray
     posture: IntArray
     sigma_mm: FloatArray
+    by_sensor: FloatArray | None = None
+    sensor_covariance: FloatArray | None = None
 
     def __len__(self) -> int:
         """Count of nodes."""
@@ -85,10 +91,12 @@ class SphereNodes:
         return np.asarray(sums / self.count.reshape(-1, *([1] * (values.ndim - 1))))
 
 
-def sphere_nodes(sections: tuple[Section, ...], per_stripe: int) -> SphereNodes:
+def sphere_nodes(
+    sections: tuple[Section, ...], per_stripe: int, sensor_covariance: FloatArray | None = None
+) -> SphereNodes:
     """Cut sections into nodes of nearly equal count.
 
-    The sensor's own error of a node is taken from how its mean leaves the section circle: errors
+    The stripe's own error of a node is taken from how its mean leaves the section circle: errors
     of neighbouring points are alike, so that dividing the scatter of single points by the root of
     their count would promise too much.
     """
@@ -121,7 +129,15 @@ def sphere_nodes(sections: tuple[Section, ...], per_stripe: int) -> SphereNodes:
         owner,
         posture_of[owner],
         np.concatenate(sigmas),
+        _by_sensor(sections),
+        sensor_covariance,
     )
+
+
+def _by_sensor(sections: tuple[Section, ...]) -> FloatArray | None:
+    parts = [(section.stripe.by_sensor, section.rows) for section in sections]
+    known = [by_sensor[rows] for by_sensor, rows in parts if by_sensor is not None]
+    return np.concatenate(known) if len(known) == len(parts) else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,6 +202,21 @@ def place_on_sphere(nodes: SphereNodes, state: SphereState) -> PlacedOnSphere:
         nodes.mean(slopes),
         nodes.mean(by_pose),
     )
+
+
+def residual_by_sensor(nodes: SphereNodes, placed: PlacedOnSphere) -> FloatArray | None:
+    """(M, P) derivative of the residuals by the sensor's parameters; None where not known."""
+    if nodes.by_sensor is None:
+        return None
+    return nodes.mean(np.einsum("ni,nip->np", placed.normals_sensor, nodes.by_sensor))
+
+
+def covariance_by_sensor(nodes: SphereNodes, placed: PlacedOnSphere) -> FloatArray:
+    """(M, M) covariance of the residuals by the sensor's calibration; zero where it is exact."""
+    by_sensor = residual_by_sensor(nodes, placed)
+    if by_sensor is None or nodes.sensor_covariance is None:
+        return np.zeros((len(nodes), len(nodes)))
+    return np.asarray(by_sensor @ nodes.sensor_covariance @ by_sensor.T)
 
 
 def _posture_middles(nodes: SphereNodes, base: FloatArray) -> FloatArray:

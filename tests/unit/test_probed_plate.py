@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.calibration.hand_eye.probed_plate import (
@@ -124,7 +125,7 @@ def test_a_touch_that_slipped_is_named_and_left_out_on_demand() -> None:
     named = fit_probed_plate(ProbedPoints(points, TIP_MM))
     assert isinstance(named, ProbedPlate)
     assert named.outliers == (5,)
-    assert any("number 6 (+0.1" in warning and "took part" in warning for warning in named.warnings)
+    assert any("row 6 (+0.1" in warning and "took part" in warning for warning in named.warnings)
     without = fit_probed_plate(
         ProbedPoints(points, TIP_MM), options=ProbingOptions(leave_out_outliers=True)
     )
@@ -173,11 +174,67 @@ def test_what_determines_no_plate_is_a_failure_in_words() -> None:
         ProbingOptions(side="up")
 
 
-def test_three_touches_have_no_sigma() -> None:
-    plate = fit_probed_plate(tip_points(n=3))
-    assert isinstance(plate, ProbedPlate)
-    assert plate.reference.covariance is None
-    assert any("three touches" in warning for warning in plate.warnings)
+@pytest.mark.parametrize("n", [3, 4, 8, 20])
+def test_the_region_of_a_plate_from_few_touches_holds_95_percent(n: int) -> None:
+    """600 plates whose touches err as the options say: none is taken for exact, or too sure."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    flat = np.column_stack([60.0 * np.cos(angle), 40.0 * np.sin(angle), np.zeros(n)])
+    rng, options = np.random.default_rng(n), ProbingOptions()
+    limit = chi2.ppf(0.95, 3)
+    n_inside = 0
+    for _ in range(600):
+        noisy = flat + options.touch_sigma_mm * rng.normal(size=(n, 1)) * [0.0, 0.0, 1.0]
+        plate = plate_from_probing(ProbedPoints(noisy), options=options)
+        assert isinstance(plate, PlateReference)
+        assert plate.covariance is not None
+        x, y, normal = plate.plane.axes
+        tilts = (x[2] / normal[2], y[2] / normal[2])
+        error = np.array([*tilts, plate.plane.point_mm[2] / normal[2]])
+        n_inside += float(error @ np.linalg.solve(plate.covariance, error)) < limit
+    # four sigma of a count; the few degrees of freedom of four touches cost two percent
+    assert n_inside / 600 == pytest.approx(0.95, abs=4.0 * np.sqrt(0.95 * 0.05 / 600) + 0.02)
+
+
+def test_few_touches_are_warned_of_and_have_the_sigma_of_a_touch() -> None:
+    for n, sigma_mm in ((3, 0.01), (3, 0.03), (7, 0.03)):
+        plate = fit_probed_plate(tip_points(n=n), options=ProbingOptions(touch_sigma_mm=sigma_mm))
+        assert isinstance(plate, ProbedPlate)
+        assert plate.reference.covariance is not None
+        # exact touches: no squares are added to the four degrees of freedom of the prior
+        expected = sigma_mm * np.sqrt(4.0 / (4.0 + n - 3) / n)
+        assert np.sqrt(plate.reference.covariance[2, 2]) == pytest.approx(expected)
+        assert any(f"{n} touches" in w and f"{sigma_mm:g} mm" in w for w in plate.warnings)
+    enough = fit_probed_plate(tip_points(n=8), options=ProbingOptions(side="+z"))
+    assert isinstance(enough, ProbedPlate)
+    assert enough.warnings == ()
+    with pytest.raises(OptionError, match="sigma of 0"):
+        ProbingOptions(touch_sigma_mm=0.0)
+
+
+def test_a_touch_is_named_by_its_row_in_the_table() -> None:
+    """Rows of another feature and rows without pose come before the one that slipped."""
+    points = touches(14, NOISE_MM, seed=3)
+    points[5] += 0.15 * NORMAL
+    both = np.concatenate([touches(4, seed=9) + 50.0, points])
+    names = ("block",) * 4 + ("plate",) * 14
+    rows = tuple(range(3, 21))
+    for probed, row in (
+        (ProbedPoints(both, TIP_MM, names), 10),
+        (ProbedPoints(both, TIP_MM, names, rows=rows), 12),
+    ):
+        plate = fit_probed_plate(probed, options=ProbingOptions(feature="plate"))
+        assert isinstance(plate, ProbedPlate)
+        assert any(f"row {row} (+0.1" in warning for warning in plate.warnings)
+        assert plate.rows[plate.outliers[0]] == row
+
+
+def test_points_on_the_surface_keep_the_tip_that_touched_them() -> None:
+    surface = ProbedPoints(touches(tip_mm=0.0), TIP_MM, is_compensated=True)
+    assert not surface.are_tip_centres
+    plate = plate_from_probing(surface)
+    assert isinstance(plate, PlateReference)
+    assert np.abs(plate.plane.distance_mm(surface.points_mm)).max() < 1e-9
+    assert plate.tip_diameter_mm == TIP_MM
 
 
 def test_of_several_features_one_must_be_chosen() -> None:

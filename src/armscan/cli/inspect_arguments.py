@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from armscan.cli.probe import Side
+
 if TYPE_CHECKING:
     from armscan.report.inspect_job import InspectRequest
 
@@ -29,6 +31,14 @@ FeatureOption = Annotated[
     float,
     typer.Option(
         "--feature-mm", help="Points this near to the surface belong to it, outliers included."
+    ),
+]
+SideOption = Annotated[
+    Side | None,
+    typer.Option(
+        "--side",
+        help="Axis that the face of --plate looks along, for centres of the tip.",
+        show_default=False,
     ),
 ]
 PageOption = Annotated[

@@ -13,6 +13,7 @@ from armscan.cli.inspect_arguments import (
     FeatureOption,
     PageOption,
     RegionOption,
+    SideOption,
     inspect_request,
 )
 from armscan.cli.output import AsJson, Force, show
@@ -32,6 +33,7 @@ def plane(
     plate: Annotated[
         Path | None, typer.Option(help="Nominal plane: probed points (CSV), or A,B,C,D in a file.")
     ] = None,
+    side: SideOption = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = 1.0,
     output: PageOption = None,
@@ -44,4 +46,5 @@ def plane(
     request = inspect_request(
         cloud, region=region, feature_mm=feature_mm, output=output, force=force
     )
-    show(run_plane_inspection(request, plane, plate), as_json=as_json)
+    summary = run_plane_inspection(request, plane, plate, None if side is None else side.value)
+    show(summary, as_json=as_json)

@@ -9,7 +9,13 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.inspect_arguments import FeatureOption, PageOption, RegionOption, numbers
+from armscan.cli.inspect_arguments import (
+    FeatureOption,
+    PageOption,
+    RegionOption,
+    SideOption,
+    numbers,
+)
 from armscan.cli.output import AsJson, Force, progress_bar, show
 
 EXAMPLE = (
@@ -50,6 +56,7 @@ def verify(
     uncertainty: Annotated[
         float, typer.Option(help="Expanded uncertainty (k = 2) of the standard, mm.")
     ] = 0.0,
+    side: SideOption = None,
     region: RegionOption = "",
     feature_mm: FeatureOption = 1.0,
     output: PageOption = None,
@@ -72,6 +79,7 @@ def verify(
         inspection=InspectionOptions(feature_mm=feature_mm),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),
+        side=None if side is None else side.value,
     )
     with progress_bar() as progress:
         summary, verdict = run_verification(request, progress)

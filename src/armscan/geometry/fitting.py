@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.estimate import Estimate, FitFailure
 
@@ -87,15 +88,61 @@ def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | Fi
     return Line(centre, axes[0])
 
 
-def fit_plane(points_mm: FloatArray) -> Estimate[Plane] | FitFailure:
+def plane_from_coefficients(
+    coefficients: FloatArray, near_mm: FloatArray, source: str = ""
+) -> Plane:
+    """The plane ``A x + B y + C z + D = 0`` (eq. 2.55), its point next to ``near_mm`` (3,).
+
+    Parameters
+    ----------
+    coefficients
+        (4,) A, B, C, D in mm; they may share any factor, whose sign turns the normal.
+    near_mm
+        Some point; the plane's own is the foot of its perpendicular.
+    source
+        Where they came from, for messages.
+
+    Raises
+    ------
+    InputError
+        If these are not four finite numbers or the normal is zero.
+    """
+    values = np.asarray(coefficients, dtype=np.float64)
+    length = float(np.linalg.norm(values[:3])) if values.shape == (4,) else 0.0
+    if not np.isfinite(values).all() or not length > 0.0:
+        raise InputError(
+            "a plane needs four finite numbers A, B, C, D and a normal that is not 0",
+            where=source,
+            remedy="give A,B,C,D with D in mm",
+        )
+    normal, offset = values[:3] / length, float(values[3]) / length
+    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    across /= np.linalg.norm(across)
+    foot = near_mm - (float(normal @ near_mm) + offset) * normal
+    return Plane(foot, np.stack([across, np.cross(normal, across), normal]))
+
+
+def fit_plane(
+    points_mm: FloatArray, *, prior_sigma_mm: float = 0.0, prior_freedom: float = 0.0
+) -> Estimate[Plane] | FitFailure:
     """Fit a plane to (N, 3) points: least sum of squared distances along the normal.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) points.
+    prior_sigma_mm, prior_freedom
+        What is known of a point's noise beforehand, and how many degrees of freedom that is worth:
+        the noise's variance is (prior_freedom prior_sigma_mm^2 + squared residuals) /
+        (prior_freedom + N - 3). That is the expected variance if it was drawn from the scaled
+        inverse chi-square distribution of prior_freedom + 2 degrees and that mean.
 
     Returns
     -------
     Estimate
-        Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset), with
-        the noise taken from the residuals (zero for three points); residuals in mm; chi2 in units
-        of that noise.
+        Covariance of `PLANE_PARAMETERS` (tilts about the centroid along axis 1 and 2, offset);
+        without a prior the noise is taken from the residuals alone, and is zero for three points;
+        residuals in mm; chi2 in units of that noise.
     """
     points = np.asarray(points_mm, dtype=np.float64)
     n = len(points)
@@ -111,9 +158,11 @@ def fit_plane(points_mm: FloatArray) -> Estimate[Plane] | FitFailure:
     plane = Plane(centre, triad)
     residuals = plane.distance_mm(points)
     freedom = n - 3
-    variance = float(residuals @ residuals) / freedom if freedom else 0.0
+    squares = float(residuals @ residuals)
+    known = prior_freedom + freedom
+    variance = (prior_freedom * prior_sigma_mm**2 + squares) / known if known > 0.0 else 0.0
     information = np.array([spread[0] ** 2, spread[1] ** 2, float(n)])
-    chi2 = float(freedom) if variance > 0.0 else 0.0
+    chi2 = squares / variance if variance > 0.0 else 0.0
     return Estimate(
         plane, PLANE_PARAMETERS, np.diag(variance / information), residuals, freedom, chi2
     )

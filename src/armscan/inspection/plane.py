@@ -7,7 +7,6 @@ import math
 
 import numpy as np
 
-from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Plane, fit_plane
@@ -25,31 +24,6 @@ from armscan.inspection.results import MeasuredLength, PlaneInspection, PointCou
 from armscan.inspection.search import dominant_flat
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
-
-
-def plane_from_coefficients(coefficients: FloatArray, near_mm: FloatArray) -> Plane:
-    """The plane ``a x + b y + c z + D = 0`` (eq. 2.55), its point next to ``near_mm`` (3,).
-
-    Parameters
-    ----------
-    coefficients
-        (4,) a, b, c, D in mm; they may share any factor.
-    near_mm
-        Some point; the plane's own is the foot of its perpendicular.
-
-    Raises
-    ------
-    InputError
-        If a, b and c are all zero.
-    """
-    size = float(np.linalg.norm(coefficients[:3]))
-    if not size > 0.0:
-        raise InputError("a plane whose A, B and C are all 0", remedy="give A,B,C,D with D in mm")
-    normal = coefficients[:3] / size
-    height = float(normal @ near_mm) + float(coefficients[3]) / size
-    along = np.linalg.svd(normal[None, :])[2][1]
-    axes = np.stack([along, np.cross(normal, along), normal])
-    return Plane(near_mm - height * normal, axes)
 
 
 def inspect_plane(

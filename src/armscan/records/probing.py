@@ -18,17 +18,23 @@ class ProbedPoints:
     points_mm
         (N, 3) in Base: on the surface, or the tip's centres.
     tip_diameter_mm
-        Diameter of the tip if ``points_mm`` are its centres; 0 for points on the surface.
+        Diameter of the tip that touched; 0 where not known, for points on the surface.
     features
         (N,) name of the feature that each point belongs to; empty where nobody said.
     source
         Where they came from, for messages.
+    is_compensated
+        True if the tip's radius was taken off already: the points are on the surface.
+    rows
+        (N,) row of each point in its table, from 1; all rows in turn if empty.
     """
 
     points_mm: FloatArray
     tip_diameter_mm: float = 0.0
     features: tuple[str, ...] = ()
     source: str = ""
+    is_compensated: bool = False
+    rows: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         points = frozen_floats(self.points_mm, (None, 3), "probed points (mm)")
@@ -39,6 +45,10 @@ class ProbedPoints:
             raise InputError(
                 f"{len(self.features)} features for {len(points)} points", where=self.source
             )
+        rows = self.rows or tuple(range(1, len(points) + 1))
+        if len(rows) != len(points):
+            raise InputError(f"{len(rows)} rows for {len(points)} points", where=self.source)
+        object.__setattr__(self, "rows", rows)
 
     def __len__(self) -> int:
         """Count of points."""
@@ -47,4 +57,4 @@ class ProbedPoints:
     @property
     def are_tip_centres(self) -> bool:
         """True if the points still have to be compensated for the tip's radius."""
-        return self.tip_diameter_mm > 0.0
+        return self.tip_diameter_mm > 0.0 and not self.is_compensated

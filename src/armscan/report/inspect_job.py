@@ -3,18 +3,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import Plane
+from armscan.geometry.fitting import Plane, plane_from_coefficients
 from armscan.inspection.cleaning import Region
 from armscan.inspection.options import InspectionOptions, StepOptions
-from armscan.inspection.plane import inspect_plane, plane_from_coefficients
+from armscan.inspection.plane import inspect_plane
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
 from armscan.models.calibration import Provenance
@@ -63,7 +64,10 @@ class InspectRequest:
 
 
 def run_plane_inspection(
-    request: InspectRequest, plane: str = "", plate: Path | None = None
+    request: InspectRequest,
+    plane: str = "",
+    plate: Path | None = None,
+    side: ProbeSide | None = None,
 ) -> Summary:
     """Inspect a flat face.
 
@@ -75,6 +79,8 @@ def run_plane_inspection(
         ``A,B,C,D`` of the nominal plane, D in mm; empty for none.
     plate
         Probed points of the nominal plane, or a file with ``A,B,C,D``; None for none.
+    side
+        Side of the plate that was touched; None for where nobody said it.
 
     Raises
     ------
@@ -83,7 +89,7 @@ def run_plane_inspection(
         then.
     """
     cloud, region = _read(request)
-    reference, text = _reference(cloud, plane, plate)
+    reference, text, weak = _reference(cloud, plane, plate, side)
     found = _found(
         inspect_plane(
             cloud,
@@ -95,7 +101,9 @@ def run_plane_inspection(
         request,
     )
     inputs = (request.cloud, *(() if plate is None else (plate,)))
-    return _finished(request, cloud, plane_report(found, cloud), inputs)
+    report = plane_report(found, cloud)
+    report = replace(report, warnings=(*weak, *report.warnings))
+    return _finished(request, cloud, report, inputs)
 
 
 def run_sphere_inspection(request: InspectRequest, diameter_mm: float) -> Summary:
@@ -172,15 +180,21 @@ def _numbers(
     return np.array(values, dtype=np.float64)
 
 
-def _reference(cloud: PointCloud, plane: str, plate: Path | None) -> tuple[Plane | None, str]:
+def _reference(
+    cloud: PointCloud, plane: str, plate: Path | None, side: ProbeSide | None
+) -> tuple[Plane | None, str, tuple[str, ...]]:
+    """The nominal plane, where it came from, and what is weak about it."""
     if plane and plate is not None:
         raise OptionError("both --plane and --plate are given", remedy="give one of them")
+    if side is not None and plate is None:
+        raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
     middle = cloud.points_mm.mean(axis=0) if len(cloud) else np.zeros(3)
     if plane:
-        return plane_from_coefficients(parse_plane(plane, "--plane"), middle), "the given plane"
+        return plane_from_coefficients(parse_plane(plane, "--plane"), middle), "the given plane", ()
     if plate is None:
-        return None, ""
-    return read_plate(plate, middle).plane, f"the plane of {plate.name}"
+        return None, "", ()
+    probed, weak = read_plate(plate, middle, side=side)
+    return probed.plane, f"the plane of {plate.name}", weak
 
 
 def _found(result: T | FitFailure, request: InspectRequest) -> T:

@@ -5,52 +5,56 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.errors import EstimationError, InputError
+from armscan.calibration.hand_eye.plate_side import ProbeSide
+from armscan.calibration.hand_eye.probed_plate import (
+    ProbingOptions,
+    fit_probed_plate,
+    plate_from_coefficients,
+)
+from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import Plane, fit_plane
-from armscan.inspection.plane import plane_from_coefficients
+from armscan.geometry.fitting import plane_from_coefficients
 from armscan.records.probing import ProbedPoints
 from armscan.storage.probed_points import read_points_or_plane
 
 
-def read_plate(path: Path, near_mm: FloatArray) -> PlateReference:
-    """Read a plate.
+def read_plate(
+    path: Path,
+    near_mm: FloatArray,
+    *,
+    towards_mm: FloatArray | None = None,
+    side: ProbeSide | None = None,
+) -> tuple[PlateReference, tuple[str, ...]]:
+    """Read a plate, and what is weak about it, in words.
 
     Parameters
     ----------
     path
-        Probed points, or a file with ``A,B,C,D``.
+        Probed points, on the surface or centres of the tip; or a file with ``A,B,C,D``.
     near_mm
         (3,) a point near which the plane's own point shall lie if only coefficients are known.
+    towards_mm
+        (M, 3) places of the arm's tool while it scanned, for probed points; None where not known.
+    side
+        Side of the plate that was touched; None to take it from ``towards_mm``. Coefficients keep
+        their own sign then.
 
     Raises
     ------
     ArmscanError
-        If the file is neither, or its points determine no plane.
+        If the file is neither, its points determine no plane, or they are of several features.
     """
     found = read_points_or_plane(path)
-    if not isinstance(found, ProbedPoints):
-        return PlateReference(plane_from_coefficients(found, near_mm), source=str(path))
-    return _fitted(found, path)
-
-
-def _fitted(found: ProbedPoints, path: Path) -> PlateReference:
-    if found.are_tip_centres:
-        raise InputError(
-            f"these are centres of a tip of {found.tip_diameter_mm:g} mm, not points on the plate",
-            where=str(path),
-            remedy="give the points on the surface that `armscan probe` writes",
-        )
-    fit = fit_plane(found.points_mm)
-    if isinstance(fit, FitFailure):
-        raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)
-    rms = float(np.sqrt(np.mean(fit.residuals**2)))
-    plane = fit.value
-    # heights over the plate count upwards; its covariance is diagonal and stays
-    if plane.normal[int(np.argmax(np.abs(plane.normal)))] < 0.0:
-        plane = Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
-    return PlateReference(plane, fit.covariance, rms, len(found), str(path))
+    if isinstance(found, ProbedPoints):
+        fit = fit_probed_plate(found, towards_mm, ProbingOptions(side=side))
+        if isinstance(fit, FitFailure):
+            raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)
+        return fit.reference, fit.warnings
+    if side is None:
+        return PlateReference(plane_from_coefficients(found, near_mm), source=str(path)), ()
+    plate = plate_from_coefficients(found, near_mm, side, str(path))
+    if isinstance(plate, FitFailure):
+        raise EstimationError(plate.reason, where=str(path), remedy=plate.remedy)
+    return plate, ()

@@ -85,7 +85,11 @@ def run_probing(request: ProbeRequest) -> Summary:
         raise EstimationError(plate.reason, where=str(request.source), remedy=plate.remedy)
     written: tuple[Path, ...] = ()
     if request.output is not None:
-        surface = ProbedPoints(plate.surface_mm[list(plate.is_used)])
+        surface = ProbedPoints(
+            plate.surface_mm[list(plate.is_used)],
+            plate.reference.tip_diameter_mm,
+            is_compensated=True,
+        )
         write_files(
             {request.output: probed_points_csv(surface)}, is_overwriting=request.is_overwriting
         )
@@ -113,7 +117,8 @@ def read_touches(source: Path, probe: Path | None = None) -> Touches:
     track, notes = read_arm_track(source)
     tip = read_probe_tip(probe or source / PROBE_FILE)
     centres = tip_centres(track, tool_from_probe(tip.centre_tool_mm))
-    points = ProbedPoints(centres, tip.diameter_mm, source=str(source))
+    rows = tuple(int(row) + 1 for row in np.flatnonzero(track.is_known))
+    points = ProbedPoints(centres, tip.diameter_mm, source=str(source), rows=rows)
     n_gaps = int((~track.is_known).sum())
     gaps = (f"for {n_gaps} of {len(track)} touches the arm gave no pose",) if n_gaps else ()
     return Touches(points, track.translations_mm[track.is_known], (*notes, *gaps))
@@ -143,7 +148,7 @@ def probe_summary(
                 "sigma",
                 f"{significant(np.degrees(sigma[0]))} and {significant(np.degrees(sigma[1]))} "
                 f"degrees of tilt, {significant(sigma[2])} mm of height, by the scatter of the "
-                "touches",
+                "touches and the sigma taken for one",
             )
         )
     return Summary(
@@ -173,7 +178,7 @@ def probe_summary(
             "flatness_mm": plate.flatness_mm,
             "rms_mm": rms,
             "side": plate.side_from,
-            "outliers": [row + 1 for row in plate.outliers],
+            "outliers": [plate.rows[k] for k in plate.outliers],
             "residual_mm": plate.residual_mm.tolist(),
         },
     )
@@ -194,6 +199,6 @@ def _touch_table(plate: ProbedPlate) -> Table:
         if k in plate.outliers and plate.is_used[k]:
             remark = "does not fit the others"
         place = tuple(f"{value:.3f}" for value in point)
-        rows.append((str(k + 1), *place, f"{residual:+.4f}", remark))
-    columns = ("touch", "x mm", "y mm", "z mm", "distance mm", "")
+        rows.append((str(plate.rows[k]), *place, f"{residual:+.4f}", remark))
+    columns = ("row", "x mm", "y mm", "z mm", "distance mm", "")
     return Table(columns, tuple(rows), "Points on the surface, in Base", (5,))

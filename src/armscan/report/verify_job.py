@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.errors import OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cleaning import Region
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.results import SphereInspection
@@ -22,6 +24,7 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
+from armscan.reconstruction.exposure_poses import PoseFate
 from armscan.report.inspect_page import InspectionReport, inspection_page
 from armscan.report.inspect_texts import plane_report, sphere_report
 from armscan.report.numbers import sentence, significant
@@ -70,6 +73,8 @@ class VerifyRequest:
         Replace a page that exists.
     command
         The command line, for the record.
+    side
+        Side of the plate that was touched; None to take it from where the tool was.
     """
 
     scan: Path
@@ -82,6 +87,7 @@ class VerifyRequest:
     inspection: InspectionOptions = field(default_factory=InspectionOptions)
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
+    side: ProbeSide | None = None
 
 
 def run_verification(
@@ -154,6 +160,8 @@ def _check(request: VerifyRequest) -> None:
         raise OptionError(
             "a check needs one standard", remedy="give either --ball DIAMETER or --plate FILE"
         )
+    if request.side is not None and request.plate is None:
+        raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
     if request.scan.is_dir() and request.scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
     if request.output is not None:
@@ -207,10 +215,25 @@ def _verified(request: VerifyRequest, measured: Measured) -> Verification:
         )
     if request.plate is None:
         raise OptionError("a check needs one standard", remedy="give --ball or --plate")
-    plate = read_plate(request.plate, measured.cloud.points_mm.mean(axis=0))
-    return verify_on_plate(
+    plate, weak = read_plate(
+        request.plate,
+        measured.cloud.points_mm.mean(axis=0),
+        towards_mm=_tool_places(measured),
+        side=request.side,
+    )
+    found = verify_on_plate(
         measured, plate, request.options, region=region, inspection=request.inspection
     )
+    return replace(found, warnings=(*weak, *found.warnings))
+
+
+def _tool_places(measured: Measured) -> FloatArray | None:
+    """(M, 3) places of the arm's tool; None where not known."""
+    if measured.scan is None:
+        return None
+    poses = measured.scan.poses
+    found = poses.translations_mm[poses.fate == PoseFate.FOUND]
+    return found if len(found) else None
 
 
 def _report(request: VerifyRequest, result: Verification, measured: Measured) -> InspectionReport:

@@ -27,6 +27,7 @@ def read_probed_points(path: Path) -> ProbedPoints:
 
     A table ``x_mm,y_mm,z_mm[,feature]``. A comment ``# point = tip-centre, tip_diameter_mm = 6``
     says that the points are centres of the tip; without it they are on the surface.
+    ``# point = surface, tip_diameter_mm = 6`` keeps the diameter that was compensated for.
 
     Raises
     ------
@@ -44,9 +45,9 @@ def probed_points_csv(points: ProbedPoints) -> bytes:
     }
     if points.features:
         columns["feature"] = points.features
-    kind = "surface"
-    if points.are_tip_centres:
-        kind = f"tip-centre, tip_diameter_mm = {points.tip_diameter_mm!r}"
+    kind = "tip-centre" if points.are_tip_centres else "surface"
+    if points.tip_diameter_mm:
+        kind += f", tip_diameter_mm = {points.tip_diameter_mm!r}"
     return csv_bytes(columns, (f"point = {kind}",))
 
 
@@ -129,9 +130,14 @@ def _points(table: CsvTable) -> ProbedPoints:
             where=table.where,
             remedy="multiply x_mm, y_mm and z_mm by 1000",
         )
+    tip_diameter_mm, is_compensated = _tip(table)
     try:
         return ProbedPoints(
-            points, _tip_diameter_mm(table), table.columns.get("feature", ()), table.where
+            points,
+            tip_diameter_mm,
+            table.columns.get("feature", ()),
+            table.where,
+            is_compensated=is_compensated,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=table.where, remedy=error.remedy) from error
@@ -146,8 +152,8 @@ def _refuse_metres_by_name(table: CsvTable) -> None:
         )
 
 
-def _tip_diameter_mm(table: CsvTable) -> float:
-    """Diameter that a comment gives; 0 for points on the surface."""
+def _tip(table: CsvTable) -> tuple[float, bool]:
+    """Diameter that a comment gives, 0 for none; whether the points are on the surface."""
     stated: dict[str, str] = {}
     for comment in table.comments:
         stated |= {
@@ -155,9 +161,10 @@ def _tip_diameter_mm(table: CsvTable) -> float:
             for key, value in re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
         }
     kind = stated.get("point", "tip-centre" if "tip_diameter_mm" in stated else "surface")
-    if kind == "surface":
-        return 0.0
-    if kind != "tip-centre":
+    is_surface = kind == "surface"
+    if is_surface and "tip_diameter_mm" not in stated:
+        return 0.0, True
+    if kind not in ("surface", "tip-centre"):
         raise FileFormatError(
             f"'point = {kind}' is not known",
             where=table.where,
@@ -168,9 +175,10 @@ def _tip_diameter_mm(table: CsvTable) -> float:
     except ValueError:
         diameter_mm = 0.0
     if not 0.0 < diameter_mm < math.inf:
+        what = "on the surface" if is_surface else "centres of the tip"
         raise FileFormatError(
-            "the points are centres of the tip, but its diameter is not given",
+            f"the points are {what}, but the tip's diameter is not given as a number of mm",
             where=table.where,
-            remedy="write the line '# point = tip-centre, tip_diameter_mm = 6'",
+            remedy=f"write the line '# point = {kind}, tip_diameter_mm = 6'",
         )
-    return diameter_mm
+    return diameter_mm, is_surface

@@ -176,6 +176,7 @@ def test_a_plate_probed_on_the_wrong_side_is_refused(offset_mm: float, what: str
     fit = calibrate_on_plate(stripes, replace(_raised(plate, offset_mm), tip_diameter_mm=6.0))
     assert isinstance(fit, FitFailure)
     assert what in fit.reason and "below the probed one" in fit.reason
+    assert "armscan probe --side" in fit.remedy
 
 
 def test_a_plate_that_sank_is_warned_of_with_its_distance() -> None:

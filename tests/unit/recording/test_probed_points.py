@@ -46,6 +46,12 @@ def test_points_are_on_the_surface_unless_a_comment_says_that_they_are_the_tips_
     assert read_probed_points(written(tmp_path, text)).tip_diameter_mm == 6.0
     text = "# point = surface\n" + TABLE
     assert read_probed_points(written(tmp_path, text)).tip_diameter_mm == 0.0
+    surface = ProbedPoints(POINTS_MM, 6.0, is_compensated=True)
+    content = probed_points_csv(surface)
+    assert content.startswith(b"# point = surface, tip_diameter_mm = 6.0")
+    found = read_probed_points(written(tmp_path, content))
+    assert found.tip_diameter_mm == 6.0
+    assert not found.are_tip_centres
 
 
 def test_columns_are_found_by_name_and_marks_of_other_systems_do_no_harm(tmp_path: Path) -> None:
@@ -59,6 +65,7 @@ def test_columns_are_found_by_name_and_marks_of_other_systems_do_no_harm(tmp_pat
     [
         ("# point = tip-centre\n" + TABLE, "diameter is not given"),
         ("# point = tip-centre, tip_diameter_mm = -6\n" + TABLE, "diameter is not given"),
+        ("# point = surface, tip_diameter_mm = six\n" + TABLE, "diameter is not given"),
         ("# point = middle\n" + TABLE, "'point = middle' is not known"),
         ("x_mm,y_mm,z_mm\n", "holds no point"),
         ("x_mm,y_mm,z\n1,2,3\n", "'z' may be 'z_mm'"),

@@ -55,6 +55,7 @@ def test_a_folder_of_touches(tmp_path: Path) -> None:
     assert summary.data["flatness_mm"] < 1e-9
     surface = read_probed_points(output)
     assert not surface.are_tip_centres
+    assert surface.tip_diameter_mm == 6.0, "a wrong side is told by it"
     np.testing.assert_allclose(surface.points_mm, on_plate(), atol=1e-9)
 
 
@@ -79,6 +80,7 @@ def test_touches_without_pose_are_counted(tmp_path: Path) -> None:
     found = read_touches(tmp_path / "touches")
     assert len(found.points) == 8
     assert any("1 of 9 touches" in warning for warning in found.warnings)
+    assert found.points.rows == (1, 2, 3, 5, 6, 7, 8, 9)
 
 
 def test_the_command_prints_and_writes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

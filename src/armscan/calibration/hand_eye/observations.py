@@ -64,7 +64,7 @@ class PlateReference:
         Plane in Base; its normal points to the side from which it was probed and is scanned.
     covariance
         (3, 3) of `armscan.geometry.fitting.PLANE_PARAMETERS` (rad, rad, mm) at ``plane.point_mm``,
-        without the arm's systematic part; None where only A, B, C, D are known.
+        without the arm's systematic part; None where it is not known, as of A, B, C, D alone.
     rms_mm
         Root mean square distance of the probed points from the plane; None where not known.
     n_points

@@ -26,8 +26,9 @@ MIN_DISAGREEMENT_MM = 0.02
 LARGE_ARM_MM = 0.1
 REJECTED_SHARE = 0.2
 PROBE_AGAIN = (
-    "probe the plate again, from the side that is scanned and after its last move, or solve the "
-    "plate along"
+    "where the tip was compensated to the wrong side, run `armscan probe --side` with the side "
+    "that was touched; else probe the plate again, from the side that is scanned and after its "
+    "last move, or solve the plate along"
 )
 
 

@@ -141,6 +141,8 @@ def reference_facts(
         facts.append(("probed", f"{plate.n_points} points{rms}"))
     if options.solve_plate:
         facts.append(("plane", "solved along, without regard to the probing"))
+    elif plate.covariance is None and plate.n_points:
+        facts.append(("plane", "taken as exact: the probed plate's uncertainty is not known"))
     elif plate.covariance is None:
         facts.append(("plane", "taken as exact: only A, B, C, D were given"))
     else:

@@ -23,7 +23,11 @@ LEAST_HEIGHT_MM = 1.0
 
 
 def face_towards(
-    plane: Plane, towards_mm: FloatArray | None, side: ProbeSide | None
+    plane: Plane,
+    towards_mm: FloatArray | None,
+    side: ProbeSide | None,
+    *,
+    is_sign_only: bool = False,
 ) -> tuple[Plane, str] | FitFailure:
     """Turn a plane's normal to the side of the probe.
 
@@ -35,6 +39,9 @@ def face_towards(
         (3,) or (M, 3) places of the tool; None where not known.
     side
         The user's word, which wins; None to follow the tool, or `DEFAULT_SIDE` without it.
+    is_sign_only
+        Nothing but the normal's sign depends on the side: where nobody says it and `DEFAULT_SIDE`
+        is not clear, the axis that the plate faces most will do.
 
     Returns
     -------
@@ -51,6 +58,9 @@ def face_towards(
             )
         return _facing(plane, above), "where the tool was"
     how = "as asked for" if side else TAKEN_FOR_GRANTED
+    if side is None and is_sign_only and abs(plane.normal[2]) < CLEAR_SIDE:
+        axis = int(np.argmax(np.abs(plane.normal)))
+        return _facing(plane, float(plane.normal[axis])), f"+{'xyz'[axis]}, {how}"
     side = side or DEFAULT_SIDE
     cosine = float(plane.normal["xyz".index(side[1])]) * (1.0 if side[0] == "+" else -1.0)
     if abs(cosine) < CLEAR_SIDE:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 from typing import get_args
 
 import numpy as np
@@ -14,7 +15,7 @@ from armscan.calibration.hand_eye.touch_outliers import find_outliers
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.fitting import Plane, fit_plane
+from armscan.geometry.fitting import Plane, fit_plane, plane_from_coefficients
 from armscan.models.probe_tip import compensate_tip
 from armscan.records.probing import ProbedPoints
 
@@ -22,6 +23,10 @@ LEAST_WIDTH = 0.05
 """Touches narrower than this part of their length leave the tilt about that length open."""
 LARGEST_RMS_MM = 1.0
 """Touches that scatter more are not on one plane, or in another unit."""
+PRIOR_FREEDOM = 4.0
+"""Degrees of freedom that the touch's sigma known beforehand is worth against the residuals."""
+GOOD_TOUCHES = 8
+"""With fewer touches, sigma is mostly what was assumed of a touch."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +42,16 @@ class ProbingOptions:
         Leave touches out that do not fit the others; else they are named only.
     feature
         Name of the points to use where the table names several features.
+    touch_sigma_mm
+        One standard deviation of a touch by arm and tip, as expected beforehand: it is worth
+        `PRIOR_FREEDOM` degrees of freedom against the scatter of the touches, so that three touches
+        have this sigma, and many have their own.
     """
 
     side: ProbeSide | None = None
     leave_out_outliers: bool = False
     feature: str = ""
+    touch_sigma_mm: float = 0.01
 
     def __post_init__(self) -> None:
         if self.side is not None and self.side not in get_args(ProbeSide):
@@ -49,6 +59,10 @@ class ProbingOptions:
                 f"no side of a plate is called '{self.side}'",
                 where="--side",
                 remedy=f"choose one of: {', '.join(get_args(ProbeSide))}",
+            )
+        if not (self.touch_sigma_mm > 0.0 and isfinite(self.touch_sigma_mm)):
+            raise OptionError(
+                f"a touch's sigma of {self.touch_sigma_mm} mm", remedy="give a number above 0"
             )
 
 
@@ -72,6 +86,8 @@ class ProbedPlate:
         How the side of the probe was found, in words.
     warnings
         What is weak, in words.
+    rows
+        Row of each touch in the table it came from, counted from 1 below the header.
     """
 
     reference: PlateReference
@@ -81,6 +97,7 @@ class ProbedPlate:
     is_used: tuple[bool, ...]
     side_from: str
     warnings: tuple[str, ...]
+    rows: tuple[int, ...]
 
     @property
     def flatness_mm(self) -> float:
@@ -129,35 +146,41 @@ def fit_probed_plate(
         If several features are named and none was chosen.
     """
     options = options or ProbingOptions()
-    points = probed.points_mm[_rows_of_feature(probed, options)]
-    plane = _fit(points)
+    of_feature = _rows_of_feature(probed, options)
+    points = probed.points_mm[of_feature]
+    plane = _fit(points, options)
     if isinstance(plane, FitFailure):
         return plane
     outliers = find_outliers(points)
     is_used = np.ones(len(points), dtype=np.bool_)
     if outliers and options.leave_out_outliers:
         is_used[list(outliers)] = False
-        plane = _fit(points[is_used])
+        plane = _fit(points[is_used], options)
         if isinstance(plane, FitFailure):
             return plane
-    oriented = face_towards(plane.value, towards_mm, options.side)
+    is_tip = probed.are_tip_centres
+    oriented = face_towards(plane.value, towards_mm, options.side, is_sign_only=not is_tip)
     if isinstance(oriented, FitFailure):
         return oriented
     facing, side_from = oriented
-    surface = compensate_tip(points, facing.normal, probed.tip_diameter_mm)
-    at = compensate_tip(facing.point_mm[None], facing.normal, probed.tip_diameter_mm)[0]
+    tip_mm = probed.tip_diameter_mm if is_tip else 0.0
+    surface = compensate_tip(points, facing.normal, tip_mm)
+    at = compensate_tip(facing.point_mm[None], facing.normal, tip_mm)[0]
     reference = PlateReference(
         Plane(at, facing.axes),
-        plane.covariance if plane.degrees_of_freedom else None,
+        plane.covariance,
         float(np.sqrt(np.mean(plane.residuals**2))),
         int(is_used.sum()),
         probed.source,
         probed.tip_diameter_mm,
     )
     residual = reference.plane.distance_mm(surface)
-    warnings = _warnings(residual, outliers, options, side_from)
+    rows = tuple(probed.rows[k] for k in np.flatnonzero(of_feature))
+    named = tuple(f"{rows[k]} ({residual[k]:+.3f} mm)" for k in outliers)
+    is_guessed = is_tip and TAKEN_FOR_GRANTED in side_from
+    warnings = _warnings(reference.n_points, named, options, side_from if is_guessed else "")
     used = tuple(bool(value) for value in is_used)
-    return ProbedPlate(reference, surface, residual, outliers, used, side_from, warnings)
+    return ProbedPlate(reference, surface, residual, outliers, used, side_from, warnings, rows)
 
 
 def plate_from_coefficients(
@@ -175,24 +198,16 @@ def plate_from_coefficients(
     InputError
         If these are not four finite numbers or the normal is zero.
     """
-    values = np.asarray(coefficients, dtype=np.float64)
-    length = float(np.linalg.norm(values[:3])) if values.shape == (4,) else 0.0
-    if not np.isfinite(values).all() or not length > 0.0:
-        raise InputError("a plane needs four finite numbers A, B, C, D and a normal", where=source)
-    normal, offset = values[:3] / length, values[3] / length
     near = np.zeros(3) if towards_mm is None else np.atleast_2d(towards_mm).mean(axis=0)
-    across = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    across /= np.linalg.norm(across)
-    foot = near - (normal @ near + offset) * normal
-    plane = Plane(foot, np.stack([across, np.cross(normal, across), normal]))
+    plane = plane_from_coefficients(coefficients, near, source)
     oriented = face_towards(plane, towards_mm, side)
     if isinstance(oriented, FitFailure):
         return oriented
     return PlateReference(oriented[0], source=source)
 
 
-def _fit(points: FloatArray) -> Estimate[Plane] | FitFailure:
-    fit = fit_plane(points)
+def _fit(points: FloatArray, options: ProbingOptions) -> Estimate[Plane] | FitFailure:
+    fit = fit_plane(points, prior_sigma_mm=options.touch_sigma_mm, prior_freedom=PRIOR_FREEDOM)
     if isinstance(fit, FitFailure):
         return fit
     along = (points - fit.value.point_mm) @ fit.value.axes[:2].T
@@ -219,21 +234,25 @@ def _rows_of_feature(probed: ProbedPoints, options: ProbingOptions) -> BoolArray
         raise InputError(
             f"the points belong to the features {', '.join(names) or 'of no name'}",
             where=probed.source,
-            remedy="choose the one that is the plate",
+            remedy="take the one that is the plate: armscan probe POINTS --feature NAME "
+            "-o plate.csv",
         )
     return np.array([name == options.feature for name in probed.features], dtype=np.bool_)
 
 
 def _warnings(
-    residual: FloatArray, outliers: tuple[int, ...], options: ProbingOptions, side_from: str
+    n_touches: int, named: tuple[str, ...], options: ProbingOptions, guessed_side: str
 ) -> tuple[str, ...]:
     warnings = []
-    if len(residual) == 3:
-        warnings.append("three touches: nothing checks the plane, and its sigma is not known")
-    if outliers:
-        named = ", ".join(f"{row + 1} ({residual[row]:+.3f} mm)" for row in outliers)
+    if n_touches < GOOD_TOUCHES:
+        unchecked = ", and nothing checks the plane" if n_touches == 3 else ""
+        warnings.append(
+            f"{n_touches} touches: the plate's sigma rests on the {options.touch_sigma_mm:g} mm "
+            f"that is taken for a touch{unchecked}; touch {GOOD_TOUCHES} places or more"
+        )
+    if named:
         what = "was left out" if options.leave_out_outliers else "took part: touch again there"
-        warnings.append(f"a touch does not fit the others and {what}: number {named}")
-    if TAKEN_FOR_GRANTED in side_from:
-        warnings.append(f"the side that was touched is {side_from}; --side says it")
+        warnings.append(f"a touch does not fit the others and {what}: row {', '.join(named)}")
+    if guessed_side:
+        warnings.append(f"the side that was touched is {guessed_side}; --side says it")
     return tuple(warnings)

@@ -62,7 +62,7 @@ def offset_in_words(offset_mm: float, tilt_deg: float, plate: PlateReference) ->
     if diameter > 0.0 and abs(abs(offset_mm) - diameter) < ALIKE * diameter:
         return (
             f"{words}; that is the tip's diameter ({diameter:g} mm): the tip was compensated "
-            "to the wrong side of the plate"
+            "to the wrong side of the plate, which `armscan probe --side` sets right"
         )
     if diameter > 0.0 and abs(abs(offset_mm) - 0.5 * diameter) < ALIKE * diameter:
         return (

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -33,6 +34,10 @@ ARM_FILE = "arm.csv"
 JOINT = re.compile(r"j(\d+)_rad")
 WARN_TURNS_RAD = 2.0 * np.pi
 REFUSE_TURNS_RAD = 4.0 * np.pi
+FORMS_AGREE_DEG = 0.02
+"""Angles of two decimals differ less from the rotation that they were rounded from."""
+JOINTS_AGREE_DEG, JOINTS_AGREE_MM = 1.0, 10.0
+"""An arm's nominal geometry differs less from what its controller reports."""
 
 Columns = Mapping[str, tuple[str, ...]]
 
@@ -82,13 +87,15 @@ def read_arm_table(
     ------
     FileFormatError
         If columns are missing, a time or trigger id appears twice, times go back, a rotation is
-        none, or numbers can only be in another unit.
+        none, numbers can only be in another unit, or the columns hold poses of two forms that
+        differ and nobody says which.
     """
     table.require(("t_ns",))
     if not len(table):
         raise FileFormatError("the table holds no sample", where=table.where)
     times = _times(table)
-    chosen = _form(table, form)
+    complete = _complete_forms(table)
+    chosen = _form(table, form, complete)
     joint_names = _joint_names(table)
     used = ("t_ns", "trigger_id", *joint_names)
     joints = table.floats(joint_names, may_lack=True) if joint_names else None
@@ -100,7 +107,12 @@ def read_arm_table(
     _refuse_metres(rotations[is_known], positions[is_known], table.where)
     track = ArmTrack(times, rotations, positions, is_known, _triggers(table), joints)
     extra = {name: cells for name, cells in table.columns.items() if name not in used}
-    return ArmTable(track, chosen, extra, tuple(_warnings(track, table.where)))
+    others = [other for other in complete if other != chosen]
+    if form is None:
+        found = [_compared(table, track, chosen, (other, rotation), arm) for other in others]
+    else:
+        found = [_left(table, chosen, other) for other in others if other != "joints"]
+    return ArmTable(track, chosen, extra, (*found, *_warnings(track, table.where)))
 
 
 def arm_columns(
@@ -177,14 +189,17 @@ def _triggers(table: CsvTable) -> IntArray | None:
     return ids
 
 
-def _form(table: CsvTable, stated: PoseForm | None) -> PoseForm:
+def _complete_forms(table: CsvTable) -> list[PoseForm]:
+    """Forms of which all columns are there."""
     complete: list[PoseForm] = [
         form
         for form, names in FORM_COLUMNS.items()
         if form != "joints" and all(name in table for name in (*POSITION, *names))
     ]
-    if _joint_names(table):
-        complete.append("joints")
+    return [*complete, "joints"] if _joint_names(table) else complete
+
+
+def _form(table: CsvTable, stated: PoseForm | None, complete: list[PoseForm]) -> PoseForm:
     if stated is None and complete:
         return complete[0]
     if stated is not None and stated in complete:
@@ -201,6 +216,46 @@ def _form(table: CsvTable, stated: PoseForm | None) -> PoseForm:
         )
     table.require(("t_ns", *POSITION, *FORM_COLUMNS[form]))
     return form
+
+
+def _left(table: CsvTable, chosen: PoseForm, other: PoseForm) -> str:
+    return (
+        f"{table.where}: there are columns of '{chosen}' and of '{other}'; '{chosen}' is used, as "
+        "session.toml says"
+    )
+
+
+def _compared(
+    table: CsvTable,
+    track: ArmTrack,
+    chosen: PoseForm,
+    other: tuple[PoseForm, EulerConvention],
+    arm: ArmModel | None,
+) -> str:
+    """Refuse columns of a second form that tell of other poses, where nobody says which count."""
+    form, rotation = other
+    both = f"there are columns of '{chosen}' and of '{form}'"
+    limit_deg = JOINTS_AGREE_DEG if form == "joints" else FORMS_AGREE_DEG
+    if form != "joints":
+        is_known, rotations, positions = _from_poses(table, form, rotation)
+    elif arm is not None and track.joints_rad is not None:
+        is_known, rotations, positions = _from_joints(table, np.array(track.joints_rad), arm)
+    else:
+        return f"{table.where}: {both}; '{chosen}' is used, as nobody says which"
+    rows = np.flatnonzero(is_known & track.is_known)
+    relative = np.einsum("nji,njk->nik", track.rotations[rows], rotations[rows])
+    angles = np.degrees(Rotation.from_matrix(relative).magnitude()) if len(rows) else np.zeros(0)
+    apart = np.linalg.norm(track.translations_mm[rows] - positions[rows], axis=1)
+    is_other = (angles > limit_deg) | (apart > JOINTS_AGREE_MM)
+    if is_other.any():
+        first = int(np.argmax(is_other))
+        raise FileFormatError(
+            f"{both}, and they differ by {angles[first]:.3g} deg and {apart[first]:.3g} mm",
+            where=table.place(int(rows[first])),
+            remedy=f'say form = "{chosen}" or form = "{form}" under [pose] in session.toml'
+            + (", or correct rotation there" if "euler" in (chosen, form) else ""),
+        )
+    return f"{table.where}: {both}, which agree; '{chosen}' is used"
 
 
 def _hint_at_names(table: CsvTable) -> None:

@@ -97,6 +97,60 @@ def test_an_empty_or_nan_pose_is_a_gap(tmp_path: Path, gap: str) -> None:
     assert any("1 of 3 samples have no pose" in warning for warning in scan.warnings)
 
 
+def two_forms(turn_deg: float) -> str:
+    """Quaternions of 40 degrees about z, and angles of so much more."""
+    half = np.radians(20.0)
+    pose = f"{float(np.cos(half))!r},0,0,{float(np.sin(half))!r},0,0,{40.0 + turn_deg}"
+    lines = (f"{500 + 1500 * k},{900 + k},0,400,{pose}" for k in range(3))
+    return table(POSITION + "qw,qx,qy,qz,a_deg,b_deg,c_deg", *lines)
+
+
+def test_of_two_forms_that_agree_one_is_used_and_named(tmp_path: Path) -> None:
+    scan = read_recording(lab_folder(tmp_path, arm=two_forms(0.01), session=NO_SESSION))
+    assert scan.session.pose_form == "quaternion"
+    assert any("which agree; 'quaternion' is used" in text for text in scan.warnings)
+
+
+def test_of_two_forms_that_differ_the_session_must_say_which(tmp_path: Path) -> None:
+    message = refusal(tmp_path / "1", arm=two_forms(0.5), session=NO_SESSION)
+    assert "line 2: there are columns of 'quaternion' and of 'euler'" in message
+    assert "differ by 0.5 deg" in message and 'form = "euler"' in message
+    for form, angle in (("quaternion", 40.0), ("euler", 40.5)):
+        session = SESSION.replace("quaternion", form)
+        scan = read_recording(lab_folder(tmp_path / form, arm=two_forms(0.5), session=session))
+        assert scan.arm is not None
+        turned = np.degrees(np.arctan2(scan.arm.rotations[0, 1, 0], scan.arm.rotations[0, 0, 0]))
+        assert turned == pytest.approx(angle)
+        assert any(f"'{form}' is used, as session.toml says" in text for text in scan.warnings)
+
+
+def test_joints_beside_poses_are_compared_if_the_arm_is_known(tmp_path: Path) -> None:
+    model = thesis_arm((300, 400, 300, 100), (20, 30, 20))
+    joints = np.random.default_rng(1).uniform(-3, 3, (3, 7))
+    rotations, positions = forward(model, joints)
+    header = "t_ns,x_mm,y_mm,z_mm,r11,r12,r13,r21,r22,r23,r31,r32,r33,j1_rad,j2_rad,j3_rad,j4_rad"
+
+    def text(off_mm: float) -> str:
+        numbers = np.hstack([positions + np.array([off_mm, 0, 0]), rotations.reshape(3, 9), joints])
+        lines = (
+            f"{500 + 1500 * k}," + ",".join(map(repr, row))
+            for k, row in enumerate(numbers.tolist())
+        )
+        return table(header + ",j5_rad,j6_rad,j7_rad", *lines)
+
+    for off_mm, stated, said in (
+        (2.0, NO_SESSION, "which agree; 'matrix' is used"),
+        (20.0, SESSION.replace("quaternion", "matrix"), ""),
+    ):
+        folder = lab_folder(tmp_path / str(off_mm), arm=text(off_mm), session=stated)
+        assert said in "".join(read_recording(folder, model).warnings)
+        assert bool(read_recording(folder, model).warnings) == bool(said)
+    folder = lab_folder(tmp_path, arm=text(20.0), session=NO_SESSION)
+    with pytest.raises(FileFormatError, match=r"differ by .* deg and 20 mm"):
+        read_recording(folder, model)
+    assert any("nobody says which" in text for text in read_recording(folder).warnings)
+
+
 BAD_ARM = {
     "empty file": ("", "empty"),
     "no rows": (ARM.splitlines()[0] + "\n", "no sample"),

@@ -37,6 +37,7 @@ from armscan.calibration.hand_eye.plate_result import (
 )
 from armscan.calibration.hand_eye.plate_search import Start, find_start
 from armscan.calibration.hand_eye.posture_geometry import REMEDY, common_to_postures
+from armscan.calibration.hand_eye.posture_names import check_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -73,8 +74,14 @@ def calibrate_on_plate(
     -------
     HandEyeFit
         The hand-eye with its covariance and evidence, or why there is none.
+
+    Raises
+    ------
+    InputError
+        If one posture's name stands for different poses.
     """
     options = options or HandEyeOptions()
+    check_postures(stripes, options.exposure_position_mm, options.exposure_rotation_rad)
     kept = straight_stripes(stripes, options)
     nodes = replace(
         condense(stripes, kept, options.nodes_per_stripe), sensor_covariance=sensor_covariance

@@ -23,6 +23,7 @@ from armscan.calibration.hand_eye.conditioning import (
 )
 from armscan.calibration.hand_eye.least_squares import LinearSolution
 from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.hand_eye.posture_names import check_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.sphere_evidence import sphere_fit
 from armscan.calibration.hand_eye.sphere_options import (
@@ -47,7 +48,6 @@ from armscan.calibration.hand_eye.sphere_residuals import (
 )
 from armscan.calibration.hand_eye.sphere_sections import find_sections
 from armscan.calibration.hand_eye.sphere_start import is_apart, start_candidates
-from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 
@@ -105,7 +105,7 @@ def calibrate_on_sphere(
         If the diameter is none.
     """
     check_diameter(diameter_mm)
-    _check_postures(stripes)
+    check_postures(stripes)
     radius = 0.5 * diameter_mm
     sections, left_out = find_sections(stripes, radius, options)
     n_postures = len({section.stripe.posture for section in sections})
@@ -157,20 +157,6 @@ def _refuse_postures(linear: LinearSolution | None, diameter_mm: float) -> FitFa
             POSTURES_REMEDY,
         )
     return refused
-
-
-def _check_postures(stripes: Sequence[PosedStripe]) -> None:
-    seen: dict[str, PosedStripe] = {}
-    for stripe in stripes:
-        first = seen.setdefault(stripe.posture, stripe)
-        turned = np.abs(first.base_from_tool.rotation - stripe.base_from_tool.rotation).max()
-        moved = first.base_from_tool.translation_mm - stripe.base_from_tool.translation_mm
-        if turned > 0.01 or np.abs(moved).max() > 1.0:
-            raise InputError(
-                f"posture '{stripe.posture}' has different poses in {first.source} and "
-                f"{stripe.source}",
-                remedy="give every posture of the arm a name of its own",
-            )
 
 
 def _search(

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One posture's name, one pose of the arm: exposures that moved under one name are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.posture_names import check_postures
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.errors import InputError
+from armscan.geometry.frames import Tool
+from armscan.geometry.poses import Pose
+from plate_rig import PlateRig, good_postures
+
+STANDING_MM, STANDING_RAD = 0.02, np.radians(0.002)
+
+
+def _moved(stripe: PosedStripe, shift_mm: float, turn_rad: float) -> PosedStripe:
+    step: Pose[Tool, Tool] = Pose.from_vectors([0.0, turn_rad, 0.0], [shift_mm, 0.0, 0.0])
+    return replace(stripe, base_from_tool=stripe.base_from_tool @ step)
+
+
+def test_two_postures_of_one_name_are_refused_on_a_plate() -> None:
+    """Taken for one posture, the second one's pose would count as known by the first one's."""
+    stripes, plate = PlateRig(good_postures(8, np.random.default_rng(1))).draw(1)
+    named = [replace(stripe, posture=f"view{k // 2}") for k, stripe in enumerate(stripes)]
+    with pytest.raises(
+        InputError, match=r"'view0' has different poses.*image00-0 to image01-0"
+    ) as e:
+        calibrate_on_plate(named, plate)
+    assert "a view of its own" in str(e.value)
+
+
+def test_an_arm_that_stands_still_is_one_posture() -> None:
+    """Encoder noise, five sigmas of it, is no movement; 0.3 degrees or 1.5 mm are."""
+    rig = PlateRig(good_postures(8, np.random.default_rng(1)), exposures_per_posture=2)
+    stripes, plate = rig.draw(1)
+    still = [
+        _moved(stripe, 5.0 * STANDING_MM * (k % 2), 5.0 * STANDING_RAD * (k % 2))
+        for k, stripe in enumerate(stripes)
+    ]
+    assert isinstance(calibrate_on_plate(still, plate), HandEyeFit)
+    for shift_mm, turn_deg in ((1.5, 0.0), (0.0, 0.3)):
+        moved = [stripes[0], _moved(stripes[1], shift_mm, np.radians(turn_deg))]
+        with pytest.raises(InputError, match=f"by {shift_mm:.1f} mm and {turn_deg:.1f} deg"):
+            calibrate_on_plate(moved, plate)
+
+
+def test_a_worse_arm_that_was_stated_may_move_more() -> None:
+    stripes, _ = PlateRig(good_postures(2, np.random.default_rng(1)), exposures_per_posture=2).draw(
+        1
+    )
+    moved = [stripes[0], _moved(stripes[1], 1.5, 0.0)]
+    check_postures(moved, HandEyeOptions(exposure_position_mm=0.3).exposure_position_mm)

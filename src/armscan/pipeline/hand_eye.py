@@ -13,15 +13,16 @@ from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate import calibrate_on_plate
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.scan_source import ScanSource
-from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.errors import ArmscanError, EstimationError, OptionError
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.exposure_pairs import check_sizes
+from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.reconstruct import ReconstructOptions, measure_exposure
+from armscan.pipeline.scan_images import ScanImages
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, triangulate_stripe
@@ -120,7 +121,8 @@ def calibrate_hand_eye_from_scan(
     Parameters
     ----------
     source
-        The scan, with an arm; exposures with the laser off serve as background of their view.
+        The scan, with an arm and one camera; exposures with the laser off serve as background of
+        their view.
     sensor
         Camera and sheets.
     plate
@@ -133,9 +135,11 @@ def calibrate_hand_eye_from_scan(
     Raises
     ------
     InputError
-        If the scan has no arm, or its images are not of the camera's sensor.
+        If the scan has no arm or several cameras, if its images are not of the camera's sensor,
+        or if one view stands for different poses.
     EstimationError
-        If no exposure has a pose, or the sheet of a stripe is ambiguous.
+        If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
+        ambiguous.
     """
     options = options or HandEyeScanOptions()
     seen = observe_stripes(source, sensor, options, progress=progress)
@@ -156,10 +160,12 @@ def observe_stripes(
 ) -> ObservedStripes:
     """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
 
-    Whatever reference the stripes lie on: a plate or a sphere.
+    Whatever reference the stripes lie on: a plate or a sphere. An image that cannot be read is
+    left out and named, as `armscan.pipeline.scan.measure_scan` does.
     """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
-    is_lit = _lit(source.rows)
+    exposures = ScanImages(source)
+    is_lit = exposures.is_lit
     chosen = _spread(np.flatnonzero(is_lit & poses.has_pose), options.max_exposures)
     postures, merged = _postures(
         [source.rows[k] for k in chosen], [poses.pose(int(k)) for k in chosen]
@@ -170,24 +176,27 @@ def observe_stripes(
         (source.rows[k].source, "the arm gave no pose for it")
         for k in np.flatnonzero(is_lit & ~poses.has_pose)
     ]
+    n_unreadable = 0
     for done, (k, posture) in enumerate(zip(chosen, postures, strict=True)):
         progress(ProgressEvent(STAGE, done, len(chosen), source.rows[k].source))
-        image = _measure(source, int(k), is_lit, sensor, options.measure)
+        try:
+            pair = exposures.pair(int(k))
+        except ArmscanError as error:
+            not_used.append((source.rows[k].source, str(error)))
+            n_unreadable += 1
+            continue
+        image = _measure(pair, sensor, options.measure)
         if image.count(PointFate.MEASURED) < options.hand_eye.min_points:
             not_used.append((source.rows[k].source, "no stripe was measured in it"))
             continue
         images.append(image)
         stripes.append(posed_stripe(image, sensor, posture, poses.pose(int(k))))
     progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
+    if n_unreadable == len(chosen) > 0:
+        raise EstimationError(f"no exposure with a pose could be read: {not_used[-1][1]}")
     n_posed = int((is_lit & poses.has_pose).sum())
     warnings = (*poses.warnings, *_left_out(len(chosen), n_posed, not_used), *merged)
     return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
-
-
-def _lit(rows: Sequence[ExposureRow]) -> BoolArray:
-    """(N,) True for exposures with a laser; for all of them where no lasers are named."""
-    is_lit = np.array([bool(row.lasers) for row in rows], dtype=np.bool_)
-    return is_lit if is_lit.any() else np.ones(len(rows), dtype=np.bool_)
 
 
 def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
@@ -242,19 +251,10 @@ def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> Float
 
 
 def _measure(
-    source: ScanSource,
-    row: int,
-    is_lit: BoolArray,
-    sensor: SensorCalibration,
-    options: ReconstructOptions,
+    pair: ExposurePair, sensor: SensorCalibration, options: ReconstructOptions
 ) -> ReconstructedImage:
-    """Stripes of one exposure; one of the same view without laser serves as background."""
-    exposure = source.exposure(row)
-    check_sizes([exposure], sensor.camera.camera)
-    view = source.rows[row].view
-    dark = [k for k in np.flatnonzero(~is_lit) if view and source.rows[k].view == view]
-    background = source.exposure(int(dark[0])) if dark else None
-    return measure_exposure((exposure, background), sensor, options)
+    check_sizes([exposure for exposure in pair if exposure is not None], sensor.camera.camera)
+    return measure_exposure(pair, sensor, options)
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:

@@ -10,7 +10,7 @@ import pytest
 
 from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
 from armscan.devices.scan_source import ScanSource
-from armscan.errors import InputError, OptionError
+from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import (
     CameraCalibration,
@@ -177,3 +177,67 @@ def test_a_scan_without_arm_or_without_stripes_says_so() -> None:
     failure = calibrate_hand_eye_from_scan(DrawnScan(), sensor, plate)
     assert isinstance(failure, FitFailure)
     assert "0 postures" in failure.reason
+
+
+@dataclass(frozen=True)
+class TornScan(DrawnScan):
+    """Some of the images cannot be read."""
+
+    torn: tuple[int, ...] = ()
+
+    def exposure(self, row: int) -> Exposure:
+        if row in self.torn:
+            raise InputError("not an image", where=f"image{row}")
+        return super().exposure(row)
+
+
+def test_an_unreadable_image_is_named_and_left_out() -> None:
+    run = _run(TornScan(torn=(2,)))
+    assert [name for name, _ in run.not_used] == ["image2"]
+    assert "not an image" in run.not_used[0][1]
+    assert any("1 exposures were not used: image2 (" in warning for warning in run.warnings)
+    assert run.fit.calibration.n_postures == 7
+    _, plate = RIG.draw(0)
+    with pytest.raises(EstimationError, match=r"could be read: .*not an image"):
+        calibrate_hand_eye_from_scan(TornScan(torn=tuple(range(8))), _sensor(), plate)
+
+
+@dataclass(frozen=True)
+class BackgroundScan(DrawnScan):
+    """The first exposure of every view is without laser; every reading is noted."""
+
+    read: list[int] = field(default_factory=list)
+
+    @property
+    def rows(self) -> tuple[ExposureRow, ...]:
+        rows = super().rows
+        return tuple(replace(r, lasers=()) if r.index % self.repeats == 0 else r for r in rows)
+
+    def exposure(self, row: int) -> Exposure:
+        self.read.append(row)
+        drawn = super().exposure(row)
+        if self.rows[row].lasers:
+            return drawn
+        return replace(drawn, image=np.full_like(drawn.image, 10))
+
+
+def test_the_background_of_a_view_is_read_once() -> None:
+    scan = BackgroundScan(repeats=3)
+    run = _run(scan)
+    assert len(run.stripes) == 16
+    assert sorted(scan.read) == list(range(24))
+
+
+@dataclass(frozen=True)
+class TwoCameraScan(DrawnScan):
+    """Every other exposure is another camera's."""
+
+    @property
+    def rows(self) -> tuple[ExposureRow, ...]:
+        return tuple(replace(row, camera=row.index % 2) for row in super().rows)
+
+
+def test_two_cameras_are_not_mixed() -> None:
+    _, plate = RIG.draw(0)
+    with pytest.raises(InputError, match="exposures of cameras 0, 1"):
+        calibrate_hand_eye_from_scan(TwoCameraScan(), _sensor(), plate)

@@ -56,7 +56,8 @@ def residuals_by_posture(fit: HandEyeFit) -> Picture:
         raster_markup(figure, "Residuals by posture"),
         title="Residuals by posture",
         caption="Small dots are points, the large dot their mean; the box is two sigma of that "
-        "mean under the noise model (pose of the arm, flatness, stripe). Means within their boxes "
+        "mean under the noise model (pose of the arm, flatness, stripe, sensor), less what the fit "
+        "follows. Means within their boxes "
         "are what an arm does; one far outside points to a posture that does not belong.",
     )
 

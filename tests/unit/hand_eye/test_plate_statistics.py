@@ -67,6 +67,38 @@ def test_estimated_scatter_is_right_and_so_is_the_covariance() -> None:
     assert 0.4 * arm_mm < fit.calibration.arm_noise.position_mm < 2.5 * arm_mm
 
 
+def test_the_means_of_the_postures_scatter_as_predicted() -> None:
+    """Coarse probing and a coarse sensor, of which plane and hand-eye follow the most.
+
+    The boxes of the page are the standard deviation of the means that stand in them. The fit leaves
+    at least 6 of a run's 12 means: 48 numbers in 8 runs, a ratio of variances to 0.2.
+    """
+    rng = np.random.default_rng(7)
+    postures = good_postures(12, np.random.default_rng(3))
+    rig = PlateRig(postures, replace(NOISE, probing_mm=0.05), points_per_stripe=60)
+    sigma = np.array([0.05, 0.05, 0.05])
+    means, ratios = [], []
+    for seed in range(8):
+        stripes, plate = rig.draw(seed)
+        wrong = sigma * rng.normal(size=3)
+        moved = [
+            replace(
+                s,
+                points_mm=s.points_mm + wrong,
+                by_sensor=np.tile(np.eye(3), (len(s), 1, 1)),
+            )
+            for s in stripes
+        ]
+        fit = calibrate_on_plate(moved, plate, GIVEN, sensor_covariance=np.diag(sigma**2))
+        assert isinstance(fit, HandEyeFit)
+        means.append([posture.mean_mm for posture in fit.postures])
+        ratios.append([posture.normalised_mean for posture in fit.postures])
+    assert 0.5 < np.mean(np.square(ratios)) < 1.6
+    predicted = np.array(means) / np.array(ratios)
+    assert predicted.std(axis=0).max() < 0.05 * predicted.mean()
+    assert 0.5 < np.mean(np.square(means)) / np.mean(np.square(predicted)) < 1.6
+
+
 def test_a_worse_arm_is_noticed() -> None:
     """All errors five times as large: the stated covariance grows with them."""
     postures = good_postures(12, np.random.default_rng(3))

@@ -10,14 +10,18 @@ from scipy.stats import chi2 as chi2_distribution
 
 from armscan.calibration.hand_eye.conditioning import Conditioning
 from armscan.calibration.hand_eye.left_out import LeftOut
-from armscan.calibration.hand_eye.noise_model import arm_noise
+from armscan.calibration.hand_eye.noise_model import arm_noise, total_covariance
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate_fit import PlateFit, plane_after
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
-from armscan.calibration.hand_eye.plate_residuals import residual_by_sensor, shifted_plane
+from armscan.calibration.hand_eye.plate_residuals import (
+    residual_by_sensor,
+    sensor_covariance,
+    shifted_plane,
+)
 from armscan.calibration.hand_eye.result import PostureResult, StripeResidual
-from armscan.geometry.arrays import BoolArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.fitting import Plane
 from armscan.geometry.frames import Sensor, Tool
 from armscan.geometry.poses import Points, Pose
@@ -50,9 +54,9 @@ def posture_results(
     left_out: dict[int, LeftOut],
     plane: Plane,
 ) -> tuple[PostureResult, ...]:
-    """Summarise every posture that took part."""
+    """Summarise every posture that took part; ``plane`` is the one that the residuals are from."""
     pose = fit.refined.state.tool_from_sensor
-    spread = fit.total - fit.slopes @ fit.linear.covariance @ fit.slopes.T
+    spread = fitted_covariance(nodes, fit)
     results = []
     for number, left in left_out.items():
         own = nodes.posture == number
@@ -70,7 +74,7 @@ def posture_results(
                 len(distances),
                 float(distances.mean()),
                 float(np.sqrt((distances**2).mean())),
-                float(share @ fit.refined.placed.residual_mm) / sigma_mm,
+                float(distances.mean()) / sigma_mm,
                 float(np.degrees(np.arccos(np.clip(abs(local[2]), 0.0, 1.0)))),
                 float(np.degrees(np.arctan2(local[1], local[0]))),
                 float(np.linalg.norm(nodes.points_mm[own], axis=1).mean()),
@@ -80,6 +84,19 @@ def posture_results(
             )
         )
     return tuple(results)
+
+
+def fitted_covariance(nodes: PlateNodes, fit: PlateFit) -> FloatArray:
+    """(N, N) covariance of the residuals from the plane that scan and probing give together.
+
+    The hand-eye and the plane follow the errors that they can explain. With ``C`` the covariance
+    of all errors, ``P`` of `LinearSolution` and ``D`` that of scatter and sensor, without the
+    plane, these residuals are ``D P e``, so that their covariance is ``D P D``.
+    """
+    scatter = total_covariance(fit.components, fit.noise.sigmas)
+    by_sensor = sensor_covariance(nodes, fit.refined.placed)
+    own = scatter if by_sensor is None else scatter + by_sensor
+    return np.asarray(own @ fit.linear.projected @ own)
 
 
 def hand_eye_calibration(

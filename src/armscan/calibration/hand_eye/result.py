@@ -50,7 +50,8 @@ class PostureResult:
     mean_mm, rms_mm
         Mean and root mean square distance of its points from the reference.
     normalised_mean
-        The mean over the standard deviation that the noise model gives it.
+        The mean over the standard deviation that the noise model gives it after the fit, which
+        follows a part of the errors.
     tilt_deg, azimuth_deg
         Of the sensor's optical axis against the plate's normal, and about it; NaN for a sphere.
     stand_off_mm

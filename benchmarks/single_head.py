@@ -20,8 +20,8 @@ from typing import cast
 import numpy as np
 
 from armscan.devices.twin import Preset
+from armscan.pipeline.render_pool import TwinName
 from armscan.pipeline.single_demo import SingleDemo, run_single
-from armscan.pipeline.single_recordings import TwinName
 from armscan.report.single_demo_data import fraction_within
 
 FIGURES = (

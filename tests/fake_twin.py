@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
 from recording_folders import MemoryScan, memory_scan
 
 N_IMAGES = 6
@@ -31,6 +34,22 @@ class FakeProbing:
     tip_diameter_mm: float
 
 
+class SlowScan(MemoryScan):
+    """An image takes a minute; which process began one is left in the folder of its name."""
+
+    def exposure(self, row: int) -> Exposure:
+        (Path(self.name) / f"started-{os.getpid()}").touch()
+        time.sleep(60.0)
+        return super().exposure(row)
+
+
+class DyingScan(MemoryScan):
+    """The process that renders an image comes to an end."""
+
+    def exposure(self, row: int) -> Exposure:
+        os._exit(1)
+
+
 @dataclass(frozen=True)
 class FakeTwin:
     head: str
@@ -43,7 +62,12 @@ class FakeTwin:
         return FakeTruth(self.seed)
 
     def scan(self, scene: str) -> MemoryScan:
-        return memory_scan(N_IMAGES, None if scene == "camera" else self.probe_plate().arm)
+        scan = memory_scan(N_IMAGES, None if scene == "camera" else self.probe_plate().arm)
+        if self.head.startswith("slow:"):
+            return SlowScan(scan.session, scan.rows, scan.images, scan.arm, name=self.head[5:])
+        if self.head == "dying":
+            return DyingScan(scan.session, scan.rows, scan.images, scan.arm)
+        return scan
 
     def probe_plate(self) -> FakeProbing:
         n = 4

@@ -1,34 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes of the twin, rendered by several processes and written as folder recordings."""
+"""One scene of the twin as a folder recording, its truth beside it."""
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Generator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
-from typing import cast, get_args
+from typing import get_args
 
-from armscan.devices.registry import load_driver
-from armscan.devices.scan_source import ScanSource
-from armscan.devices.twin import Preset, Twin, TwinScene
-from armscan.errors import EstimationError, OptionError
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.devices.twin import Preset, TwinScene
+from armscan.errors import OptionError, OutputError
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.render_pool import TwinName
+from armscan.pipeline.twin_recordings import record_scenes, record_touches
 from armscan.storage.atomic import check_outputs, write_files
 from armscan.storage.atomic_folder import check_new_folder
-from armscan.storage.probe_files import ProbeTip, write_probing
-from armscan.storage.recording_images import encoded_png
-from armscan.storage.recording_writer import write_recording, written_session
-
-IMAGES_A_PROCESS = 15
-"""Fewer do not pay: a process takes some seconds before its first image."""
-STAGE = "render images"
-
-_scans: list[ScanSource] = []
-"""The scene of a rendering process, made once; empty in any other process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +71,18 @@ class SimulatedScene:
 
 
 def truth_path(folder: Path) -> Path:
-    """``NAME.truth.json`` beside the folder ``NAME``: truth never travels inside a recording."""
-    return folder.with_name(f"{folder.name}.truth.json")
+    """``NAME.truth.json`` beside the folder ``NAME``: truth never travels inside a recording.
+
+    Raises
+    ------
+    OutputError
+        If the folder is a root.
+    """
+    # "." and "a/.." have no name of their own
+    named = folder if folder.name not in ("", "..") else folder.resolve()
+    if not named.name:
+        raise OutputError("a root has no name", where=str(folder), remedy="name a new folder")
+    return named.with_name(f"{named.name}.truth.json")
 
 
 def simulate_scene(
@@ -118,82 +113,23 @@ def simulate_scene(
         If a result exists or cannot be written.
     OptionError
         If there is no such head.
+    EstimationError
+        If a process that renders came to an end.
     """
     settings = SimulateOptions() if options is None else options
     truth = truth_path(folder)
     check_new_folder(folder)
     check_outputs((truth,))
-    twin = _twin(head, settings)
+    name = TwinName(head, settings.preset, settings.seed)
+    twin = name.build()
     n_images, n_samples = 0, 0
     if scene == "probing":
-        n_samples = _write_touches(folder, twin)
+        n_samples = record_touches(folder, twin)
     else:
-        source = twin.scan(scene)
+        source = record_scenes(
+            {scene: folder}, name, processes=settings.processes, progress=progress
+        )[scene]
         n_images = len(source.rows)
         n_samples = 0 if source.arm is None else len(source.arm)
-        _write_scan(folder, source, (head, scene, settings), progress)
     write_files({truth: twin.truth.document()})
     return SimulatedScene(folder, truth, n_images, n_samples, twin.target)
-
-
-def _twin(head: str, options: SimulateOptions) -> Twin:
-    return cast(Twin, load_driver("twin")(head=head, preset=options.preset, seed=options.seed))
-
-
-def _write_touches(folder: Path, twin: Twin) -> int:
-    probing = twin.probe_plate()
-    tip = ProbeTip(probing.tool_from_probe_mm, probing.tip_diameter_mm)
-    write_probing(folder, probing.arm, tip, is_simulated=True)
-    return len(probing.arm)
-
-
-def _write_scan(
-    folder: Path,
-    source: ScanSource,
-    made_from: tuple[str, TwinScene, SimulateOptions],
-    progress: Progress,
-) -> None:
-    def report(done: int, total: int, item: str) -> None:
-        progress(ProgressEvent(STAGE, done, total, item))
-
-    n = len(source.rows)
-    n_processes = min(made_from[2].processes, max(1, n // IMAGES_A_PROCESS))
-    if n_processes == 1:
-        write_recording(folder, source, report)
-        return
-    images = _rendered_elsewhere(n, n_processes, made_from)
-    try:
-        write_recording(folder, source, report, encoded=images)
-    except BrokenProcessPool as error:
-        raise EstimationError(
-            "a process that rendered images came to an end",
-            where=str(folder),
-            remedy="free some memory, or give --processes 1",
-        ) from error
-    finally:
-        images.close()
-
-
-def _rendered_elsewhere(
-    n_images: int, n_processes: int, made_from: tuple[str, TwinScene, SimulateOptions]
-) -> Generator[bytes]:
-    """PNG files in the order of the rows, from processes that each build the scene anew."""
-    pool = ProcessPoolExecutor(
-        n_processes, get_context("spawn"), initializer=_start_rendering, initargs=made_from
-    )
-    try:
-        yield from pool.map(_render, range(n_images))
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _start_rendering(head: str, scene: TwinScene, options: SimulateOptions) -> None:
-    # an interrupt is for the process that writes; it ends the others
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _scans.append(_twin(head, options).scan(scene))
-
-
-def _render(row: int) -> bytes:
-    source = _scans[0]
-    setup = written_session(source).cameras[source.rows[row].camera]
-    return encoded_png(source.exposure(row), setup)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,10 +15,11 @@ from armscan.devices.twin import Preset, Twin, TwinScene
 from armscan.models.calibration import Provenance
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.render_pool import TwinName
 from armscan.pipeline.single_demo import SCENES, SingleDemo, SingleOptions, run_single
-from armscan.pipeline.single_recordings import TwinName, record_scenes
+from armscan.pipeline.twin_recordings import record_scenes, record_touches
 from armscan.records.exposure import Exposure
-from armscan.report.demo_folder import clear_demo_folder
+from armscan.report.demo_folder import replaced_demo
 from armscan.report.numbers import sentence
 from armscan.report.origin import footer
 from armscan.report.page import render_page
@@ -30,7 +32,7 @@ from armscan.storage.calibration_files import camera_document, sensor_document
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.provenance import new_provenance
 from armscan.storage.recording_exposures import EXPOSURES_FILE
-from armscan.storage.recording_reader import FolderRecording
+from armscan.storage.recording_reader import FolderRecording, read_recording
 from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.scanner_files import scanner_document
 
@@ -39,7 +41,13 @@ RECORDINGS = "recordings"
 TRUTH = "truth.json"
 DOCUMENTS = ("camera.json", "sensor.json", "scanner.json")
 OWN_NAMES = frozenset({RECORDINGS, TRUTH, *DOCUMENTS, "cloud.ply", "report.html", "summary.json"})
-"""What this demo writes: a folder that holds nothing else may be used again."""
+"""What this demo writes into its folder."""
+OWN_FILES = re.compile(
+    "|".join(re.escape(name) for name in OWN_NAMES - {RECORDINGS})
+    + rf"|{RECORDINGS}/({'|'.join(('probing', *SCENES))})/"
+    r"(session\.toml|exposures\.csv|arm\.csv|probe\.toml|images/(on/|off/)?\d{2,4}\.png)"
+)
+"""Paths of all that: a folder that holds nothing else may be used again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,43 +83,56 @@ def run_single_demo(request: SingleDemoRequest, progress: Progress = silent) -> 
     ArmscanError
         If the folder holds something else than an earlier demo or cannot be written.
     """
-    folder = request.folder
     name = TwinName(HEAD, request.preset, request.seed)
     twin = name.build()
-    clear_demo_folder(folder, OWN_NAMES)
-    start = perf_counter()
-    (folder / RECORDINGS).mkdir(parents=True)
-    write_files({folder / TRUTH: twin.truth.document()})
-    views = {scene: request.options.most_views.get(scene) for scene in SCENES}
-    scans = record_scenes(
-        folder / RECORDINGS, name, views, processes=request.processes, progress=progress
+    with replaced_demo(request.folder, OWN_FILES) as place:
+        start = perf_counter()
+        write_files({place / TRUTH: twin.truth.document()})
+        scans = _recorded(place / RECORDINGS, name, request, progress)
+        rendered = round(perf_counter() - start, 2)
+        demo = run_single(twin, request.options, progress, scans=scans)
+        seconds = {"render": rendered, **demo.seconds}
+        return _written(request, place, twin, demo, scans, seconds=seconds)
+
+
+def _recorded(
+    folder: Path, name: TwinName, request: SingleDemoRequest, progress: Progress
+) -> dict[TwinScene, FolderRecording]:
+    """All scenes and the touches of the plate as recordings, read back."""
+    folder.mkdir()
+    record_touches(folder / "probing", name.build())
+    record_scenes(
+        {scene: folder / scene for scene in SCENES},
+        name,
+        request.options.most_views,
+        processes=request.processes,
+        progress=progress,
     )
-    rendered = round(perf_counter() - start, 2)
-    demo = run_single(twin, request.options, progress, scans=scans)
-    return _written(request, twin, demo, scans, {"render": rendered, **demo.seconds})
+    return {scene: read_recording(folder / scene) for scene in SCENES}
 
 
 def _written(
     request: SingleDemoRequest,
+    place: Path,
     twin: Twin,
     demo: SingleDemo,
     scans: Mapping[TwinScene, FolderRecording],
+    *,
     seconds: dict[str, float],
 ) -> Summary:
     start = perf_counter()
-    folder = request.folder
-    commands = single_demo_commands(folder / RECORDINGS, twin, demo)
+    commands = single_demo_commands(request.folder / RECORDINGS, twin, demo)
     photographs: dict[str, Exposure] = {s: _photograph(scan) for s, scan in scans.items()}
     data = demo_data(demo, head=HEAD, seed=request.seed, preset=request.preset, seconds=seconds)
     head = data["heads"][HEAD]
-    documents = _documents(request, demo, scans)
-    provenance = _provenance(request, (folder / TRUTH,))
+    documents = _documents(request, place, demo, scans)
+    provenance = _provenance(request, place, (place / TRUTH,))
     page = single_demo_page(demo, head, photographs, commands, footer(provenance))
-    write_files({**documents, folder / "report.html": render_page(page)})
+    write_files({**documents, place / "report.html": render_page(page)})
     seconds["write"] = round(perf_counter() - start, 2)
     head["seconds"] = seconds
-    summary = _summary(folder, demo, data, commands)
-    write_files({folder / "summary.json": summary_json(summary).encode()})
+    summary = _summary(request.folder, demo, data, commands)
+    write_files({place / "summary.json": summary_json(summary).encode()})
     return summary
 
 
@@ -122,37 +143,51 @@ def _photograph(scan: ScanSource) -> Exposure:
 
 
 def _documents(
-    request: SingleDemoRequest, demo: SingleDemo, scans: Mapping[TwinScene, FolderRecording]
+    request: SingleDemoRequest,
+    place: Path,
+    demo: SingleDemo,
+    scans: Mapping[TwinScene, FolderRecording],
 ) -> dict[Path, bytes]:
     """Calibrations and the part's cloud, each with what it came from."""
-    found, folder = demo.instrument, request.folder
-    camera = replace(found.camera, provenance=_provenance(request, _tables(scans["camera"])))
+    found = demo.instrument
+
+    def provenance(scene: TwinScene, *parents: str) -> Provenance:
+        folder = scans[scene].folder
+        return _provenance(
+            request, place, (folder / EXPOSURES_FILE, folder / SESSION_FILE), *parents
+        )
+
+    camera = replace(found.camera, provenance=provenance("camera"))
     sensor = replace(
         found.sensor,
         camera=camera,
-        provenance=_provenance(request, _tables(scans["laser"]), camera.provenance.document_id),
+        provenance=provenance("laser", camera.provenance.document_id),
     )
     scanner = ScannerCalibration(
         sensor,
         found.hand_eye.fit.calibration,
-        _provenance(request, _tables(scans["hand-eye"]), sensor.provenance.document_id),
+        provenance("hand-eye", sensor.provenance.document_id),
     )
     return {
-        folder / "camera.json": camera_document(camera),
-        folder / "sensor.json": sensor_document(sensor),
-        folder / "scanner.json": scanner_document(scanner),
-        folder / "cloud.ply": ply_bytes(demo.part.scan.cloud),
+        place / "camera.json": camera_document(camera),
+        place / "sensor.json": sensor_document(sensor),
+        place / "scanner.json": scanner_document(scanner),
+        place / "cloud.ply": ply_bytes(demo.part.scan.cloud),
     }
 
 
-def _tables(scan: FolderRecording) -> tuple[Path, ...]:
-    return (scan.folder / EXPOSURES_FILE, scan.folder / SESSION_FILE)
-
-
-def _provenance(request: SingleDemoRequest, files: Iterable[Path], *parents: str) -> Provenance:
+def _provenance(
+    request: SingleDemoRequest, place: Path, files: Iterable[Path], *parents: str
+) -> Provenance:
+    """Of files that lie in ``place`` yet and will lie in the demo's folder."""
     words = ("armscan", "demo", "single", "-o", request.folder.as_posix())
     options = ("--preset", request.preset, "--seed", str(request.seed))
-    return new_provenance(files, command=(*words, *options), parent_ids=parents)
+    found = new_provenance(files, command=(*words, *options), parent_ids=parents)
+    inputs = tuple(
+        replace(item, path=(request.folder / Path(item.path).relative_to(place)).as_posix())
+        for item in found.inputs
+    )
+    return replace(found, inputs=inputs)
 
 
 def _summary(folder: Path, demo: SingleDemo, data: Mapping[str, Any], commands: Table) -> Summary:

@@ -17,7 +17,7 @@ import fake_twin
 from armscan.cli.simulate import PresetName, Scene
 from armscan.devices.twin import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
-from armscan.pipeline import simulate as pipeline
+from armscan.pipeline import render_pool
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.simulate import SimulateOptions, simulate_scene
 from armscan.report.simulate_job import SimulateRequest, run_simulation
@@ -55,7 +55,7 @@ def test_a_scene_is_a_recording_and_its_truth_lies_beside_it(tmp_path: Path) -> 
 
 
 def test_several_processes_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "IMAGES_A_PROCESS", 3)
+    monkeypatch.setattr(render_pool, "IMAGES_A_PROCESS", 3)
     simulate_scene(tmp_path / "two", HEAD, "ball", SimulateOptions(processes=2))
     simulate_scene(tmp_path / "one", HEAD, "ball", SimulateOptions(processes=1))
     names = [p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file()]
@@ -67,7 +67,7 @@ def test_several_processes_write_the_same(tmp_path: Path, monkeypatch: pytest.Mo
 def test_an_interrupt_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images_a_process: int
 ) -> None:
-    monkeypatch.setattr(pipeline, "IMAGES_A_PROCESS", images_a_process)
+    monkeypatch.setattr(render_pool, "IMAGES_A_PROCESS", images_a_process)
 
     def stop(event: ProgressEvent) -> None:
         raise KeyboardInterrupt

@@ -106,6 +106,14 @@ def test_what_cannot_be_inspected_gets_one_sentence(
     assert "holds 0 points" in fails(
         "inspect", "sphere", ball, "--diameter", 34.96, "--region", "0,1,0,1,0,1"
     )
+    assert "xmax is nan" in fails(
+        "inspect", "sphere", ball, "--diameter", 34.96, "--region", "0,nan,0,1,0,1"
+    )
+    for option in ("--diameter=nan", "--diameter=-1", "--diameter=inf"):
+        assert "give the diameter in mm" in fails("inspect", "sphere", ball, option)
+    assert "normal is 0, 0, 0" in fails("inspect", "step", ball, "--height", 7, "--normal", "0,0,0")
+    for option in ("--height=nan", "--margin=-1", "--margin=nan", "--feature-mm=inf"):
+        assert "; give" in fails("inspect", "step", clouds / "block.ply", "--height=7", option)
     assert "no two parallel faces 7" in fails(
         "inspect", "step", clouds / "block.ply", "--height", 7
     )
@@ -117,6 +125,25 @@ def test_what_cannot_be_inspected_gets_one_sentence(
         "inspect", "plane", ball, "--plane", "0,0,1,0", "--plate", plate
     )
     assert "there is no such file" in fails("inspect", "plane", tmp_path / "absent.ply")
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--uncertainty=-1", "uncertainty of the standard is -1.0 mm"),
+        ("--uncertainty=nan", "uncertainty of the standard is nan mm"),
+        ("--mpe=nan", "the limit is nan mm"),
+        ("--mpe=-0.1", "the limit is -0.1 mm"),
+        ("--ball=nan", "--ball: a diameter of nan mm"),
+        ("--ball=inf", "--ball: a diameter of inf mm"),
+        ("--feature-mm=nan", "feature_mm is nan"),
+        ("--region=1,0,0,1,0,1", "--region: xmin 1 is not below xmax 0"),
+    ],
+)
+def test_the_daily_check_refuses_what_is_no_length(
+    clouds: Path, fails: Fails, option: str, said: str
+) -> None:
+    assert said in fails("verify", clouds / "ball.ply", "--ball=34.96", option)
 
 
 def test_the_daily_check_ends_with_its_verdict(

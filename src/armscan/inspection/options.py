@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from armscan.errors import OptionError
@@ -35,13 +36,21 @@ class InspectionOptions:
     min_points: int = 30
 
     def __post_init__(self) -> None:
-        _require(self.feature_mm > 0.0, f"a feature {self.feature_mm} mm thick", "give a length")
         _require(
-            self.outlier_sigma >= 2.0,
+            0.0 < self.feature_mm < math.inf,
+            f"feature_mm is {self.feature_mm}",
+            "give more than 0 mm, as 1.0",
+        )
+        _require(
+            2.0 <= self.outlier_sigma < math.inf,
             f"outlier limit of {self.outlier_sigma} sigma",
             "give at least 2, or good points are lost",
         )
-        _require(self.kept_band_mm >= 0.0, f"a kept band of {self.kept_band_mm} mm", "give 0 or up")
+        _require(
+            0.0 <= self.kept_band_mm < math.inf,
+            f"a kept band of {self.kept_band_mm} mm",
+            "give 0 or up",
+        )
         _require(
             0.0 < self.search_band_mm <= self.feature_mm,
             f"a search band of {self.search_band_mm} mm",
@@ -68,7 +77,9 @@ class StepOptions:
     height_tolerance: float = 0.05
 
     def __post_init__(self) -> None:
-        _require(0.0 <= self.margin_mm < 100.0, f"a margin of {self.margin_mm} mm", "give 0 to 100")
+        _require(
+            0.0 <= self.margin_mm < 100.0, f"margin_mm is {self.margin_mm}", "give 0 to 100 mm"
+        )
         _require(
             0.0 < self.height_tolerance <= 0.5,
             f"a height tolerance of {self.height_tolerance}",

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.errors import EstimationError
+from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cleaning import Region
@@ -73,6 +73,12 @@ class VerifyOptions:
 
     mpe_mm: float | None = None
     reference_u_mm: float = 0.0
+
+    def __post_init__(self) -> None:
+        lengths = {"limit": self.mpe_mm, "uncertainty of the standard": self.reference_u_mm}
+        for name, length in lengths.items():
+            if length is not None and not 0.0 <= length < math.inf:
+                raise OptionError(f"the {name} is {length} mm", remedy="give 0 mm or more")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,6 +9,7 @@ import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.box import REMEDY, box_corners_mm
 from armscan.records.cloud import PointCloud
 
 
@@ -25,7 +26,7 @@ class BaseBox:
         if not bool((self.low_mm < self.high_mm).all()):
             raise OptionError(
                 "a lower limit of the volume is not below its upper one",
-                remedy="give xmin,xmax,ymin,ymax,zmin,zmax in mm",
+                remedy=REMEDY,
             )
 
     def holds(self, points_base_mm: FloatArray) -> BoolArray:
@@ -45,17 +46,15 @@ def parse_volume(text: str, where: str = "--volume") -> BaseBox:
     Raises
     ------
     OptionError
-        If these are not six finite numbers in order.
+        If these are not six finite numbers, each lower limit below its upper one.
     """
-    try:
-        values = np.array([float(word) for word in text.split(",")])
-    except ValueError:
-        values = np.zeros(0)
-    if values.shape != (6,) or not bool(np.isfinite(values).all()):
-        raise OptionError(
-            f"'{text}' is no volume", where=where, remedy="give xmin,xmax,ymin,ymax,zmin,zmax in mm"
-        )
-    return BaseBox(values[0::2], values[1::2])
+    values = []
+    for word in text.split(","):
+        try:
+            values.append(float(word))
+        except ValueError as error:
+            raise OptionError(f"'{word}' is no number", where=where, remedy=REMEDY) from error
+    return BaseBox(*box_corners_mm(values, where))
 
 
 def cut_cloud(cloud: PointCloud, box: BaseBox) -> PointCloud:

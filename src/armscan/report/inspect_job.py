@@ -11,6 +11,8 @@ import numpy as np
 
 from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.box import box_corners_mm
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Plane, plane_from_coefficients
 from armscan.inspection.cleaning import Region
@@ -141,7 +143,7 @@ def run_step_inspection(
     """
     steps = step_options or StepOptions()
     cloud, region = _read(request)
-    given = _numbers(normal, 3, "--normal") if normal else None
+    given = _normal(normal) if normal else None
     found = _found(
         inspect_step(
             cloud,
@@ -167,16 +169,18 @@ def _read(request: InspectRequest) -> tuple[PointCloud, Region | None]:
         check_outputs((request.output,), is_overwriting=request.is_overwriting)
     region = None
     if request.region:
-        limits = _numbers(request.region, 6, "--region")
-        region = Region(limits[0::2], limits[1::2])
+        region = Region(*box_corners_mm(request.region, "--region"))
     return read_cloud(request.cloud), region
 
 
-def _numbers(
-    values: tuple[float, ...], count: int, option: str
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    if len(values) != count or not np.isfinite(values).all():
-        raise OptionError(f"{len(values)} numbers where {count} are needed", where=option)
+def _normal(values: tuple[float, ...]) -> FloatArray:
+    remedy = "give the three numbers x,y,z of the faces' normal, not all 0"
+    if len(values) != 3:
+        fact = f"{len(values)} numbers where 3 are needed"
+        raise OptionError(fact, where="--normal", remedy=remedy)
+    if not (np.isfinite(values).all() and any(values)):
+        fact = f"the normal is {', '.join(f'{value:g}' for value in values)}"
+        raise OptionError(fact, where="--normal", remedy=remedy)
     return np.array(values, dtype=np.float64)
 
 

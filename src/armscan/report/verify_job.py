@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-
-import numpy as np
 
 from armscan.calibration.hand_eye.plate_side import ProbeSide
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.box import box_corners_mm
 from armscan.inspection.cleaning import Region
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.results import SphereInspection
@@ -162,6 +162,12 @@ def _check(request: VerifyRequest) -> None:
         )
     if request.side is not None and request.plate is None:
         raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
+    if request.ball_mm is not None and not 0.0 < request.ball_mm < math.inf:
+        raise OptionError(
+            f"a diameter of {request.ball_mm} mm", where="--ball", remedy="give the diameter in mm"
+        )
+    if request.region:
+        box_corners_mm(request.region, "--region")
     if request.scan.is_dir() and request.scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
     if request.output is not None:
@@ -201,10 +207,7 @@ def _inputs(request: VerifyRequest) -> tuple[Path, ...]:
 def _verified(request: VerifyRequest, measured: Measured) -> Verification:
     region = None
     if request.region:
-        if len(request.region) != 6:
-            raise OptionError(f"{len(request.region)} numbers where 6 are needed", where="--region")
-        limits = np.array(request.region)
-        region = Region(limits[0::2], limits[1::2])
+        region = Region(*box_corners_mm(request.region, "--region"))
     if request.ball_mm is not None:
         return verify_on_ball(
             measured,

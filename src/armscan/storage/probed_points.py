@@ -64,14 +64,18 @@ def parse_plane(text: str, where: str = "") -> FloatArray:
     OptionError
         If these are not four finite numbers, or the normal is zero.
     """
+    words = re.split(r"[\s,]+", text.strip())
+    remedy = "give four numbers A,B,C,D, with D in mm"
     try:
-        values = np.array([float(word) for word in re.split(r"[\s,]+", text.strip())])
-    except ValueError:
-        values = np.zeros(0)
-    if values.shape != (4,) or not bool(np.isfinite(values).all()):
-        raise OptionError(
-            f"'{text.strip()}' is no plane", where=where, remedy="give four numbers A,B,C,D"
-        )
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise OptionError(f"'{text.strip()}' is no plane", where=where, remedy=remedy) from error
+    if values.shape != (4,):
+        fact = f"{len(words)} numbers where 4 are needed"
+        raise OptionError(fact, where=where, remedy=remedy)
+    for name, value in zip(PLANE_NAMES, values, strict=True):
+        if not np.isfinite(value):
+            raise OptionError(f"{name.upper()} is {value:g}", where=where, remedy=remedy)
     length = math.sqrt(float(values[:3] @ values[:3]))
     if length == 0.0:
         raise OptionError(

@@ -94,9 +94,19 @@ def test_a_plane_is_scaled_to_a_unit_normal() -> None:
     np.testing.assert_allclose(parse_plane("3 4 0 5"), [0.6, 0.8, 0.0, 1.0])
 
 
-@pytest.mark.parametrize("text", ["", "1,2,3", "1,2,3,4,5", "a,b,c,d", "1,2,nan,4", "0,0,0,1"])
-def test_what_is_no_plane_is_refused(text: str) -> None:
-    with pytest.raises(OptionError):
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "'' is no plane"),
+        ("1,2,3", "3 numbers where 4 are needed"),
+        ("1,2,3,4,5", "5 numbers where 4 are needed"),
+        ("a,b,c,d", "'a,b,c,d' is no plane"),
+        ("1,2,nan,4", "C is nan"),
+        ("0,0,0,1", "normal A,B,C is zero"),
+    ],
+)
+def test_what_is_no_plane_is_refused(text: str, said: str) -> None:
+    with pytest.raises(OptionError, match=said):
         parse_plane(text)
 
 

@@ -42,6 +42,17 @@ GEOMETRIES = {
     "f 5150 px, 12 views of 11x9 at 3.75 mm": Scene(
         camera=HEAD, target=CircleGrid(11, 9, 3.75), distance_mm=140.0, noise_px=0.01, reach=0.15
     ),
+    "12 views, target points off by 0.005 mm": Scene(missed_mm=0.005),
+    "f 5150 px, target points off by 0.0003 mm": Scene(
+        camera=HEAD,
+        target=CircleGrid(11, 9, 3.75),
+        distance_mm=140.0,
+        noise_px=0.003,
+        reach=0.15,
+        n_views=15,
+        max_tilt_deg=45.0,
+        missed_mm=0.0003,
+    ),
 }
 
 

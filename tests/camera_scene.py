@@ -35,6 +35,8 @@ class Scene:
     """Offset of the board's middle from the image centre, over the image size."""
 
     bow_mm: tuple[float, float] = (0.0, 0.0)
+    missed_mm: float = 0.0
+    """Standard deviation by which each target point misses its place, alike in all views."""
 
 
 def board_pose(scene: Scene, rng: np.random.Generator) -> Pose[Sensor, Board]:
@@ -58,10 +60,14 @@ def bowed_points(target: Target, bow_mm: tuple[float, float]) -> FloatArray:
 
 
 def view_of(
-    scene: Scene, pose: Pose[Sensor, Board], rng: np.random.Generator, source: str
+    scene: Scene,
+    pose: Pose[Sensor, Board],
+    rng: np.random.Generator,
+    source: str,
+    missed_mm: FloatArray | float = 0.0,
 ) -> TargetView:
     """What a detector with Gaussian noise would deliver; only points inside the image."""
-    surface = bowed_points(scene.target, scene.bow_mm)
+    surface = bowed_points(scene.target, scene.bow_mm) + missed_mm
     pixels = scene.camera.project(surface @ pose.rotation.T + pose.translation_mm)
     inside = np.flatnonzero(scene.camera.is_inside(pixels))
     m = len(inside)
@@ -79,11 +85,15 @@ def view_of(
 def make_views(scene: Scene, seed: int) -> tuple[list[TargetView], list[Pose[Sensor, Board]]]:
     """Views that show at least half of the target, with the poses they were taken from."""
     rng = np.random.default_rng(seed)
+    missed = np.zeros_like(scene.target.points_board_mm)
+    missed[:, :2] = scene.missed_mm * np.random.default_rng([seed, 1]).normal(
+        size=missed[:, :2].shape
+    )
     views: list[TargetView] = []
     poses: list[Pose[Sensor, Board]] = []
     while len(views) < scene.n_views:
         pose = board_pose(scene, rng)
-        view = view_of(scene, pose, rng, f"view{len(views):02d}.png")
+        view = view_of(scene, pose, rng, f"view{len(views):02d}.png", missed)
         if len(view) >= 0.5 * len(scene.target.points_board_mm):
             views.append(view)
             poses.append(pose)

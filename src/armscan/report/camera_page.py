@@ -133,9 +133,19 @@ def _camera_section(fit: CameraFit) -> Section:
             Text(
                 f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
                 "Standard deviations rest on the scatter of the residuals, which is "
-                f"{fit.noise_scale:.2f} times what the detector expected."
+                f"{fit.noise_scale:.2f} times what the detector expected." + _target_text(fit)
             ),
         ),
+    )
+
+
+def _target_text(fit: CameraFit) -> str:
+    if fit.target_error_mm == 0.0:
+        return ""
+    return (
+        " Residuals of a target point repeat from view to view: the points miss their places by "
+        f"{significant(fit.target_error_mm)} mm (one standard deviation an axis). More views do "
+        "not average that; the standard deviations hold it."
     )
 
 

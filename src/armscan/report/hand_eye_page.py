@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.models.scanner import ScannerCalibration
+from armscan.models.scanner import ArmNoise, HandEyeDiagnostics, ScannerCalibration
 from armscan.reconstruction.result import ReconstructedImage
 from armscan.records.exposure import Exposure
 from armscan.report import hand_eye_figures as figures
@@ -146,13 +146,26 @@ def _cards(fit: HandEyeFit, scanner: ScannerCalibration) -> tuple[Card, ...]:
             Card(
                 "Condition", f"{known.condition:.0f}", f"rank {known.rank} of 6; below 100 is good"
             ),
-            Card(
-                "Fits the noise model",
-                "no" if known.chi2_probability < 0.001 else "yes",
-                f"residuals {chi2_verdict(known.chi2_probability)}",
-            ),
+            _noise_card(hand_eye.arm_noise, known),
         ]
     return tuple(cards)
+
+
+def _noise_card(arm: ArmNoise, known: HandEyeDiagnostics) -> Card:
+    """The test of a given noise model; a model fitted to the residuals cannot fail one."""
+    if known.is_noise_estimated:
+        position = float(np.hypot(arm.position_mm, arm.exposure_position_mm))
+        return Card(
+            "Arm's scatter",
+            f"{significant(position, digits=2)} mm",
+            "an axis at the scan point, estimated from the residuals: compare it with the "
+            "arm's certificate",
+        )
+    return Card(
+        "Fits the noise model",
+        "no" if known.chi2_probability < 0.001 else "yes",
+        f"residuals {chi2_verdict(known.chi2_probability)}",
+    )
 
 
 def _result_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:

@@ -19,6 +19,10 @@ from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.camera.prepared_views import PreparedViews
 from armscan.calibration.camera.result import CameraFit, RefusedView, ViewFit
 from armscan.calibration.camera.robust import Solution, chi2_of_points, residuals_px
+from armscan.calibration.camera.target_error import (
+    covariance_with_target_error,
+    estimate_target_error,
+)
 from armscan.calibration.camera.warp import judge_warp, with_warp
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -52,7 +56,9 @@ def assemble(
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
         return determined
-    covariance, condition = solution.variance_factor * determined[0], determined[1]
+    target_error = estimate_target_error(solution)
+    covariance = covariance_with_target_error(solution, determined[0], target_error)
+    condition = determined[1]
     refusal = _focal_refusal(solution, covariance)
     if refusal is not None:
         return refusal
@@ -79,6 +85,7 @@ def assemble(
         rms_px=rms(residuals_px(observations, solution.state)[kept]),
         sigma_point_px=_sigma_point_px(solution),
         noise_scale=_noise_scale(used, solution),
+        target_error_mm=target_error.sigma_mm,
         degrees_of_freedom=solution.degrees_of_freedom,
         condition=condition,
         coverage=coverage,

@@ -227,6 +227,10 @@ class CameraFit:
         By how much the points scatter more than their detector's covariances say: root of chi2
         over the degrees of freedom with these covariances alone. What is done about it:
         `armscan.calibration.camera.noise`.
+    target_error_mm
+        Standard deviation, along each axis of the board, by which the target's points miss their
+        places, as found from residuals that repeat from view to view; 0 where none do. The
+        covariance holds its effect.
     degrees_of_freedom
         Count of observed coordinates minus count of unknowns.
     condition
@@ -255,6 +259,7 @@ class CameraFit:
     rms_px: float
     sigma_point_px: float
     noise_scale: float
+    target_error_mm: float
     degrees_of_freedom: int
     condition: float
     coverage: Coverage

@@ -10,8 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.cli import main
+from armscan.records.probing import ProbedPoints
+from armscan.report.probe_job import ProbeRequest, run_probing
 from armscan.storage.clouds import read_ply
+from armscan.storage.probed_points import probed_points_csv
 from armscan.storage.scanner_files import read_scanner_calibration
 from smoke.drawn_arm import PLANE, PLATE, PLATE_D_MM, ROTATION, TRANSLATION_MM, draw_postures
 from smoke.drawn_bench import Bench
@@ -129,6 +133,22 @@ def test_a_plate_elsewhere_is_noticed(
     words = ["calibrate", "hand-eye", scan, "--sensor", calibrated.sensor]
     said = fails(*words, "--plane", "0.5,0,0.8,30", "-o", tmp_path / "s.json", writes=tmp_path)
     assert "plate" in said
+
+
+def test_a_tip_compensated_to_the_wrong_side_is_told_by_its_diameter(
+    calibrated: Bench, scan: Path, fails: Fails, tmp_path: Path
+) -> None:
+    """The way that the pages describe: probe writes plate.csv, the hand-eye reads it."""
+    x, y = np.meshgrid([-60.0, 0.0, 60.0], [-50.0, 0.0, 50.0])
+    flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(9)])
+    flat[:, 2] = -(flat @ PLATE + PLATE_D_MM) / PLATE[2]
+    centres, wrong = tmp_path / "centres.csv", tmp_path / "wrong.csv"
+    centres.write_bytes(probed_points_csv(ProbedPoints(flat + 3.0 * PLATE, 6.0)))
+    run_probing(ProbeRequest(centres, wrong, options=ProbingOptions(side="-z")))
+    words = ["calibrate", "hand-eye", scan, "--sensor", calibrated.sensor, "--plate", wrong]
+    said = fails(*words, "-o", tmp_path / "s.json")
+    assert "that is the tip's diameter (6 mm)" in said
+    assert "armscan probe --side" in said
 
 
 def without(scan: Path, folder: Path, *names: str) -> Path:

@@ -13,6 +13,8 @@ from armscan.geometry.fitting import fit_plane
 OUTLIER_PROBABILITY = 0.01
 """Chance that good touches, all together, get one of them named."""
 FEWEST_TO_JUDGE = 6
+ROUNDING_MM = 1e-9
+"""Residuals that small are the rounding of numbers, not touches."""
 
 
 def find_outliers(points_mm: FloatArray) -> tuple[int, ...]:
@@ -45,5 +47,7 @@ def _studentised(points: FloatArray) -> FloatArray:
     leverage = 1.0 / n + (along**2 / np.maximum((along**2).sum(axis=0), 1e-300)).sum(axis=1)
     free = np.maximum(1.0 - leverage, 1e-12)
     squares = float(fit.residuals @ fit.residuals)
-    others = np.maximum(squares - fit.residuals**2 / free, 1e-24 * max(squares, 1e-300))
+    if squares <= n * ROUNDING_MM**2:
+        return np.zeros(n)
+    others = np.maximum(squares - fit.residuals**2 / free, 1e-24 * squares)
     return np.asarray(np.abs(fit.residuals) / np.sqrt(others / (n - 4) * free))

@@ -12,7 +12,7 @@ from armscan.errors import OptionError, OutputError
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.render_pool import TwinName
 from armscan.pipeline.twin_recordings import record_scenes, record_touches
-from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.atomic import check_outputs
 from armscan.storage.atomic_folder import check_new_folder
 
 
@@ -122,14 +122,18 @@ def simulate_scene(
     check_outputs((truth,))
     name = TwinName(head, settings.preset, settings.seed)
     twin = name.build()
+    beside = {truth: twin.truth.document()}
     n_images, n_samples = 0, 0
     if scene == "probing":
-        n_samples = record_touches(folder, twin)
+        n_samples = record_touches(folder, twin, beside)
     else:
         source = record_scenes(
-            {scene: folder}, name, processes=settings.processes, progress=progress
+            {scene: folder},
+            name,
+            processes=settings.processes,
+            beside=beside,
+            progress=progress,
         )[scene]
         n_images = len(source.rows)
         n_samples = 0 if source.arm is None else len(source.arm)
-    write_files({truth: twin.truth.document()})
     return SimulatedScene(folder, truth, n_images, n_samples, twin.target)

@@ -24,6 +24,7 @@ def record_scenes(
     most_views: MostViews | None = None,
     *,
     processes: int = 2,
+    beside: Mapping[Path, bytes] | None = None,
     progress: Progress = silent,
 ) -> dict[TwinScene, ScanSource]:
     """Render scenes of a twin and write each as a folder recording.
@@ -41,6 +42,8 @@ def record_scenes(
     processes
         Processes that render. A script that asks for more than 1 needs the usual
         ``if __name__ == "__main__"``.
+    beside
+        Files that belong to the recordings; they appear with the first one.
     progress
         Told of every image.
 
@@ -67,13 +70,14 @@ def record_scenes(
     with closing(rendered(name, scenes, processes)) as images:
         for scene, scan in scans.items():
             own = islice(images, len(scan.rows))
-            write_recording(folders[scene], scan, report, encoded=own)
+            files = beside if before == 0 else None
+            write_recording(folders[scene], scan, report, encoded=own, beside=files)
             before += len(scan.rows)
     return scans
 
 
-def record_touches(folder: Path, twin: Twin) -> int:
-    """Write the twin's touches of the plate; returns their count.
+def record_touches(folder: Path, twin: Twin, beside: Mapping[Path, bytes] | None = None) -> int:
+    """Write the twin's touches of the plate, and files that belong to them; returns their count.
 
     Raises
     ------
@@ -82,5 +86,5 @@ def record_touches(folder: Path, twin: Twin) -> int:
     """
     probing = twin.probe_plate()
     tip = ProbeTip(probing.tool_from_probe_mm, probing.tip_diameter_mm)
-    write_probing(folder, probing.arm, tip, is_simulated=True)
+    write_probing(folder, probing.arm, tip, is_simulated=True, beside=beside)
     return len(probing.arm)

@@ -24,7 +24,7 @@ def check_new_folder(folder: Path) -> None:
     target = folder.resolve()
     if target in (Path.cwd(), Path(target.anchor)):
         raise OutputError(
-            "the folder itself is made anew, which the current folder and a root cannot be",
+            "this is the current folder or a root, which cannot be made anew",
             where=str(folder),
             remedy="name a new folder, as scan",
         )

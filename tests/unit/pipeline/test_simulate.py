@@ -19,8 +19,9 @@ from armscan.devices.twin import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
 from armscan.pipeline import render_pool
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.simulate import SimulateOptions, simulate_scene
+from armscan.pipeline.simulate import SimulateOptions, simulate_scene, truth_path
 from armscan.report.simulate_job import SimulateRequest, run_simulation
+from armscan.storage import atomic_folder
 from armscan.storage.probe_files import read_probe_tip
 from armscan.storage.recording_reader import read_arm_track, read_recording
 from armscan.storage.simulated import are_simulated
@@ -75,6 +76,38 @@ def test_an_interrupt_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         simulate_scene(tmp_path / "scan", HEAD, "ball", progress=stop)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("scene", ["ball", "probing"])
+def test_no_recording_is_seen_without_its_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: TwinScene
+) -> None:
+    """The truth cannot be written, as on a full disk: then there is no recording either."""
+
+    def full(contents: object, **_: object) -> None:
+        raise OutputError("no space")
+
+    monkeypatch.setattr(atomic_folder, "write_files", full)
+    with pytest.raises(OutputError, match="no space"):
+        simulate_scene(tmp_path / "scan", HEAD, scene, SimulateOptions(processes=1))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [".", "", "..", "sub/..", "/"])
+def test_a_folder_that_cannot_be_made_anew_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="name a new folder"):
+        simulate_scene(Path(name), HEAD, "probing")
+
+
+def test_a_folder_named_from_below_has_its_truth_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scan" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert truth_path(Path("scan/below/..")) == tmp_path / "scan.truth.json"
 
 
 def test_probing_gives_touches_and_the_tip(tmp_path: Path) -> None:

@@ -18,15 +18,22 @@ def cloud_of(
     frame: CloudFrame = "Base",
     sigma_mm: float = 0.01,
     noise_mm: float = 0.0,
+    noise_along: FloatArray | None = None,
     normals: FloatArray | None = None,
 ) -> PointCloud:
-    """A cloud with isotropic covariances."""
+    """A cloud with isotropic covariances, and in them the stripe's noise along (N, 3) or (3,) units.
+
+    As in a placed cloud, the noise's length stands beside the covariance that holds it.
+    """
     n = len(points)
+    own = np.broadcast_to(
+        np.zeros(3) if noise_along is None else noise_mm * noise_along, points.shape
+    )
     numbers = np.zeros(n, dtype=np.int64) if exposure is None else exposure
     return PointCloud(
         frame=frame,
         points_mm=points,
-        covariance_mm2=np.tile(np.eye(3) * sigma_mm**2, (n, 1, 1)),
+        covariance_mm2=np.eye(3) * sigma_mm**2 + own[:, :, None] * own[:, None, :],
         sigma_noise_mm=np.full(n, noise_mm),
         sheet=np.zeros(n, dtype=np.int64),
         sheet_names=("A",),

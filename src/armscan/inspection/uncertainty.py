@@ -109,12 +109,13 @@ def _propagated_mm(
 ) -> float:
     """Each block is shifted as a whole by an error of its points' mean covariance.
 
-    The stripes' own noise, which is independent from point to point, comes on top. NaN for a
-    single block: an error of the sensor stretches the one exposure, and a shift cannot tell.
+    The stripes' own noise, which is independent from point to point, is taken out of that
+    covariance and counted point by point. NaN for a single block: an error of the sensor stretches
+    the one exposure, and a shift cannot tell.
     """
-    covariance = cloud.covariance_mm2[rows]
-    if n < 2 or not covariance.any():
+    if n < 2 or not cloud.covariance_mm2[rows].any():
         return math.nan
+    covariance = _without_noise(cloud, rows)
     by_point = influence_along(fit)[:, None] * fit.directions
     pull = np.stack([np.bincount(block, by_point[:, k], n) for k in range(3)], axis=1)
     count = np.bincount(block, minlength=n)
@@ -124,3 +125,16 @@ def _propagated_mm(
             mean = np.bincount(block, covariance[:, i, j], n) / count
             variance += float((pull[:, i] * mean) @ pull[:, j])
     return math.sqrt(max(variance, 0.0))
+
+
+def _without_noise(cloud: PointCloud, rows: IntArray) -> FloatArray:
+    """(N, 3, 3) covariances of points less their own noise, as far as a cloud tells.
+
+    It keeps the noise's length, not its direction. The longest axis stands for that: its variance
+    is never below the noise's, so that none becomes negative; it is the right one where noise
+    prevails, and where it does not the noise matters little.
+    """
+    covariance = cloud.covariance_mm2[rows]
+    axis = np.linalg.eigh(covariance)[1][:, :, 2]
+    own = cloud.sigma_noise_mm[rows, None] * axis
+    return np.asarray(covariance - own[:, :, None] * own[:, None, :])

@@ -20,16 +20,15 @@ SPREAD_LIMIT = 1.0 + 3.3 / math.sqrt(2 * N_RUNS)
 """Ratio of a standard deviation from 40 runs to the true one: 99.9 % below (normal errors)."""
 
 
-def ball_diameter(seed: int) -> MeasuredLength:
+def ball_diameter(seed: int, arm_mm: float = ARM_MM, noise_mm: float = NOISE_MM) -> MeasuredLength:
     """Exposures err as a whole by the arm, points by the stripe's noise."""
     rng = np.random.default_rng(seed)
     outward = ball_stripes(16, 30)
     exposure = np.repeat(np.arange(16), 30)
-    points = RADIUS_MM * outward + rng.normal(0.0, ARM_MM, (16, 3))[exposure]
-    points += outward * rng.normal(0.0, NOISE_MM, (len(points), 1))
-    found = inspect_sphere(
-        cloud_of(points, exposure, sigma_mm=ARM_MM, noise_mm=NOISE_MM), 2 * RADIUS_MM
-    )
+    points = RADIUS_MM * outward + rng.normal(0.0, arm_mm, (16, 3))[exposure]
+    points += outward * rng.normal(0.0, noise_mm, (len(points), 1))
+    cloud = cloud_of(points, exposure, sigma_mm=arm_mm, noise_mm=noise_mm, noise_along=outward)
+    found = inspect_sphere(cloud, 2 * RADIUS_MM)
     assert not isinstance(found, FitFailure)
     return found.diameter
 
@@ -51,6 +50,15 @@ def test_the_diameters_sigma_is_its_scatter_over_repeats() -> None:
     assert found[0].sigma_mm == max(found[0].sigma_scatter_mm, found[0].sigma_propagated_mm)
 
 
+def test_the_stripes_noise_averages_out_and_is_counted_once() -> None:
+    """Taken also for an error of the whole exposure it would make sigma three times too large."""
+    found = [ball_diameter(seed, arm_mm=0.001, noise_mm=0.02) for seed in range(12)]
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    propagated = float(np.mean([item.sigma_propagated_mm for item in found]))
+    limit = 1.0 + 3.3 / math.sqrt(2 * 12)
+    assert 1.0 / limit < scatter / propagated < limit
+
+
 def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
     """An exposure that crosses both faces shifts both: the height's sigma is far below its own."""
     clean, exposure = block_stripes(20.0, 20, 200)
@@ -59,7 +67,9 @@ def test_what_an_exposure_errs_on_both_faces_leaves_the_height_alone() -> None:
         rng = np.random.default_rng(seed)
         points = clean + rng.normal(0.0, 0.02, (20, 3))[exposure]
         points[:, 2] += rng.normal(0.0, NOISE_MM, len(points))
-        found = inspect_step(cloud_of(points, exposure, sigma_mm=0.02, noise_mm=NOISE_MM), 20.0)
+        up = np.array([0.0, 0.0, 1.0])
+        cloud = cloud_of(points, exposure, sigma_mm=0.02, noise_mm=NOISE_MM, noise_along=up)
+        found = inspect_step(cloud, 20.0)
         assert not isinstance(found, FitFailure)
         heights.append(found.height)
     scatter = float(np.std([item.value_mm for item in heights], ddof=1))

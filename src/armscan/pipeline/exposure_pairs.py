@@ -75,6 +75,12 @@ def pair_exposures(
     return list(zip(exposures, partners, strict=True))
 
 
+WINDOW_REMEDY = (
+    "use images of the camera's full size; if the sensor read a window, say where it begins by "
+    "window_x_px and window_y_px under [[camera]] in session.toml"
+)
+
+
 def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
     """Raise `InputError` if an exposure is not of the camera's sensor.
 
@@ -87,11 +93,14 @@ def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
         is_whole = window.x_px == window.y_px == 0 and window.binning == 1
         fits = width <= camera.width_px and height <= camera.height_px
         if not fits or (is_whole and (width, height) != (camera.width_px, camera.height_px)):
+            is_window = fits and is_whole
             raise InputError(
                 f"the image reaches to {width} x {height} px, the camera was calibrated with "
                 f"{camera.width_px} x {camera.height_px} px",
                 where=exposure.source,
-                remedy="use images of the camera's full size",
+                remedy=WINDOW_REMEDY
+                if is_window
+                else "use images of the camera that was calibrated",
             )
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError, InputError
+from armscan.errors import ArmscanError, FileFormatError, InputError
 from armscan.geometry.arrays import ImageArray
 from armscan.records.exposure import Exposure
 from armscan.records.session import CameraSetup, ExposureRow
@@ -70,6 +70,26 @@ def setup_of_image(path: Path, setup: CameraSetup, lacking: Sequence[str]) -> Ca
     image = read_exposure(path, ImageOptions(bits, setup.align))
     found: dict[str, Any] = {key: getattr(image, key) for key in lacking}
     return replace(setup, **found)
+
+
+def window_note(path: Path, setup: CameraSetup) -> str:
+    """A sentence if an image is smaller than its camera, whose window nobody said; else empty.
+
+    An image that cannot be read is no matter of this note; it is named when it is asked for.
+    """
+    try:
+        image = read_exposure(path)
+    except ArmscanError:
+        return ""
+    size = (setup.width_px or image.width_px, setup.height_px or image.height_px)
+    is_larger = image.width_px > size[0] or image.height_px > size[1]
+    if is_larger or (image.width_px, image.height_px) == size:
+        return ""
+    return (
+        f"{path.name} with {image.width_px} x {image.height_px} px is a window at "
+        f"{setup.window.x_px}, {setup.window.y_px} of the camera's {size[0]} x {size[1]} px; "
+        "window_x_px and window_y_px say where it begins"
+    )
 
 
 def encoded_png(exposure: Exposure, setup: CameraSetup) -> bytes:

@@ -23,11 +23,12 @@ from armscan.storage.recording_exposures import (
     is_inside,
     repeated_files,
 )
-from armscan.storage.recording_images import read_recorded, setup_of_image
+from armscan.storage.recording_images import read_recorded, setup_of_image, window_note
 from armscan.storage.recording_session import SESSION_FILE, SessionFile, read_session_file
 from armscan.storage.simulated import are_simulated
 
 SIZE_KEYS = ("width_px", "height_px")
+WINDOW_KEYS = ("window_x_px", "window_y_px")
 CAMERA_KEYS = (*SIZE_KEYS, "bits_used", "colour")
 
 
@@ -251,5 +252,8 @@ def _cameras(
             setup = setup_of_image(folder / first.source, setup, lacking)
             values = ", ".join(f"{key} {getattr(setup, key)}" for key in lacking)
             facts.append(f"camera {number} has {values}, as {first.source}")
+        if first is not None and not lacking and not stated.issuperset(WINDOW_KEYS):
+            note = window_note(folder / first.source, setup)
+            facts += [f"camera {number}: {note}"] if note else []
         cameras.append(setup)
     return tuple(cameras), facts

@@ -57,8 +57,9 @@ def test_images_must_be_of_the_cameras_size_or_lie_on_its_sensor() -> None:
         image("turned.png", (40, 30)),
         image("w.png", (10, 40), window=SensorWindow(0, 21)),
     ):
-        with pytest.raises(InputError, match="camera was calibrated with 40 x 30"):
+        with pytest.raises(InputError, match="camera was calibrated with 40 x 30") as caught:
             check_sizes([wrong], CAMERA)
+        assert ("window_x_px and window_y_px" in str(caught.value)) == (wrong.source == "small.png")
 
 
 def scene(seed: int, has_line: bool) -> np.ndarray:

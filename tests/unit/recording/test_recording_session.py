@@ -176,6 +176,26 @@ def test_an_image_has_its_cameras_size_or_lies_inside_it(
     assert f"is {size_px[0]} x {size_px[1]} px, its camera 8 x 6 px" in message
 
 
+@pytest.mark.parametrize(
+    ("size_px", "window", "is_noted"),
+    [
+        ((5, 4), "", True),
+        ((5, 4), "window_x_px = 0\n", True),
+        ((5, 4), "window_x_px = 0\nwindow_y_px = 0\n", False),
+        ((8, 6), "", False),
+    ],
+)
+def test_a_window_whose_place_nobody_said_is_noted(
+    tmp_path: Path, size_px: tuple[int, int], window: str, is_noted: bool
+) -> None:
+    """The camera of the session has 8 x 6 px."""
+    folder = lab_folder(tmp_path, session=SESSION + window)
+    cv2.imwrite(str(folder / "images/0.png"), pixels(7, size_px[::-1]))
+    assumed = read_recording(folder).session.assumed
+    said = "camera 0: 0.png with 5 x 4 px is a window at 0, 0 of the camera's 8 x 6 px; window_x_px"
+    assert [text.startswith(said) for text in assumed] == [True] * is_noted
+
+
 def test_high_aligned_bits_are_shifted_and_too_many_are_refused(tmp_path: Path) -> None:
     session = SESSION.replace("bits_used = 8", 'bits_used = 12\nalign = "high"')
     folder = lab_folder(tmp_path, session=session)

@@ -21,7 +21,7 @@ def cloud_of(
     noise_along: FloatArray | None = None,
     normals: FloatArray | None = None,
 ) -> PointCloud:
-    """A cloud with isotropic covariances, and in them the stripe's noise along (N, 3) or (3,) units.
+    """A cloud with isotropic covariances and, in them, the stripe's noise along unit vectors.
 
     As in a placed cloud, the noise's length stands beside the covariance that holds it.
     """

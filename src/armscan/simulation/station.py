@@ -154,8 +154,7 @@ def render_exposure(
     head, station
         What looks at what.
     base_from_sensor
-        Poses over the exposure time, equally long each; one if the head stands still. The room
-        and the target are seen from the middle one.
+        Poses over the exposure time, equally long each; one if the head stands still.
     settings
         Window, lasers, light.
     rng
@@ -194,10 +193,10 @@ def exposure_light(
         light += np.float32(settings.laser_gain) * line[inside]
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
-    middle = len(views) // 2
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    room = _room(head, station, base_from_sensor[middle], views[middle], region)
-    light += np.float32(brightness) * room[inside]
+    share = np.float32(brightness / len(views))
+    for pose, view in zip(base_from_sensor, views, strict=True):
+        light += share * _room(head, station, pose, view, region)[inside]
     return light
 
 

@@ -208,6 +208,24 @@ def test_a_moving_head_smears_the_line_about_its_middle_pose() -> None:
     assert variance(moving) - variance(still) == pytest.approx(np.var(at), rel=0.05)
 
 
+def test_a_moving_head_sees_the_room_from_all_its_poses_alike() -> None:
+    """With two poses neither is the middle: the image is the mean of both, in either order."""
+    head = quiet(build_head())
+    board: Pose[Base, Board] = Pose(np.diag([1.0, -1.0, -1.0]), np.array([-18.75, 15.0, 0.0]))
+    station = Station((GROUND,), Target(CirclePattern(11, 9, 3.75, 1.875), board))
+    settings = ExposureSettings(Window(1300, 800, 200, 160), room_light=0.9)
+    early, late = above(), above(0.5)
+
+    def light(*poses: Pose[Base, Sensor]) -> NDArray[np.float64]:
+        rng = np.random.default_rng(0)
+        return exposure_light(head, station, poses, settings, rng).astype(np.float64)
+
+    first, last = light(early), light(late)
+    assert np.abs(first - last).max() > 0.05
+    for poses in ((early, late), (late, early)):
+        assert np.abs(light(*poses) - 0.5 * (first + last)).max() < 1e-5
+
+
 def test_gloss_brightens_the_mirror_direction_only() -> None:
     head = build_head("thesis-single", "thesis", 1)
     base = replace(quiet(head).imaging, gloss=1.0)

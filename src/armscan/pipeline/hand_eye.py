@@ -205,6 +205,7 @@ def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) 
         warnings.append(f"{n_chosen} of {n_posed} exposures were used, evenly spread")
     if not_used:
         named = ", ".join(f"{name} ({reason})" for name, reason in not_used[:4])
+        named += f", and {len(not_used) - 4} more" if len(not_used) > 4 else ""
         warnings.append(f"{len(not_used)} exposures were not used: {named}")
     return tuple(warnings)
 

@@ -96,7 +96,9 @@ def calibrated(
     elif inputs.plate is not None:
         fit = calibrate_on_plate(stripes, inputs.plate, request.options, sensor_covariance=known)
     if isinstance(fit, FitFailure):
-        raise EstimationError(fit.reason, where=name, remedy=fit.remedy)
+        assumed = dict.fromkeys(text for r in inputs.recordings for text in r.session.assumed)
+        reason = "; ".join((fit.reason, *(f"assumed: {text}" for text in assumed)))
+        raise EstimationError(reason, where=name, remedy=fit.remedy)
     return fit
 
 

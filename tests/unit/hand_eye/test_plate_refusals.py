@@ -9,14 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from armscan.calibration.hand_eye.left_out import LeftOut
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.plate_checks import influence_warnings
+from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
 from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.euler import euler_from_rotations, rotations_from_euler
+from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
 from armscan.geometry.fitting import Plane
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
@@ -125,6 +128,31 @@ def test_misread_poses_are_refused_with_the_reading_that_fits(change: Repose, wo
     assert "no hand-eye fits" in fit.reason and words in fit.reason and fit.remedy
 
 
+@pytest.mark.parametrize("read", ["intrinsic-xyz", "extrinsic-xyz"])
+def test_a_misread_convention_is_named_before_the_plate_is_blamed(read: EulerConvention) -> None:
+    """The plane left free takes up 90 % of it, tilted and shifted as no plate is probed."""
+    stripes, plate = PlateRig(good_postures(8, np.random.default_rng(1))).draw(1)
+
+    def change(pose: Pose[Base, Tool]) -> Pose[Base, Tool]:
+        angles = euler_from_rotations(pose.rotation[None], "intrinsic-zxz")
+        return Pose(rotations_from_euler(angles, read)[0], pose.translation_mm)
+
+    fit = calibrate_on_plate(_reposed(stripes, change), plate)
+    assert isinstance(fit, FitFailure)
+    assert f"read as {read}, reading them as intrinsic-zxz would leave 0.00" in fit.reason
+    assert 'rotation = "intrinsic-zxz"' in fit.remedy and "probe" not in fit.remedy
+
+
+def test_a_posture_that_the_hand_eye_rests_on_is_named() -> None:
+    """Sigmas of 0.01: a move by 6 of them in one parameter is named, one by 4 is not."""
+    options = HandEyeOptions()
+    stripes, _ = _scan()
+    nodes = condense(stripes, straight_stripes(stripes, options), options.nodes_per_stripe)
+    left = {k: LeftOut(size * np.eye(9)[4], 1.0, 1.0, 0.0) for k, size in ((3, 0.04), (11, -0.06))}
+    (warning,) = influence_warnings(nodes, left, 1e-4 * np.eye(6))
+    assert "without posture posture11" in warning and "by 6 of its stated sigmas" in warning
+
+
 def test_poses_shifted_by_one_exposure_are_recognised() -> None:
     stripes, plate = _scan()
     poses = [s.base_from_tool for s in stripes]
@@ -186,6 +214,17 @@ def test_a_plate_that_sank_is_warned_of_with_its_distance() -> None:
     warning = next(w for w in fit.warnings if "disagree" in w)
     distance = float(warning.split("lies ")[1].split(" mm")[0])
     assert distance == pytest.approx(0.15, abs=0.06)
+
+
+def test_a_plate_without_covariance_is_not_said_to_be_coefficients() -> None:
+    stripes, plate = _scan()
+    said = {}
+    for n_points in (0, plate.n_points):
+        fit = calibrate_on_plate(stripes, replace(plate, covariance=None, n_points=n_points))
+        assert isinstance(fit, HandEyeFit)
+        said[n_points] = dict(fit.reference)["plane"]
+    assert "only A, B, C, D were given" in said[0]
+    assert "probed plate's uncertainty is not known" in said[plate.n_points]
 
 
 def test_a_plate_seen_from_behind_is_warned_of() -> None:

@@ -23,6 +23,7 @@ from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.hand_eye import (
     HandEyeRun,
     HandEyeScanOptions,
+    _left_out,
     calibrate_hand_eye_from_scan,
 )
 from armscan.records.arm_track import ArmTrack
@@ -241,3 +242,9 @@ def test_two_cameras_are_not_mixed() -> None:
     _, plate = RIG.draw(0)
     with pytest.raises(InputError, match="exposures of cameras 0, 1"):
         calibrate_hand_eye_from_scan(TwoCameraScan(), _sensor(), plate)
+
+
+def test_exposures_that_were_not_used_are_counted_beyond_those_named() -> None:
+    (warning,) = _left_out(20, 20, [(f"image{k}", "dark") for k in range(12)])
+    assert warning.startswith("12 exposures were not used: image0 (dark)")
+    assert warning.endswith("image3 (dark), and 8 more")

@@ -22,6 +22,7 @@ from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate_checks import (
     agreement_warnings,
     explain_misfit,
+    influence_warnings,
     point_warnings,
     refuse_other_plane,
 )
@@ -163,6 +164,7 @@ def _result(
             *checked.warnings,
             *conditioning_warnings(conditioning, len(postures), cause),
             *agreement_warnings(nodes, plate, fit, options),
+            *influence_warnings(nodes, left, fit.covariance[:6, :6]),
             *point_warnings(stripes, kept, options),
         ),
     )

@@ -29,7 +29,9 @@ class Reading:
     typical_mm: float
 
 
-def find_reading(nodes: PlateNodes, plate: Plane, typical_mm: float) -> Reading | None:
+def find_reading(
+    nodes: PlateNodes, plate: Plane, typical_mm: float, *, most_mm: float = np.inf
+) -> Reading | None:
     """First other reading of the same poses that the stripes agree with; None if there is none.
 
     Parameters
@@ -38,10 +40,12 @@ def find_reading(nodes: PlateNodes, plate: Plane, typical_mm: float) -> Reading 
         The data as read.
     typical_mm
         What they leave as read.
+    most_mm
+        What the reading may leave at most.
     """
     for words, remedy, moved in _readings(thinned(nodes)):
         left = find_start(moved, plate).typical_mm
-        if left < BETTER * typical_mm:
+        if left < BETTER * typical_mm and left <= most_mm:
             return Reading(words, remedy, left)
     return None
 
@@ -56,7 +60,8 @@ def _readings(nodes: PlateNodes) -> Iterator[tuple[str, str, PlateNodes]]:
                 for branch in (angles, _other_branch(angles, read)):
                     yield (
                         f"if the angles were read as {read}, reading them as {meant}",
-                        f"give the rotation convention {meant}",
+                        f"give the rotation convention {meant}: of a recording in session.toml, "
+                        f'[pose] rotation = "{meant}"; of robot poses with --euler',
                         nodes.moved(rotations_from_euler(branch, meant), translations),
                     )
     back = rotations.transpose(0, 2, 1)

@@ -20,7 +20,7 @@ def test_the_real_twin_probes_its_plate(tmp_path: Path, capsys: pytest.CaptureFi
     assert json.loads((tmp_path / "touches.truth.json").read_text())["simulated"] is True
     assert main(["info", str(folder), "--json"]) == 0
     (item,) = json.loads(capsys.readouterr().out)["items"]
-    assert item["arm_samples"] >= 20 and item["arm_gaps"] == 0
+    assert item["arm_samples"] >= 20 and item["arm_samples_without_pose"] == 0
     assert main(words) == 2
     assert "not empty" in capsys.readouterr().err
 

@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from armscan.errors import ArmscanError
+from armscan.geometry.arrays import IntArray
 from armscan.models.scanner import HAND_EYE_PARAMETER_NAMES, ScannerCalibration
+from armscan.reconstruction.sync import SyncOptions, exposure_poses, largest_gap_ns
 from armscan.records.arm_track import NO_TRIGGER, ArmTrack
 from armscan.records.session import CameraSetup
 from armscan.report.numbers import with_sigma
@@ -18,6 +21,7 @@ from armscan.storage.probed_points import read_probed_points
 from armscan.storage.recording_reader import FolderRecording, read_arm_track, read_recording
 
 NS_PER_S = 1e9
+NS_PER_MS = 1e6
 
 
 def describe_recording(folder: Path) -> dict[str, Any]:
@@ -33,12 +37,13 @@ def describe_recording(folder: Path) -> dict[str, Any]:
         "exposures": len(scan.rows),
         "views": _n_views(scan),
         "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
+        **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
         **({"lasers": lasers} if lasers else {}),
         "cameras": [_camera_line(setup) for setup in scan.session.cameras],
     }
     if scan.arm is not None:
         content |= {"pose_form": scan.session.pose_form, "clock": scan.session.clock}
-        content |= _track(scan.arm)
+        content |= _track(scan.arm) | _poses(scan, scan.arm)
     return content | _notes(scan.session.assumed, scan.warnings)
 
 
@@ -131,7 +136,8 @@ def _track(track: ArmTrack) -> dict[str, Any]:
     known = track.translations_mm[track.is_known]
     content: dict[str, Any] = {
         "arm_samples": len(track),
-        "arm_gaps": int((~track.is_known).sum()),
+        "arm_samples_without_pose": int((~track.is_known).sum()),
+        **_steps("arm", track.t_ns),
         "has_joints": track.joints_rad is not None,
         "has_triggers": track.trigger_ids is not None
         and bool((track.trigger_ids != NO_TRIGGER).any()),
@@ -140,6 +146,37 @@ def _track(track: ArmTrack) -> dict[str, Any]:
         extent = np.linalg.norm(known.max(axis=0) - known.min(axis=0))
         content["arm_extent_mm"] = round(float(extent), 3)
     return content
+
+
+def _steps(what: str, t_ns: IntArray) -> dict[str, float]:
+    """Median and longest step between times; nothing for a single one."""
+    if len(t_ns) < 2:
+        return {}
+    steps_ms = np.diff(t_ns) / NS_PER_MS
+    return {
+        f"{what}_median_period_ms": round(float(np.median(steps_ms)), 6),
+        f"{what}_longest_step_ms": round(float(steps_ms.max()), 6),
+    }
+
+
+def _poses(scan: FolderRecording, track: ArmTrack) -> dict[str, Any]:
+    """How many exposures have a pose, how it is found, and why the others have none."""
+    limit_ns = largest_gap_ns(track, SyncOptions())
+    gaps = {
+        "arm_gap_limit_ms": limit_ns / NS_PER_MS,
+        "arm_steps_above_gap_limit": int((np.diff(track.t_ns) > limit_ns).sum()),
+    }
+    try:
+        poses = exposure_poses(scan.rows, track, scan.session.clock)
+    except ArmscanError as error:
+        return {**gaps, "exposures_with_pose": 0, "exposures_without_pose": error.what}
+    return {
+        **gaps,
+        "exposures_with_pose": int(poses.has_pose.sum()),
+        "poses_found": poses.how,
+        **({"exposures_without_pose": poses.missing} if poses.missing else {}),
+        **({"poses_doubtful": list(poses.warnings)} if poses.warnings else {}),
+    }
 
 
 def _notes(assumed: tuple[str, ...], warnings: tuple[str, ...]) -> dict[str, Any]:

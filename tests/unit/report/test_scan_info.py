@@ -35,11 +35,37 @@ def test_a_recording_is_counted_and_what_is_odd_is_said(tmp_path: Path) -> None:
     for path in (folder, folder / "arm.csv", folder / "exposures.csv"):
         found = described(path)
         assert found["exposures"] == 3 and found["views"] == 2
-        assert (found["arm_samples"], found["arm_gaps"]) == (3, 1)
+        assert (found["arm_samples"], found["arm_samples_without_pose"]) == (3, 1)
         assert found["lasers"] == ["A", "B"]
         assert found["cameras"] == ["8 x 6 px, 8 bits, mono"]
         assert "no session.toml" in str(found["assumed"])
         assert "1 of 3 samples" in str(found["warnings"])
+
+
+def test_rates_missing_rows_and_exposures_without_pose_are_said(tmp_path: Path) -> None:
+    """The arm reports every 10 ms; its rows from 100 to 200 ms are missing, without a mark."""
+    ms = 10**6
+    lines = [f"{t * ms},{900 + t},0,400,1,0,0,0" for t in range(0, 301, 10) if not 100 < t < 200]
+    arm = "\n".join([ARM.splitlines()[0], *lines]) + "\n"
+    head = EXPOSURES.splitlines()[0]
+    shown = [f"{k},{t * ms},0,images/{k}.png,A" for k, t in enumerate((45, 85, 165))]
+    found = described(lab_folder(tmp_path, arm=arm, exposures="\n".join([head, *shown]) + "\n"))
+    assert (found["exposure_median_period_ms"], found["exposure_longest_step_ms"]) == (60.0, 80.0)
+    assert (found["arm_median_period_ms"], found["arm_longest_step_ms"]) == (10.0, 100.0)
+    assert (found["arm_gap_limit_ms"], found["arm_steps_above_gap_limit"]) == (30.0, 1)
+    assert found["arm_samples_without_pose"] == 0
+    assert found["exposures_with_pose"] == 2
+    assert found["poses_found"] == "by time, between samples up to 30 ms apart"
+    assert found["exposures_without_pose"] == "1 in a gap of the arm's samples"
+
+
+def test_a_recording_of_which_no_exposure_has_a_pose_is_described_all_the_same(
+    tmp_path: Path,
+) -> None:
+    empty = ARM.replace("901,1,400,0.8,0.6,0,0", ",,,,,,")
+    found = described(lab_folder(tmp_path, arm=empty))
+    assert found["exposures_with_pose"] == 0
+    assert "none of 3 exposures has a pose" in str(found["exposures_without_pose"])
 
 
 def test_a_simulated_recording_is_called_so(tmp_path: Path) -> None:

@@ -70,7 +70,11 @@ def read_arm_model(path: Path) -> ArmModel:
         text = json.dumps(content, default=str)
         return _model(ArmTables.model_validate_json(text, strict=True))
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileFormatError(f"this is no TOML: {error}", where=str(path)) from error
+        raise FileFormatError(
+            f"this is no TOML: {error}",
+            where=str(path),
+            remedy='write lines as name = "my arm", one [[axis]] for each axis',
+        ) from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

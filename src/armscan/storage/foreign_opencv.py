@@ -134,9 +134,15 @@ def _numbers(value: Any, name: str, where: str) -> FloatArray:
     try:
         numbers = np.asarray(content, dtype=np.float64).reshape(-1)
     except (TypeError, ValueError) as error:
-        raise FileFormatError(f"'{name}' is not a matrix of numbers", where=where) from error
+        raise FileFormatError(
+            f"'{name}' is not a matrix of numbers", where=where, remedy="copy the file again"
+        ) from error
     if not np.isfinite(numbers).all():
-        raise FileFormatError(f"'{name}' holds values that are not finite", where=where)
+        raise FileFormatError(
+            f"'{name}' holds values that are not finite",
+            where=where,
+            remedy="calibrate the camera again",
+        )
     return numbers
 
 
@@ -150,7 +156,11 @@ def _matrix(tree: Mapping[str, Any], where: str) -> FloatArray:
         )
     numbers = _numbers(value, "camera_matrix", where)
     if numbers.size != 9:
-        raise FileFormatError(f"camera_matrix has {numbers.size} numbers, expected 9", where=where)
+        raise FileFormatError(
+            f"camera_matrix has {numbers.size} numbers, expected 9",
+            where=where,
+            remedy="write fx 0 cx 0 fy cy 0 0 1",
+        )
     matrix = numbers.reshape(3, 3)
     if abs(matrix[0, 1]) > SKEW_LIMIT * abs(matrix[0, 0]):
         raise FileFormatError(
@@ -186,6 +196,7 @@ def _distortion(tree: Mapping[str, Any], where: str) -> FloatArray:
         raise FileFormatError(
             f"distortion_coefficients has {numbers.size} numbers, expected k1 k2 p1 p2 [k3]",
             where=where,
+            remedy="calibrate with the plain model of five coefficients",
         )
     coefficients = np.zeros(N_COEFFICIENTS)
     coefficients[: numbers.size] = numbers[:N_COEFFICIENTS]
@@ -215,4 +226,6 @@ def _check_model(tree: Mapping[str, Any], where: str) -> None:
             remedy="calibrate with k1 k2 p1 p2 k3",
         )
     if tree.get("fisheye_model") not in (None, 0, 0.0, False):
-        raise FileFormatError("the lens model is fisheye", where=where)
+        raise FileFormatError(
+            "the lens model is fisheye", where=where, remedy="calibrate with the pinhole model"
+        )

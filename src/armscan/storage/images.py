@@ -59,13 +59,19 @@ def read_exposure(
     data = read_bytes(path)
     kind = image_format(data)
     if kind is None:
-        raise FileFormatError(f"this is not a {FORMATS} image", where=str(path))
+        raise FileFormatError(
+            f"this is not a {FORMATS} image",
+            where=str(path),
+            remedy="give an image, and copy it again if it was one",
+        )
     check_complete(data, str(path))
     image, stated_bits = decode_netpbm(data, str(path)) if kind == "PGM" else _decode(data, path)
     bits = options.bits_used or stated_bits
     if bits > 8 * image.dtype.itemsize:
         raise OptionError(
-            f"the file has {8 * image.dtype.itemsize} bits a pixel, not {bits}", where=str(path)
+            f"the file has {8 * image.dtype.itemsize} bits a pixel, not {bits}",
+            where=str(path),
+            remedy="give the bits that the file has, or leave the option out",
         )
     if options.align == "high":
         image = _as_image(image >> (8 * image.dtype.itemsize - bits))
@@ -131,7 +137,7 @@ def read_bytes(path: Path) -> bytes:
         If there is no such file, it is a folder, it is empty or it may not be read.
     """
     if path.is_dir():
-        raise FileFormatError("this is a folder, not a file", where=str(path))
+        raise FileFormatError("this is a folder, not a file", where=str(path), remedy="name a file")
     try:
         data = path.read_bytes()
     except FileNotFoundError as error:
@@ -140,7 +146,9 @@ def read_bytes(path: Path) -> bytes:
         ) from error
     except OSError as error:
         raise FileFormatError(
-            f"the file cannot be read ({error.strerror})", where=str(path)
+            f"the file cannot be read ({error.strerror})",
+            where=str(path),
+            remedy="check that it may be read",
         ) from error
     if not data:
         raise FileFormatError(

@@ -39,11 +39,17 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
             remedy="copy the file again, or write it anew",
         ) from error
     except (UnicodeDecodeError, RecursionError) as error:
-        raise FileFormatError("this is not a JSON document", where=where) from error
+        raise FileFormatError(
+            "this is not a JSON document", where=where, remedy="copy the file again; it may be cut"
+        ) from error
     except ValueError as error:
         raise FileFormatError(str(error), where=where, remedy="calibrate anew") from error
     if not isinstance(value, dict):
-        raise FileFormatError("this is not a JSON object", where=where)
+        raise FileFormatError(
+            "this is not a JSON object",
+            where=where,
+            remedy="give a document that armscan or a camera calibration wrote",
+        )
     return value
 
 

@@ -39,13 +39,16 @@ def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
     """
     header = HEADER.match(data)
     if header is None:
-        raise FileFormatError("the PGM header is not understood", where=where)
+        raise FileFormatError(
+            "the PGM header is not understood", where=where, remedy="save the image as PNG"
+        )
     kind = int(header[1])
     width, height, greatest = (int(header[k]) for k in (2, 3, 4))
     if not 1 <= greatest <= 65535 or width < 1 or height < 1:
         raise FileFormatError(
             f"the PGM header gives {width} x {height} px and a greatest value of {greatest}",
             where=where,
+            remedy="save the image as PNG",
         )
     shape = (height, width, 3) if kind in (3, 6) else (height, width)
     body = data[header.end() :]
@@ -73,8 +76,14 @@ def _ascii_values(body: bytes, where: str) -> IntArray:
         values = np.array([int(word) for word in words], dtype=np.int64)
     except ValueError as error:
         raise FileFormatError(
-            "the PGM file holds words that are no numbers", where=where
+            "the PGM file holds words that are no numbers",
+            where=where,
+            remedy="save the image as PNG",
         ) from error
     if len(values) and not 0 <= values.min() <= values.max() <= 65535:
-        raise FileFormatError("the PGM file holds values outside 0 to 65535", where=where)
+        raise FileFormatError(
+            "the PGM file holds values outside 0 to 65535",
+            where=where,
+            remedy="save the image as PNG",
+        )
     return values

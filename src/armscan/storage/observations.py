@@ -93,7 +93,9 @@ def read_observations(path: Path) -> Observations:
         )
     except (zipfile.BadZipFile, ValueError, KeyError, EOFError, OSError) as error:
         raise FileFormatError(
-            "this is not a complete file of observations", where=str(path)
+            "this is not a complete file of observations",
+            where=str(path),
+            remedy="copy the file again, or calibrate again",
         ) from error
 
 

@@ -78,12 +78,20 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
     """
     header = HEADER.match(data)
     if header is None:
-        raise FileFormatError("this is not a PLY file with a complete header", where=where)
+        raise FileFormatError(
+            "this is not a PLY file with a complete header",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
+        )
     body = data[header.end() :]
     try:
         order, count, fields, comments = _header(header[1].decode("latin-1"))
     except (ValueError, KeyError, IndexError) as error:
-        raise FileFormatError("the PLY header is not understood", where=where) from error
+        raise FileFormatError(
+            "the PLY header is not understood",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
+        ) from error
     if order == "=":
         table = _ascii_table(body, fields, count, where)
     else:
@@ -130,5 +138,7 @@ def _ascii_table(
         return np.array([tuple(float(word) for word in row) for row in rows], dtype=fields)
     except ValueError as error:
         raise FileFormatError(
-            "the points of the PLY file are not understood", where=where
+            "the points of the PLY file are not understood",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
         ) from error

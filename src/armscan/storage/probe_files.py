@@ -68,7 +68,11 @@ def read_probe_tip(path: Path) -> ProbeTip:
         content = tomllib.loads(read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n"))
         keys = ProbeKeys.model_validate_json(json.dumps(content, default=str), strict=True)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileFormatError(f"this is no TOML: {error}", where=str(path)) from error
+        raise FileFormatError(
+            f"this is no TOML: {error}",
+            where=str(path),
+            remedy="write centre_tool_mm = [x, y, z] and tip_diameter_mm = 6.0",
+        ) from error
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

@@ -92,7 +92,9 @@ def read_arm_table(
     """
     table.require(("t_ns",))
     if not len(table):
-        raise FileFormatError("the table holds no sample", where=table.where)
+        raise FileFormatError(
+            "the table holds no sample", where=table.where, remedy="write one line a sample"
+        )
     times = _times(table)
     complete = _complete_forms(table)
     chosen = _form(table, form, complete)

@@ -33,7 +33,9 @@ def exposure_rows(table: CsvTable) -> tuple[tuple[ExposureRow, ...], Columns]:
     """
     table.require(REQUIRED)
     if not len(table):
-        raise FileFormatError("the table lists no exposure", where=table.where)
+        raise FileFormatError(
+            "the table lists no exposure", where=table.where, remedy="write one line an image"
+        )
     n = len(table)
     index, times = table.ints("index"), table.ints("t_ns")
     camera = table.ints("camera")

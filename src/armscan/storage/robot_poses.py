@@ -42,7 +42,11 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
     is_json = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{")
     table = _from_json(data, where) if is_json else _from_text(data, where)
     if not len(table):
-        raise FileFormatError("the file holds no pose", where=where)
+        raise FileFormatError(
+            "the file holds no pose",
+            where=where,
+            remedy="write six numbers a line: x, y, z in mm and three angles in degrees",
+        )
     if np.abs(table[:, 3:]).max() > FULL_TURN_DEG:
         raise FileFormatError(
             f"an angle of {np.abs(table[:, 3:]).max():g} deg",
@@ -72,7 +76,9 @@ def _from_text(data: bytes, where: str) -> FloatArray:
     try:
         lines = data.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise FileFormatError("this is not UTF-8 text", where=where) from error
+        raise FileFormatError(
+            "this is not UTF-8 text", where=where, remedy="save it as UTF-8"
+        ) from error
     rows: list[list[float]] = []
     is_header_possible = True
     for number, line in enumerate(lines, start=1):

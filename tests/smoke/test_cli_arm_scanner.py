@@ -94,7 +94,7 @@ def test_a_recording_with_a_sensor_only_stays_in_the_sensor(
         ({"--sphere-diameter": "50"}, "more than one reference"),
         ({"--sensor": None}, "needs the sensor's calibration"),
         ({"--plane": "0,0,0,1"}, "normal A,B,C is zero"),
-        ({"--plane": "1,2"}, "no plane"),
+        ({"--plane": "1,2"}, "4 are needed"),
         ({"--profiles": "p*.csv"}, "do not mix"),
         ({"--arm-rotation-deg": "20"}, "give rad"),
         ({"--euler": "zyx"}, "no rotation convention"),
@@ -202,7 +202,7 @@ def test_options_of_recordings_need_one(
 
 def test_a_wrong_volume(scan: Path, scanner: Path, fails: Fails, tmp_path: Path) -> None:
     words = ["reconstruct", scan, "--scanner", scanner, "-o", tmp_path / "c.ply"]
-    assert "no volume" in fails(*words, "--volume", "1,2,3", writes=tmp_path)
+    assert "6 are needed" in fails(*words, "--volume", "1,2,3", writes=tmp_path)
     assert "not below" in fails(*words, "--volume", "2,1,0,1,0,1", writes=tmp_path)
 
 

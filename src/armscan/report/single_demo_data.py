@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.inspection.results import Deviations, StepInspection
+from armscan.inspection.results import Deviations, PointCounts, StepInspection
 from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.pipeline.single_demo import SingleDemo
 from armscan.reconstruction.result import PointFate
 from armscan.report.hand_eye_numbers import total_covariance
 
 FRACTION_RULE = (
-    "shares count every measured point of the feature (up to 1 mm from it), those that its fit "
-    "left out included"
+    "rms and shares count every measured point of the feature (up to 1 mm from it), those that its "
+    "fit left out included; points further away are counted beside them: they lie on what stands "
+    "around, or are wrong"
 )
 
 
@@ -53,11 +54,13 @@ def head_data(demo: SingleDemo) -> dict[str, Any]:
             "normalised_error": errors.normalised,
         },
         "plate": {
+            **_counts(demo.plate.counts),
             **_shares(demo.plate.fitted, (0.03, 0.05, 0.08)),
             "std_mm": demo.plate.fitted.value("std_mm"),
             "reference": demo.plate.fitted.reference,
         },
         "sphere": {
+            **_counts(demo.ball.counts),
             **_shares(demo.ball.nominal, (0.03, 0.05, 0.08)),
             "diameter_mm": demo.ball.diameter.value_mm,
             "diameter_error_mm": demo.ball.diameter.value_mm - demo.ball.nominal_diameter_mm,
@@ -70,6 +73,8 @@ def head_data(demo: SingleDemo) -> dict[str, Any]:
         ],
         "part": {
             "n_points": len(demo.part.distance_mm),
+            "n_measured": len(demo.part.distance_mm) + demo.part.n_elsewhere,
+            "n_beyond_1mm": demo.part.n_elsewhere,
             "rms_mm": demo.part.rms_mm,
             "fraction_within_0p05mm": demo.part.fraction_within(0.05),
             "normalised_rms": demo.part.normalised_rms,
@@ -102,11 +107,19 @@ def fraction_within(values_mm: FloatArray, limit_mm: float) -> float:
 
 def _shares(deviations: Deviations, limits_mm: Sequence[float]) -> dict[str, Any]:
     values = deviations.deviations_mm
-    shares = {
+    return {
         f"fraction_within_{limit:g}mm".replace(".", "p"): fraction_within(values, limit)
         for limit in limits_mm
     }
-    return {"n_points": len(values), **shares}
+
+
+def _counts(counts: PointCounts) -> dict[str, int]:
+    """Points of the feature, of the cloud, and those further from the feature than 1 mm."""
+    return {
+        "n_points": counts.n_feature,
+        "n_measured": counts.n_region,
+        "n_beyond_1mm": counts.n_region - counts.n_feature,
+    }
 
 
 def _step(step: StepInspection, frame: str) -> dict[str, Any]:
@@ -115,5 +128,8 @@ def _step(step: StepInspection, frame: str) -> dict[str, Any]:
         "mean_mm": float(step.heights_mm.mean()),
         "std_mm": float(step.heights_mm.std(ddof=1)),
         "fitted_mm": step.height.value_mm,
+        "fitted_sigma_mm": step.height.sigma_mm,
+        "n_points": step.counts.n_feature,
+        "n_measured": step.counts.n_region,
         "frame": frame,
     }

@@ -192,13 +192,12 @@ def _provenance(
 
 def _summary(folder: Path, demo: SingleDemo, data: Mapping[str, Any], commands: Table) -> Summary:
     names = (*DOCUMENTS, "cloud.ply", "report.html", "summary.json")
-    seconds: Mapping[str, float] = data["heads"][HEAD]["seconds"]
-    fit = demo.instrument.hand_eye.fit
+    head, fit = data["heads"][HEAD], demo.instrument.hand_eye.fit
     return Summary(
         title="Demo on a simulated single-line arm scanner: calibrated, used, compared with its "
         "truth",
-        facts=(("time", f"{sum(seconds.values()):.0f} s"),),
-        tables=(comparison_table(data["heads"][HEAD]), truth_table(demo), commands),
+        facts=(("time", f"{sum(head['seconds'].values()):.0f} s"),),
+        tables=(comparison_table(head), truth_table(demo, head), commands),
         warnings=tuple(sentence(f"hand-eye: {text}") for text in fit.warnings),
         written=(folder / RECORDINGS, *(folder / name for name in names)),
         next_step=f"open {folder / 'report.html'} in a browser",

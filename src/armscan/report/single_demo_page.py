@@ -82,7 +82,7 @@ def single_demo_page(
             ),
             Section("The plate, the ball and the blocks", (_histograms(demo),)),
             Section("The part", (_part(demo),)),
-            Section("Against the truth", (truth_table(demo),)),
+            Section("Against the truth", (truth_table(demo, head),)),
             Section("Step by step", (commands, seconds_table(head["seconds"]))),
         ),
         is_simulated=True,
@@ -97,7 +97,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Plate: within ±0.05 mm",
             "97.9 % of 83,210 points",
-            f"{_within(plate)} of {plate['n_points']:,} points ({plate['reference']} plane)",
+            f"{_within(plate)} of {_points(plate)} ({plate['reference']} plane)",
         ),
         (
             "Ball of 34.96 mm: diameter",
@@ -107,7 +107,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
         (
             "Ball: within ±0.05 mm",
             "95.54 % of 179,427 points",
-            f"{_within(ball)} of {ball['n_points']:,} points ({ball['reference']} radius)",
+            f"{_within(ball)} of {_points(ball)} ({ball['reference']} radius)",
         ),
     ]
     for step in head["steps"]:
@@ -117,7 +117,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
             (
                 f"Step of {step['nominal_mm']:g} mm, {how}",
                 "19.989 ± 0.006 mm (its cross-line head)" if is_thesis else "–",
-                f"{step['mean_mm']:.4f} ± {step['std_mm']:.4f} mm",
+                f"{step['mean_mm']:.4f} ± {step['std_mm']:.4f} mm ({_points(step)})",
             )
         )
     hand_eye = head["hand_eye"]
@@ -138,7 +138,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
     return Table(("", "thesis (real)", "ours (simulated)"), tuple(rows), "", (1, 2))
 
 
-def truth_table(demo: SingleDemo) -> Table:
+def truth_table(demo: SingleDemo, head: Mapping[str, Any]) -> Table:
     """Errors of the calibrations and of the part, also in their own sigmas."""
     errors, part = demo.errors, demo.part
     rows = (
@@ -161,7 +161,7 @@ def truth_table(demo: SingleDemo) -> Table:
         ),
         (
             "Points on the part",
-            f"{significant(part.rms_mm, 'mm rms')}",
+            f"{significant(part.rms_mm, 'mm rms')} of {_points(head['part'])}",
             f"{part.normalised_rms:.2f} rms (1 is usual)",
         ),
     )
@@ -175,6 +175,13 @@ def seconds_table(seconds: Mapping[str, float]) -> Table:
     return Table(("stage", "seconds"), tuple(rows))
 
 
+def _points(figures: Mapping[str, Any]) -> str:
+    """How many points a figure is over, and of how many that were measured."""
+    text = f"{figures['n_points']:,} points of {figures['n_measured']:,} measured"
+    beyond = figures.get("n_beyond_1mm")
+    return text if beyond is None else f"{text}, {beyond:,} beyond 1 mm"
+
+
 def _within(figures: Mapping[str, Any]) -> str:
     return share_text(100.0 * figures["fraction_within_0p05mm"])
 
@@ -185,8 +192,9 @@ def _sigmas(length: float, n_parameters: int) -> str:
 
 def _rule_text() -> str:
     return (
-        f"Of plate and ball, {FRACTION_RULE}. The thesis's figures were measured on a real "
-        "instrument; ours are simulated, with an arm and optics made to be like it."
+        f"Of plate, ball and part, {FRACTION_RULE}. Of a step's faces the margins are left "
+        "out. The thesis's figures were measured on a real instrument; ours are simulated, with an "
+        "arm and optics made to be like it."
     )
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armscan.cli import main
-from armscan.storage.clouds import ply_bytes, xyz_bytes
+from armscan.storage.clouds import ply_bytes, read_ply, xyz_bytes
 from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
 Fails = Callable[..., str]
@@ -103,7 +104,7 @@ def test_what_cannot_be_inspected_gets_one_sentence(
     assert "not a list of numbers" in fails(
         "inspect", "sphere", ball, "--diameter", 34.96, "--region", "left,right"
     )
-    assert "holds 0 points" in fails(
+    assert "in the region lie 0 of" in fails(
         "inspect", "sphere", ball, "--diameter", 34.96, "--region", "0,1,0,1,0,1"
     )
     assert "xmax is nan" in fails(
@@ -165,3 +166,24 @@ def test_the_daily_check_ends_with_its_verdict(
     assert "inconclusive" in capsys.readouterr().out
     assert "either --ball DIAMETER or --plate FILE" in fails("verify", clouds / "ball.ply")
     assert "give --scanner" in fails("verify", tmp_path, "--ball", 34.96)
+
+
+def test_a_simulated_cloud_is_called_so_wherever_it_lies(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The mark is in the cloud, so a copy far from the recording bears it too."""
+    copy = tmp_path / "copy.ply"
+    copy.write_bytes(ply_bytes(replace(read_ply(clouds / "ball.ply"), is_simulated=True)))
+    assert report(capsys, "sphere", copy, "--diameter", 34.96)["simulated"] is True
+    assert report(capsys, "sphere", clouds / "ball.ply", "--diameter", 34.96)["simulated"] is False
+    assert main(["verify", str(copy), "--ball", "34.96", "--mpe", "0.05"]) == 0
+    assert "(simulated data)" in capsys.readouterr().out
+
+
+def test_words_of_small_refusals(clouds: Path, fails: Fails, tmp_path: Path) -> None:
+    ball = clouds / "ball.ply"
+    said = fails("inspect", "sphere", ball, "--diameter", 35, "--region", "0,1,0,1,0,1")
+    assert "in the region lie 0 of the cloud's 800 points" in said
+    folder = tmp_path / "x"
+    said = fails("simulate", "thesis-single", "ball", "-o", folder, "--preset=bad")
+    assert "'bad' is not one of" in said and "Value error" not in said

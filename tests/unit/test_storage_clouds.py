@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 
 from armscan.errors import FileFormatError
 from armscan.records.cloud import PointCloud
+from armscan.report.file_info import describe_files
 from armscan.storage.clouds import XYZ_LOSES, ply_bytes, read_ply, xyz_bytes
+from armscan.storage.foreign_clouds import read_cloud
 from armscan.storage.ply_format import parse_ply
 
 ARRAYS = (
@@ -120,3 +123,17 @@ def test_xyz_says_what_it_loses() -> None:
     assert all(loss in text.splitlines()[0] for loss in XYZ_LOSES)
     found = np.array([line.split() for line in text.splitlines()[1:]], dtype=float)
     np.testing.assert_allclose(found, before.points_mm, atol=0.51e-7, rtol=0)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".xyz"])
+@pytest.mark.parametrize("is_simulated", [True, False])
+def test_a_cloud_says_that_it_is_simulated(tmp_path: Path, suffix: str, is_simulated: bool) -> None:
+    """In the file itself, which is moved away from the recording."""
+    path = tmp_path / f"cloud{suffix}"
+    before = replace(cloud(), is_simulated=is_simulated)
+    path.write_bytes(ply_bytes(before) if suffix == ".ply" else xyz_bytes(before))
+    after = read_cloud(path)
+    assert after.is_simulated is is_simulated
+    assert after.frame == "Sensor"
+    (described,) = describe_files([str(path)]).data["items"] if suffix == ".ply" else ({},)
+    assert described.get("simulated", is_simulated) is is_simulated

@@ -67,6 +67,7 @@ def _sentence(error: BaseException) -> str:
     if isinstance(error, ArmscanError):
         return str(error)
     message = cast(str, getattr(error, "format_message", error.__str__)())
+    message = message.replace(": Value error, ", ": ")
     hint = "Put quotes around patterns" if "unexpected extra arg" in message else "Add -h for help"
     return f"{message.replace(chr(10), ' ').rstrip('.')}. {hint}."
 

@@ -100,9 +100,10 @@ def select(
     else:
         rows = np.flatnonzero(region.holds(cloud.points_mm))
     if len(rows) < min_points:
-        place = "the cloud" if region is None else f"the region, of the cloud's {len(cloud)},"
+        place = "the cloud holds" if region is None else "in the region lie"
+        of_all = "" if region is None else f" of the cloud's {len(cloud)}"
         raise InputError(
-            f"{place} holds {len(rows)} points; an inspection needs {min_points}",
+            f"{place} {len(rows)}{of_all} points; an inspection needs {min_points}",
             remedy="measure more points" if region is None else "widen the region",
         )
     return Selection(cloud, rows, options)

@@ -151,7 +151,8 @@ def measure_scan(
         placed[row] = result
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
     exposures = _records(source, images, poses, placed, reasons)
-    return _joined(placed, exposures, poses, placing, options)
+    found = _joined(placed, exposures, poses, placing, options)
+    return replace(found, cloud=replace(found.cloud, is_simulated=source.is_simulated))
 
 
 def place_exposure(

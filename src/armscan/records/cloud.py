@@ -43,6 +43,8 @@ class PointCloud:
         (N,) peak grey level of the stripe.
     normals
         (N, 3) unit surface normals towards the sensor, or None where not estimated.
+    is_simulated
+        True if the points were measured on rendered images.
     """
 
     frame: CloudFrame
@@ -56,6 +58,7 @@ class PointCloud:
     segment: IntArray
     intensity: FloatArray
     normals: FloatArray | None = None
+    is_simulated: bool = False
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.points_mm))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -104,7 +104,8 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     by_source = {exposure.source: exposure for exposure in exposures}
     page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
     is_ply = request.output.suffix.lower() == ".ply"
-    cloud = ply_bytes(result.cloud) if is_ply else xyz_bytes(result.cloud)
+    measured = replace(result.cloud, is_simulated=is_simulated)
+    cloud = ply_bytes(measured) if is_ply else xyz_bytes(measured)
     write_files(
         {files.document: cloud, files.page: render_page(page)},
         is_overwriting=request.is_overwriting,

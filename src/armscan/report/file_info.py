@@ -145,6 +145,7 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
     if "cov_xx_mm2" in fields:
         cloud = read_ply(path)
         content["frame"] = cloud.frame
+        content["simulated"] = cloud.is_simulated
         content["sheets"] = list(cloud.sheet_names)
         content["exposures"] = list(cloud.exposure_sources)
         content["median_sigma_mm"] = float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0

@@ -214,7 +214,7 @@ def _finished(
     inputs: tuple[Path, ...],
     more_options: tuple[StepOptions, ...] = (),
 ) -> Summary:
-    is_simulated = are_simulated(inputs)
+    is_simulated = cloud.is_simulated or are_simulated(inputs)
     written: tuple[Path, ...] = ()
     if request.output is not None:
         provenance = _provenance(request, report, inputs, more_options)

@@ -143,7 +143,7 @@ def checks_table(checks: tuple[Check, ...]) -> Table:
         )
         for check in checks
     )
-    heads = ("check", "error E", "predicted sigma", "limit MPE", "uncertainty U", "verdict")
+    heads = ("check", "error E", "predicted spread", "limit MPE", "uncertainty U", "verdict")
     return Table(heads, rows, "", (5,))
 
 
@@ -189,7 +189,7 @@ def _measured(request: VerifyRequest, progress: Progress) -> tuple[Measured, boo
                 where=str(request.scan),
                 remedy="give a recording with the arm's poses, or a cloud made from one",
             )
-        return Measured(cloud), are_simulated(_inputs(request))
+        return Measured(cloud), cloud.is_simulated or are_simulated(_inputs(request))
     source = read_recording(request.scan)
     scanner = None if request.scanner is None else read_scanner_calibration(request.scanner)
     if scanner is None:

@@ -27,6 +27,8 @@ COVARIANCE = {
     "cov_zz_mm2": (2, 2),
 }
 INDICES = ("sheet", "exposure", "segment")
+SIMULATED = "simulated"
+"""Comment in the header of a cloud that was measured on rendered images."""
 
 XYZ_LOSES = (
     "normals",
@@ -42,7 +44,8 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     """Content of a binary little-endian PLY file that holds all of a cloud, in float64 and int32.
 
     ``sigma_mm`` is written for other programs; it follows from the covariance. Names stand in the
-    header: ``comment frame Sensor``, ``comment sheet 0 "A"``, ``comment exposure 0 "laser.png"``.
+    header: ``comment frame Sensor``, ``comment sheet 0 "A"``, ``comment exposure 0 "laser.png"``;
+    of points measured on rendered images also ``comment simulated``.
     """
     columns: dict[str, NDArray[Any]] = {}
     columns |= {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
@@ -58,6 +61,8 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     for name, values in columns.items():
         table[name] = values
     comments = ["written by armscan", "unit mm", f"frame {cloud.frame}"]
+    if cloud.is_simulated:
+        comments.append(SIMULATED)
     for word, names in (("sheet", cloud.sheet_names), ("exposure", cloud.exposure_sources)):
         comments += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
     return ply_header(table.dtype, len(cloud), comments) + table.tobytes()
@@ -66,7 +71,8 @@ def ply_bytes(cloud: PointCloud) -> bytes:
 def xyz_bytes(cloud: PointCloud) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
     buffer = io.StringIO()
-    header = f"x_mm y_mm z_mm in frame {cloud.frame}; not in this file: {'; '.join(XYZ_LOSES)}"
+    frame = f"{cloud.frame}; {SIMULATED}" if cloud.is_simulated else cloud.frame
+    header = f"x_mm y_mm z_mm in frame {frame}; not in this file: {'; '.join(XYZ_LOSES)}"
     np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header)
     return buffer.getvalue().encode()
 
@@ -106,6 +112,7 @@ def read_ply(path: Path) -> PointCloud:
             segment=table["segment"],
             intensity=table["intensity"],
             normals=np.stack([table[n] for n in NORMAL], axis=1) if has_normals else None,
+            is_simulated=SIMULATED in vertices.comments,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=str(path)) from error

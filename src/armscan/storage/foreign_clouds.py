@@ -13,7 +13,7 @@ import numpy as np
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.records.cloud import CloudFrame, PointCloud
-from armscan.storage.clouds import COVARIANCE, POINT, read_ply
+from armscan.storage.clouds import COVARIANCE, POINT, SIMULATED, read_ply
 from armscan.storage.images import read_bytes
 from armscan.storage.ply_format import parse_ply
 
@@ -39,7 +39,11 @@ def read_cloud(path: Path) -> PointCloud:
         if names.issuperset(COVARIANCE):
             return read_ply(path)
         if missing := sorted(set(POINT) - names):
-            raise FileFormatError(f"the PLY file's points have no {missing[0]}", where=str(path))
+            raise FileFormatError(
+                f"the PLY file's points have no {missing[0]}",
+                where=str(path),
+                remedy="give a cloud with x, y and z in mm",
+            )
         points = np.stack([table[name].astype(np.float64) for name in POINT], axis=1)
         return _bare_cloud(points, FOREIGN_FRAME, path)
     if path.suffix.lower() not in (".xyz", ".txt", ".csv", ".asc"):
@@ -60,7 +64,9 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
     start = 1 if lines and not lines[0].startswith("#") and not _is_point(lines[0]) else 0
     body = "\n".join(lines[start:])
     if not any(line.strip() and not line.startswith("#") for line in lines[start:]):
-        raise FileFormatError("the file holds no points", where=str(path))
+        raise FileFormatError(
+            "the file holds no points", where=str(path), remedy="write lines of x y z in mm"
+        )
     try:
         points = np.loadtxt(io.StringIO(body), usecols=(0, 1, 2), ndmin=2)
     except (ValueError, IndexError) as error:
@@ -70,7 +76,8 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
             remedy="give one point a line: x y z in mm, with a point as decimal sign",
         ) from error
     known = cast(CloudFrame, frame) if frame in get_args(CloudFrame) else FOREIGN_FRAME
-    return _bare_cloud(points, known, path)
+    is_simulated = named is not None and f"; {SIMULATED};" in text.partition("\n")[0]
+    return _bare_cloud(points, known, path, is_simulated=is_simulated)
 
 
 def _is_point(line: str) -> bool:
@@ -80,7 +87,9 @@ def _is_point(line: str) -> bool:
         return False
 
 
-def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCloud:
+def _bare_cloud(
+    points_mm: FloatArray, frame: CloudFrame, path: Path, *, is_simulated: bool = False
+) -> PointCloud:
     n = len(points_mm)
     zeros = np.zeros(n, dtype=np.int64)
     try:
@@ -95,6 +104,7 @@ def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCl
             exposure_sources=(path.name,),
             segment=zeros,
             intensity=np.zeros(n),
+            is_simulated=is_simulated,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error

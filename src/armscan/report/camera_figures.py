@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.ticker import MaxNLocator
 
 from armscan.calibration.camera.result import CameraFit, ViewFit
 from armscan.geometry.arrays import FloatArray
@@ -183,6 +184,7 @@ def residual_histogram(fit: CameraFit) -> Picture:
         axes.hist(residuals[:, 0], edges, color=ACCENT, alpha=0.75, label="x")
         axes.hist(residuals[:, 1], edges, color=ACCENT_LIGHT, alpha=0.75, label="y")
         axes.plot(x, bell, color=INK, linewidth=1.2, label=f"Gaussian, σ = {significant(sigma)} px")
+        axes.xaxis.set_major_locator(MaxNLocator(5))
         axes.set_xlabel("residual, px")
         axes.set_ylabel("points")
         axes.set_ylim(top=1.3 * axes.get_ylim()[1])

@@ -46,6 +46,7 @@ def residuals_by_posture(fit: HandEyeFit) -> Picture:
             axes.bar(k, 4 * sigma, 0.5, -2 * sigma, color="none", edgecolor=MUTED, zorder=2)
             axes.plot([k], [1000.0 * posture.mean_mm], "o", color=ALERT, markersize=5, zorder=3)
         axes.set_xticks(range(len(fit.postures)), [p.posture for p in fit.postures])
+        axes.tick_params(axis="x", labelrotation=60 if len(fit.postures) > 8 else 0, labelsize=7.5)
         axes.set_xlabel("posture")
         axes.set_ylabel("distance from the reference, µm")
         widest = max(2.0 * _sigma_of_mean(posture) for posture in fit.postures)

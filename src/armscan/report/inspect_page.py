@@ -15,6 +15,8 @@ from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.summary import Table
 
+LEAST_MM = 5e-5
+"""Smaller lengths, as the mean of what was fitted, are shown as zero."""
 STATEMENT = (
     "Nominal means: known before the measurement. Fitted means: made from these points "
     "themselves, so it cannot show an error of size or place. Every statistic is over all points "
@@ -140,4 +142,6 @@ def _value(deviations: Deviations, k: int) -> str:
     item = deviations.statistics[k]
     if item.unit == "%":
         return share_text(item.value)
+    if item.unit == "mm" and abs(item.value) < LEAST_MM:
+        return "0.0000 mm"
     return significant(item.value, item.unit)

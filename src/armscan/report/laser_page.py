@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse, SheetFit, SheetImage
 from armscan.models.calibration import Provenance
 from armscan.models.light_sheet import BOW_TERMS
@@ -27,6 +28,8 @@ USE_COLOURS = {
     PointUse.ON_EDGE: "#8d7bff",
 }
 BOARD_COLOUR = "#35e0c0"
+WEAK_P = 0.01
+"""A lack-of-fit probability below this is said to object, though too weakly for a bow."""
 
 
 def laser_page(
@@ -120,7 +123,10 @@ def lack_of_fit_text(test: LackOfFit) -> str:
     """A lack-of-fit test in words."""
     if test.degrees_of_freedom == 0 or not math.isfinite(test.p_value):
         return "nothing is redundant, so nothing can be tested"
-    verdict = "the model does not explain the stripes" if test.p_value < 0.001 else "no objection"
+    if test.p_value < SheetOptions().lack_of_fit_p:
+        verdict = "the model does not explain the stripes"
+    else:
+        verdict = "weak objection" if test.p_value < WEAK_P else "no objection"
     return f"F = {test.f_ratio:.2f}, p = {test.p_value:.2g}: {verdict}"
 
 

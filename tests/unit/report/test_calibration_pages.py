@@ -15,7 +15,7 @@ from armscan.calibration.camera.calibrate import calibrate_camera
 from armscan.calibration.camera.options import CameraOptions
 from armscan.calibration.camera.result import CameraFit
 from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse
 from armscan.calibration.laser.target_edges import TargetEdges
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.records.exposure import Exposure
@@ -23,7 +23,7 @@ from armscan.records.profile import REJECTING, StripeFlag
 from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
 from armscan.report.camera_page import camera_page
 from armscan.report.laser_job import laser_summary
-from armscan.report.laser_page import USE_COLOURS, laser_page
+from armscan.report.laser_page import USE_COLOURS, lack_of_fit_text, laser_page
 from armscan.report.numbers import with_sigma
 from armscan.report.page import render_page
 from armscan.report.stripe_figures import FLAG_COLOURS
@@ -173,3 +173,12 @@ def test_pages_say_where_the_data_come_from(is_simulated: bool) -> None:
 def test_every_flag_that_rejects_has_a_colour_of_its_own() -> None:
     assert {flag for flag in StripeFlag if flag & REJECTING} == set(FLAG_COLOURS)
     assert len({colour for colour, _ in FLAG_COLOURS.values()}) == len(FLAG_COLOURS)
+
+
+@pytest.mark.parametrize(
+    ("p_value", "words"),
+    [(0.2, "no objection"), (0.0027, "weak objection"), (0.0004, "does not explain")],
+)
+def test_lack_of_fit_is_worded_by_the_decisions_own_limit(p_value: float, words: str) -> None:
+    """The sheet is bowed below 0.001; 0.0027 is not nothing."""
+    assert words in lack_of_fit_text(LackOfFit(2.03, 20, p_value))

@@ -152,7 +152,7 @@ def reference_facts(
 ) -> tuple[tuple[str, str], ...]:
     """What the plate was, and what was taken for scatter, as (label, value)."""
     a, b, c, d = plate.plane.coefficients
-    facts = [("plate", f"{a:.6f} x + {b:.6f} y + {c:.6f} z + {d:.4f} = 0 in Base (mm)")]
+    facts = [("plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
     if plate.n_points:
         rms = "" if plate.rms_mm is None else f", {plate.rms_mm:.4f} mm rms from it"
         facts.append(("probed", f"{plate.n_points} points{rms}"))
@@ -171,3 +171,7 @@ def reference_facts(
         origin = "estimated" if component.is_estimated else "given"
         facts.append((f"scatter: {component.name}", f"{sigma:.3g} {unit} ({origin})"))
     return tuple(facts)
+
+
+def _signed(value: float, digits: int = 6) -> str:
+    return f"{'-' if value < 0.0 else '+'} {abs(value):.{digits}f}"

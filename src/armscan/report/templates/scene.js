@@ -63,7 +63,13 @@ function drawScenes() {
       context.putImageData(image, 0, 0);
       context.font = `${12 * ratio}px sans-serif`;
       context.fillStyle = ink;
-      for (const [text, ...at] of labels) context.fillText(text, ...place(at, 0));
+      // a pale rim keeps a label readable where lines cross it
+      context.strokeStyle = "rgba(255, 255, 255, 0.9)";
+      context.lineWidth = 4 * ratio;
+      for (const [text, ...at] of labels) {
+        context.strokeText(text, ...place(at, 0));
+        context.fillText(text, ...place(at, 0));
+      }
       drawAxes(context, turn, 46 * ratio, height - 46 * ratio, 30 * ratio, ratio);
       drawBar(context, width, height, scale, ratio);
     }

@@ -109,3 +109,10 @@ def test_the_current_folder_and_a_root_are_not_made_anew(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(OutputError, match="name a new folder"):
         check_new_folder(Path(name))
+
+
+def test_a_file_in_place_of_a_folder_is_called_a_file(tmp_path: Path) -> None:
+    (tmp_path / "note").write_text("x")
+    for check in (lambda path: check_outputs((path,)), check_new_folder):
+        with pytest.raises(OutputError, match="this is a file, not a folder"):
+            check(tmp_path / "note" / "plate.csv")

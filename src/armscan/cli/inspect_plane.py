@@ -18,7 +18,9 @@ from armscan.cli.inspect_arguments import (
 )
 from armscan.cli.output import AsJson, Force, show
 
-EXAMPLE = "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plane.html"
+EXAMPLE = (
+    "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plate-inspection.html"
+)
 
 
 def plane(

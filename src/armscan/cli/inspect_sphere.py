@@ -16,7 +16,7 @@ from armscan.cli.inspect_arguments import (
 )
 from armscan.cli.output import AsJson, Force, show
 
-EXAMPLE = "\b\nExample:\n  armscan inspect sphere ball.ply --diameter 34.96 -o ball.html"
+EXAMPLE = "\b\nExample:\n  armscan inspect sphere ball.ply --diameter 34.96 -o ball-inspection.html"
 
 
 def sphere(

@@ -18,7 +18,7 @@ from armscan.cli.inspect_arguments import (
 from armscan.cli.output import AsJson, Force, show
 
 EXAMPLE = (
-    "\b\nExample:\n  armscan inspect step blocks.ply --height 20 -o step.html\n\n"
+    "\b\nExample:\n  armscan inspect step blocks.ply --height 20 -o blocks-inspection.html\n\n"
     "\b\nA cloud of one exposure cannot tell how far its light sheet leans on the faces;\n"
     "without --normal it is taken to stand square."
 )

@@ -29,6 +29,12 @@ def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> Non
     """
     for path in paths:
         folder = path.parent
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(
+                "this is a file, not a folder to write to",
+                where=str(folder),
+                remedy="choose another folder",
+            )
         if not folder.is_dir():
             raise OutputError(
                 "there is no such folder to write to", where=str(folder), remedy="create it first"

@@ -33,6 +33,12 @@ def check_new_folder(folder: Path) -> None:
             "this exists and is not empty", where=str(folder), remedy="name a new folder"
         )
     parent = target.parent
+    if parent.exists() and not parent.is_dir():
+        raise OutputError(
+            "this is a file, not a folder to write to",
+            where=str(parent),
+            remedy="choose another folder",
+        )
     if not parent.is_dir():
         raise OutputError(
             "there is no such folder to write to", where=str(parent), remedy="create it first"

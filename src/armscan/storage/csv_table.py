@@ -225,6 +225,12 @@ def _decoded(data: bytes, where: str) -> str:
         raise FileFormatError(
             "this is not UTF-8 text", where=where, remedy="save it as CSV in UTF-8"
         ) from error
+    if text.lstrip().startswith(("{", "[", "<")):
+        raise FileFormatError(
+            "this is no table: it looks like JSON or XML",
+            where=where,
+            remedy="give a CSV file with the names of the columns in its first line",
+        )
     if "\0" in text:
         raise FileFormatError("this is no text", where=where, remedy="save it as CSV in UTF-8")
     return text

@@ -221,7 +221,7 @@ def _odd(table: CsvTable, unknown: Mapping[str, tuple[str, ...]]) -> list[str]:
         found.append(f"{table.where}: columns not known, kept: {', '.join(unknown)}")
     if table.is_cut:
         found.append(
-            f"{table.where}: the last line does not end with a line break: was the file cut?"
+            f"{table.where}: the last line does not end with a line break, so the file may be cut"
         )
     return found
 

@@ -150,5 +150,5 @@ def test_input_without_the_step_is_refused_in_words() -> None:
         inspect_step(cloud_of(points), -3.0)
     with pytest.raises(InputError, match="normal of the step's faces is zero"):
         inspect_step(cloud_of(profile(0.0)), HEIGHT_MM, normal=np.zeros(3))
-    with pytest.raises(OptionError, match="margin of -1"):
+    with pytest.raises(OptionError, match="margin_mm is -1"):
         StepOptions(margin_mm=-1.0)

@@ -122,3 +122,9 @@ def test_a_file_of_points_is_not_taken_for_a_plane(tmp_path: Path) -> None:
     assert isinstance(found, ProbedPoints)
     with pytest.raises(FileFormatError, match="normal"):
         read_points_or_plane(written(tmp_path, "A,B,C,D\n0,0,0,1\n"))
+
+
+def test_json_is_no_table(tmp_path: Path) -> None:
+    path = written(tmp_path, '{\n"poses": [1, 2,\n3]}\n')
+    with pytest.raises(FileFormatError, match=r"looks like JSON.*CSV file with the names"):
+        read_probed_points(path)

@@ -25,6 +25,8 @@ def single_demo_commands(recordings: Path, twin: Twin, demo: SingleDemo) -> Tabl
         "--plate plate.csv -o scanner.json",
         *_measured(recordings, "plate", "plane plate.ply --plate plate.csv"),
         *_measured(recordings, "ball", f"sphere ball.ply --diameter {truth.ball_diameter_mm:g}"),
+        f"armscan verify {recordings / 'ball'} --scanner scanner.json "
+        f"--ball {truth.ball_diameter_mm:g}",
     ]
     for k, height in enumerate(truth.step_heights_mm):
         found = _measured(recordings, "steps", f"step steps.ply --height {height:g}")
@@ -35,7 +37,7 @@ def single_demo_commands(recordings: Path, twin: Twin, demo: SingleDemo) -> Tabl
         f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
     ]
     columns = ("The same, command by command",)
-    return Table(columns, tuple((line,) for line in lines))
+    return Table(columns, tuple((line,) for line in lines), "", (0,))
 
 
 def _measured(recordings: Path, scene: str, inspection: str) -> list[str]:

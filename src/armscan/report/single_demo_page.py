@@ -81,7 +81,7 @@ def single_demo_page(
                 ),
             ),
             Section("The plate, the ball and the blocks", (_histograms(demo),)),
-            Section("The part", (_part(demo),)),
+            Section("The part", (Text("These points are cloud.ply."), _part(demo))),
             Section("Against the truth", (truth_table(demo, head),)),
             Section("Step by step", (commands, seconds_table(head["seconds"]))),
         ),
@@ -210,7 +210,8 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
         Card(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
-            f"error of the diameter; {_within(ball)} in ±0.05 mm",
+            f"error of the diameter, sigma {1000.0 * ball['diameter_sigma_mm']:.1f} µm; "
+            f"{_within(ball)} in ±0.05 mm",
         ),
         Card(
             "Step, one exposure",

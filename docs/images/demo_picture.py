@@ -13,44 +13,74 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from armscan.storage.clouds import read_ply
-from armscan.storage.images import read_exposure
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.sphere import inspect_sphere
+from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.scan import measure_scan
+from armscan.storage.recording_reader import FolderRecording, read_recording
+from armscan.storage.scanner_files import read_scanner_calibration
 from armscan.vision.stripe.extract import extract_stripes
 
-LINE = "#0b6e7f"
+LINE, ACCENT, MUTED = "#0b6e7f", "#c8541b", "#5d6b7a"
+BALL_MM = 34.96
 
 
-def photo(axes: Axes, image: np.ndarray, title: str) -> None:
-    """Show a photograph, brightened for the page."""
-    levels = np.clip(image / image.max(), 0.0, 1.0) ** 0.6
-    axes.imshow(levels)
-    axes.set_title(title, loc="left", fontsize=10)
+def draw_stripe(axes: Axes, scan: FolderRecording) -> None:
+    """One exposure of the ball with its stripe centres."""
+    exposure = scan.exposure(len(scan.rows) // 3)
+    levels = np.clip(exposure.image / 90.0, 0.0, 1.0) ** 0.6
+    axes.imshow(levels, cmap="gray", extent=(0, exposure.width_px, exposure.height_px, 0))
+    found = extract_stripes(exposure)
+    x, y = (found.points_px[found.is_accepted] - [exposure.window.x_px, exposure.window.y_px]).T
+    axes.plot(x, y, ".", color="#35f2d0", markersize=1.0)
+    axes.set(xlim=(x.min() - 250, x.max() + 250), ylim=(exposure.height_px, 0))
+    axes.set_title("1  the laser line on a ball, centres found", loc="left", fontsize=10)
     axes.set_axis_off()
+
+
+def draw_postures(axes: Axes, scan: FolderRecording, scanner: ScannerCalibration) -> None:
+    """The head over the plate, from the side: where it was and where it looked."""
+    arm = scan.arm
+    if arm is None:
+        raise SystemExit("the recording has no arm")
+    for row in np.flatnonzero(arm.is_known):
+        pose = arm.pose(int(row)) @ scanner.hand_eye.tool_from_sensor
+        start = pose.translation_mm
+        end = start + 60.0 * pose.rotation[:, 2]
+        axes.plot([start[0], end[0]], [start[2], end[2]], color=LINE, linewidth=1.2)
+        axes.plot(start[0], start[2], "o", color=LINE, markersize=4.0)
+    axes.axhline(scanner.hand_eye.plate.point_mm[2], color=ACCENT, linewidth=2.5)
+    axes.set_title("2  hand-eye: postures over a flat plate", loc="left", fontsize=10)
+    axes.set(xlabel="x in Base, mm", ylabel="z, mm", aspect="equal")
+
+
+def draw_ball(axes: Axes, scan: FolderRecording, scanner: ScannerCalibration) -> None:
+    """Distances of the ball's points from the nominal radius."""
+    ball = inspect_sphere(measure_scan(scan, scanner).cloud, BALL_MM)
+    if isinstance(ball, FitFailure):
+        raise SystemExit(ball.reason)
+    micrometres = 1000.0 * ball.nominal.deviations_mm
+    axes.hist(micrometres, bins=np.arange(-50.0, 51.0, 1.0), color=LINE)
+    axes.set_title(
+        f"3  {len(micrometres):,} points, diameter {ball.diameter.value_mm:.3f} mm",
+        loc="left",
+        fontsize=10,
+    )
+    axes.set(xlabel="distance from the nominal radius, µm", yticks=[])
 
 
 def main(demo: Path, picture: Path) -> None:
     """Draw three steps of the demo side by side."""
-    photos = demo / "photos"
-    figure = Figure(figsize=(12.0, 3.7), layout="constrained")
-    board, stripe, profile = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 0.9))
-    photo(board, read_exposure(photos / "laser/on/02.png").image, "1  the laser line on a board")
-    laser = read_exposure(photos / "object/laser.png")
-    centres = extract_stripes(laser, background=read_exposure(photos / "object/background.png"))
-    photo(stripe, laser.image, "2  stripe centres on an object")
-    x, y = centres.points_px[centres.is_accepted].T
-    stripe.plot(x, y, ".", color="#35f2d0", markersize=1.2)
-    cloud = read_ply(demo / "cloud.ply")
-    _, y_mm, z_mm = cloud.points_mm.T
-    profile.plot(z_mm, y_mm, ".", color=LINE, markersize=2.0)
-    sigma_um = 1000.0 * np.median(cloud.sigma_mm)
-    profile.set_title(
-        f"3  {len(cloud)} points, median σ {sigma_um:.0f} µm", loc="left", fontsize=10
-    )
-    profile.set_xlabel("z, mm")
-    profile.set_ylabel("y, mm")
-    profile.invert_yaxis()
-    profile.set_aspect("equal", adjustable="datalim")
-    profile.spines[["top", "right"]].set_visible(False)
+    scanner = read_scanner_calibration(demo / "scanner.json")
+    ball = read_recording(demo / "recordings" / "ball")
+    figure = Figure(figsize=(12.0, 3.3), layout="constrained")
+    stripe, postures, histogram = figure.subplots(1, 3, width_ratios=(1.35, 1.0, 0.9))
+    draw_stripe(stripe, ball)
+    draw_postures(postures, read_recording(demo / "recordings" / "hand-eye"), scanner)
+    draw_ball(histogram, ball, scanner)
+    for axes in (postures, histogram):
+        axes.spines[["top", "right", "left"]].set_visible(False)
+        axes.tick_params(colors=MUTED, labelsize=8)
     figure.savefig(picture, dpi=110)
 
 

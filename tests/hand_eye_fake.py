@@ -107,7 +107,7 @@ def _stripe(
         posture,
         camera @ TOOL_FROM_SENSOR.inverse(),
         in_sensor,
-        np.tile([0.0, 0.0, 0.003], (len(points), 1)),
+        np.tile([0.0, 0.0, 0.003], (len(points), 1))[:, :, None],
         np.zeros(len(points), dtype=np.int64),
     )
     return stripe, points

@@ -190,7 +190,9 @@ class PlateRig:
                         f"posture{k:02d}",
                         self.reported_pose(k, common + own),
                         clean + noise,
-                        np.tile(max(self.noise.stripe_mm, 1e-4) * across, (len(clean), 1)),
+                        np.tile(max(self.noise.stripe_mm, 1e-4) * across, (len(clean), 1))[
+                            :, :, None
+                        ],
                         np.zeros(len(clean), dtype=np.int64),
                     )
                 )

@@ -71,7 +71,7 @@ class SphereRig:
             name,
             self._reported(pose, generator),
             np.concatenate(points),
-            np.concatenate(noise),
+            np.concatenate(noise)[:, :, None],
             np.concatenate(sheets),
         )
 

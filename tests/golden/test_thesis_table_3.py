@@ -159,7 +159,7 @@ def observed(generator: np.random.Generator, scale: float) -> list[PosedStripe]:
                     name,
                     reported,
                     points + noise * across,
-                    np.tile(STRIPE_MM * across, (len(points), 1)),
+                    np.tile(STRIPE_MM * across, (len(points), 1))[:, :, None],
                     np.zeros(len(points), dtype=np.int64),
                 )
             )

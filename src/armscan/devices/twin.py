@@ -3,16 +3,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
 from armscan.devices.scan_source import ScanSource
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.frames import CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
 
 TwinScene = Literal[
-    "camera", "laser", "hand-eye", "plate", "ball", "steps", "still-step", "part", "probing"
+    "camera",
+    "laser",
+    "hand-eye",
+    "plate",
+    "ball",
+    "steps",
+    "still-step",
+    "part",
+    "waves",
+    "markers",
+    "probing",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
 
@@ -22,11 +34,19 @@ class TwinTruth(Protocol):
 
     @property
     def camera_parameters(self) -> FloatArray:
-        """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``."""
+        """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``, of the left camera or the only one."""
 
     @property
-    def sheet_points_mm(self) -> FloatArray:
-        """(N, 3) true points of the light sheet over the working region, Sensor frame."""
+    def right_camera_parameters(self) -> FloatArray | None:
+        """(9,) the same of the right camera; None for a head of one camera."""
+
+    @property
+    def right_from_sensor(self) -> Pose[CameraRight, Sensor] | None:
+        """Where the left camera is in the right one's frame; None for a head of one camera."""
+
+    @property
+    def sheet_points_mm(self) -> Mapping[str, FloatArray]:
+        """(N, 3) true points of each light sheet over the working region, Sensor frame."""
 
     @property
     def tool_from_sensor(self) -> Pose[Tool, Sensor]:
@@ -52,6 +72,32 @@ class TwinTruth(Protocol):
 
     def document(self) -> bytes:
         """All of it as JSON, with the mark ``"simulated": true``."""
+
+
+class TrueStripe(Protocol):
+    """Where one light sheet's centre truly lies in an image."""
+
+    @property
+    def sheet(self) -> str:
+        """Name of the light sheet."""
+
+    @property
+    def points_px(self) -> FloatArray:
+        """(N, 2) full-sensor pixels, about one a row or column of the image."""
+
+    @property
+    def points_base_mm(self) -> FloatArray:
+        """(N, 3) the same points in Base."""
+
+
+class SimulatedScan(ScanSource, Protocol):
+    """A scan whose truth can be asked for, and whose lasers can be chosen while it is taken."""
+
+    def true_stripes(self, row: int) -> Sequence[TrueStripe]:
+        """The stripes of all lasers of the head in the exposure of a row, on or off."""
+
+    def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
+        """The exposure of a row with other lasers on than its row says, as a live rig takes it."""
 
 
 class Probing(Protocol):
@@ -93,12 +139,15 @@ class Twin(Protocol):
     def truth(self) -> TwinTruth:
         """What it was made from."""
 
-    def scan(self, scene: TwinScene) -> ScanSource:
+    def scan(self, scene: TwinScene) -> SimulatedScan:
         """The recording of one scene; pixels are rendered when an exposure is asked for.
 
-        ``camera`` and ``laser`` have no arm. In ``laser`` each view is a pair: laser on (lasers
-        ``A``), then off (no lasers). In ``hand-eye`` equal views are one posture. ``still-step``
-        is one exposure of a 20 mm step.
+        ``camera`` and ``laser`` have no arm. In ``laser`` each view is one placement of the
+        target: one exposure for each laser source alone, then one without any. In ``hand-eye``
+        equal views are one posture. ``still-step`` is one exposure of a step: 20 mm, or 5 mm for
+        a head of many lines. A head of two cameras takes every exposure with both at one instant:
+        two rows of equal time, trigger and view. A head with several sources has all of them on
+        during scans; `SimulatedScan.expose` takes an exposure with others.
         """
 
     def probe_plate(self) -> Probing:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.frames import CameraRight, Sensor
+from armscan.geometry.poses import Pose
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 from armscan.models.camera import CameraModel
 from armscan.models.diagnostics import CameraDiagnostics, SensorDiagnostics, SheetDiagnostics
@@ -15,6 +17,23 @@ from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES, LightSh
 SHEET_PARAMETER_NAMES = (*PLANE_PARAMETER_NAMES, *(f"bow_u{i}v{j}_mm" for i, j in BOW_TERMS))
 """Order of a sheet's parameters in every covariance and Jacobian; the tilts are in mm, the rise
 over the sheet's scale."""
+
+RIGHT_POSE_PARAMETER_NAMES = (
+    "rotation_x_right_rad",
+    "rotation_y_right_rad",
+    "rotation_z_right_rad",
+    "translation_x_right_mm",
+    "translation_y_right_mm",
+    "translation_z_right_mm",
+)
+"""Order of the parameters of ``right_from_sensor``: rotation-vector increment in CameraRight,
+multiplied from the left (``R <- exp(dr) R``), then the increment of the translation."""
+
+SECOND_PARAMETER_NAMES = (
+    *(f"right.{name}" for name in CAMERA_PARAMETER_NAMES),
+    *(f"right.{name}" for name in RIGHT_POSE_PARAMETER_NAMES),
+)
+"""What a second camera adds to a sensor's parameters, after the sheets'."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,8 +156,24 @@ class SheetCalibration:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SecondCamera:
+    """The right camera of a stereo head (eqs. 4.15 and 4.16).
+
+    Parameters
+    ----------
+    camera
+        Its calibration.
+    right_from_sensor
+        Where the Sensor frame, that of the left camera, lies in the right camera's.
+    """
+
+    camera: CameraCalibration
+    right_from_sensor: Pose[CameraRight, Sensor]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SensorCalibration:
-    """A camera and the light sheets that it sees: what turns stripes into points.
+    """Camera or cameras and the light sheets that they see: what turns stripes into points.
 
     Parameters
     ----------
@@ -147,12 +182,15 @@ class SensorCalibration:
     sheets
         One entry a light sheet.
     covariance
-        (9 + 8 S, 9 + 8 S) joint covariance of the camera's parameters and of each sheet's
-        `SHEET_PARAMETER_NAMES`, in the order of ``sheets``.
+        (P, P) joint covariance in the order of ``parameter_names``: the camera's 9 parameters, each
+        sheet's 8 (`SHEET_PARAMETER_NAMES`), then the 15 of a second camera
+        (`SECOND_PARAMETER_NAMES`), if there is one.
     provenance
         How it came to be.
     diagnostics
         Evidence for a reader; None where there is none.
+    second
+        The right camera of a stereo head; None for a head of one camera.
     """
 
     camera: CameraCalibration
@@ -160,6 +198,7 @@ class SensorCalibration:
     covariance: FloatArray
     provenance: Provenance
     diagnostics: SensorDiagnostics | None = None
+    second: SecondCamera | None = None
 
     def __post_init__(self) -> None:
         if not self.sheets:
@@ -167,7 +206,7 @@ class SensorCalibration:
         names = [sheet.name for sheet in self.sheets]
         if len(set(names)) != len(names):
             raise InputError(f"light sheets share a name: {', '.join(names)}")
-        n = len(CAMERA_PARAMETER_NAMES) + len(SHEET_PARAMETER_NAMES) * len(self.sheets)
+        n = len(self.parameter_names)
         object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
 
     @property
@@ -176,9 +215,17 @@ class SensorCalibration:
         names = list(CAMERA_PARAMETER_NAMES)
         for sheet in self.sheets:
             names += [f"{sheet.name}.{name}" for name in SHEET_PARAMETER_NAMES]
+        if self.second is not None:
+            names += SECOND_PARAMETER_NAMES
         return tuple(names)
 
     def sheet_parameter_slice(self, index: int) -> slice:
         """Columns of ``covariance`` that belong to sheet number ``index``."""
         start = len(CAMERA_PARAMETER_NAMES) + index * len(SHEET_PARAMETER_NAMES)
         return slice(start, start + len(SHEET_PARAMETER_NAMES))
+
+    @property
+    def second_parameter_slice(self) -> slice:
+        """Columns of ``covariance`` that belong to the second camera; empty without one."""
+        start = self.sheet_parameter_slice(len(self.sheets)).start
+        return slice(start, len(self.parameter_names))

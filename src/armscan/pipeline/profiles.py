@@ -58,7 +58,7 @@ def posed_stripes_from_profiles(
             posture,
             pose,
             profile.points_mm,
-            _noise(profile.points_mm),
+            _noise(profile.points_mm)[:, :, None],
             np.zeros(len(profile), dtype=np.int64),
         )
         for profile, posture, pose in zip(profiles, postures, poses, strict=True)

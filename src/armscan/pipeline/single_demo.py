@@ -222,6 +222,10 @@ def calibration_errors(twin: Twin, instrument: Instrument) -> SingleErrors:
     own = sensor.sheet_parameter_slice(0)
     return SingleErrors(
         camera_errors(instrument.camera, truth.camera_parameters),
-        sheet_errors(sensor.sheets[0], sensor.covariance[own, own], truth.sheet_points_mm),
+        sheet_errors(
+            sensor.sheets[0],
+            sensor.covariance[own, own],
+            truth.sheet_points_mm[sensor.sheets[0].name],
+        ),
         hand_eye_errors(instrument.scanner, truth.tool_from_sensor),
     )

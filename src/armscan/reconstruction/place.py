@@ -13,7 +13,7 @@ from armscan.geometry.frames import Base, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import skew
 from armscan.models.scanner import ArmNoise, ScannerCalibration
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns
+from armscan.reconstruction.triangulate import StripePoints, noise_size_mm, sensor_columns
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import Profile
 
@@ -74,8 +74,8 @@ class Placing:
     scanner
         The calibration.
     factors
-        One (17 + 6, K) matrix F a sheet with ``F F'`` the joint covariance of the camera's and
-        that sheet's parameters and of the hand-eye; (6, K) where the sensor delivers points.
+        One (Q + 6, K) matrix F a sheet with ``F F'`` the joint covariance of what its points
+        depend on (`sensor_columns`) and of the hand-eye; (6, K) where the sensor delivers points.
     scan_point_mm
         (3,) in Sensor; None to take the mean of each exposure's points.
     """
@@ -164,7 +164,7 @@ def place_stripe(
         "Base",
         placed.points_base_mm,
         0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        np.linalg.norm(stripe.noise_mm, axis=1),
+        noise_size_mm(stripe.noise_mm),
         stripe.sheet,
         tuple(sheet.name for sheet in scanner.sensor.sheets),
         np.zeros(len(stripe.row), dtype=np.int64),
@@ -187,7 +187,8 @@ def place_delivered_points(
     points_sensor_mm
         (N, 3).
     noise_mm
-        (N, 3) one standard deviation of each point's own noise, as the vector in which it acts.
+        (N, 3, J) one standard deviation of each of a point's own noises, as the vector in which it
+        acts.
     base_from_tool, placing
         As for `place_stripe`.
 
@@ -244,6 +245,6 @@ def _pose_and_noise(
             + hand_eye.tool_from_sensor.translation_mm
         )
         middle = base_from_tool.rotation @ in_tool + base_from_tool.translation_mm
-    noise = noise_mm @ placed.by_sensor_point.T
+    noise = placed.by_sensor_point @ noise_mm
     covariance = arm_covariance(placed.points_base_mm, middle, hand_eye.arm_noise)
-    return np.asarray(covariance + noise[:, :, None] * noise[:, None, :])
+    return np.asarray(covariance + noise @ noise.transpose(0, 2, 1))

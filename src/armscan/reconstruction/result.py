@@ -21,6 +21,10 @@ class PointFate(IntEnum):
     """The lens model has no inverse there, or the ray misses the sheet."""
     OUT_OF_DEPTH = 3
     """Meets the sheet outside the depths accepted: those in which it was calibrated, widened."""
+    AMBIGUOUS = 4
+    """Several sheets explain it about as well."""
+    STRAY = 5
+    """No sheet explains it: a reflection, or the laser's bright centre."""
 
     @property
     def label(self) -> str:
@@ -33,6 +37,8 @@ _FATE_LABELS = {
     PointFate.FLAGGED: "flagged by the stripe extraction",
     PointFate.NO_RAY: "no ray meets the sheet",
     PointFate.OUT_OF_DEPTH: "too far outside the calibrated depths",
+    PointFate.AMBIGUOUS: "on several sheets about as likely",
+    PointFate.STRAY: "on no sheet: stray light",
 }
 
 

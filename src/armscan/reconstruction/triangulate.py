@@ -13,7 +13,7 @@ from armscan.models.calibration import SHEET_PARAMETER_NAMES, SensorCalibration
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import Profile
 
-N_CAMERA = 9
+N_CAMERA, N_SHEET = 9, len(SHEET_PARAMETER_NAMES)
 
 
 def meet_sheets(
@@ -57,10 +57,12 @@ class StripePoints:
     points_mm
         (M, 3) in the Sensor frame.
     noise_mm
-        (M, 3) one standard deviation of the stripe's own noise: the direction in which it acts,
-        within the sheet, times its size.
+        (M, 3, J) one standard deviation of each independent noise: the direction in which it acts
+        times its size. One camera has one, the stripe's own noise, which acts within the sheet;
+        a point that both cameras see has one of each camera.
     by_sensor
-        (M, 3, 17) derivative by the camera's 9 parameters and the 8 of the point's sheet.
+        (M, 3, Q) derivative by the parameters that `sensor_columns` names for the point's sheet:
+        the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one.
     sheet
         (M,) index into ``sensor.sheets``.
     """
@@ -86,7 +88,7 @@ def triangulate(
         ``sigma_noise_mm`` the stripe noise alone.
     """
     stripe = triangulate_stripe(profile, sheet_of_point, sensor)
-    covariance = stripe.noise_mm[:, :, None] * stripe.noise_mm[:, None, :]
+    covariance = stripe.noise_mm @ stripe.noise_mm.transpose(0, 2, 1)
     for k in range(len(sensor.sheets)):
         own = stripe.sheet == k
         joint = sensor_covariance(sensor, k)
@@ -95,7 +97,7 @@ def triangulate(
         "Sensor",
         stripe.points_mm,
         0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        np.linalg.norm(stripe.noise_mm, axis=1),
+        noise_size_mm(stripe.noise_mm),
         stripe.sheet,
         tuple(sheet.name for sheet in sensor.sheets),
         np.zeros(len(stripe.row), dtype=np.int64),
@@ -135,7 +137,7 @@ def triangulate_stripe(
     )
     points = np.zeros((len(profile), 3))
     noise = np.zeros((len(profile), 3))
-    by_sensor = np.zeros((len(profile), 3, N_CAMERA + len(SHEET_PARAMETER_NAMES)))
+    by_sensor = np.zeros((len(profile), 3, len(sensor_columns(sensor, 0))))
     is_met = np.zeros(len(profile), dtype=np.bool_)
     for k, calibrated in enumerate(sensor.sheets):
         own = np.flatnonzero(has_ray & (sheets == k))
@@ -144,9 +146,15 @@ def triangulate_stripe(
         )
         across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dq[own], profile.normals_px[own])
         noise[own] = across * profile.sigma_px[own, None]
-        by_sensor[own] = np.concatenate([dpoint_dxy @ dxy_dcamera[own], dpoint_dsheet], axis=2)
+        by_sensor[own, :, :N_CAMERA] = dpoint_dxy @ dxy_dcamera[own]
+        by_sensor[own, :, N_CAMERA : N_CAMERA + N_SHEET] = dpoint_dsheet
     kept = np.flatnonzero(is_met)
-    return StripePoints(kept, points[kept], noise[kept], by_sensor[kept], sheets[kept])
+    return StripePoints(kept, points[kept], noise[kept, :, None], by_sensor[kept], sheets[kept])
+
+
+def noise_size_mm(noise_mm: FloatArray) -> FloatArray:
+    """(M,) root sum square of the independent noises (M, 3, J) of each point."""
+    return np.asarray(np.sqrt((noise_mm**2).sum(axis=(1, 2))))
 
 
 def _checked_sheets(
@@ -167,12 +175,17 @@ def _checked_sheets(
 
 
 def sensor_columns(sensor: SensorCalibration, sheet: int) -> IntArray:
-    """(17,) places, in ``sensor.covariance``, of the camera's parameters and one sheet's."""
-    own = sensor.sheet_parameter_slice(sheet)
-    return np.concatenate([np.arange(N_CAMERA), np.arange(own.start, own.stop)])
+    """(Q,) places, in ``sensor.covariance``, of what the points of one sheet depend on.
+
+    The camera's 9 parameters, the sheet's 8, then the 15 of a second camera, if there is one.
+    """
+    own, second = sensor.sheet_parameter_slice(sheet), sensor.second_parameter_slice
+    return np.concatenate(
+        [np.arange(N_CAMERA), np.arange(own.start, own.stop), np.arange(second.start, second.stop)]
+    )
 
 
 def sensor_covariance(sensor: SensorCalibration, sheet: int) -> FloatArray:
-    """(17, 17) covariance of the camera's parameters and those of one sheet."""
+    """(Q, Q) covariance of what the points of one sheet depend on, as `sensor_columns`."""
     places = sensor_columns(sensor, sheet)
     return np.asarray(sensor.covariance[np.ix_(places, places)])

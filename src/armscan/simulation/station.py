@@ -116,8 +116,8 @@ class TrueStripe:
 
     Parameters
     ----------
-    laser
-        Name of the laser.
+    sheet
+        Name of the light sheet.
     points_px
         (N, 2) full-sensor pixels.
     points_sensor_mm, points_base_mm
@@ -126,7 +126,7 @@ class TrueStripe:
         (N,) index into the station's things, as float64; the target, if any, comes after them.
     """
 
-    laser: str
+    sheet: str
     points_px: FloatArray
     points_sensor_mm: FloatArray
     points_base_mm: FloatArray

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -104,17 +104,22 @@ class TwinScan:
 
     def exposure(self, row: int) -> Exposure:
         """Render one exposure; the same every time and in whatever order they are asked for."""
+        return self.expose(row, self.shots[row].settings.lasers)
+
+    def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
+        """Render one exposure with other lasers on than its row says."""
         shot = self.shots[row]
         rng = np.random.default_rng([*self.seed, row])
         poses = shot.sub_poses or (shot.base_from_sensor,)
-        image = render_exposure(self.head, shot.station, poses, shot.settings, rng)
+        settings = replace(shot.settings, lasers=lasers)
+        image = render_exposure(self.head, shot.station, poses, settings, rng)
         window = shot.settings.window
         return Exposure(
             image,
             shot.row.source,
             bits_used=self.head.imaging.detector.bits,
             window=SensorWindow(window.x_px, window.y_px),
-            lasers=shot.row.lasers,
+            lasers=lasers,
             t_ns=shot.row.t_ns,
             camera=shot.row.camera,
             trigger_id=shot.row.trigger_id,
@@ -122,6 +127,7 @@ class TwinScan:
         )
 
     def true_stripes(self, row: int) -> tuple[TrueStripe, ...]:
-        """Where the sheets' centres truly lie in one exposure, at its middle."""
+        """Where all sheets' centres truly lie in one exposure, at its middle, on or off."""
         shot = self.shots[row]
-        return true_stripes(self.head, shot.station, shot.base_from_sensor, shot.settings)
+        settings = replace(shot.settings, lasers=tuple(laser.name for laser in self.head.lasers))
+        return true_stripes(self.head, shot.station, shot.base_from_sensor, settings)

@@ -11,7 +11,7 @@ import numpy as np
 
 from armscan.devices.twin import Preset
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.frames import CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.plate_probing import TIP_DIAMETER_MM, TRUE_PROBE_MM
@@ -42,9 +42,19 @@ class InstrumentTruth:
         return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
 
     @property
-    def sheet_points_mm(self) -> FloatArray:
-        """(N, 3) true points of the light sheet over the working region, Sensor frame."""
-        return sheet_points_mm(self.instrument.head)
+    def right_camera_parameters(self) -> FloatArray | None:
+        """(9,) the same of the right camera; None for a head of one camera."""
+        return None
+
+    @property
+    def right_from_sensor(self) -> Pose[CameraRight, Sensor] | None:
+        """Where the left camera is in the right one's frame; None for a head of one camera."""
+        return None
+
+    @property
+    def sheet_points_mm(self) -> dict[str, FloatArray]:
+        """(N, 3) true points of each light sheet over the working region, Sensor frame."""
+        return {self.instrument.head.lasers[0].name: sheet_points_mm(self.instrument.head)}
 
     @property
     def tool_from_sensor(self) -> Pose[Tool, Sensor]:
@@ -83,7 +93,9 @@ class InstrumentTruth:
             "preset": self.preset,
             "seed": self.seed,
             "camera_parameters": self.camera_parameters.tolist(),
-            "sheet_points_sensor_mm": self.sheet_points_mm.tolist(),
+            "sheet_points_sensor_mm": {
+                name: points.tolist() for name, points in self.sheet_points_mm.items()
+            },
             "target_marks_board_mm": self.instrument.target.marks_board_mm.tolist(),
             "tool_from_sensor": _pose(self.tool_from_sensor),
             "plate_plane_base": self.plate_plane.tolist(),

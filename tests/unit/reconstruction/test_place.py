@@ -174,12 +174,12 @@ def test_points_that_a_sensor_delivered() -> None:
     hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None)
     placing = prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
     points = np.array([[0.0, -10.0, 100.0], [0.0, 10.0, 110.0]])
-    noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])
+    noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])[:, :, None]
     placed, covariance = place_delivered_points(points, noise, rig.BASE_FROM_TOOL, placing)
     by = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
     expected = by.by_hand_eye @ hand_eye.covariance @ by.by_hand_eye.transpose(0, 2, 1)
     expected += arm_covariance(placed, placed.mean(axis=0), rig.ARM_NOISE)
-    turned = noise @ by.by_sensor_point.T
+    turned = noise[:, :, 0] @ by.by_sensor_point.T
     expected += turned[:, :, None] * turned[:, None, :]
     np.testing.assert_allclose(covariance, expected, atol=1e-12)
     with pytest.raises(InputError, match="camera"):

@@ -128,8 +128,8 @@ def test_truth_is_of_the_same_instrument_and_says_that_it_is_simulated():
     twin = build_twin(seed=3)
     truth = twin.truth
     laser, camera = twin.instrument.head.lasers[0], twin.instrument.head.camera
-    assert np.abs(laser.offset_mm(truth.sheet_points_mm)).max() < 1e-9
-    assert np.ptp(truth.sheet_points_mm[:, 2]) == pytest.approx(60.0)
+    assert np.abs(laser.offset_mm(truth.sheet_points_mm["A"])).max() < 1e-9
+    assert np.ptp(truth.sheet_points_mm["A"][:, 2]) == pytest.approx(60.0)
     assert truth.camera_parameters[0] == camera.fx
     assert np.linalg.norm(truth.plate_plane[:3]) == pytest.approx(1.0)
     plate = twin.instrument.bench.base_from_plate.translation_mm

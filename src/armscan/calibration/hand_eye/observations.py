@@ -26,7 +26,8 @@ class PosedStripe:
     points_mm
         (N, 3) in the Sensor frame.
     noise_mm
-        (N, 3) one standard deviation of each point's own noise, as the vector in which it acts.
+        (N, 3, J) one standard deviation of each of a point's own noises, as the vector in which it
+        acts: one of each camera that saw the point.
     sheet
         (N,) index of the light sheet that each point lies on.
     by_sensor
@@ -45,7 +46,7 @@ class PosedStripe:
     def __post_init__(self) -> None:
         points = frozen_floats(self.points_mm, (None, 3), "points_mm")
         object.__setattr__(self, "points_mm", points)
-        noise = frozen_floats(self.noise_mm, (len(points), 3), "noise_mm")
+        noise = frozen_floats(self.noise_mm, (len(points), 3, None), "noise_mm")
         object.__setattr__(self, "noise_mm", noise)
         object.__setattr__(self, "sheet", frozen_ints(self.sheet, (len(points),), "sheet"))
 

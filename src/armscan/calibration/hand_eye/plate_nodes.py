@@ -145,12 +145,12 @@ def _pieces(points_mm: FloatArray, n_nodes: int) -> list[IntArray]:
 
 def _mean(stripe: PosedStripe, own: IntArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     noise = stripe.noise_mm[own]
-    variance = (noise**2).sum(axis=1)
+    variance = (noise**2).sum(axis=(1, 2))
     floor = max(1e-2 * float(np.median(variance)), 1e-12)
     weights = 1.0 / np.maximum(variance, floor)
     weights /= weights.sum()
-    spread = noise * weights[:, None]
+    spread = noise * weights[:, None, None]
     by_sensor = None
     if stripe.by_sensor is not None:
         by_sensor = np.tensordot(weights, stripe.by_sensor[own], axes=1)
-    return weights @ stripe.points_mm[own], spread.T @ spread, by_sensor
+    return weights @ stripe.points_mm[own], np.einsum("nij,nkj->ik", spread, spread), by_sensor

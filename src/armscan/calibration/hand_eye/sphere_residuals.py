@@ -110,7 +110,7 @@ def sphere_nodes(
         count = np.diff(edges)
         means = np.add.reduceat(section.off_circle_mm, edges[:-1]) / count
         form = float(means @ means) / max(n_nodes - 3, 1)
-        own = (section.stripe.noise_mm[section.rows] ** 2).sum(axis=1).mean() / count
+        own = (section.stripe.noise_mm[section.rows] ** 2).sum(axis=(1, 2)).mean() / count
         firsts.append(edges[:-1] + start)
         counts.append(count)
         owners.append(np.full(n_nodes, k))

@@ -14,6 +14,7 @@ from armscan.models.calibration import (
     Provenance,
 )
 from armscan.models.camera import PARAMETER_NAMES
+from armscan.models.two_views import TwoViews
 
 STEREO_PARAMETER_NAMES = (
     *(f"left.{name}" for name in PARAMETER_NAMES),
@@ -78,3 +79,8 @@ class StereoCalibration:
     def __post_init__(self) -> None:
         n = len(STEREO_PARAMETER_NAMES)
         object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
+
+    @property
+    def views(self) -> TwoViews:
+        """The two cameras as a model, without what is uncertain in them."""
+        return TwoViews(self.left.camera, self.right.camera, self.right_from_left)

@@ -18,7 +18,7 @@ from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
 from armscan.inspection.options import InspectionOptions, StepOptions
-from armscan.pipeline.reconstruct import ReconstructOptions
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
@@ -83,7 +83,7 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         "seed": default_of(SingleDemoRequest, "seed"),
         "preset": default_of(SingleDemoRequest, "preset"),
     },
-    ("reconstruct",): {"sheet": ReconstructOptions().sheet, **STRIPES, **IMAGES},
+    ("reconstruct",): {"sheet": MeasureOptions().sheet, **STRIPES, **IMAGES},
 }
 
 

@@ -50,7 +50,7 @@ def test_points_lie_on_the_object(
     assert main([str(word) for word in words]) == 0
     report = json.loads(capsys.readouterr().out)
     cloud = read_ply(cloud_path)
-    assert "ReconstructOptions.sheet" in cloud_path.with_suffix(".html").read_text("utf-8")
+    assert "MeasureOptions.sheet" in cloud_path.with_suffix(".html").read_text("utf-8")
     assert report["n_points"] == len(cloud) > 200
     assert [Path(name).name for name in report["written"]] == ["cloud.ply", "cloud.html"]
     tilt_x, tilt_y, z = OBJECT_PLACE

@@ -12,7 +12,8 @@ from armscan.errors import EstimationError
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.laser import calibrate_sheets_from_exposures
-from armscan.pipeline.reconstruct import ReconstructOptions, reconstruct
+from armscan.pipeline.measure_options import MeasureOptions
+from armscan.pipeline.reconstruct import reconstruct
 from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.result import PointFate
 from armscan.storage.images import read_exposure
@@ -113,13 +114,13 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
     assert 215.0 < cloud.points_mm[:, 2].min() < cloud.points_mm[:, 2].max() < 300.0
     assert 190.0 < np.ptp(cloud.points_mm[:, 1]) < 225.0, "a bust of about 20 cm"
     assert any("outside its calibrated depth range" in warning for warning in result.warnings)
-    asked = reconstruct([on], sensor, backgrounds=[off], options=ReconstructOptions(sheet="B"))
+    asked = reconstruct([on], sensor, backgrounds=[off], options=MeasureOptions(sheet="B"))
     np.testing.assert_array_equal(asked.cloud.points_mm, cloud.points_mm)
 
 
 def test_an_ambiguous_stripe_is_asked_for_not_guessed(sensor: SensorCalibration) -> None:
     on = read_exposure(DATA / "laser_object" / "laser.png")
     off = read_exposure(DATA / "laser_object" / "laser_background.png")
-    wide = ReconstructOptions(depths=DepthRange(margin=30.0))
+    wide = MeasureOptions(depths=DepthRange(margin=30.0))
     with pytest.raises(EstimationError, match="--sheet"):
         reconstruct([on], sensor, backgrounds=[off], options=wide)

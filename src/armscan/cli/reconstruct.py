@@ -70,7 +70,7 @@ def reconstruct(
     as_json: AsJson = False,
 ) -> None:
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
-    from armscan.pipeline.reconstruct import ReconstructOptions
+    from armscan.pipeline.measure_options import MeasureOptions
     from armscan.reconstruction.choose_sheet import DepthRange
     from armscan.report.cloud_job import CloudRequest
     from armscan.report.scan_job import run_measurement
@@ -82,7 +82,7 @@ def reconstruct(
         images=tuple(images),
         background=tuple(background or ()),
         output=output,
-        options=ReconstructOptions(
+        options=MeasureOptions(
             stripes=StripeOptions(
                 method=cast(StripeMethod, stripe_method),
                 laser_colour=cast(LaserColour, laser_colour),

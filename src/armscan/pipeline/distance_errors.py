@@ -12,10 +12,10 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks
 from armscan.models.scanner import ArmNoise, ScannerCalibration
+from armscan.pipeline.measure import measured_again
 from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.reconstruction.place import place_with_jacobian
-from armscan.reconstruction.result import PointFate
-from armscan.reconstruction.triangulate import sensor_columns, triangulate_stripe
+from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.cloud import PointCloud
 
 
@@ -82,13 +82,11 @@ def distance_by_calibration(
     found = np.zeros((len(scan.cloud), n + 6))
     order = np.argsort(scan.cloud.exposure, kind="stable")
     ends = np.searchsorted(scan.cloud.exposure[order], np.arange(len(scan.images) + 1))
-    for k, image in enumerate(scan.images):
+    for k, stripe in measured_again(scan.images, sensor):
         rows = order[ends[k] : ends[k + 1]]
         along = directions[rows]
         if not along.any():
             continue
-        sheets = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
-        stripe = triangulate_stripe(image.profile, sheets, sensor)
         if len(stripe.row) != len(rows):
             raise EstimationError("points of the scan were cut off before the check")
         pose = scan.poses.pose(scan.image_rows[k])

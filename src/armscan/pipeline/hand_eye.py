@@ -19,13 +19,13 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
+from armscan.pipeline.instants import ScanInstants
+from armscan.pipeline.measure import MeasuredImage, cameras_of, measurer_for, see
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import ReconstructOptions, measure_exposure
-from armscan.pipeline.scan_images import ScanImages
-from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.result import ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns, triangulate_stripe
+from armscan.reconstruction.triangulate import StripePoints, sensor_columns
 from armscan.records.session import ExposureRow
 
 STAGE = "stripes of the postures"
@@ -51,7 +51,7 @@ class HandEyeScanOptions:
     """
 
     hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
-    measure: ReconstructOptions = field(default_factory=ReconstructOptions)
+    measure: MeasureOptions = field(default_factory=MeasureOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
     max_exposures: int = 200
 
@@ -121,8 +121,8 @@ def calibrate_hand_eye_from_scan(
     Parameters
     ----------
     source
-        The scan, with an arm and one camera; exposures with the laser off serve as background of
-        their view.
+        The scan, with an arm and the sensor's cameras; exposures with the laser off serve as
+        background of their view.
     sensor
         Camera and sheets.
     plate
@@ -135,8 +135,8 @@ def calibrate_hand_eye_from_scan(
     Raises
     ------
     InputError
-        If the scan has no arm or several cameras, if its images are not of the camera's sensor,
-        or if one view stands for different poses.
+        If the scan has no arm or not the sensor's cameras, if its images are not of the camera's
+        sensor, or if one view stands for different poses.
     EstimationError
         If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
         ambiguous.
@@ -164,37 +164,47 @@ def observe_stripes(
     left out and named, as `armscan.pipeline.scan.measure_scan` does.
     """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
-    exposures = ScanImages(source)
-    is_lit = exposures.is_lit
-    chosen = _spread(np.flatnonzero(is_lit & poses.has_pose), options.max_exposures)
+    cameras = cameras_of(sensor)
+    exposures = ScanInstants(source, len(cameras))
+    lit = exposures.lit
+    has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in lit], dtype=np.bool_)
+    chosen = [lit[k] for k in _spread(np.flatnonzero(has_pose), options.max_exposures)]
     postures, merged = _postures(
-        [source.rows[k] for k in chosen], [poses.pose(int(k)) for k in chosen]
+        [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
     stripes: list[PosedStripe] = []
     images: list[ReconstructedImage] = []
     not_used = [
-        (source.rows[k].source, "the arm gave no pose for it")
-        for k in np.flatnonzero(is_lit & ~poses.has_pose)
+        (source.rows[row].source, "the arm gave no pose for it")
+        for one, known in zip(lit, has_pose, strict=True)
+        for row in one.rows
+        if not known
     ]
     n_unreadable = 0
-    for done, (k, posture) in enumerate(zip(chosen, postures, strict=True)):
-        progress(ProgressEvent(STAGE, done, len(chosen), source.rows[k].source))
+    for done, (instant, posture) in enumerate(zip(chosen, postures, strict=True)):
+        first = source.rows[instant.rows[0]].source
+        progress(ProgressEvent(STAGE, done, len(chosen), first))
         try:
-            pair = exposures.pair(int(k))
+            pairs = [exposures.pair(row) for row in instant.rows]
         except ArmscanError as error:
-            not_used.append((source.rows[k].source, str(error)))
+            not_used.append((first, str(error)))
             n_unreadable += 1
             continue
-        image = _measure(pair, sensor, options.measure)
-        if image.count(PointFate.MEASURED) < options.hand_eye.min_points:
-            not_used.append((source.rows[k].source, "no stripe was measured in it"))
-            continue
-        images.append(image)
-        stripes.append(posed_stripe(image, sensor, posture, poses.pose(int(k))))
+        seen = [
+            see(pair, camera, options.measure.stripes)
+            for pair, camera in zip(pairs, cameras, strict=True)
+        ]
+        # Each still is named by itself: where the sensor is on the arm is not known yet.
+        for one in measurer_for(sensor, options.measure).measure(seen, None, instant.t_ns):
+            if len(one.points.row) < options.hand_eye.min_points:
+                not_used.append((one.image.profile.source, "no stripe was measured in it"))
+                continue
+            images.append(one.image)
+            stripes.append(posed_stripe(one, sensor, posture, poses.pose(instant.rows[0])))
     progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
     if n_unreadable == len(chosen) > 0:
         raise EstimationError(f"no exposure with a pose could be read: {not_used[-1][1]}")
-    n_posed = int((is_lit & poses.has_pose).sum())
+    n_posed = int(has_pose.sum())
     warnings = (*poses.warnings, *_left_out(len(chosen), n_posed, not_used), *merged)
     return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
 
@@ -211,35 +221,33 @@ def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) 
 
 
 def posed_stripe(
-    image: ReconstructedImage,
+    measured: MeasuredImage,
     sensor: SensorCalibration,
     posture: str,
     base_from_tool: Pose[Base, Tool],
 ) -> PosedStripe:
-    """Triangulate the measured points of one exposure and give them their pose.
+    """Give the measured points of one exposure their pose.
 
     Parameters
     ----------
-    image
-        Stripe points with their sheets.
+    measured
+        Points in the Sensor frame.
     sensor
-        Camera and sheets.
+        Camera or cameras and sheets.
     posture
         Name of the arm's posture.
     base_from_tool
         As the arm reported it.
     """
-    sheet = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
-    points = triangulate_stripe(image.profile, sheet, sensor)
-    by_sensor = _by_all_parameters(points, sensor)
+    points = measured.points
     return PosedStripe(
-        image.profile.source,
+        measured.image.profile.source,
         posture,
         base_from_tool,
         points.points_mm,
         points.noise_mm,
         points.sheet,
-        by_sensor,
+        _by_all_parameters(points, sensor),
     )
 
 
@@ -249,13 +257,6 @@ def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> Float
         own = np.flatnonzero(points.sheet == k)
         spread[np.ix_(own, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[own]
     return spread
-
-
-def _measure(
-    pair: ExposurePair, sensor: SensorCalibration, options: ReconstructOptions
-) -> ReconstructedImage:
-    check_sizes([exposure for exposure in pair if exposure is not None], sensor.camera.camera)
-    return measure_exposure(pair, sensor, options)
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:

@@ -4,44 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
-import numpy as np
-
-from armscan.errors import EstimationError
+from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes, pair_exposures
+from armscan.pipeline.exposure_pairs import ExposurePair, pair_exposures
+from armscan.pipeline.measure import cameras_of, measurer_for, see
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.result import PointFate, ReconstructedImage, Reconstruction
-from armscan.reconstruction.triangulate import meet_sheets, triangulate
+from armscan.reconstruction.triangulate import cloud_in_sensor
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import StripeOptions
 
 STAGE = "reconstruct"
-
-
-@dataclass(frozen=True, slots=True)
-class ReconstructOptions:
-    """How stripes on objects become points.
-
-    Parameters
-    ----------
-    stripes
-        Stripe extraction.
-    depths
-        Depths that are accepted; points outside are left out and counted.
-    sheet
-        Name of the sheet that drew all stripes; empty to find it.
-    """
-
-    stripes: StripeOptions = field(default_factory=StripeOptions)
-    depths: DepthRange = field(default_factory=DepthRange)
-    sheet: str = ""
 
 
 def reconstruct(
@@ -49,19 +26,24 @@ def reconstruct(
     sensor: SensorCalibration,
     *,
     backgrounds: Sequence[Exposure] = (),
-    options: ReconstructOptions | None = None,
+    rights: Sequence[Exposure] = (),
+    right_backgrounds: Sequence[Exposure] = (),
+    options: MeasureOptions | None = None,
     progress: Progress = silent,
 ) -> Reconstruction:
-    """Extract the stripes of every exposure and triangulate them.
+    """Extract the stripes of every exposure, name their sheets and triangulate them.
 
     Parameters
     ----------
     exposures
-        With the laser on.
+        With the laser on, of the left camera or the only one; each is measured by itself.
     sensor
-        Camera and sheets.
+        Camera or cameras and sheets.
     backgrounds
         The same views without laser, one for each exposure, or none.
+    rights, right_backgrounds
+        The right camera's exposures of the same instants, in the same order, and theirs without
+        laser; for a sensor of two cameras.
     options
         Defaults if None.
     progress
@@ -70,22 +52,26 @@ def reconstruct(
     Raises
     ------
     InputError
-        If images and backgrounds do not pair, or are not of the camera's sensor.
+        If images and backgrounds do not pair, are not of the camera's sensor, or if the images are
+        not of as many cameras as the sensor has.
     EstimationError
         If the sheet of a stripe is ambiguous, or nothing was measured at all.
     """
-    options = options or ReconstructOptions()
-    pairs = pair_exposures(exposures, backgrounds)
-    check_sizes([*exposures, *backgrounds], sensor.camera.camera)
+    options = options or MeasureOptions()
+    instants = _instants(exposures, backgrounds, rights, right_backgrounds, sensor)
+    cameras = cameras_of(sensor)
     images: list[ReconstructedImage] = []
     clouds: list[PointCloud] = []
-    for done, pair in enumerate(pairs):
-        progress(ProgressEvent(STAGE, done, len(pairs), pair[0].source))
-        image = measure_exposure(pair, sensor, options)
-        images.append(image)
-        sheet = np.where(image.fate == PointFate.MEASURED, image.sheet, -1)
-        clouds.append(triangulate(image.profile, sheet, sensor))
-    progress(ProgressEvent(STAGE, len(pairs), len(pairs)))
+    for done, pairs in enumerate(instants):
+        progress(ProgressEvent(STAGE, done, len(instants), pairs[0][0].source))
+        measurer = measurer_for(sensor, options)
+        seen = [
+            see(pair, camera, options.stripes) for pair, camera in zip(pairs, cameras, strict=True)
+        ]
+        for one in measurer.measure(seen):
+            images.append(one.image)
+            clouds.append(cloud_in_sensor(one.points, one.image.profile, sensor))
+    progress(ProgressEvent(STAGE, len(instants), len(instants)))
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
         raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
@@ -93,25 +79,27 @@ def reconstruct(
     return Reconstruction(cloud, tuple(images), measurement_warnings(images, depths, sensor))
 
 
-def measure_exposure(
-    pair: ExposurePair, sensor: SensorCalibration, options: ReconstructOptions
-) -> ReconstructedImage:
-    """Stripes of one exposure, the sheet of each point and what becomes of it."""
-    exposure, background = pair
-    profile = extract_stripes(exposure, options.stripes, background)
-    choice = choose_sheets(
-        profile, sensor, options.depths, sheet_name=options.sheet, lasers=exposure.lasers
-    )
-    points, is_met = meet_sheets(profile.points_px, choice.sheet, sensor)
-    fate = np.full(len(profile), int(PointFate.MEASURED))
-    for k, sheet in enumerate(sensor.sheets):
-        low, high = options.depths.limits_mm(sheet)
-        outside = (points[:, 2] < low) | (points[:, 2] > high)
-        fate[(choice.sheet == k) & outside] = PointFate.OUT_OF_DEPTH
-    fate[choice.sheet < 0] = PointFate.OUT_OF_DEPTH
-    fate[(choice.sheet >= 0) & ~is_met] = PointFate.NO_RAY
-    fate[~profile.is_accepted] = PointFate.FLAGGED
-    return ReconstructedImage(profile, fate, choice.sheet, choice.how)
+def _instants(
+    exposures: Sequence[Exposure],
+    backgrounds: Sequence[Exposure],
+    rights: Sequence[Exposure],
+    right_backgrounds: Sequence[Exposure],
+    sensor: SensorCalibration,
+) -> list[tuple[ExposurePair, ...]]:
+    left = pair_exposures(exposures, backgrounds)
+    if sensor.second is None:
+        if rights:
+            raise InputError(
+                f"{len(rights)} images of a right camera, but the sensor has one camera",
+                remedy="leave them out, or name the sensor of the stereo head",
+            )
+        return [(pair,) for pair in left]
+    if len(rights) != len(left):
+        raise InputError(
+            f"{len(left)} images of the left camera but {len(rights)} of the right one",
+            remedy="give the right camera's image of every instant, in the same order",
+        )
+    return list(zip(left, pair_exposures(rights, right_backgrounds), strict=True))
 
 
 NOTHING_MEASURED_REMEDY = (

@@ -12,20 +12,17 @@ import numpy as np
 
 from armscan.devices.scan_source import ScanSource
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
+from armscan.pipeline.exposure_pairs import ExposurePair
+from armscan.pipeline.instants import Instant, ScanInstants
+from armscan.pipeline.measure import LitProfile, MeasuredImage, cameras_of, measurer_for, see
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import (
-    NOTHING_MEASURED_REMEDY,
-    ReconstructOptions,
-    measure_exposure,
-    nothing_measured,
-)
-from armscan.pipeline.scan_images import ScanImages
+from armscan.pipeline.reconstruct import NOTHING_MEASURED_REMEDY, nothing_measured
 from armscan.pipeline.scan_result import (
     ScanExposure,
     ScanExposureFate,
@@ -37,13 +34,12 @@ from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
 from armscan.reconstruction.place import Placing, place_stripe, prepare_placing
-from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.result import ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.reconstruction.triangulate import triangulate_stripe
 from armscan.reconstruction.volume import BaseBox, cut_cloud
 from armscan.records.cloud import PointCloud
 
-__all__ = ["PlacedImage", "ScanOptions", "ScanReconstruction", "measure_scan", "place_exposure"]
+__all__ = ["PlacedImage", "ScanOptions", "ScanReconstruction", "measure_scan", "place_image"]
 
 STAGE = "scan"
 MANY_WITHOUT_NORMAL = 0.1
@@ -68,7 +64,7 @@ class ScanOptions:
         Exposures measured at a time, while the next one is read.
     """
 
-    measure: ReconstructOptions = field(default_factory=ReconstructOptions)
+    measure: MeasureOptions = field(default_factory=MeasureOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
     volume: BaseBox | None = None
     normals: NormalOptions | None = field(default_factory=NormalOptions)
@@ -98,9 +94,9 @@ def measure_scan(
 ) -> ScanReconstruction:
     """Measure the stripes of every exposure that has a pose and place them in Base.
 
-    Exposures are read one after another and dropped once measured; an image that cannot be read
-    is counted and named. Where rows name lasers, rows without any serve as background of the
-    exposures of their view.
+    Instants are read one after another and dropped once measured; an image that cannot be read
+    is counted and named, and so is its partner of the same instant. Where rows name lasers, rows
+    without any serve as background of the exposures of their view.
 
     Parameters
     ----------
@@ -116,7 +112,8 @@ def measure_scan(
     Raises
     ------
     InputError
-        If the scanner has no camera, the scan no arm, or an image is not of the scanner's sensor.
+        If the scanner has no camera, the scan no arm or not as many cameras as the scanner, or an
+        image is not of the scanner's sensor.
     EstimationError
         If no exposure has a pose, the sheet of a stripe is ambiguous, or nothing was measured.
     """
@@ -128,72 +125,66 @@ def measure_scan(
     poses = exposure_poses(
         source.rows, source.arm, source.session.clock, scanner.latency_ns, options.sync
     )
-    images = ScanImages(source)
-    wanted = [int(k) for k in np.flatnonzero(images.is_lit & poses.has_pose)]
+    cameras = cameras_of(scanner.sensor)
+    images = ScanInstants(source, len(cameras))
+    wanted = [one for one in images.lit if poses.has_pose[list(one.rows)].all()]
     placing = prepare_placing(scanner)
     placed: dict[int, PlacedImage] = {}
     reasons: dict[int, str] = {}
 
-    def measure(row: int, pair: ExposurePair) -> PlacedImage:
-        return place_exposure(pair, poses.pose(row), placing, options)
-
-    def pairs() -> Iterator[tuple[int, ExposurePair]]:
-        for done, row in enumerate(wanted):
-            progress(ProgressEvent(STAGE, done, len(wanted), source.rows[row].source))
+    def readings() -> Iterator[tuple[Instant, tuple[ExposurePair, ...]]]:
+        for done, instant in enumerate(wanted):
+            progress(ProgressEvent(STAGE, done, len(wanted), source.rows[instant.rows[0]].source))
             try:
-                pair = images.pair(row)
+                pairs = tuple(images.pair(row) for row in instant.rows)
             except ArmscanError as error:
-                reasons[row] = str(error)
+                reasons.update(dict.fromkeys(instant.rows, str(error)))
                 continue
-            yield row, pair
+            yield instant, pairs
 
-    for row, result in _in_threads(measure, pairs(), options.threads):
-        placed[row] = result
+    def extract(pairs: tuple[ExposurePair, ...]) -> list[LitProfile]:
+        stripes = options.measure.stripes
+        return [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
+
+    measurer = measurer_for(scanner.sensor, options.measure)
+    hand_eye = scanner.hand_eye.tool_from_sensor
+    for instant, seen in _in_threads(extract, readings(), options.threads):
+        pose = poses.pose(instant.rows[0])
+        measured = measurer.measure(seen, pose @ hand_eye, instant.t_ns)
+        for row, one in zip(instant.rows, measured, strict=True):
+            placed[row] = place_image(one, pose, placing, options.volume)
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
-    exposures = _records(source, images, poses, placed, reasons)
+    exposures = _records(source, images.is_lit, poses, placed, reasons)
     found = _joined(placed, exposures, poses, placing, options)
     return replace(found, cloud=replace(found.cloud, is_simulated=source.is_simulated))
 
 
-def place_exposure(
-    pair: ExposurePair,
+def place_image(
+    measured: MeasuredImage,
     base_from_tool: Pose[Base, Tool],
     placing: Placing,
-    options: ScanOptions,
+    volume: BaseBox | None,
 ) -> PlacedImage:
-    """Measure one exposure and place its points in Base.
-
-    Raises
-    ------
-    InputError
-        If the image is not of the scanner's sensor, or the scanner has none.
-    EstimationError
-        If the sheet of a stripe is ambiguous.
-    """
-    sensor = placing.scanner.sensor
-    if sensor is None:
-        raise InputError("the scanner has no camera", remedy="give one with a sensor")
-    check_sizes([exposure for exposure in pair if exposure is not None], sensor.camera.camera)
-    image = measure_exposure(pair, sensor, options.measure)
-    sheet = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
-    stripe = triangulate_stripe(image.profile, sheet, sensor)
+    """Place the measured points of one exposure in Base and cut those outside a volume."""
+    stripe, image = measured.points, measured.image
     cloud = place_stripe(stripe, image.profile, base_from_tool, placing)
-    depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(len(sensor.sheets)))
-    inside = cloud if options.volume is None else cut_cloud(cloud, options.volume)
+    n_sheets = len(placing.factors)
+    depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
+    inside = cloud if volume is None else cut_cloud(cloud, volume)
     return PlacedImage(image, inside, depths, len(cloud) - len(inside))
 
 
 def _in_threads(
-    measure: Callable[[int, ExposurePair], PlacedImage],
-    pairs: Iterator[tuple[int, ExposurePair]],
+    extract: Callable[[tuple[ExposurePair, ...]], list[LitProfile]],
+    readings: Iterator[tuple[Instant, tuple[ExposurePair, ...]]],
     threads: int,
-) -> Iterator[tuple[int, PlacedImage]]:
-    """Measure in order with a bounded number of exposures in memory; stops at the first error."""
-    pending: deque[tuple[int, Future[PlacedImage]]] = deque()
+) -> Iterator[tuple[Instant, list[LitProfile]]]:
+    """Extract in order with a bounded number of exposures in memory; stops at the first error."""
+    pending: deque[tuple[Instant, Future[list[LitProfile]]]] = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
-            for row, pair in pairs:
-                pending.append((row, pool.submit(measure, row, pair)))
+            for instant, pairs in readings:
+                pending.append((instant, pool.submit(extract, pairs)))
                 if len(pending) > threads:
                     first, result = pending.popleft()
                     yield first, result.result()
@@ -206,7 +197,7 @@ def _in_threads(
 
 def _records(
     source: ScanSource,
-    images: ScanImages,
+    is_lit: BoolArray,
     poses: ExposurePoses,
     placed: dict[int, PlacedImage],
     reasons: dict[int, str],
@@ -217,7 +208,7 @@ def _records(
             records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
         elif k in reasons:
             records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
-        elif not images.is_lit[k]:
+        elif not is_lit[k]:
             records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
         else:
             reason = PoseFate(int(poses.fate[k])).label

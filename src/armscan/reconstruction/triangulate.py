@@ -87,7 +87,13 @@ def triangulate(
         In the order of the profile; ``covariance_mm2`` is stripe noise plus calibration,
         ``sigma_noise_mm`` the stripe noise alone.
     """
-    stripe = triangulate_stripe(profile, sheet_of_point, sensor)
+    return cloud_in_sensor(triangulate_stripe(profile, sheet_of_point, sensor), profile, sensor)
+
+
+def cloud_in_sensor(
+    stripe: StripePoints, profile: Profile, sensor: SensorCalibration
+) -> PointCloud:
+    """The points of one exposure as a cloud in the Sensor frame."""
     covariance = stripe.noise_mm @ stripe.noise_mm.transpose(0, 2, 1)
     for k in range(len(sensor.sheets)):
         own = stripe.sheet == k

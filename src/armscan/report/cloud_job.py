@@ -11,9 +11,10 @@ import numpy as np
 
 from armscan.errors import InputError
 from armscan.models.calibration import SensorCalibration
+from armscan.pipeline.instants import ScanInstants
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import ReconstructOptions, reconstruct
-from armscan.pipeline.scan_images import ScanImages
+from armscan.pipeline.reconstruct import reconstruct
 from armscan.reconstruction.result import Reconstruction
 from armscan.records.exposure import Exposure
 from armscan.report.cloud_page import cloud_page, fate_table
@@ -65,7 +66,7 @@ class CloudRequest:
     images: tuple[str, ...]
     background: tuple[str, ...]
     output: Path
-    options: ReconstructOptions = field(default_factory=ReconstructOptions)
+    options: MeasureOptions = field(default_factory=MeasureOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
     volume: str = ""
     arm: Path | None = None
@@ -137,7 +138,7 @@ def _read_images(request: CloudRequest) -> _Images:
 
 def _of_recording(folder: Path) -> _Images:
     recording = read_recording(folder)
-    scan = ScanImages(recording)
+    scan = ScanInstants(recording, 1)
     pairs = [scan.pair(row) for row in np.flatnonzero(scan.is_lit).tolist()]
     on = [exposure for exposure, _ in pairs]
     off = [background for _, background in pairs if background is not None]

@@ -21,9 +21,9 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.hand_eye import HandEyeScanOptions, ObservedStripes, observe_stripes
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.profiles import posed_stripes_from_profiles
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import ReconstructOptions
 from armscan.records.exposure import Exposure
 from armscan.records.probing import ProbedPoints
 from armscan.report.hand_eye_request import HandEyeRequest
@@ -113,7 +113,7 @@ def _from_recordings(
     sensor = read_sensor_calibration(sensor_file)
     plate, notes = _reference(request, _tool_places(recordings))
     options = HandEyeScanOptions(
-        hand_eye=request.options, measure=ReconstructOptions(stripes=request.stripes)
+        hand_eye=request.options, measure=MeasureOptions(stripes=request.stripes)
     )
     groups = []
     for recording in recordings:

@@ -23,7 +23,7 @@ from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.report.hand_eye_request import HandEyeRequest
-from armscan.report.single_demo_job import SingleDemoRequest
+from armscan.report.head_demo_job import HeadDemoRequest
 from armscan.storage.image_options import ImageOptions
 from armscan.vision.stripe.options import StripeOptions
 
@@ -80,8 +80,8 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         **STRIPES,
     },
     ("demo",): {
-        "seed": default_of(SingleDemoRequest, "seed"),
-        "preset": default_of(SingleDemoRequest, "preset"),
+        "seed": default_of(HeadDemoRequest, "seed"),
+        "preset": default_of(HeadDemoRequest, "preset"),
     },
     ("reconstruct",): {"sheet": MeasureOptions().sheet, **STRIPES, **IMAGES},
 }

@@ -41,12 +41,12 @@ def demo(
     """Render images, calibrate from them, measure things, and state the errors."""
     from armscan.devices.twin import Preset
     from armscan.report.demo_job import DemoRequest, run_photo_demo
-    from armscan.report.single_demo_job import SingleDemoRequest, run_single_demo
+    from armscan.report.head_demo_job import HeadDemoRequest, run_head_demo
 
     with progress_bar() as progress:
         if scene is Scene.PHOTOS:
             summary = run_photo_demo(DemoRequest(output, seed), progress)
         else:
-            request = SingleDemoRequest(output, seed, cast(Preset, preset))
-            summary = run_single_demo(request, progress)
+            request = HeadDemoRequest(output, seed, cast(Preset, preset))
+            summary = run_head_demo(request, progress)
     show(summary, as_json=as_json)

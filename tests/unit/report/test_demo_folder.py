@@ -9,7 +9,7 @@ import pytest
 
 from armscan.errors import OutputError
 from armscan.report.demo_folder import replaced_demo
-from armscan.report.single_demo_job import OWN_FILES
+from armscan.report.head_demo_job import OWN_FILES
 
 HEX = "0123456789abcdef0123456789abcdef"
 FILES = (

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from armscan.pipeline.single_demo import SingleDemo
+from armscan.pipeline.head_demo import HeadDemo
 from armscan.records.exposure import Exposure
 from armscan.report import cloud_figures
 from armscan.report import hand_eye_figures as hand_eye_charts
@@ -20,9 +20,9 @@ from armscan.report.drawing import Marks, photo_markup
 from armscan.report.hand_eye_numbers import hand_eye_facts, hand_eye_numbers, total_covariance
 from armscan.report.hand_eye_page import posture_table
 from armscan.report.hand_eye_scene import posture_scene
+from armscan.report.head_demo_data import FRACTION_RULE
 from armscan.report.numbers import sentence, significant
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
-from armscan.report.single_demo_data import FRACTION_RULE
 from armscan.report.stripe_figures import sheet_colour
 from armscan.report.summary import Table
 
@@ -38,8 +38,8 @@ SCENE_TEXTS = {
 }
 
 
-def single_demo_page(
-    demo: SingleDemo,
+def head_demo_page(
+    demo: HeadDemo,
     head: Mapping[str, Any],
     photographs: Mapping[str, Exposure],
     commands: Table,
@@ -52,7 +52,7 @@ def single_demo_page(
     demo
         What the chain found.
     head
-        The same figures as `armscan.report.single_demo_data.head_data` gives them.
+        The same figures as `armscan.report.head_demo_data.head_data` gives them.
     photographs
         One exposure of each scene, by the scene's name.
     commands
@@ -138,7 +138,7 @@ def comparison_table(head: Mapping[str, Any]) -> Table:
     return Table(("", "thesis (real)", "ours (simulated)"), tuple(rows), "", (1, 2))
 
 
-def truth_table(demo: SingleDemo, head: Mapping[str, Any]) -> Table:
+def truth_table(demo: HeadDemo, head: Mapping[str, Any]) -> Table:
     """Errors of the calibrations and of the part, also in their own sigmas."""
     errors, part = demo.errors, demo.part
     rows = (
@@ -233,7 +233,7 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
     )
 
 
-def _photographs(demo: SingleDemo, photographs: Mapping[str, Exposure]) -> Gallery:
+def _photographs(demo: HeadDemo, photographs: Mapping[str, Exposure]) -> Gallery:
     """One image a scene; on the bright target the found stripe is marked, else it is lost there."""
     found = {image.source: image.profile for image in demo.instrument.laser.images}
     pictures = []
@@ -246,7 +246,7 @@ def _photographs(demo: SingleDemo, photographs: Mapping[str, Exposure]) -> Galle
     return Gallery(tuple(pictures), 300)
 
 
-def _hand_eye_charts(demo: SingleDemo) -> tuple[Picture, ...]:
+def _hand_eye_charts(demo: HeadDemo) -> tuple[Picture, ...]:
     scanner, fit = demo.instrument.scanner, demo.instrument.hand_eye.fit
     numbers = hand_eye_numbers(fit.calibration, total_covariance(scanner))
     return (
@@ -255,7 +255,7 @@ def _hand_eye_charts(demo: SingleDemo) -> tuple[Picture, ...]:
     )
 
 
-def _histograms(demo: SingleDemo) -> Gallery:
+def _histograms(demo: HeadDemo) -> Gallery:
     still = demo.still_step
     pictures = [
         deviation_histogram(
@@ -285,7 +285,7 @@ def _histograms(demo: SingleDemo) -> Gallery:
     return Gallery(tuple(pictures), 420)
 
 
-def _part(demo: SingleDemo) -> Gallery:
+def _part(demo: HeadDemo) -> Gallery:
     cloud = demo.part.scan.cloud
     return Gallery(
         (

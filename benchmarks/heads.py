@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole chain of a simulated single-line arm scanner over many seeds, against its limits.
 
-    python benchmarks/single_head.py --seeds 20 --preset thesis --processes 2
+    python benchmarks/heads.py --seeds 20 --preset thesis --processes 2
 
 Each seed draws another instrument, bench, hand and noise; images are rendered, calibrated from,
 measured and inspected in memory. A row a seed, then the median and the 95th percentile of each
@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 
 from armscan.devices.twin import Preset
+from armscan.pipeline.head_demo import HeadDemo, run_head
 from armscan.pipeline.render_pool import TwinName
-from armscan.pipeline.single_demo import SingleDemo, run_single
-from armscan.report.single_demo_data import fraction_within
+from armscan.report.head_demo_data import fraction_within
 
 FIGURES = (
     ("plate in 0.05 %", 99.5, "least"),
@@ -52,7 +52,7 @@ FAILED = [math.inf if kind == "most" else -math.inf for _, _, kind in FIGURES]
 """Figures of a seed that came to no end."""
 
 
-def figures_of(demo: SingleDemo) -> list[float]:
+def figures_of(demo: HeadDemo) -> list[float]:
     plate, ball = demo.plate.fitted.deviations_mm, demo.ball.nominal.deviations_mm
     still, errors = demo.still_step, demo.errors.hand_eye
     large = max(demo.steps, key=lambda step: step.nominal_height_mm)
@@ -81,7 +81,7 @@ def figures_of(demo: SingleDemo) -> list[float]:
 def row_of(preset: str, seed: int) -> list[float]:
     # as many workers as cores: threads inside them would only wait for each other
     cv2.setNumThreads(1)
-    return figures_of(run_single(TwinName("thesis-single", cast(Preset, preset), seed).build()))
+    return figures_of(run_head(TwinName("thesis-single", cast(Preset, preset), seed).build()))
 
 
 def print_row(name: str, values: Iterable[float]) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.results import Deviations, PointCounts, StepInspection
+from armscan.pipeline.head_demo import HeadDemo
 from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.pipeline.single_demo import SingleDemo
 from armscan.reconstruction.result import PointFate
 from armscan.report.hand_eye_numbers import total_covariance
 
@@ -23,7 +23,7 @@ FRACTION_RULE = (
 
 
 def demo_data(
-    demo: SingleDemo, *, head: str, seed: int, preset: str, seconds: Mapping[str, float]
+    demo: HeadDemo, *, head: str, seed: int, preset: str, seconds: Mapping[str, float]
 ) -> dict[str, Any]:
     """All figures; fractions are 0 to 1, lengths in mm, angles in degrees."""
     return {
@@ -36,7 +36,7 @@ def demo_data(
     }
 
 
-def head_data(demo: SingleDemo) -> dict[str, Any]:
+def head_data(demo: HeadDemo) -> dict[str, Any]:
     """The figures of one head."""
     scanner = demo.instrument.scanner
     variance = np.diag(total_covariance(scanner))

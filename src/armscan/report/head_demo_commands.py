@@ -6,11 +6,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from armscan.devices.twin import Twin
-from armscan.pipeline.single_demo import SingleDemo
+from armscan.pipeline.head_demo import HeadDemo
 from armscan.report.summary import Table
 
 
-def single_demo_commands(recordings: Path, twin: Twin, demo: SingleDemo) -> Table:
+def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
     """Each step on the demo's recordings; results go to the current folder."""
     normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
     target, truth = twin.target, twin.truth

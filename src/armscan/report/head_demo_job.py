@@ -14,18 +14,18 @@ from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Preset, Twin, TwinScene
 from armscan.models.calibration import Provenance
 from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.head_demo import SCENES, HeadDemo, HeadOptions, run_head
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.render_pool import TwinName
-from armscan.pipeline.single_demo import SCENES, SingleDemo, SingleOptions, run_single
 from armscan.pipeline.twin_recordings import record_scenes, record_touches
 from armscan.records.exposure import Exposure
 from armscan.report.demo_folder import replaced_demo
+from armscan.report.head_demo_commands import head_demo_commands
+from armscan.report.head_demo_data import demo_data
+from armscan.report.head_demo_page import comparison_table, head_demo_page, truth_table
 from armscan.report.numbers import sentence
 from armscan.report.origin import footer
 from armscan.report.page import render_page
-from armscan.report.single_demo_commands import single_demo_commands
-from armscan.report.single_demo_data import demo_data
-from armscan.report.single_demo_page import comparison_table, single_demo_page, truth_table
 from armscan.report.summary import Summary, Table, summary_json
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import camera_document, sensor_document
@@ -51,7 +51,7 @@ OWN_FILES = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class SingleDemoRequest:
+class HeadDemoRequest:
     """Where the demo goes, and what is simulated.
 
     Parameters
@@ -71,11 +71,11 @@ class SingleDemoRequest:
     folder: Path
     seed: int = 1
     preset: Preset = "thesis"
-    options: SingleOptions = field(default_factory=SingleOptions)
+    options: HeadOptions = field(default_factory=HeadOptions)
     processes: int = 2
 
 
-def run_single_demo(request: SingleDemoRequest, progress: Progress = silent) -> Summary:
+def run_head_demo(request: HeadDemoRequest, progress: Progress = silent) -> Summary:
     """Render and record, calibrate, measure, inspect, compare with the truth, and write it all.
 
     Raises
@@ -90,13 +90,13 @@ def run_single_demo(request: SingleDemoRequest, progress: Progress = silent) -> 
         write_files({place / TRUTH: twin.truth.document()})
         scans = _recorded(place / RECORDINGS, name, request, progress)
         rendered = round(perf_counter() - start, 2)
-        demo = run_single(twin, request.options, progress, scans=scans)
+        demo = run_head(twin, request.options, progress, scans=scans)
         seconds = {"render": rendered, **demo.seconds}
         return _written(request, place, twin, demo, scans, seconds=seconds)
 
 
 def _recorded(
-    folder: Path, name: TwinName, request: SingleDemoRequest, progress: Progress
+    folder: Path, name: TwinName, request: HeadDemoRequest, progress: Progress
 ) -> dict[TwinScene, FolderRecording]:
     """All scenes and the touches of the plate as recordings, read back."""
     folder.mkdir()
@@ -112,22 +112,22 @@ def _recorded(
 
 
 def _written(
-    request: SingleDemoRequest,
+    request: HeadDemoRequest,
     place: Path,
     twin: Twin,
-    demo: SingleDemo,
+    demo: HeadDemo,
     scans: Mapping[TwinScene, FolderRecording],
     *,
     seconds: dict[str, float],
 ) -> Summary:
     start = perf_counter()
-    commands = single_demo_commands(request.folder / RECORDINGS, twin, demo)
+    commands = head_demo_commands(request.folder / RECORDINGS, twin, demo)
     photographs: dict[str, Exposure] = {s: _photograph(scan) for s, scan in scans.items()}
     data = demo_data(demo, head=HEAD, seed=request.seed, preset=request.preset, seconds=seconds)
     head = data["heads"][HEAD]
     documents = _documents(request, place, demo, scans)
     provenance = _provenance(request, place, (place / TRUTH,))
-    page = single_demo_page(demo, head, photographs, commands, footer(provenance))
+    page = head_demo_page(demo, head, photographs, commands, footer(provenance))
     write_files({**documents, place / "report.html": render_page(page)})
     seconds["write"] = round(perf_counter() - start, 2)
     head["seconds"] = seconds
@@ -143,9 +143,9 @@ def _photograph(scan: ScanSource) -> Exposure:
 
 
 def _documents(
-    request: SingleDemoRequest,
+    request: HeadDemoRequest,
     place: Path,
-    demo: SingleDemo,
+    demo: HeadDemo,
     scans: Mapping[TwinScene, FolderRecording],
 ) -> dict[Path, bytes]:
     """Calibrations and the part's cloud, each with what it came from."""
@@ -177,7 +177,7 @@ def _documents(
 
 
 def _provenance(
-    request: SingleDemoRequest, place: Path, files: Iterable[Path], *parents: str
+    request: HeadDemoRequest, place: Path, files: Iterable[Path], *parents: str
 ) -> Provenance:
     """Of files that lie in ``place`` yet and will lie in the demo's folder."""
     words = ("armscan", "demo", "single", "-o", request.folder.as_posix())
@@ -190,7 +190,7 @@ def _provenance(
     return replace(found, inputs=inputs)
 
 
-def _summary(folder: Path, demo: SingleDemo, data: Mapping[str, Any], commands: Table) -> Summary:
+def _summary(folder: Path, demo: HeadDemo, data: Mapping[str, Any], commands: Table) -> Summary:
     names = (*DOCUMENTS, "cloud.ply", "report.html", "summary.json")
     head, fit = data["heads"][HEAD], demo.instrument.hand_eye.fit
     return Summary(

@@ -15,11 +15,11 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
+from armscan.pipeline.head_calibration import Instrument, succeeded
 from armscan.pipeline.progress import Progress
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import measure_scan
 from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.pipeline.single_calibration import Instrument, succeeded
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.cloud import PointCloud
 

@@ -15,9 +15,7 @@ from armscan.inspection.results import PlaneInspection, SphereInspection, StepIn
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.pipeline.fewer_views import FewerViews
 from armscan.pipeline.hand_eye import calibrate_hand_eye_from_scan
-from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.pipeline.single_calibration import (
+from armscan.pipeline.head_calibration import (
     IN_MEMORY,
     Instrument,
     ScanOf,
@@ -26,7 +24,7 @@ from armscan.pipeline.single_calibration import (
     plate_of,
     succeeded,
 )
-from armscan.pipeline.single_measurements import (
+from armscan.pipeline.head_measurements import (
     MeasuredPart,
     measure_ball,
     measure_part,
@@ -34,6 +32,8 @@ from armscan.pipeline.single_measurements import (
     measure_steps,
     measure_still_step,
 )
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.pipeline.truth_errors import (
     CameraErrors,
     HandEyeErrors,
@@ -53,7 +53,7 @@ SCENES: tuple[TwinScene, ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class SingleOptions:
+class HeadOptions:
     """How much of the twin's scans the chain uses.
 
     Parameters
@@ -66,7 +66,7 @@ class SingleOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class SingleErrors:
+class HeadErrors:
     """Errors of the calibrations against the twin's truth."""
 
     camera: CameraErrors
@@ -75,7 +75,7 @@ class SingleErrors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SingleDemo:
+class HeadDemo:
     """All that the chain found.
 
     Parameters
@@ -108,7 +108,7 @@ class SingleDemo:
     still_step: StepInspection
     still_normal: FloatArray
     part: MeasuredPart
-    errors: SingleErrors
+    errors: HeadErrors
     seconds: Mapping[str, float]
 
 
@@ -127,13 +127,13 @@ class Stopwatch:
         return result
 
 
-def run_single(
+def run_head(
     twin: Twin,
-    options: SingleOptions | None = None,
+    options: HeadOptions | None = None,
     progress: Progress = silent,
     *,
     scans: Mapping[TwinScene, ScanSource] | None = None,
-) -> SingleDemo:
+) -> HeadDemo:
     """Calibrate the twin's scanner from its scans, measure its things, compare with the truth.
 
     Parameters
@@ -152,7 +152,7 @@ def run_single(
     EstimationError
         If a stage does not determine its result.
     """
-    options = options or SingleOptions()
+    options = options or HeadOptions()
 
     def scan_of(scene: TwinScene) -> ScanSource:
         found = (scans or {}).get(scene)
@@ -161,7 +161,7 @@ def run_single(
         return source if most is None else FewerViews(source, most)
 
     watch = Stopwatch()
-    instrument = calibrate_single(twin, scan_of, progress, watch)
+    instrument = calibrate_head(twin, scan_of, progress, watch)
     truth = twin.truth
     plate_scan, plate = watch.timed(
         "plate", lambda: measure_plate(scan_of("plate"), instrument, progress)
@@ -180,7 +180,7 @@ def run_single(
     )
     part = watch.timed("part", lambda: measure_part(scan_of("part"), instrument, truth, progress))
     errors = calibration_errors(twin, instrument)
-    return SingleDemo(
+    return HeadDemo(
         instrument,
         plate_scan,
         plate,
@@ -195,10 +195,8 @@ def run_single(
     )
 
 
-def calibrate_single(
-    twin: Twin, scan_of: ScanOf, progress: Progress, watch: Stopwatch
-) -> Instrument:
-    """Camera, light sheet, plate and hand-eye; arguments and errors as `run_single`."""
+def calibrate_head(twin: Twin, scan_of: ScanOf, progress: Progress, watch: Stopwatch) -> Instrument:
+    """Camera, light sheet, plate and hand-eye; arguments and errors as `run_head`."""
     target = parse_target(twin.target)
     camera_run = watch.timed(
         "calibrate_camera", lambda: calibrate_camera_of(scan_of("camera"), target, progress)
@@ -216,11 +214,11 @@ def calibrate_single(
     return Instrument(camera_run, camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
 
 
-def calibration_errors(twin: Twin, instrument: Instrument) -> SingleErrors:
+def calibration_errors(twin: Twin, instrument: Instrument) -> HeadErrors:
     """How far the calibrations are from the twin's truth."""
     truth, sensor = twin.truth, instrument.sensor
     own = sensor.sheet_parameter_slice(0)
-    return SingleErrors(
+    return HeadErrors(
         camera_errors(instrument.camera, truth.camera_parameters),
         sheet_errors(
             sensor.sheets[0],

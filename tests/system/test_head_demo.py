@@ -12,14 +12,14 @@ from typing import Any
 
 import pytest
 
-from armscan.pipeline.single_demo import SingleOptions
-from armscan.report.single_demo_job import HEAD, OWN_NAMES, SingleDemoRequest, run_single_demo
+from armscan.pipeline.head_demo import HeadOptions
+from armscan.report.head_demo_job import HEAD, OWN_NAMES, HeadDemoRequest, run_head_demo
 from armscan.report.summary import Summary
 from armscan.storage.clouds import read_ply
 from armscan.storage.recording_reader import read_recording
 from armscan.storage.scanner_files import read_scanner_calibration
 
-FEW = SingleOptions(
+FEW = HeadOptions(
     {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}
 )
 CHI_6_IN_999 = math.sqrt(22.46)
@@ -36,7 +36,7 @@ class Done:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
     folder = tmp_path_factory.mktemp("single") / "demo"
-    summary = run_single_demo(SingleDemoRequest(folder, seed=3, options=FEW, processes=1))
+    summary = run_head_demo(HeadDemoRequest(folder, seed=3, options=FEW, processes=1))
     content = json.loads((folder / "summary.json").read_text("utf-8"))
     return Done(folder, summary, content["heads"][HEAD])
 

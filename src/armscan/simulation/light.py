@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.poses import Pose
 
 RED = (1.0, 0.09, 0.05)
 """What the three channels of a colour camera answer to a red laser."""
@@ -25,7 +27,7 @@ class LineLaser:
     Parameters
     ----------
     name
-        Name of the light source.
+        Name of the light sheet.
     source_mm
         (3,) where the fan starts, in the frame of the scene.
     forward, across
@@ -45,6 +47,10 @@ class LineLaser:
         Part of the brightness that is lost from the fan's middle to its ends.
     colour
         (3,) response of red, green and blue to this light; mono cameras see the first.
+    source
+        Name of the light source that it is switched with; by default that of the sheet.
+    cubic_rad
+        Bends the sheet further: its centre at the fan angle a is raised by this times ``a**3``.
     """
 
     name: str
@@ -59,6 +65,8 @@ class LineLaser:
     irradiance: float = 1.0
     falloff: float = 0.4
     colour: tuple[float, float, float] = RED
+    source: str = ""
+    cubic_rad: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source_mm", frozen_floats(self.source_mm, (3,), "source_mm"))
@@ -73,23 +81,36 @@ class LineLaser:
         object.__setattr__(self, "across", frozen_floats(across / length, (3,), "across"))
         if not (self.waist_mm > 0.0 and self.waist_distance_mm > 0.0 and self.half_angle_rad > 0.0):
             raise InputError("a laser needs a waist and a fan of positive size", where=self.name)
+        object.__setattr__(self, "source", self.source or self.name)
 
     @property
     def normal(self) -> FloatArray:
         """(3,) normal of the fan plane, the axis of the cone."""
         return np.cross(self.forward, self.across)
 
+    def moved(self, there_from_here: Pose[Any, Any]) -> LineLaser:
+        """The same sheet in another frame, or at another place."""
+        turn = there_from_here.rotation
+        return replace(
+            self,
+            source_mm=turn @ self.source_mm + there_from_here.translation_mm,
+            forward=turn @ self.forward,
+            across=turn @ self.across,
+        )
+
     def rays(self, fan_angle_rad: FloatArray) -> FloatArray:
         """(N, 3) unit directions of the sheet's centre at fan angles (N,)."""
         angle = np.asarray(fan_angle_rad, dtype=np.float64)[:, None]
         flat = np.cos(angle) * self.forward + np.sin(angle) * self.across
-        return np.asarray(np.cos(self.skew_rad) * flat + np.sin(self.skew_rad) * self.normal)
+        centre = self._centre_rad(angle)
+        return np.asarray(np.cos(centre) * flat + np.sin(centre) * self.normal)
 
     def offset_mm(self, points_mm: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) from the centre of the sheet, along the arc."""
         forward, across, up, distance = self._local(points_mm)
         elevation = np.arctan2(up, np.hypot(forward, across))
-        return np.asarray(distance * (elevation - self.skew_rad))
+        centre = self._centre_rad(np.arctan2(across, forward))
+        return np.asarray(distance * (elevation - centre))
 
     def thickness_mm(self, distance_mm: FloatArray) -> FloatArray:
         """Gaussian sigma of the sheet at distances (N,) from the source."""
@@ -116,13 +137,20 @@ class LineLaser:
         forward, across, up, distance = self._local(points_mm)
         elevation = np.arctan2(up, np.hypot(forward, across))
         sigma = self.thickness_mm(distance)
-        reach = distance * (elevation - self.skew_rad) / sigma
+        angle = np.arctan2(across, forward)
+        reach = distance * (elevation - self._centre_rad(angle)) / sigma
         spread = self.waist_mm * self.waist_distance_mm / (sigma * distance)
-        fan = np.arctan2(across, forward) / self.half_angle_rad
+        fan = angle / self.half_angle_rad
         along = np.where(np.abs(fan) <= 1.0, 1.0 - self.falloff * fan**2, 0.0)
         facing = np.einsum("ni,ni->n", self.source_mm - points_mm, normals)
         cosine = np.maximum(facing / distance, 0.0)
         return np.asarray(reach), np.asarray(self.irradiance * spread * along * cosine)
+
+    def _centre_rad(self, fan_angle_rad: FloatArray) -> FloatArray | float:
+        """Elevation of the sheet's centre over the fan plane."""
+        if self.cubic_rad == 0.0:
+            return self.skew_rad
+        return np.asarray(self.skew_rad + self.cubic_rad * fan_angle_rad**3)
 
     def _local(self, points_mm: FloatArray) -> tuple[FloatArray, ...]:
         """Coordinates along forward, across and normal, and the distance from the source."""

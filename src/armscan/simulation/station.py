@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from armscan.simulation.band_light import band_light
 from armscan.simulation.board import PrintedBoard
 from armscan.simulation.board_photo import render_board
 from armscan.simulation.flat_pattern import FlatPattern
-from armscan.simulation.head import Head, Window
+from armscan.simulation.head import Head, MountedCamera, Window
 from armscan.simulation.imaging import Imaging
 from armscan.simulation.light import LineLaser
 from armscan.simulation.region import Region, to_pixels
@@ -92,7 +93,7 @@ class ExposureSettings:
     window
         Part of the sensor that is read.
     lasers
-        Names of the lasers that are on.
+        Names of the light sources that are on.
     room_light
         Brightness of white that faces up under the room's light, as a part of full scale; None for
         the preset's ambient light.
@@ -112,16 +113,16 @@ class ExposureSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrueStripe:
-    """True centre points of one laser's stripe, about one a column.
+    """True centre points of one sheet's stripe, about one a column or row.
 
     Parameters
     ----------
     sheet
         Name of the light sheet.
     points_px
-        (N, 2) full-sensor pixels.
+        (N, 2) full-sensor pixels of the camera that was asked for.
     points_sensor_mm, points_base_mm
-        (N, 3) in the two frames.
+        (N, 3) in the two frames, whichever camera it was.
     thing
         (N,) index into the station's things, as float64; the target, if any, comes after them.
     """
@@ -146,6 +147,8 @@ def render_exposure(
     base_from_sensor: Sequence[Pose[Base, Sensor]],
     settings: ExposureSettings,
     rng: np.random.Generator,
+    *,
+    camera: int = 0,
 ) -> ImageArray:
     """Image (H, W) of one exposure.
 
@@ -159,15 +162,17 @@ def render_exposure(
         Window, lasers, light.
     rng
         Source of speckle and noise.
+    camera
+        Index of the head's camera that looks.
 
     Raises
     ------
     InputError
-        If a laser is not of this head or no pose is given.
+        If a laser or camera is not of this head or no pose is given.
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
-    light = exposure_light(head, station, base_from_sensor, settings, rng)
+    light = exposure_light(head, station, base_from_sensor, settings, rng, camera=camera)
     return expose_mono(light, head.imaging.detector, rng)
 
 
@@ -177,60 +182,89 @@ def exposure_light(
     base_from_sensor: Sequence[Pose[Base, Sensor]],
     settings: ExposureSettings,
     rng: np.random.Generator,
+    *,
+    camera: int = 0,
 ) -> NDArray[np.float32]:
     """Light (H, W) of one exposure on the sensor, parts of full scale, without sensor noise."""
-    imaging, window = head.imaging, settings.window
+    imaging, window, eye = head.imaging, settings.window, _mounted(head, camera)
     station = station.under(imaging)
     region = Region.around(window.x_px, window.y_px, window.width_px, window.height_px)
-    views = [_view(head, station, pose, region) for pose in base_from_sensor]
+    poses = [_eye_pose(eye, pose) for pose in base_from_sensor]
+    views = [_view(eye, station, pose, region) for pose in poses]
     light = np.zeros((window.height_px, window.width_px), np.float32)
     inside = (
         slice(window.y_px - region.y_px, window.y_px - region.y_px + window.height_px),
         slice(window.x_px - region.x_px, window.x_px - region.x_px + window.width_px),
     )
-    for laser in _chosen(head, settings.lasers):
-        line = band_light(views, head.camera, laser, region, speckle=imaging.speckle, rng=rng)
+    for laser in _seen_lasers(head, eye, settings.lasers):
+        line = band_light(views, eye.camera, laser, region, speckle=imaging.speckle, rng=rng)
         light += np.float32(settings.laser_gain) * line[inside]
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
     share = np.float32(brightness / len(views))
-    for pose, view in zip(base_from_sensor, views, strict=True):
-        light += share * _room(head, station, pose, view, region)[inside]
+    for pose, view in zip(poses, views, strict=True):
+        light += share * _room(eye, station, pose, view, region)[inside]
     return light
 
 
 def true_stripes(
-    head: Head, station: Station, base_from_sensor: Pose[Base, Sensor], settings: ExposureSettings
+    head: Head,
+    station: Station,
+    base_from_sensor: Pose[Base, Sensor],
+    settings: ExposureSettings,
+    *,
+    camera: int = 0,
 ) -> tuple[TrueStripe, ...]:
     """Where the centres of the sheets that are on truly lie, for a head that stands still."""
-    window = settings.window
-    camera = head.camera.cropped(*_corners(window))
-    scene = seen_from(station, base_from_sensor)
+    window, eye = settings.window, _mounted(head, camera)
+    pose = _eye_pose(eye, base_from_sensor)
+    sensor_from_eye = eye.camera_from_sensor.inverse()
+    lens = eye.camera.cropped(*_corners(window))
+    scene = seen_from(station, pose)
     stripes = []
-    for laser in _chosen(head, settings.lasers):
-        found = find_stripe(scene, camera, laser, laser_band(scene, camera, laser))
-        in_sensor: Points[Sensor] = Points(found.points_mm)
-        pixels = found.points_px + np.array([window.x_px, window.y_px])
+    for laser in _seen_lasers(head, eye, settings.lasers):
+        found = find_stripe(scene, lens, laser, laser_band(scene, lens, laser))
+        in_eye: Points[Any] = Points(found.points_mm)
+        in_sensor = found.points_mm if camera == 0 else (sensor_from_eye @ in_eye).xyz_mm
         stripes.append(
             TrueStripe(
                 laser.name,
-                pixels,
-                found.points_mm,
-                (base_from_sensor @ in_sensor).xyz_mm,
+                found.points_px + np.array([window.x_px, window.y_px]),
+                in_sensor,
+                (pose @ in_eye).xyz_mm,
                 found.surface,
             )
         )
     return tuple(stripes)
 
 
-def _view(head: Head, station: Station, pose: Pose[Base, Sensor], region: Region) -> PosedView:
+def _mounted(head: Head, camera: int) -> MountedCamera:
+    if not 0 <= camera < len(head.cameras):
+        raise InputError(f"head '{head.name}' has no camera {camera}")
+    return head.cameras[camera]
+
+
+def _eye_pose(eye: MountedCamera, base_from_sensor: Pose[Base, Sensor]) -> Pose[Base, Any]:
+    """Where one camera of the head is."""
+    return base_from_sensor @ eye.camera_from_sensor.inverse()
+
+
+def _seen_lasers(head: Head, eye: MountedCamera, sources: tuple[str, ...]) -> list[LineLaser]:
+    """The sheets that are on, in the frame of a camera."""
+    sheets = head.sheets_of(sources)
+    if eye is head.cameras[0]:
+        return list(sheets)
+    return [laser.moved(eye.camera_from_sensor) for laser in sheets]
+
+
+def _view(eye: MountedCamera, station: Station, pose: Pose[Base, Any], region: Region) -> PosedView:
     finishes = tuple(thing.finish for thing in station.things)
-    return look(seen_from(station, pose), (*finishes, Finish()), head.camera, region)
+    return look(seen_from(station, pose), (*finishes, Finish()), eye.camera, region)
 
 
 def _room(
-    head: Head, station: Station, pose: Pose[Base, Sensor], view: PosedView, region: Region
+    eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
 ) -> FloatArray:
     """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
     _, (rows, columns) = region.nodes_px()
@@ -238,14 +272,14 @@ def _room(
     coarse = to_pixels(nodes, region)
     if station.target is None:
         return np.asarray(coarse)
-    camera = head.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
+    camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     board = board_seen_from(station.target, pose)
     background = np.asarray(coarse, dtype=np.float64)[..., None]
     return render_board(board, camera, view.scene.lamp, background)[..., 0]
 
 
-def seen_from(station: Station, base_from_sensor: Pose[Base, Sensor]) -> Scene:
-    """The station's things, then its target, in the Sensor frame."""
+def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:
+    """The station's things, then its target, in the frame of the head or of one camera."""
     sensor_from_base = base_from_sensor.inverse()
     surfaces: list[Surface] = [Placed(thing, sensor_from_base) for thing in station.things]
     if station.target is not None:
@@ -253,7 +287,7 @@ def seen_from(station: Station, base_from_sensor: Pose[Base, Sensor]) -> Scene:
     return Scene(tuple(surfaces), lamp=_lamp_seen_from(station.room, sensor_from_base))
 
 
-def _lamp_seen_from(room: Lamp, sensor_from_base: Pose[Sensor, Base]) -> Lamp:
+def _lamp_seen_from(room: Lamp, sensor_from_base: Pose[Any, Base]) -> Lamp:
     position: Points[Base] = Points(np.array([room.position_mm]))
     x, y, z = (sensor_from_base @ position).xyz_mm[0]
     up = sensor_from_base.rotation @ np.asarray(room.up)
@@ -264,18 +298,10 @@ def _lamp_seen_from(room: Lamp, sensor_from_base: Pose[Sensor, Base]) -> Lamp:
     )
 
 
-def board_seen_from(target: Target, base_from_sensor: Pose[Base, Sensor]) -> PrintedBoard:
-    """The target in the Sensor frame."""
+def board_seen_from(target: Target, base_from_sensor: Pose[Base, Any]) -> PrintedBoard:
+    """The target in the frame of the head or of one camera."""
     pose = base_from_sensor.inverse() @ target.base_from_board
     return PrintedBoard(target.pattern, pose, target.light, target.dark)
-
-
-def _chosen(head: Head, names: tuple[str, ...]) -> tuple[LineLaser, ...]:
-    known = {laser.name: laser for laser in head.lasers}
-    for name in names:
-        if name not in known:
-            raise InputError(f"head '{head.name}' has no laser '{name}'")
-    return tuple(known[name] for name in names)
 
 
 def _corners(window: Window) -> tuple[int, int, int, int]:

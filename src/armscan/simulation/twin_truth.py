@@ -13,7 +13,9 @@ from armscan.devices.twin import Preset
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
+from armscan.simulation.head import RIGHT
 from armscan.simulation.instrument import Instrument
+from armscan.simulation.optics import RenderCamera
 from armscan.simulation.plate_probing import TIP_DIAMETER_MM, TRUE_PROBE_MM
 from armscan.simulation.sheet_middle import sheet_points_mm
 from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_HEIGHTS_MM
@@ -38,23 +40,24 @@ class InstrumentTruth:
     @property
     def camera_parameters(self) -> FloatArray:
         """(9,) ``fx fy cx cy`` in px and ``k1 k2 p1 p2 k3``."""
-        c = self.instrument.head.camera
-        return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
+        return _parameters(self.instrument.head.camera)
 
     @property
     def right_camera_parameters(self) -> FloatArray | None:
         """(9,) the same of the right camera; None for a head of one camera."""
-        return None
+        cameras = self.instrument.head.cameras
+        return _parameters(cameras[RIGHT].camera) if len(cameras) > RIGHT else None
 
     @property
     def right_from_sensor(self) -> Pose[CameraRight, Sensor] | None:
         """Where the left camera is in the right one's frame; None for a head of one camera."""
-        return None
+        cameras = self.instrument.head.cameras
+        return cameras[RIGHT].camera_from_sensor if len(cameras) > RIGHT else None
 
     @property
     def sheet_points_mm(self) -> dict[str, FloatArray]:
         """(N, 3) true points of each light sheet over the working region, Sensor frame."""
-        return {self.instrument.head.lasers[0].name: sheet_points_mm(self.instrument.head)}
+        return sheet_points_mm(self.instrument.head)
 
     @property
     def tool_from_sensor(self) -> Pose[Tool, Sensor]:
@@ -120,7 +123,16 @@ class InstrumentTruth:
                 "encoder_waves_rad": arm.waves_rad.tolist(),
             },
         }
+        right = self.right_camera_parameters
+        if right is not None and self.right_from_sensor is not None:
+            content["right_camera_parameters"] = right.tolist()
+            content["right_from_sensor"] = _pose(self.right_from_sensor)
         return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def _parameters(camera: RenderCamera) -> FloatArray:
+    c = camera
+    return np.array([c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3])
 
 
 def _pose(pose: Pose[Any, Any]) -> dict[str, Any]:

@@ -12,8 +12,10 @@ from armscan.errors import InputError
 from armscan.geometry.euler import rotations_from_euler
 from armscan.geometry.frames import Base, Plate, Sensor, Tool
 from armscan.geometry.poses import Pose
-from armscan.simulation.head import SINGLE_SHEET, Head, Tolerances, Window, build_head
+from armscan.simulation.head import Head, Window, build_head
+from armscan.simulation.head_drawing import Tolerances
 from armscan.simulation.plate import FlatPlate
+from armscan.simulation.printed_heads import SINGLE_SHEET
 from armscan.simulation.shapes import Placed
 from armscan.simulation.station import ExposureSettings, Station, TrueStripe, true_stripes
 from armscan.simulation.thing import Thing

@@ -15,7 +15,8 @@ from armscan.geometry.poses import Pose
 from armscan.records.exposure import Exposure
 from armscan.records.sensor_window import SensorWindow
 from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.head import Head, Tolerances, Window, build_head
+from armscan.simulation.head import Head, Window, build_head
+from armscan.simulation.head_drawing import Tolerances
 from armscan.simulation.plate import FlatPlate
 from armscan.simulation.render import Speckle, render_laser
 from armscan.simulation.shapes import Box, Placed, Rod

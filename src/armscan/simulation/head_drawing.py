@@ -103,7 +103,7 @@ def draw_lasers(
             sheet_tilt_rad=_ORDER_SHARE * spread.sheet_tilt_rad,
             sheet_offset_mm=_ORDER_SHARE * spread.sheet_offset_mm,
         )
-        mount = Pose[Sensor, Sensor](tilt, middle.aim_mm + shift - tilt @ middle.aim_mm)
+        mount: Pose[Sensor, Sensor] = Pose(tilt, middle.aim_mm + shift - tilt @ middle.aim_mm)
         lasers += [_draw_laser(sheet, level, each, rng).moved(mount) for sheet in own]
     return tuple(lasers)
 

@@ -4,18 +4,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.frames import CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import (
     CameraCalibration,
     InputFile,
     Provenance,
+    SecondCamera,
     SensorCalibration,
     SheetCalibration,
 )
@@ -105,6 +106,15 @@ def sensor_calibration() -> SensorCalibration:
         provenance(),
         SensorDiagnostics(1.2, 3.4, "one sheet in each image"),
     )
+
+
+def stereo_sensor_calibration() -> SensorCalibration:
+    """The same sensor with a right camera."""
+    first = sensor_calibration()
+    axes = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
+    pose: Pose[CameraRight, Sensor] = Pose(axes, np.array([-117.4, 1 / 3, 63.2]))
+    second = SecondCamera(replace(camera_calibration(), rms_px=1 / 9), pose)
+    return replace(first, second=second, covariance=covariance(40, 5))
 
 
 def scanner_calibration(*, has_sensor: bool = True) -> ScannerCalibration:

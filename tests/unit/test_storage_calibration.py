@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pytest
 from armscan.errors import FileFormatError
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
+from armscan.report.file_info import describe_files
 from armscan.storage.calibration_files import (
     camera_document,
     read_calibration,
@@ -22,7 +23,14 @@ from armscan.storage.calibration_files import (
     read_sensor_calibration,
     sensor_document,
 )
-from calibration_documents import assert_same, camera_calibration, sensor_calibration
+from armscan.storage.scanner_files import read_scanner_calibration, scanner_document
+from calibration_documents import (
+    assert_same,
+    camera_calibration,
+    scanner_calibration,
+    sensor_calibration,
+    stereo_sensor_calibration,
+)
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -151,3 +159,36 @@ def test_swapped_files_are_noticed(tmp_path: Path) -> None:
         read_camera_calibration(sensor)
     with pytest.raises(FileFormatError, match="is a camera calibration, and a sensor calibration"):
         read_sensor_calibration(camera)
+
+
+def test_a_second_camera_comes_back_exactly_and_alone_adds_a_key(tmp_path: Path) -> None:
+    path = tmp_path / "sensor.json"
+    path.write_bytes(sensor_document(stereo_sensor_calibration()))
+    assert_same(read_sensor_calibration(path), stereo_sensor_calibration())
+    content = json.loads(path.read_text("utf-8"))
+    assert content["covariance"]["parameter_names"][25] == "right.fx_px"
+    assert set(content) - set(json.loads(sensor_document(sensor_calibration()))) == {"second"}
+
+
+def test_a_scanner_keeps_its_second_camera(tmp_path: Path) -> None:
+    path = tmp_path / "scanner.json"
+    known = scanner_calibration()
+    coupling = np.arange(240).reshape(6, 40) / 7
+    stereo = replace(
+        known,
+        sensor=stereo_sensor_calibration(),
+        hand_eye=replace(known.hand_eye, sensor_coupling=coupling),
+    )
+    path.write_bytes(scanner_document(stereo))
+    assert_same(read_scanner_calibration(path), stereo)
+    described = describe_files([str(path)]).data["items"][0]
+    assert described["baseline_mm"] == pytest.approx(np.linalg.norm([117.4, 1 / 3, 63.2]), abs=1e-4)
+
+
+def test_a_covariance_of_another_count_of_cameras_is_refused(tmp_path: Path) -> None:
+    content = json.loads(sensor_document(stereo_sensor_calibration()))
+    del content["second"]
+    path = tmp_path / "sensor.json"
+    path.write_bytes(json.dumps(content).encode())
+    with pytest.raises(FileFormatError, match=r"covariance"):
+        read_sensor_calibration(path)

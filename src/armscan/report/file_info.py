@@ -26,6 +26,7 @@ from armscan.report.scan_info import (
     describe_recording,
     describe_scanner,
     describe_touches,
+    second_camera_facts,
 )
 from armscan.report.summary import Summary
 from armscan.storage.arm_files import ARM_MODEL_FILE
@@ -217,6 +218,7 @@ def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
         "what": f"sensor calibration, {len(sheets)} light sheets, camera "
         f"{camera.width_px} x {camera.height_px} px",
         "sheets": sheets,
+        **({} if calibration.second is None else second_camera_facts(calibration.second)),
         **_origin(calibration.provenance),
     }
 

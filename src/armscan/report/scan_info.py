@@ -10,6 +10,7 @@ import numpy as np
 
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import IntArray
+from armscan.models.calibration import SecondCamera
 from armscan.models.scanner import HAND_EYE_PARAMETER_NAMES, ScannerCalibration
 from armscan.reconstruction.sync import SyncOptions, exposure_poses, largest_gap_ns
 from armscan.records.arm_track import NO_TRIGGER, ArmTrack
@@ -62,6 +63,7 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
     """Values of the hand-eye with their uncertainty, and what it rests on."""
     hand_eye = calibration.hand_eye
     sensor = calibration.sensor
+    second = None if sensor is None else sensor.second
     sheets = "no images" if sensor is None else f"{len(sensor.sheets)} light sheets"
     sigma = np.sqrt(np.diag(hand_eye.covariance))
     pose = hand_eye.tool_from_sensor
@@ -70,6 +72,7 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
     known = hand_eye.diagnostics
     return {
         "what": f"scanner calibration, {sheets}",
+        **({} if second is None else second_camera_facts(second)),
         **{
             name: with_sigma(float(value), float(spread))
             for name, value, spread in zip(names, values, sigma, strict=True)
@@ -79,6 +82,17 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
         "points": hand_eye.n_points,
         **({} if known is None else {"method": known.method, "condition": known.condition}),
         "latency_ns": calibration.latency_ns,
+    }
+
+
+def second_camera_facts(second: SecondCamera) -> dict[str, Any]:
+    """The right camera of a stereo head, and how far and how turned it stands from the left."""
+    camera, pose = second.camera.camera, second.right_from_sensor
+    turn_deg = float(np.degrees(np.linalg.norm(pose.rotation_vector_rad)))
+    return {
+        "second_camera": f"{camera.width_px} x {camera.height_px} px, "
+        f"fx {camera.fx_px:.2f} px, turned by {turn_deg:.3f} deg",
+        "baseline_mm": round(float(np.linalg.norm(pose.translation_mm)), 4),
     }
 
 

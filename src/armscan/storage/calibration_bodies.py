@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import CameraRight, Sensor
+from armscan.geometry.poses import Pose
 from armscan.models.calibration import (
     CameraCalibration,
     InputFile,
     Provenance,
+    SecondCamera,
     SensorCalibration,
     SheetCalibration,
 )
@@ -29,6 +33,8 @@ from armscan.storage.calibration_schema import (
     IntrinsicsBody,
     ObservationsBody,
     ProvenanceBody,
+    RightPoseBody,
+    SecondCameraBody,
     SensorDiagnosticsBody,
     SensorDocument,
     SheetBody,
@@ -95,6 +101,7 @@ def sensor_document_of(
         sheets=tuple(_sheet_body(sheet) for sheet in calibration.sheets),
         covariance=covariance_body(calibration.parameter_names, calibration.covariance),
         diagnostics=diagnostics_body(calibration.diagnostics, SensorDiagnosticsBody),
+        second=None if calibration.second is None else second_camera_body(calibration.second),
         observations=observations,
         provenance=provenance_body(calibration.provenance),
     )
@@ -104,21 +111,47 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
     """Sensor calibration from its document."""
     camera = camera_from_body(document.camera, provenance_from_body(document.camera_provenance))
     sheets = tuple(_sheet_from_body(body) for body in document.sheets)
+    second = None if document.second is None else second_camera_from_body(document.second)
     size = len(document.covariance.parameter_names)
     empty = SensorCalibration(
         camera,
         sheets,
         np.zeros((size, size)),
         provenance_from_body(document.provenance),
+        sensor_diagnostics(document.diagnostics),
+        second,
     )
     covariance = covariance_from_body(document.covariance, empty.parameter_names)
-    return SensorCalibration(
-        camera,
-        sheets,
-        covariance,
-        empty.provenance,
-        sensor_diagnostics(document.diagnostics),
+    return replace(empty, covariance=covariance)
+
+
+def second_camera_body(second: SecondCamera) -> SecondCameraBody:
+    """Body of a stereo head's right camera."""
+    return SecondCameraBody(
+        camera=camera_body(second.camera),
+        camera_provenance=provenance_body(second.camera.provenance),
+        right_from_sensor=right_pose_body(second.right_from_sensor),
     )
+
+
+def second_camera_from_body(body: SecondCameraBody) -> SecondCamera:
+    """Right camera of a stereo head from its body."""
+    provenance = provenance_from_body(body.camera_provenance)
+    pose = right_pose_from_body(body.right_from_sensor)
+    return SecondCamera(camera_from_body(body.camera, provenance), pose)
+
+
+def right_pose_body(pose: Pose[CameraRight, Sensor]) -> RightPoseBody:
+    """Body of the pose of the left camera in the right one's frame."""
+    first, second, third = (triple(row) for row in pose.rotation)
+    return RightPoseBody(
+        rotation_rows=(first, second, third), translation_right_mm=triple(pose.translation_mm)
+    )
+
+
+def right_pose_from_body(body: RightPoseBody) -> Pose[CameraRight, Sensor]:
+    """Pose of the left camera in the right one's frame from its body."""
+    return Pose(np.array(body.rotation_rows), np.array(body.translation_right_mm))
 
 
 def provenance_body(provenance: Provenance) -> ProvenanceBody:

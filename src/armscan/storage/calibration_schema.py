@@ -4,9 +4,17 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+)
 
 SCHEMA_VERSION: Final = 1
 CAMERA_SCHEMA: Final = "armscan/camera-calibration"
@@ -189,6 +197,21 @@ class SheetBody(Body):
     diagnostics: SheetDiagnosticsBody | None
 
 
+class RightPoseBody(Body):
+    """``p_right = R p_sensor + t``, the rotation by its rows."""
+
+    rotation_rows: tuple[Triple, Triple, Triple]
+    translation_right_mm: Triple
+
+
+class SecondCameraBody(Body):
+    """The right camera of a stereo head, and where the Sensor frame lies in its own."""
+
+    camera: CameraBody
+    camera_provenance: ProvenanceBody
+    right_from_sensor: RightPoseBody
+
+
 class CameraDocument(Body):
     """``camera.json``."""
 
@@ -200,7 +223,7 @@ class CameraDocument(Body):
 
 
 class SensorDocument(Body):
-    """``sensor.json``."""
+    """``sensor.json``; ``second`` is there only for a head of two cameras."""
 
     schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")
     schema_version: Literal[1] = SCHEMA_VERSION
@@ -209,5 +232,14 @@ class SensorDocument(Body):
     sheets: tuple[SheetBody, ...] = Field(min_length=1)
     covariance: CovarianceBody
     diagnostics: SensorDiagnosticsBody | None
+    second: SecondCameraBody | None = None
     observations: ObservationsBody | None = None
     provenance: ProvenanceBody
+
+    @model_serializer(mode="wrap")
+    def _without_absent_camera(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Heads of one camera keep the document that they always had."""
+        content: dict[str, Any] = write(self)
+        if self.second is None:
+            del content["second"]
+        return content

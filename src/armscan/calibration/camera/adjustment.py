@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,6 +20,8 @@ CONVERGED = 1e-12
 """Relative decrease of chi2 at which the iteration ends."""
 
 MAX_DAMPING = 1e12
+
+S = TypeVar("S")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +47,7 @@ class NormalEquations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjustment:
+class Adjustment(Generic[S]):
     """Where an adjustment ended.
 
     Parameters
@@ -56,7 +60,7 @@ class Adjustment:
         False if the last step allowed still lowered chi2: a lower minimum is near.
     """
 
-    state: State
+    state: S
     equations: NormalEquations
     is_converged: bool
 
@@ -109,10 +113,33 @@ def linearise(
     if prediction is None:
         return None
     predicted, by_shared, by_pose = prediction
+    return normal_equations(observations, predicted, by_shared @ basis, by_pose, weights)
+
+
+def normal_equations(
+    observations: Observations,
+    predicted_px: FloatArray,
+    by_shared: FloatArray,
+    by_pose: FloatArray,
+    weights: FloatArray,
+) -> NormalEquations:
+    """Sum up the points' equations in blocks.
+
+    Parameters
+    ----------
+    observations
+        N points of V views; a view may have none.
+    predicted_px
+        (N, 2) prediction.
+    by_shared, by_pose
+        (N, 2, F) and (N, 2, 6) its derivatives by the free shared unknowns and by the view's pose.
+    weights
+        (N,) factors of each point's chi2.
+    """
     whitening = observations.whitening * np.sqrt(weights)[:, None, None]
-    residual = (whitening @ (observations.points_px - predicted)[:, :, None])[:, :, 0]
-    jacobian = whitening @ np.concatenate([by_shared @ basis, by_pose], axis=2)
-    f = basis.shape[1]
+    residual = (whitening @ (observations.points_px - predicted_px)[:, :, None])[:, :, 0]
+    jacobian = whitening @ np.concatenate([by_shared, by_pose], axis=2)
+    f = by_shared.shape[2]
     n = observations.n_views
     shared, gradient = np.zeros((f, f)), np.zeros(f)
     cross, pose, pose_gradient = np.zeros((n, f, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6))
@@ -187,7 +214,7 @@ def adjust(
     basis: FloatArray,
     weights: FloatArray | None = None,
     max_steps: int = MAX_STEPS,
-) -> Adjustment | FitFailure:
+) -> Adjustment[State] | FitFailure:
     """Minimise eq. 2.39, weighted by each point's covariance.
 
     Parameters
@@ -208,16 +235,42 @@ def adjust(
     adjustment
         The minimum, or what was reached by the last step; or why there is none.
     """
-    if weights is None:
-        weights = np.ones(len(observations.points_px))
-    equations = linearise(observations, start, basis, weights)
+    used = np.ones(len(observations.points_px)) if weights is None else weights
+    return descend(
+        start,
+        lambda state: linearise(observations, state, basis, used),
+        lambda state, shared_step, pose_steps: moved(state, basis, shared_step, pose_steps),
+        max_steps,
+    )
+
+
+def descend(
+    start: S,
+    equations_at: Callable[[S], NormalEquations | None],
+    move: Callable[[S, FloatArray, FloatArray], S],
+    max_steps: int = MAX_STEPS,
+) -> Adjustment[S] | FitFailure:
+    """Levenberg-Marquardt with the poses eliminated per view, over any such unknowns.
+
+    Parameters
+    ----------
+    start
+        Starting values.
+    equations_at
+        Normal equations at a state, or None where it is impossible.
+    move
+        The state after a step of the (F,) shared unknowns and the (V, 6) poses.
+    max_steps
+        Most iterations; what is reached by then is returned.
+    """
+    equations = equations_at(start)
     if equations is None:
         return FitFailure("the starting values put the board behind the camera")
     state, damping = start, 1e-4
     for _ in range(max_steps):
         step = damped_step(equations, damping)
-        trial = moved(state, basis, *step) if step is not None else None
-        proposed = linearise(observations, trial, basis, weights) if trial is not None else None
+        trial = move(state, *step) if step is not None else None
+        proposed = equations_at(trial) if trial is not None else None
         if trial is None or proposed is None or not proposed.chi2 <= equations.chi2:
             if damping > MAX_DAMPING or (step is not None and _is_tiny(equations, step)):
                 return Adjustment(state, equations, is_converged=True)

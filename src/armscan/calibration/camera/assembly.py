@@ -20,6 +20,7 @@ from armscan.calibration.camera.prepared_views import PreparedViews
 from armscan.calibration.camera.result import CameraFit, RefusedView, ViewFit
 from armscan.calibration.camera.robust import Solution, chi2_of_points, residuals_px
 from armscan.calibration.camera.target_error import (
+    board_residuals,
     covariance_with_target_error,
     estimate_target_error,
 )
@@ -56,8 +57,11 @@ def assemble(
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
         return determined
-    target_error = estimate_target_error(solution)
-    covariance = covariance_with_target_error(solution, determined[0], target_error)
+    found = board_residuals(solution)
+    target_error = estimate_target_error(found)
+    covariance = covariance_with_target_error(
+        determined[0], solution.variance_factor, target_error, found
+    )
     condition = determined[1]
     refusal = _focal_refusal(solution, covariance)
     if refusal is not None:

@@ -127,7 +127,7 @@ def solve_robustly(
         if isinstance(result, FitFailure):
             return result
         chi2 = chi2_of_points(observations, result.state)
-        levels, outlier = _judge(observations, chi2)
+        levels, outlier = judge(observations, chi2)
         if not outlier.any() and levels.max() < SUSPECT_LEVEL:
             return Solution(
                 observations,
@@ -141,7 +141,7 @@ def solve_robustly(
             )
     state = _reweighted(observations, start, basis, trusted)
     chi2 = chi2_of_points(observations, state)
-    levels, outlier = _judge(observations, chi2)
+    levels, outlier = judge(observations, chi2)
     shares = _outlier_shares(observations, chi2)
     for _ in range(REJECTION_ROUNDS):
         weights = np.where(outlier, 0.0, 1.0)
@@ -149,7 +149,7 @@ def solve_robustly(
         if isinstance(kept, FitFailure):
             return kept
         state, equations, is_converged = kept.state, kept.equations, kept.is_converged
-        _, again = _judge(observations, chi2_of_points(observations, state))
+        _, again = judge(observations, chi2_of_points(observations, state))
         if np.array_equal(again, outlier):
             break
         outlier = again
@@ -176,8 +176,11 @@ def _reweighted(
     return state
 
 
-def _judge(observations: Observations, chi2: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Relative level of each view and which points are outliers, each against its own view."""
+def judge(observations: Observations, chi2: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Relative level (V,) of each view and which points (N,) are outliers against their own view.
+
+    Every view must have a point; ``chi2`` is (N,) as from `chi2_of_points`.
+    """
     absolute = _view_levels(observations, chi2)
     typical = _typical(absolute)
     own = np.maximum(absolute, typical)[observations.view_of_point]

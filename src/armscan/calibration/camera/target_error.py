@@ -9,6 +9,7 @@ added to the covariance, and what is left of the scatter counts as independent.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,11 +40,79 @@ class TargetError:
     independent_share: float
 
 
-def estimate_target_error(solution: Solution) -> TargetError:
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardResiduals:
+    """Residuals of N points kept, and what a move of a point on its board does to them.
+
+    Parameters
+    ----------
+    board_mm
+        (N, 3) places on the board: equal places are one point of the target.
+    residuals_px
+        (N, 2) observed minus predicted.
+    by_board
+        (N, 2, 2) derivative of the prediction by the point's place along the board's axes.
+    by_shared, by_pose
+        (N, 2, S) and (N, 2, 6) derivative by the shared unknowns and by the pose of its board.
+    information
+        (N, 2, 2) inverse covariance of the points.
+    board
+        (N,) number of the pose in the order of the unknowns.
+    view
+        (N,) number of the view: two cameras have two views of one board.
+    """
+
+    board_mm: FloatArray
+    residuals_px: FloatArray
+    by_board: FloatArray
+    by_shared: FloatArray
+    by_pose: FloatArray
+    information: FloatArray
+    board: IntArray
+    view: IntArray
+
+    @property
+    def point(self) -> IntArray:
+        """(N,) number of the target's point."""
+        places = np.rint(self.board_mm[:, :2] / SAME_POINT_MM).astype(np.int64)
+        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+    @staticmethod
+    def joined(parts: Sequence[BoardResiduals]) -> BoardResiduals:
+        """All of several cameras' points."""
+        names = BoardResiduals.__slots__
+        return BoardResiduals(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        )
+
+
+def board_residuals(solution: Solution) -> BoardResiduals | None:
+    """The points kept of one camera's solution; None if that is impossible."""
+    observations, state = solution.observations, solution.state
+    prediction = predict(observations, state)
+    if prediction is None:
+        return None
+    predicted, by_shared, by_pose = prediction
+    kept = np.flatnonzero(solution.weights > 0.0)
+    view = np.asarray(observations.view_of_point)[kept]
+    whitening = observations.whitening[kept]
+    return BoardResiduals(
+        observations.board_mm[kept],
+        (observations.points_px - predicted)[kept],
+        by_pose[kept][:, :, 3:] @ state.rotations[view][:, :, :2],
+        by_shared[kept],
+        by_pose[kept],
+        whitening.transpose(0, 2, 1) @ whitening,
+        view,
+        view,
+    )
+
+
+def estimate_target_error(found: BoardResiduals | None) -> TargetError:
     """Find how far target points miss their places, from how residuals agree between views."""
-    by_board, residuals, point = _on_board(solution)
-    if solution.observations.n_views < FEWEST_VIEWS:
+    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
         return TargetError(0.0, 1.0)
+    residuals, by_board, point = found.residuals_px, found.by_board, found.point
     missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
     count = np.bincount(point)
     total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
@@ -60,59 +129,42 @@ def estimate_target_error(solution: Solution) -> TargetError:
 
 
 def covariance_with_target_error(
-    solution: Solution, unit_covariance: FloatArray, error: TargetError
+    unit_covariance: FloatArray,
+    variance_factor: float,
+    error: TargetError,
+    found: BoardResiduals | None,
 ) -> FloatArray:
     """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
 
     Parameters
     ----------
-    solution
-        At the minimum.
     unit_covariance
         From `armscan.calibration.camera.covariance.joint_covariance`.
+    variance_factor
+        sigma0 squared of the solution.
     error
         Of the target.
+    found
+        The residuals that showed it.
     """
-    covariance = error.independent_share * solution.variance_factor * unit_covariance
-    if error.sigma_mm == 0.0:
+    covariance = error.independent_share * variance_factor * unit_covariance
+    if error.sigma_mm == 0.0 or found is None:
         return covariance
-    pull = _pull_of_points(solution, len(unit_covariance))
+    pull = _pull_of_points(found, len(unit_covariance))
     moved = np.tensordot(unit_covariance, pull, axes=(1, 1))
     return np.asarray(covariance + error.sigma_mm**2 * np.einsum("ipk,jpk->ij", moved, moved))
 
 
-def _pull_of_points(solution: Solution, size: int) -> FloatArray:
+def _pull_of_points(found: BoardResiduals, size: int) -> FloatArray:
     """(P, S + 6 V, 2) right-hand side that a unit error of each target point causes."""
-    observations, state = solution.observations, solution.state
-    by_board, _, point = _on_board(solution)
-    kept = np.flatnonzero(solution.weights > 0.0)
-    prediction = predict(observations, state)
-    if prediction is None:
-        return np.zeros((0, size, 2))
-    _, by_shared, by_pose = prediction
-    whitening = observations.whitening[kept]
-    weighted = whitening.transpose(0, 2, 1) @ whitening @ by_board
-    shared = by_shared[kept].transpose(0, 2, 1) @ weighted
-    pose = by_pose[kept].transpose(0, 2, 1) @ weighted
-    n_shared = by_shared.shape[2]
+    point = found.point
+    weighted = found.information @ found.by_board
+    shared = found.by_shared.transpose(0, 2, 1) @ weighted
+    pose = found.by_pose.transpose(0, 2, 1) @ weighted
+    n_shared = found.by_shared.shape[2]
     pull = np.zeros((int(point.max()) + 1, size, 2))
     np.add.at(pull[:, :n_shared], point, shared)
-    first = n_shared + 6 * np.asarray(observations.view_of_point)[kept]
+    first = n_shared + 6 * found.board
     for k in range(6):
         np.add.at(pull, (point, first + k), pose[:, k])
     return pull
-
-
-def _on_board(solution: Solution) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Derivative (N, 2, 2) of kept points by their place on the board, residuals, point number."""
-    observations, state = solution.observations, solution.state
-    kept = solution.weights > 0.0
-    prediction = predict(observations, state)
-    if prediction is None:
-        return np.zeros((0, 2, 2)), np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
-    predicted, _, by_pose = prediction
-    axes = state.rotations[observations.view_of_point][:, :, :2]
-    by_board = (by_pose[:, :, 3:] @ axes)[kept]
-    places = np.rint(observations.board_mm[kept, :2] / SAME_POINT_MM).astype(np.int64)
-    number = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
-    return by_board, (observations.points_px - predicted)[kept], number

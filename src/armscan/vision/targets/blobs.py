@@ -18,6 +18,9 @@ BLOCK_FRACTIONS = (1 / 40, 1 / 12, 1 / 4)
 MAX_ROUNDNESS_ERROR = 0.12
 """Largest deviation of a contour from its ellipse of inertia, as a fraction of the radius."""
 MIN_AXIS_RATIO = 0.25
+SAME_LOG_AREA = 1.0
+"""Blobs around one place whose areas differ by less than this, in logarithm, are one blob found at
+several thresholds; a target's circles never nest."""
 _PIXEL_ERROR = 1.0
 _NOISE_SIGMAS = 5.0
 _PARENT = 3
@@ -50,10 +53,21 @@ class Blobs:
         return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
 
 
-def find_blobs(grey8: Grey8, options: TargetOptions) -> Blobs:
+def find_blobs(
+    grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA
+) -> Blobs:
     """Return every contour that is an ellipse within the range of sizes, once.
 
     A blob found at several threshold scales is kept where its contour is roundest.
+
+    Parameters
+    ----------
+    grey8
+        The image.
+    options
+        Sizes and contrast.
+    same_log_area
+        Where circles nest, less than `SAME_LOG_AREA`, so that their rims stay apart.
     """
     rows: list[tuple[float, ...]] = []
     margin = max(255.0 * options.min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
@@ -72,7 +86,7 @@ def find_blobs(grey8: Grey8, options: TargetOptions) -> Blobs:
             ]
     table = np.array(rows).reshape(-1, 7)
     table = table[np.argsort(table[:, 5], kind="stable")]
-    table = table[_first_of_each(table)]
+    table = table[_first_of_each(table, same_log_area)]
     shapes = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
     return Blobs(table[:, :2].copy(), shapes, table[:, 6] > 0.5)
 
@@ -123,7 +137,7 @@ def _ellipse_of(
     return centre[0], centre[1], grown[0, 0], grown[0, 1], grown[1, 1], error
 
 
-def _first_of_each(table: FloatArray) -> BoolArray:
+def _first_of_each(table: FloatArray, same_log_area: float) -> BoolArray:
     """Keep the first of all blobs whose centres lie within a third of its short half axis."""
     kept = np.ones(len(table), dtype=np.bool_)
     if not len(table):
@@ -135,6 +149,6 @@ def _first_of_each(table: FloatArray) -> BoolArray:
             continue
         near = np.array(tree.query_ball_point(row[:2], 0.35 * np.sqrt(area[k])), dtype=np.int64)
         same = (near > k) & (table[near, 6] == row[6])
-        same &= np.abs(np.log(area[near] / area[k])) < 1.0
+        same &= np.abs(np.log(area[near] / area[k])) < same_log_area
         kept[near[same]] = False
     return kept

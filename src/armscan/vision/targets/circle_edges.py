@@ -45,6 +45,8 @@ class MeasuredCircles:
         The fits.
     blur_px
         (N,) standard deviation of the edges.
+    contrast_levels
+        (N,) level outside minus level inside.
     """
 
     points_px: FloatArray
@@ -52,10 +54,15 @@ class MeasuredCircles:
     is_good: BoolArray
     ellipses: Ellipses
     blur_px: FloatArray
+    contrast_levels: FloatArray
 
 
 def measure_circles(
-    grey: RawGrey, centres_px: FloatArray, shapes_px2: FloatArray, min_contrast_levels: float
+    grey: RawGrey,
+    centres_px: FloatArray,
+    shapes_px2: FloatArray,
+    min_contrast_levels: float,
+    max_band_px: FloatArray | float = np.inf,
 ) -> MeasuredCircles:
     """Measure circles on raw pixels.
 
@@ -67,6 +74,8 @@ def measure_circles(
         (N, 2) and (N, 2, 2): ellipses to about 2 px; ``d' S^-1 d = 1`` on the rim.
     min_contrast_levels
         Circles with less contrast are not good.
+    max_band_px
+        (N,) largest half width of the band of pixels looked at, where other edges are near.
     """
     rims = Rims.from_shapes(centres_px, shapes_px2)
     perimeter = float(np.median(np.pi * rims.half_px.sum(axis=1)))
@@ -77,7 +86,7 @@ def measure_circles(
     angle = np.asarray((np.arange(n_sectors) + 0.5) * (2.0 * np.pi / n_sectors), np.float64)
     before: EdgeProfiles | None = None
     for _ in range(_ROUNDS):
-        width = np.minimum(width, _widest(rims))
+        width = np.minimum(np.minimum(width, max_band_px), _widest(rims))
         pixels = band_pixels(grey, rims, width, gradient)
         before = profiles = fit_profiles(pixels, n_sectors, blur, before)
         points, sigma = _edge_points(rims, angle, profiles)
@@ -86,11 +95,11 @@ def measure_circles(
         rims = _updated(rims, ellipses)
         blur = profiles.blur_px
         width = BAND_BLURS * blur + 1.0
-    contrast = np.abs(np.median(profiles.contrast, axis=1))
-    is_good = ellipses.is_ellipse & (contrast >= min_contrast_levels)
+    contrast = np.median(profiles.contrast, axis=1)
+    is_good = ellipses.is_ellipse & (np.abs(contrast) >= min_contrast_levels)
     is_good &= np.isfinite(sigma).mean(axis=1) >= _MIN_EDGE_FRACTION
     is_good &= np.hypot(*(rims.centres_px - centres_px).T) < 0.5 * rims.half_px[:, 0]
-    return MeasuredCircles(points, sigma, is_good, ellipses, blur)
+    return MeasuredCircles(points, sigma, is_good, ellipses, blur, contrast)
 
 
 def _widest(rims: Rims) -> FloatArray:

@@ -8,14 +8,18 @@ this cannot fail for an ellipse, because the origin lies inside it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 
 _STEPS = 12
 _TERMS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2))
+_TERM_MATRICES = np.zeros((5, 3, 3))
+for _k, (_i, _j) in enumerate(_TERMS):
+    _TERM_MATRICES[_k, _i, _j] = _TERM_MATRICES[_k, _j, _i] = 1.0
+_TERM_MATRICES.setflags(write=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,9 +82,7 @@ class Ellipses:
         inverse = np.linalg.inv(self.matrices)
         pole = np.einsum("nij,nj->ni", inverse, own)
         dpole = np.zeros((len(own), 3, 5))
-        for k, (i, j) in enumerate(_TERMS):
-            derivative = np.zeros((3, 3))
-            derivative[i, j] = derivative[j, i] = 1.0
+        for k, derivative in enumerate(_TERM_MATRICES):
             dpole[:, :, k] = -np.einsum("nij,jk,nk->ni", inverse, derivative, pole)
         xy = pole[:, :2] / pole[:, 2:]
         dxy = (dpole[:, :2] - xy[:, :, None] * dpole[:, 2:]) / pole[:, 2:, None]
@@ -107,17 +109,47 @@ class Ellipses:
         own = (points_px - self.origin_px[:, None]) / self.scale_px[:, None, None]
         return _sampson(own, self.terms)[0] * self.scale_px[:, None]
 
+    def conics_in(self, origin_px: FloatArray, unit_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Conics in coordinates shifted to (N, 2) origins and divided by (N,) units.
+
+        Returns
+        -------
+        conics
+            (N, 3, 3); positive outside the ellipse, negative inside.
+        by_terms
+            (N, 5, 3, 3) their derivative by ``terms``.
+        """
+        change = np.zeros((len(self.terms), 3, 3))
+        change[:, 0, 0] = change[:, 1, 1] = unit_px / self.scale_px
+        change[:, :2, 2] = (origin_px - self.origin_px) / self.scale_px[:, None]
+        change[:, 2, 2] = 1.0
+        turned = change.transpose(0, 2, 1)
+        by_terms = turned[:, None] @ _TERM_MATRICES @ change[:, None]
+        return turned @ self.matrices @ change, by_terms
+
+    @staticmethod
+    def circles(origin_px: FloatArray) -> Ellipses:
+        """Circles of radius 1 px around (N, 2) places: stand-ins for what was not fitted."""
+        n = len(origin_px)
+        terms = np.tile([1.0, 0.0, 1.0, 0.0, 0.0], (n, 1))
+        covariance = np.tile(np.eye(5), (n, 1, 1))
+        return Ellipses(origin_px, np.ones(n), terms, covariance, np.zeros(n), np.zeros(n))
+
+    def subset(self, rows: IntArray) -> Ellipses:
+        """Return the ellipses of some rows, in that order."""
+        return Ellipses(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def replaced(self, rows: IntArray, others: Ellipses) -> Ellipses:
+        """Return a copy in which some rows hold others."""
+        arrays = [getattr(self, field.name).copy() for field in fields(self)]
+        for array, field in zip(arrays, fields(self), strict=True):
+            array[rows] = getattr(others, field.name)
+        return Ellipses(*arrays)
+
     def circles_where(self, replaced: BoolArray, origin_px: FloatArray) -> Ellipses:
         """Return a copy with unit circles at (N, 2) origins where a fit is to be replaced."""
-        circle = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
-        return Ellipses(
-            np.where(replaced[:, None], origin_px, self.origin_px),
-            np.where(replaced, 1.0, self.scale_px),
-            np.where(replaced[:, None], circle, self.terms),
-            np.where(replaced[:, None, None], np.eye(5), self.covariance),
-            self.chi2,
-            self.degrees_of_freedom,
-        )
+        rows = np.flatnonzero(replaced)
+        return self.replaced(rows, Ellipses.circles(origin_px[rows]))
 
     def _own_lines(self, lines_px: FloatArray) -> FloatArray:
         own = lines_px.copy()

@@ -13,7 +13,14 @@ from typing import Any
 import pytest
 
 from armscan.pipeline.head_demo import HeadOptions
-from armscan.report.head_demo_job import HEAD, OWN_NAMES, HeadDemoRequest, run_head_demo
+from armscan.report.head_demo_job import (
+    DOCUMENTS,
+    RECORDINGS,
+    RESULTS,
+    TRUTH,
+    HeadDemoRequest,
+    run_head_demo,
+)
 from armscan.report.summary import Summary
 from armscan.storage.clouds import read_ply
 from armscan.storage.recording_reader import read_recording
@@ -22,6 +29,7 @@ from armscan.storage.scanner_files import read_scanner_calibration
 FEW = HeadOptions(
     {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}
 )
+HEAD = "thesis-single"
 CHI_6_IN_999 = math.sqrt(22.46)
 """Length of six standard normal numbers that one in a thousand exceeds."""
 
@@ -36,13 +44,18 @@ class Done:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
     folder = tmp_path_factory.mktemp("single") / "demo"
-    summary = run_head_demo(HeadDemoRequest(folder, seed=3, options=FEW, processes=1))
+    summary = run_head_demo(HeadDemoRequest(folder, HEAD, seed=3, options=FEW, processes=1))
     content = json.loads((folder / "summary.json").read_text("utf-8"))
     return Done(folder, summary, content["heads"][HEAD])
 
 
 def test_everything_is_written_and_nothing_else(demo: Done) -> None:
-    assert {path.name for path in demo.folder.iterdir()} == OWN_NAMES
+    assert {path.name for path in demo.folder.iterdir()} == {
+        RECORDINGS,
+        TRUTH,
+        *DOCUMENTS,
+        *RESULTS,
+    }
     scanner = read_scanner_calibration(demo.folder / "scanner.json")
     assert scanner.provenance.parent_ids == (scanner.sensor.provenance.document_id,)
     assert read_ply(demo.folder / "cloud.ply").frame == "Base"

@@ -47,6 +47,7 @@ def demo(
         if scene is Scene.PHOTOS:
             summary = run_photo_demo(DemoRequest(output, seed), progress)
         else:
-            request = HeadDemoRequest(output, seed, cast(Preset, preset))
+            head = f"thesis-{scene.value}"
+            request = HeadDemoRequest(output, head, seed, cast(Preset, preset))
             summary = run_head_demo(request, progress)
     show(summary, as_json=as_json)

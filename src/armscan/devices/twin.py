@@ -24,6 +24,7 @@ TwinScene = Literal[
     "part",
     "waves",
     "markers",
+    "markers-moved",
     "probing",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
@@ -134,6 +135,10 @@ class Twin(Protocol):
     @property
     def target(self) -> str:
         """The calibration target as the command line names it."""
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the laser sources, each switched by itself."""
 
     @property
     def truth(self) -> TwinTruth:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A single-line arm scanner calibrated from its scans: camera, light sheet, plate, hand-eye."""
+"""An arm scanner of any head calibrated from its scans: camera, light sheet, plate, hand-eye."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -11,24 +10,25 @@ from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.calibration.hand_eye.probed_plate import plate_from_probing
 from armscan.calibration.laser.result import LaserFit
 from armscan.devices.scan_source import ScanSource
-from armscan.devices.twin import Probing, TwinScene
+from armscan.devices.twin import Probing, Twin
 from armscan.errors import EstimationError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.models.probe_tip import tip_centres, tool_from_probe
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
-from armscan.pipeline.hand_eye import HandEyeRun
+from armscan.pipeline.documents import camera_calibration, sensor_calibration
+from armscan.pipeline.hand_eye import HandEyeRun, calibrate_hand_eye_from_scan
 from armscan.pipeline.laser import calibrate_sheets_from_exposures
 from armscan.pipeline.progress import Progress
+from armscan.pipeline.stopwatch import Stopwatch
+from armscan.pipeline.twin_scans import TwinScans
 from armscan.records.exposure import Exposure
 from armscan.records.probing import ProbedPoints
 from armscan.vision.targets.definition import Target
+from armscan.vision.targets.specification import parse_target
 
 T = TypeVar("T")
-
-ScanOf = Callable[[TwinScene], ScanSource]
-"""Gives the scan of a scene."""
 
 IN_MEMORY = Provenance("in memory", "", "", (), ())
 
@@ -57,9 +57,46 @@ class Instrument:
     hand_eye: HandEyeRun
 
     @property
+    def cameras(self) -> tuple[CameraCalibration, ...]:
+        """The camera or cameras, left first."""
+        second = self.sensor.second
+        return (self.camera,) if second is None else (self.camera, second.camera)
+
+    @property
     def scanner(self) -> ScannerCalibration:
         """All together."""
         return ScannerCalibration(self.sensor, self.hand_eye.fit.calibration, IN_MEMORY)
+
+
+def calibrate_head(
+    twin: Twin, scans: TwinScans, progress: Progress, watch: Stopwatch
+) -> Instrument:
+    """Camera, light sheets, plate and hand-eye of a twin.
+
+    Raises
+    ------
+    EstimationError
+        If a scan does not determine what rests on it.
+    """
+    target = parse_target(twin.target)
+    camera_run = watch.timed(
+        "calibrate_camera",
+        lambda: calibrate_camera_of(scans.calibration("camera"), target, progress),
+    )
+    camera = camera_calibration(camera_run.fit, IN_MEMORY)
+    laser = watch.timed(
+        "calibrate_laser",
+        lambda: calibrate_sheets_of(scans.calibration("laser"), target, camera, progress),
+    )
+    sensor = sensor_calibration(laser, IN_MEMORY)
+    plate = watch.timed("probe_plate", lambda: plate_of(twin.probe_plate()))
+    hand_eye = watch.timed(
+        "calibrate_hand_eye",
+        lambda: calibrate_hand_eye_from_scan(
+            scans.calibration("hand-eye"), sensor, plate, progress=progress
+        ),
+    )
+    return Instrument(camera_run, camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
 
 
 def calibrate_camera_of(source: ScanSource, target: Target, progress: Progress) -> CameraRun:

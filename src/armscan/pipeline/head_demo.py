@@ -1,39 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole chain on a simulated single-line arm scanner, from rendered images to inspections."""
+"""The whole chain on a simulated arm scanner of any head, from rendered images to inspections."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from time import perf_counter
-from typing import TypeVar
+from functools import partial
 
-from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Twin, TwinScene
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
-from armscan.pipeline.documents import camera_calibration, sensor_calibration
-from armscan.pipeline.fewer_views import FewerViews
-from armscan.pipeline.hand_eye import calibrate_hand_eye_from_scan
-from armscan.pipeline.head_calibration import (
-    IN_MEMORY,
-    Instrument,
-    ScanOf,
-    calibrate_camera_of,
-    calibrate_sheets_of,
-    plate_of,
-    succeeded,
-)
+from armscan.pipeline.head_calibration import Instrument, calibrate_head
 from armscan.pipeline.head_measurements import (
     MeasuredPart,
-    measure_ball,
-    measure_part,
-    measure_plate,
-    measure_steps,
+    inspect_ball,
+    inspect_part,
+    inspect_plate,
+    inspect_steps,
     measure_still_step,
+    still_height_mm,
 )
+from armscan.pipeline.naming_truth import NamingErrors, naming_errors
 from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.scan import measure_scan
 from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.stopwatch import Stopwatch
 from armscan.pipeline.truth_errors import (
     CameraErrors,
     HandEyeErrors,
@@ -42,14 +33,10 @@ from armscan.pipeline.truth_errors import (
     hand_eye_errors,
     sheet_errors,
 )
-from armscan.vision.targets.specification import parse_target
+from armscan.pipeline.twin_scans import RenderedScans, TwinScans
 
-T = TypeVar("T")
-
-SCENES: tuple[TwinScene, ...] = (
-    "camera", "laser", "hand-eye", "plate", "ball", "steps", "still-step", "part",
-)  # fmt: skip
-"""Scenes that the chain scans, in its order; the plate is probed besides."""
+ONE_SHEET_SCENES: tuple[TwinScene, ...] = ("plate", "ball", "steps", "part")
+"""Scenes scanned by hand with a head of one sheet; where sheets are named, waves come besides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +54,20 @@ class HeadOptions:
 
 @dataclass(frozen=True, slots=True)
 class HeadErrors:
-    """Errors of the calibrations against the twin's truth."""
+    """Errors of the calibrations against the twin's truth.
 
-    camera: CameraErrors
-    sheet: SheetErrors
+    Parameters
+    ----------
+    cameras
+        One a camera, left first.
+    sheets
+        One a light sheet, in the order of the calibration.
+    hand_eye
+        Where the sensor sits on the arm.
+    """
+
+    cameras: tuple[CameraErrors, ...]
+    sheets: tuple[SheetErrors, ...]
     hand_eye: HandEyeErrors
 
 
@@ -82,17 +79,19 @@ class HeadDemo:
     ----------
     instrument
         The calibrated scanner.
-    plate_scan, plate
-        The plate, and its inspection.
-    ball_scan, ball
-        The ball, and its inspection.
+    scans
+        Points in Base of every scene that was scanned by hand.
+    plate, ball
+        Inspections of the plate and of the ball.
     steps
         One inspection a gauge block, through the arm.
     still_step, still_normal
-        The block in one exposure, in Sensor; and the normal (3,) of its faces there, from the
+        A block in one exposure, in Sensor; and the normal (3,) of its faces there, from the
         arm's pose.
     part
         The free-form part.
+    naming
+        Names of stripes against the truth, by scene; empty for a head of one sheet.
     errors
         Of the calibrations.
     seconds
@@ -100,31 +99,16 @@ class HeadDemo:
     """
 
     instrument: Instrument
-    plate_scan: ScanReconstruction
+    scans: Mapping[TwinScene, ScanReconstruction]
     plate: PlaneInspection
-    ball_scan: ScanReconstruction
     ball: SphereInspection
     steps: tuple[StepInspection, ...]
     still_step: StepInspection
     still_normal: FloatArray
     part: MeasuredPart
+    naming: Mapping[TwinScene, NamingErrors]
     errors: HeadErrors
     seconds: Mapping[str, float]
-
-
-class Stopwatch:
-    """Seconds of named stages."""
-
-    def __init__(self) -> None:
-        """Start with no stage."""
-        self.seconds: dict[str, float] = {}
-
-    def timed(self, stage: str, work: Callable[[], T]) -> T:
-        """Do the work and note how long it took."""
-        start = perf_counter()
-        result = work()
-        self.seconds[stage] = round(perf_counter() - start, 2)
-        return result
 
 
 def run_head(
@@ -132,7 +116,7 @@ def run_head(
     options: HeadOptions | None = None,
     progress: Progress = silent,
     *,
-    scans: Mapping[TwinScene, ScanSource] | None = None,
+    scans: TwinScans | None = None,
 ) -> HeadDemo:
     """Calibrate the twin's scanner from its scans, measure its things, compare with the truth.
 
@@ -145,7 +129,7 @@ def run_head(
     progress
         Told of every exposure.
     scans
-        Recordings of the twin's scenes; scenes that are not there are rendered when read.
+        Where scans come from; None renders them when they are read.
 
     Raises
     ------
@@ -153,77 +137,67 @@ def run_head(
         If a stage does not determine its result.
     """
     options = options or HeadOptions()
-
-    def scan_of(scene: TwinScene) -> ScanSource:
-        found = (scans or {}).get(scene)
-        source = twin.scan(scene) if found is None else found
-        most = options.most_views.get(scene)
-        return source if most is None else FewerViews(source, most)
-
+    given = scans or RenderedScans(twin, options.most_views)
     watch = Stopwatch()
-    instrument = calibrate_head(twin, scan_of, progress, watch)
-    truth = twin.truth
-    plate_scan, plate = watch.timed(
-        "plate", lambda: measure_plate(scan_of("plate"), instrument, progress)
-    )
-    ball_scan, ball = watch.timed(
-        "ball",
-        lambda: measure_ball(scan_of("ball"), instrument, truth.ball_diameter_mm, progress),
-    )
-    steps = watch.timed(
-        "steps",
-        lambda: measure_steps(scan_of("steps"), instrument, truth.step_heights_mm, progress),
-    )
+    instrument = calibrate_head(twin, given, progress, watch)
+    scanner, truth = instrument.scanner, twin.truth
+    scenes = scanned_scenes(instrument)
+    sources = {
+        scene: watch.timed(f"take_{scene}", partial(given.scanned, scene, scanner, progress))
+        for scene in (*scenes, "still-step")
+    }
+    found = {
+        scene: watch.timed(scene, partial(measure_scan, sources[scene], scanner, progress=progress))
+        for scene in scenes
+    }
+    steps = inspect_steps(found["steps"], truth.step_heights_mm)
     still, still_normal = watch.timed(
         "still_step",
-        lambda: measure_still_step(scan_of("still-step"), instrument, steps[0].normal, progress),
+        lambda: measure_still_step(
+            sources["still-step"], instrument, steps[0].normal, still_height_mm(instrument)
+        ),
     )
-    part = watch.timed("part", lambda: measure_part(scan_of("part"), instrument, truth, progress))
-    errors = calibration_errors(twin, instrument)
+    naming: dict[TwinScene, NamingErrors] = {}
+    if len(scenes) > len(ONE_SHEET_SCENES):
+        naming = {
+            scene: watch.timed(
+                "compare_names", partial(naming_errors, found[scene], twin.scan(scene))
+            )
+            for scene in scenes
+        }
     return HeadDemo(
         instrument,
-        plate_scan,
-        plate,
-        ball_scan,
-        ball,
+        found,
+        inspect_plate(found["plate"], instrument),
+        inspect_ball(found["ball"], truth.ball_diameter_mm),
         steps,
         still,
         still_normal,
-        part,
-        errors,
+        inspect_part(found["part"], truth),
+        naming,
+        calibration_errors(twin, instrument),
         watch.seconds,
     )
 
 
-def calibrate_head(twin: Twin, scan_of: ScanOf, progress: Progress, watch: Stopwatch) -> Instrument:
-    """Camera, light sheet, plate and hand-eye; arguments and errors as `run_head`."""
-    target = parse_target(twin.target)
-    camera_run = watch.timed(
-        "calibrate_camera", lambda: calibrate_camera_of(scan_of("camera"), target, progress)
-    )
-    camera = camera_calibration(camera_run.fit, IN_MEMORY)
-    laser = watch.timed(
-        "calibrate_laser", lambda: calibrate_sheets_of(scan_of("laser"), target, camera, progress)
-    )
-    sensor = sensor_calibration(laser, IN_MEMORY)
-    plate = watch.timed("probe_plate", lambda: plate_of(twin.probe_plate()))
-    hand_eye = watch.timed(
-        "calibrate_hand_eye",
-        lambda: calibrate_hand_eye_from_scan(scan_of("hand-eye"), sensor, plate, progress=progress),
-    )
-    return Instrument(camera_run, camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
+def scanned_scenes(instrument: Instrument) -> tuple[TwinScene, ...]:
+    """Scenes that are scanned by hand: where sheets must be named, a wavy plate too."""
+    return ONE_SHEET_SCENES if len(instrument.sensor.sheets) == 1 else (*ONE_SHEET_SCENES, "waves")
 
 
 def calibration_errors(twin: Twin, instrument: Instrument) -> HeadErrors:
     """How far the calibrations are from the twin's truth."""
     truth, sensor = twin.truth, instrument.sensor
-    own = sensor.sheet_parameter_slice(0)
+    cameras = [camera_errors(sensor.camera, truth.camera_parameters)]
+    if sensor.second is not None and truth.right_camera_parameters is not None:
+        cameras.append(camera_errors(sensor.second.camera, truth.right_camera_parameters))
+    sheets = []
+    for k, sheet in enumerate(sensor.sheets):
+        own = sensor.sheet_parameter_slice(k)
+        points = truth.sheet_points_mm[sheet.name]
+        low, high = sheet.depth_range_mm
+        inside = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+        sheets.append(sheet_errors(sheet, sensor.covariance[own, own], inside))
     return HeadErrors(
-        camera_errors(instrument.camera, truth.camera_parameters),
-        sheet_errors(
-            sensor.sheets[0],
-            sensor.covariance[own, own],
-            truth.sheet_points_mm[sensor.sheets[0].name],
-        ),
-        hand_eye_errors(instrument.scanner, truth.tool_from_sensor),
+        tuple(cameras), tuple(sheets), hand_eye_errors(instrument.scanner, truth.tool_from_sensor)
     )

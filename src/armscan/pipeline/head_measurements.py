@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibrated single-line arm scanner measures of the twin's things, against their truth."""
+"""What a calibrated arm scanner measures of the twin's things, against their truth."""
 
 from __future__ import annotations
 
@@ -16,15 +16,13 @@ from armscan.inspection.results import PlaneInspection, SphereInspection, StepIn
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
 from armscan.pipeline.head_calibration import Instrument, succeeded
-from armscan.pipeline.progress import Progress
 from armscan.pipeline.reconstruct import reconstruct
-from armscan.pipeline.scan import measure_scan
 from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.cloud import PointCloud
 
 STILL_HEIGHT_MM = 20.0
-"""Height of the block of the scene ``still-step``, as in figure 5.19."""
+STEREO_STILL_HEIGHT_MM = 5.0
 PART_REACH_MM = 1.0
 """Points of the part's scan further than this from its surface lie on what stands around it."""
 
@@ -63,39 +61,37 @@ class MeasuredPart:
         return float(np.mean(np.abs(self.distance_mm) <= limit_mm))
 
 
-def measure_plate(
-    source: ScanSource, instrument: Instrument, progress: Progress
-) -> tuple[ScanReconstruction, PlaneInspection]:
-    """Scan of the plate, and its points against the fitted and the probed plane.
+def inspect_plate(scan: ScanReconstruction, instrument: Instrument) -> PlaneInspection:
+    """Points of the plate against the fitted and the probed plane.
 
     Raises
     ------
     EstimationError
         If no plane was found.
     """
-    scan = measure_scan(source, instrument.scanner, progress=progress)
-    plane = inspect_plane(scan.cloud, instrument.plate.plane, reference_text="the probed plane")
-    return scan, succeeded(plane, source.name)
+    plane = instrument.plate.plane
+    return succeeded(inspect_plane(scan.cloud, plane, reference_text="the probed plane"), "plate")
 
 
-def measure_ball(
-    source: ScanSource, instrument: Instrument, diameter_mm: float, progress: Progress
-) -> tuple[ScanReconstruction, SphereInspection]:
-    """Scan of the ball, and its points against fitted and nominal diameter; raises the same."""
-    scan = measure_scan(source, instrument.scanner, progress=progress)
-    return scan, succeeded(inspect_sphere(scan.cloud, diameter_mm), source.name)
+def inspect_ball(scan: ScanReconstruction, diameter_mm: float) -> SphereInspection:
+    """Points of the ball against fitted and nominal diameter; raises the same."""
+    return succeeded(inspect_sphere(scan.cloud, diameter_mm), "ball")
 
 
-def measure_steps(
-    source: ScanSource, instrument: Instrument, heights_mm: tuple[float, ...], progress: Progress
+def inspect_steps(
+    scan: ScanReconstruction, heights_mm: tuple[float, ...]
 ) -> tuple[StepInspection, ...]:
     """Heights of gauge blocks through the arm; raises the same."""
-    cloud = measure_scan(source, instrument.scanner, progress=progress).cloud
-    return tuple(succeeded(inspect_step(cloud, height), source.name) for height in heights_mm)
+    return tuple(succeeded(inspect_step(scan.cloud, height), "steps") for height in heights_mm)
+
+
+def still_height_mm(instrument: Instrument) -> float:
+    """Height of the block of the scene ``still-step``: figure 5.19, or 5.33 with two cameras."""
+    return STILL_HEIGHT_MM if instrument.sensor.second is None else STEREO_STILL_HEIGHT_MM
 
 
 def measure_still_step(
-    source: ScanSource, instrument: Instrument, normal_base: FloatArray, progress: Progress
+    source: ScanSource, instrument: Instrument, normal_base: FloatArray, height_mm: float
 ) -> tuple[StepInspection, FloatArray]:
     """Height of a block from one exposure, in the Sensor frame; raises the same.
 
@@ -105,13 +101,13 @@ def measure_still_step(
     Parameters
     ----------
     source
-        One exposure.
+        One exposure, of each camera.
     instrument
         The scanner.
     normal_base
         (3,) normal of the faces in Base, as the scan of the blocks gave it.
-    progress
-        Told of the exposure.
+    height_mm
+        Nominal height.
 
     Returns
     -------
@@ -121,20 +117,18 @@ def measure_still_step(
     poses = exposure_poses(source.rows, source.arm, source.session.clock)
     base_from_sensor = poses.pose(0) @ instrument.scanner.hand_eye.tool_from_sensor
     normal = base_from_sensor.rotation.T @ normal_base
-    cloud = reconstruct([source.exposure(0)], instrument.sensor, progress=progress).cloud
-    return succeeded(inspect_step(cloud, STILL_HEIGHT_MM, normal=normal), source.name), normal
+    first, *others = (source.exposure(row) for row in range(len(source.rows)))
+    cloud = reconstruct([first], instrument.sensor, rights=others).cloud
+    return succeeded(inspect_step(cloud, height_mm, normal=normal), source.name), normal
 
 
-def measure_part(
-    source: ScanSource, instrument: Instrument, truth: TwinTruth, progress: Progress
-) -> MeasuredPart:
-    """Scan of the free-form part, and its points against the true surface; raises the same."""
-    scan = measure_scan(source, instrument.scanner, progress=progress)
+def inspect_part(scan: ScanReconstruction, truth: TwinTruth) -> MeasuredPart:
+    """Points of the free-form part against the true surface; raises the same."""
     cloud = scan.cloud
     distance = truth.part_distance_mm(cloud.points_mm)
     rows = np.flatnonzero(np.abs(distance) <= PART_REACH_MM)
     if len(rows) == 0:
-        raise EstimationError("no measured point lies on the part", where=source.name)
+        raise EstimationError("no measured point lies on the part")
     sigma = _sigma_along(cloud, truth, rows)
     normalised = float(np.sqrt(np.mean((distance[rows] / sigma) ** 2)))
     return MeasuredPart(scan, rows, distance[rows], len(cloud) - len(rows), normalised)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What ``demo single`` found, for programs: the layout of ``summary.json``."""
+"""What the demo of a head found, for programs: the layout of ``summary.json``."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.results import Deviations, PointCounts, StepInspection
 from armscan.pipeline.head_demo import HeadDemo
+from armscan.pipeline.naming_truth import NamingErrors
 from armscan.pipeline.scan_result import ScanReconstruction
 from armscan.reconstruction.result import PointFate
 from armscan.report.hand_eye_numbers import total_covariance
@@ -41,10 +43,10 @@ def head_data(demo: HeadDemo) -> dict[str, Any]:
     scanner = demo.instrument.scanner
     variance = np.diag(total_covariance(scanner))
     errors = demo.errors.hand_eye
-    scans = (demo.plate_scan, demo.ball_scan, demo.part.scan)
+    scans = [demo.scans[scene] for scene in ("plate", "ball", "part")]
     sheets = demo.instrument.sensor.sheets
     return {
-        "camera": [{"rms_px": demo.instrument.camera.rms_px}],
+        "camera": [{"rms_px": camera.rms_px} for camera in demo.instrument.cameras],
         "sheets": [{"name": sheet.name, "rms_mm": sheet.rms_mm} for sheet in sheets],
         "hand_eye": {
             "rotation_error_deg": errors.rotation_deg,
@@ -79,25 +81,31 @@ def head_data(demo: HeadDemo) -> dict[str, Any]:
             "fraction_within_0p05mm": demo.part.fraction_within(0.05),
             "normalised_rms": demo.part.normalised_rms,
         },
-        "named_stripes_per_exposure": named_stripes(scans),
-        "points_per_exposure": points_per_exposure(scans),
+        "named_stripes_per_exposure": float(np.mean([stripes for stripes, _ in instants(scans)])),
+        "points_per_exposure": float(np.mean([points for _, points in instants(scans)])),
+        "naming": {scene: naming_data(found) for scene, found in demo.naming.items()},
     }
 
 
-def named_stripes(scans: Sequence[ScanReconstruction]) -> float:
-    """Mean count of light sheets that gave a measured point, an exposure."""
-    counts = [
-        len(set(image.sheet[image.fate == int(PointFate.MEASURED)].tolist()))
-        for scan in scans
-        for image in scan.images
-    ]
-    return float(np.mean(counts))
+def instants(scans: Sequence[ScanReconstruction]) -> list[tuple[int, int]]:
+    """Light sheets that gave a measured point, and measured points, of every instant.
+
+    What two cameras saw at one instant counts once.
+    """
+    found: dict[tuple[int, int], tuple[set[int], int]] = {}
+    for number, scan in enumerate(scans):
+        for row, image in zip(scan.image_rows, scan.images, strict=True):
+            key = (number, scan.exposures[row].row.t_ns)
+            sheets, count = found.get(key, (set(), 0))
+            measured = image.fate == int(PointFate.MEASURED)
+            sheets = sheets | set(image.sheet[measured].tolist())
+            found[key] = (sheets, count + int(measured.sum()))
+    return [(len(sheets), count) for sheets, count in found.values()]
 
 
-def points_per_exposure(scans: Sequence[ScanReconstruction]) -> float:
-    """Mean count of measured points, an exposure."""
-    counts = [image.count(PointFate.MEASURED) for scan in scans for image in scan.images]
-    return float(np.mean(counts))
+def naming_data(found: NamingErrors) -> dict[str, Any]:
+    """Names against the truth: counts over the instants that were checked."""
+    return {**asdict(found), "wrong_share": found.wrong_share, "named_share": found.named_share}
 
 
 def fraction_within(values_mm: FloatArray, limit_mm: float) -> float:

@@ -18,7 +18,10 @@ from armscan.report.page import Picture
 T = TypeVar("T")
 
 MAX_PICTURES = 24
-SHEET_COLOURS = ("#2fe6c3", "#5aa9ff", "#c58bff", "#a6e22e", "#ffc2f2", "#8fd3ff")
+SHEET_COLOURS = (
+    "#2fe6c3", "#5aa9ff", "#c58bff", "#a6e22e", "#ffc2f2", "#8fd3ff",
+    "#ffb35c", "#4dd0e1", "#f48fb1", "#dce775", "#b39ddb", "#80cbc4",
+)  # fmt: skip
 """Bright colours of the sheets on photographs, in order, then repeated."""
 FLAG_COLOURS = {
     StripeFlag.BACKGROUND_STEP: ("#ff9f1c", "flagged: background step"),

@@ -14,7 +14,12 @@ from armscan.report.stripe_figures import (
     stripe_picture,
 )
 
-FATE_COLOURS = {PointFate.NO_RAY: "#8a6d5a", PointFate.OUT_OF_DEPTH: "#ff7a3c"}
+FATE_COLOURS = {
+    PointFate.NO_RAY: "#8a6d5a",
+    PointFate.OUT_OF_DEPTH: "#ff7a3c",
+    PointFate.AMBIGUOUS: "#ffd23f",
+    PointFate.STRAY: "#ff4d6d",
+}
 
 
 def stripe_gallery(

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrations and the cloud that a demo writes, each with what it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from armscan.devices.twin import TwinScene
+from armscan.models.calibration import Provenance
+from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.head_demo import HeadDemo
+from armscan.storage.calibration_files import camera_document, sensor_document
+from armscan.storage.clouds import ply_bytes
+from armscan.storage.provenance import new_provenance
+from armscan.storage.recording_exposures import EXPOSURES_FILE
+from armscan.storage.recording_reader import FolderRecording
+from armscan.storage.recording_session import SESSION_FILE
+from armscan.storage.scanner_files import scanner_document
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOrigin:
+    """Where a demo's files come from.
+
+    Parameters
+    ----------
+    command
+        The command line.
+    folder, place
+        Where they will lie, and where they lie yet.
+    """
+
+    command: tuple[str, ...]
+    folder: Path
+    place: Path
+
+    def provenance(self, files: Iterable[Path], *parents: str) -> Provenance:
+        """Provenance that names files in ``place`` as they will be in ``folder``."""
+        found = new_provenance(files, command=self.command, parent_ids=parents)
+        inputs = tuple(
+            replace(item, path=(self.folder / Path(item.path).relative_to(self.place)).as_posix())
+            for item in found.inputs
+        )
+        return replace(found, inputs=inputs)
+
+    def of_recording(self, recording: FolderRecording, *parents: str) -> Provenance:
+        """Provenance of what rests on a recording."""
+        folder = recording.folder
+        return self.provenance((folder / EXPOSURES_FILE, folder / SESSION_FILE), *parents)
+
+
+def demo_documents(
+    demo: HeadDemo, scans: Mapping[TwinScene, FolderRecording], origin: DemoOrigin
+) -> dict[Path, bytes]:
+    """Files to write: camera or cameras, sensor, scanner, and the part's cloud."""
+    found, place = demo.instrument, origin.place
+    camera = replace(found.camera, provenance=origin.of_recording(scans["camera"]))
+    sensor = replace(
+        found.sensor,
+        camera=camera,
+        provenance=origin.of_recording(scans["laser"], camera.provenance.document_id),
+    )
+    scanner = ScannerCalibration(
+        sensor,
+        found.hand_eye.fit.calibration,
+        origin.of_recording(scans["hand-eye"], sensor.provenance.document_id),
+    )
+    return {
+        place / "camera.json": camera_document(camera),
+        place / "sensor.json": sensor_document(sensor),
+        place / "scanner.json": scanner_document(scanner),
+        place / "cloud.ply": ply_bytes(demo.part.scan.cloud),
+    }

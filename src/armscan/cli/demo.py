@@ -18,6 +18,9 @@ class Scene(StrEnum):
     """What can be shown."""
 
     SINGLE = "single"
+    CROSS = "cross"
+    MULTI = "multi"
+    ALL = "all"
     PHOTOS = "photos"
 
 
@@ -25,7 +28,8 @@ def demo(
     scene: Annotated[
         Scene,
         typer.Argument(
-            help="single: a line scanner on a measuring arm, with plate, ball, blocks and part; "
+            help="single, cross, multi: a scanner of one, two crossed or eleven lines on a "
+            "measuring arm, with plate, ball, blocks and part; all: the three beside each other; "
             "photos: a camera, a line laser, a board and a bust."
         ),
     ] = Scene.SINGLE,
@@ -42,10 +46,14 @@ def demo(
     from armscan.devices.twin import Preset
     from armscan.report.demo_job import DemoRequest, run_photo_demo
     from armscan.report.head_demo_job import HeadDemoRequest, run_head_demo
+    from armscan.report.three_heads_job import run_three_heads
 
     with progress_bar() as progress:
         if scene is Scene.PHOTOS:
             summary = run_photo_demo(DemoRequest(output, seed), progress)
+        elif scene is Scene.ALL:
+            request = HeadDemoRequest(output, seed=seed, preset=cast(Preset, preset))
+            summary = run_three_heads(request, progress)
         else:
             head = f"thesis-{scene.value}"
             request = HeadDemoRequest(output, head, seed, cast(Preset, preset))

@@ -98,6 +98,19 @@ def run_head_demo(request: HeadDemoRequest, progress: Progress = silent) -> Summ
     ArmscanError
         If the folder holds something else than an earlier demo or cannot be written.
     """
+    return make_head_demo(request, progress)[0]
+
+
+def make_head_demo(
+    request: HeadDemoRequest, progress: Progress = silent
+) -> tuple[Summary, HeadDemo]:
+    """As `run_head_demo`, with all that the chain found.
+
+    Raises
+    ------
+    ArmscanError
+        If the folder holds something else than an earlier demo or cannot be written.
+    """
     name = TwinName(request.head, request.preset, request.seed)
     twin = name.build()
     with replaced_demo(request.folder, OWN_FILES) as place:
@@ -109,7 +122,8 @@ def run_head_demo(request: HeadDemoRequest, progress: Progress = silent) -> Summ
         rendered = round(perf_counter() - start, 2)
         demo = run_head(twin, request.options, progress, scans=scans)
         seconds = {"render": rendered, **demo.seconds}
-        return _written(request, place, twin, demo, scans.recordings, seconds=seconds)
+        summary = _written(request, place, twin, demo, scans.recordings, seconds=seconds)
+    return summary, demo
 
 
 def _written(

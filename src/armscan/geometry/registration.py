@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rigid motion between two lists of the same points, weighted by both lists' covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.frames import Frame
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector, skew
+
+A = TypeVar("A", bound=Frame)
+B = TypeVar("B", bound=Frame)
+
+REGISTRATION_PARAMETERS = (
+    "rotation_x_rad",
+    "rotation_y_rad",
+    "rotation_z_rad",
+    "translation_x_mm",
+    "translation_y_mm",
+    "translation_z_mm",
+)
+"""Order of the parameters: a rotation-vector increment multiplied from the left, in the frame that
+the pose leads to, and the translation."""
+
+MAX_ROUNDS = 30
+SETTLED = 1e-12
+LEAST_SPREAD_SIGMAS = 10.0
+"""Points whose second extent is within this many standard deviations lie on a line: the turn about
+it would be uncertain by more than a tenth of a radian."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointPairs:
+    """The same N points in two frames, A and B, each with its covariance.
+
+    Parameters
+    ----------
+    points_a_mm, points_b_mm
+        (N, 3).
+    covariance_a_mm2, covariance_b_mm2
+        (N, 3, 3), independent between points and lists; their sum is positive definite.
+    """
+
+    points_a_mm: FloatArray
+    points_b_mm: FloatArray
+    covariance_a_mm2: FloatArray
+    covariance_b_mm2: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.points_a_mm)
+        for name, shape in (
+            ("points_a_mm", (n, 3)),
+            ("points_b_mm", (n, 3)),
+            ("covariance_a_mm2", (n, 3, 3)),
+            ("covariance_b_mm2", (n, 3, 3)),
+        ):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.points_a_mm)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointMisfit(Generic[A]):
+    """How far each point of one list is from where all the others put it, in A.
+
+    Parameters
+    ----------
+    offset_mm
+        (N, 3) the point in A minus the point of B carried there by the motion that the OTHER
+        points determine; NaN where these determine none.
+    chi2
+        (N,) the offset's square in units of its covariance: chi-square of three degrees if the
+        point did not move.
+    """
+
+    offset_mm: FloatArray
+    chi2: FloatArray
+
+    def moved(self, level: float) -> int | None:
+        """Index of the worst point, if the chance of so large a misfit is below ``level``.
+
+        ``level`` is for all points together (Bonferroni); None if every point fits.
+        """
+        known = np.flatnonzero(np.isfinite(self.chi2))
+        if not len(known):
+            return None
+        worst = int(known[np.argmax(self.chi2[known])])
+        limit = float(chi2.isf(level / len(known), 3))
+        return worst if float(self.chi2[worst]) > limit else None
+
+
+def closed_form_pose(
+    points_a_mm: FloatArray, points_b_mm: FloatArray, weights: FloatArray | None = None
+) -> Pose[A, B]:
+    """``a_from_b`` of least weighted squares over (N, 3) points, in closed form.
+
+    Eqs. 2.47-2.51 with 2.50 corrected: of H = U S V' the rotation is V diag(1, 1, det(V U')) U';
+    the thesis prints it without the determinant, which gives a mirror image for points in a plane.
+    """
+    w = np.ones(len(points_a_mm)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    middle_a, middle_b = w @ points_a_mm, w @ points_b_mm
+    h = (points_b_mm - middle_b).T @ ((points_a_mm - middle_a) * w[:, None])
+    u, _, vt = np.linalg.svd(h)
+    rotation = vt.T @ np.diag([1.0, 1.0, np.linalg.det(vt.T @ u.T)]) @ u.T
+    return Pose(rotation, middle_a - rotation @ middle_b)
+
+
+def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
+    """Estimate ``a_from_b`` by generalised least squares over both lists' covariances.
+
+    Gauss-Newton from the closed form; the weight of a pair is the inverse of
+    ``C_a + R C_b R'`` at the rotation found.
+
+    Returns
+    -------
+    Estimate
+        Covariance of `REGISTRATION_PARAMETERS`, by the covariances given. Residuals: (N, 3) in mm,
+        point in A minus carried point of B, in A.
+    FitFailure
+        With fewer than three points, or points on a line.
+
+    Raises
+    ------
+    InputError
+        If the two covariances of a point add up to none that is positive definite.
+    """
+    if failure := _degenerate(pairs):
+        return failure
+    trace = np.trace(pairs.covariance_a_mm2 + pairs.covariance_b_mm2, axis1=1, axis2=2)
+    if float(trace.min()) <= 0.0:
+        raise _no_covariance()
+    pose: Pose[A, B] = closed_form_pose(pairs.points_a_mm, pairs.points_b_mm, 1.0 / trace)
+    for _ in range(MAX_ROUNDS):
+        residuals, jacobian, weights = _linearised(pairs, pose)
+        weighted = np.einsum("nji,njk->nik", jacobian, weights)
+        normal = np.einsum("nij,njk->ik", weighted, jacobian)
+        step = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residuals))
+        pose = Pose(
+            rotation_from_vector(step[:3]) @ pose.rotation,
+            pose.translation_mm + step[3:],
+        )
+        if float(step @ normal @ step) < SETTLED:
+            break
+    residuals, jacobian, weights = _linearised(pairs, pose)
+    normal = np.einsum("nji,njk,nkl->il", jacobian, weights, jacobian)
+    squares = float(np.einsum("ni,nij,nj->", residuals, weights, residuals))
+    return Estimate(
+        pose,
+        REGISTRATION_PARAMETERS,
+        np.linalg.inv(normal),
+        residuals,
+        3 * len(pairs) - 6,
+        squares,
+    )
+
+
+def misfits(pairs: PointPairs, fit: Estimate[Pose[A, B]]) -> PointMisfit[A]:
+    """Each point's offset from where the others put it (deleted residuals, Baarda's test).
+
+    Parameters
+    ----------
+    pairs
+        What was registered.
+    fit
+        Its registration, with every point in it.
+    """
+    residuals, jacobian, weights = _linearised(pairs, fit.value)
+    covariance = np.linalg.inv(weights)
+    own = covariance - jacobian @ fit.covariance @ np.swapaxes(jacobian, 1, 2)
+    n = len(pairs)
+    offset, square = np.full((n, 3), np.nan), np.full(n, np.nan)
+    for k in range(n):
+        redundancy = own[k] @ weights[k]
+        if float(np.linalg.eigvals(redundancy).real.min()) > 1e-6:
+            offset[k] = np.linalg.solve(redundancy, residuals[k])
+            square[k] = residuals[k] @ np.linalg.solve(own[k], residuals[k])
+    return PointMisfit(offset, square)
+
+
+def carried_covariance_mm2(
+    points_b_mm: FloatArray,
+    covariance_b_mm2: FloatArray,
+    a_from_b: Pose[A, B],
+    covariance: FloatArray,
+) -> FloatArray:
+    """(N, 3, 3) covariance in A of (N, 3) points of B: their own, turned, plus the registration's.
+
+    ``covariance`` is (6, 6) in the order of `REGISTRATION_PARAMETERS`.
+    """
+    turned = points_b_mm @ a_from_b.rotation.T
+    jacobian = np.concatenate(
+        [-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2
+    )
+    own = a_from_b.rotation @ covariance_b_mm2 @ a_from_b.rotation.T
+    return np.asarray(own + jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
+
+
+def spread_mm(points_mm: FloatArray) -> FloatArray:
+    """(3,) root mean square extents of (N, 3) points about their middle, largest first."""
+    if len(points_mm) == 0:
+        return np.zeros(3)
+    centred = points_mm - points_mm.mean(axis=0)
+    values = np.linalg.eigvalsh(centred.T @ centred / len(points_mm))[::-1]
+    return np.asarray(np.sqrt(np.maximum(values, 0.0)))
+
+
+def _degenerate(pairs: PointPairs) -> FitFailure | None:
+    if len(pairs) < 3:
+        return FitFailure(
+            f"a rigid motion needs three points in both lists, got {len(pairs)}",
+            "measure more common points",
+        )
+    noise = float(
+        np.sqrt(np.max(np.linalg.eigvalsh(pairs.covariance_a_mm2 + pairs.covariance_b_mm2)))
+    )
+    across = min(spread_mm(pairs.points_a_mm)[1], spread_mm(pairs.points_b_mm)[1])
+    if across <= max(LEAST_SPREAD_SIGMAS * noise, 1e-9):
+        return FitFailure(
+            f"the {len(pairs)} common points lie on a line, within {across:.3g} mm: the turn about "
+            "it is not determined",
+            "measure points that spread in two directions",
+        )
+    return None
+
+
+def _linearised(pairs: PointPairs, pose: Pose[A, B]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (N, 3), derivative of the carried point (N, 3, 6), weights (N, 3, 3)."""
+    turned = pairs.points_b_mm @ pose.rotation.T
+    residuals = pairs.points_a_mm - turned - pose.translation_mm
+    jacobian = np.concatenate(
+        [-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2
+    )
+    total = pairs.covariance_a_mm2 + pose.rotation @ pairs.covariance_b_mm2 @ pose.rotation.T
+    if float(np.linalg.eigvalsh(total).min()) <= 0.0:
+        raise _no_covariance()
+    return residuals, jacobian, np.asarray(np.linalg.inv(total), dtype=np.float64)
+
+
+def _no_covariance() -> InputError:
+    return InputError(
+        "a point's covariances are not positive definite",
+        remedy="give each point the covariance of its measurement",
+    )

@@ -161,9 +161,14 @@ def free_basis(
         names += ["cx_px", "cy_px"]
     names += [name for name in PARAMETER_NAMES[4:] if name in DISTORTION_PARAMETERS[model]]
     solved = names + (list(WARP_NAMES) if with_warp else [])
-    basis = np.zeros((len(SHARED_NAMES), len(solved)))
-    for column, name in enumerate(solved):
+    return basis_of(solved, is_aspect_fixed=options.is_aspect_fixed), tuple(names)
+
+
+def basis_of(names: Sequence[str], *, is_aspect_fixed: bool) -> FloatArray:
+    """(11, F) directions of F shared unknowns; with a fixed aspect fy follows fx, the first."""
+    basis = np.zeros((len(SHARED_NAMES), len(names)))
+    for column, name in enumerate(names):
         basis[SHARED_NAMES.index(name), column] = 1.0
-    if options.is_aspect_fixed:
+    if is_aspect_fixed:
         basis[SHARED_NAMES.index("fy_px"), 0] = 1.0
-    return basis, tuple(names)
+    return basis

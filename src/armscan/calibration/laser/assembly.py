@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.laser.cameras import N_CAMERA, HeadCameras
 from armscan.calibration.laser.conditioning import geometry_warnings, refuse_loose_tilt
 from armscan.calibration.laser.coplanarity import CommonPlane, PosedSighting, fit_common_plane
 from armscan.calibration.laser.misfit import find_misfit_image
-from armscan.calibration.laser.naming import NamedStripes
+from armscan.calibration.laser.naming import NamedStripes, board_numbers
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.planes import compare_planes
@@ -21,7 +22,7 @@ from armscan.calibration.laser.sightings import BoardImage
 from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.models.calibration import CameraCalibration, SheetCalibration
+from armscan.models.calibration import SheetCalibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,8 +45,8 @@ class SheetCase:
         The model of each sheet.
     errors
         Covariance of boards and camera.
-    camera
-        The camera.
+    cameras
+        The cameras.
     options
         In force.
     """
@@ -57,11 +58,19 @@ class SheetCase:
     kept: BoolArray
     models: Sequence[SheetModel]
     errors: CommonErrors
-    camera: CameraCalibration
+    cameras: HeadCameras
     options: SheetOptions
 
 
-def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
+@dataclass(frozen=True, slots=True)
+class LooseSheet:
+    """A sheet whose direction its boards leave open."""
+
+    sheet: int
+    failure: FitFailure
+
+
+def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
     """Solve all sheets together and put the result into words and numbers.
 
     Where the final lack-of-fit test of a sheet fails, its stripes' sigmas have been raised: what
@@ -83,7 +92,7 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
     for k in range(len(models)):
         fit = _sheet_fit(k, case, solution)
         if isinstance(fit, FitFailure):
-            return fit
+            return LooseSheet(k, fit)
         sheets.append(fit)
     warnings = list(case.named.warnings)
     if not solution.has_converged:
@@ -98,21 +107,29 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure:
                 f"sheet {name}: its model does not explain the stripes within their noise and the "
                 f"boards' errors; the stripes' sigmas are taken {raised:.1f} times larger"
             )
-    if not case.camera.has_covariance:
+    if not case.cameras.has_covariance:
         warnings.append(
             "the camera came without covariance: the sheets' sigmas leave its errors out"
         )
     return LaserFit(
         tuple(sheets),
         _image_evidence(case, solution),
-        case.camera,
-        solution.covariance,
+        case.cameras.left,
+        _with_second_last(solution.covariance, case.cameras.n_parameters),
         max(_noise_factor(k, case) for k in range(len(models))),
         max(model.noise.correlation_points for model in models),
         case.named.how,
         case.options,
         tuple(warnings),
+        second=case.cameras.second,
     )
+
+
+def _with_second_last(covariance: FloatArray, n_camera: int) -> FloatArray:
+    """From the order cameras, sheets to that of a sensor: left camera, sheets, second camera."""
+    order = np.arange(len(covariance))
+    order = np.concatenate([order[:N_CAMERA], order[n_camera:], order[N_CAMERA:n_camera]])
+    return np.asarray(covariance[np.ix_(order, order)])
 
 
 def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | FitFailure:
@@ -120,7 +137,8 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
     used = case.observations.select(case.kept)
     own = used.sheet == k
     points, sheet = used.points_mm[own], solution.sheets[k]
-    covariance = solution.covariance[9 + 8 * k : 17 + 8 * k, 9 + 8 * k : 17 + 8 * k]
+    start = case.cameras.n_parameters + 8 * k
+    covariance = solution.covariance[start : start + 8, start : start + 8]
     geometry = sheet_geometry(sheet, used.select(own), images)
     tilt_variance = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
     tilt_sigma_deg = float(np.degrees(np.sqrt(max(tilt_variance, 0.0)) / sheet.scale_mm))
@@ -154,7 +172,7 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
         common.largest_mm if common else 0.0,
         common.sigma_largest_mm if common else 0.0,
         geometry.board_angle_deg,
-        compare_planes(sheet, points, images, stripes, case.camera.camera),
+        compare_planes(sheet, points, images, stripes, case.cameras),
         warnings,
     )
 
@@ -185,8 +203,8 @@ def _common_plane(k: int, case: SheetCase) -> CommonPlane | None:
             members.append(
                 PosedSighting(
                     replace(sighting, noise_ends_mm2=sighting.noise_ends_mm2 * level**2),
-                    image.data.sensor_from_board.covariance,
-                    case.camera.covariance,
+                    image.placed.covariance,
+                    case.cameras.covariance,
                 )
             )
     common = fit_common_plane(members)
@@ -205,6 +223,7 @@ def _image_evidence(case: SheetCase, solution: SheetSolution) -> tuple[SheetImag
     height, residual, _, _ = observations.residuals_px(solution.sheets)
     remaining = np.full(len(observations), np.nan)
     remaining[kept] = solution.remaining_px
+    boards = board_numbers(case.images)
     evidence = []
     for i, image in enumerate(case.images):
         own = observations.image == i
@@ -219,14 +238,14 @@ def _image_evidence(case: SheetCase, solution: SheetSolution) -> tuple[SheetImag
             SheetImage(
                 image.data.profile,
                 image.data.view,
-                image.data.sensor_from_board.value,
+                image.placed.sensor_from_board,
                 use,
                 sheet,
                 image.points.points_mm,
                 columns[0],
                 columns[1],
                 columns[2],
-                float(np.linalg.norm(solution.common[6 * i : 6 * i + 6])),
+                float(np.linalg.norm(solution.common[6 * boards[i] : 6 * boards[i] + 6])),
             )
         )
     return tuple(evidence)

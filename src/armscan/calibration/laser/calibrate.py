@@ -4,15 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.laser.assembly import SheetCase, assemble_fit
+from armscan.calibration.laser.assembly import LooseSheet, SheetCase, assemble_fit
+from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.conditioning import refuse_few_boards
 from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
-from armscan.calibration.laser.naming import NamedStripes, name_stripes
-from armscan.calibration.laser.observations import SheetObservations, collect_observations
+from armscan.calibration.laser.naming import NamedStripes, board_numbers, name_stripes
+from armscan.calibration.laser.observations import (
+    SheetObservations,
+    collect_observations,
+    placement_covariances,
+)
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit
 from armscan.calibration.laser.sheet_model import SheetModel, choose_model, start_sheet
@@ -22,13 +27,22 @@ from armscan.geometry.arrays import BoolArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.light_sheet import LightSheet
+from armscan.models.stereo import StereoCalibration
 
 OUTLIER_ROUNDS = 4
 
 
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    """One sheet that its boards do not determine."""
+
+    sheet: int
+    failure: FitFailure
+
+
 def calibrate_sheets(
     boards: Sequence[BoardStripes],
-    camera: CameraCalibration,
+    camera: CameraCalibration | StereoCalibration,
     options: SheetOptions | None = None,
 ) -> LaserFit | FitFailure:
     """Calibrate one or several light sheets that lie on boards of known pose.
@@ -36,15 +50,16 @@ def calibrate_sheets(
     The stripe points are carried to the board (`meet_board`), sorted into straight stripes, named
     over the images, and fitted: generalised least squares of the residuals across the stripe in
     the image, with the stripe's sigma of each point, and with the errors of the boards' poses and
-    of the camera as common unknowns of known covariance. A bow is added where the lack-of-fit
+    of the cameras as common unknowns of known covariance. A bow is added where the lack-of-fit
     test asks for it and the boards support it.
 
     Parameters
     ----------
     boards
-        One entry an image.
+        One entry an image; images of one placement share its board's pose and the error of that.
     camera
-        Its covariance goes into the weights and into the result.
+        One camera, or the two of a stereo head. Their covariance goes into the weights and into
+        the result.
     options
         Defaults if None.
 
@@ -52,10 +67,17 @@ def calibrate_sheets(
     -------
     LaserFit or FitFailure
         A failure for one board, for stripes that are all one line in space, for stripes that
-        cannot be named, and where nothing usable is left.
+        cannot be named, and where nothing usable is left. Of the lines of a fan, those that the
+        boards do not determine are left out with a warning.
+
+    Raises
+    ------
+    InputError
+        If an image is of a camera that is not calibrated.
     """
     options = options or SheetOptions()
-    images = [sight_stripes(board, camera.camera, options) for board in boards]
+    cameras = HeadCameras.of(camera)
+    images = [sight_stripes(board, cameras, options) for board in boards]
     if not any(image.sightings for image in images):
         return FitFailure(
             f"no straight stripe with {options.min_points} accepted points lies on the board in "
@@ -63,15 +85,24 @@ def calibrate_sheets(
             "check that laser-on and board images belong together, the target's size, and the "
             "stripe extraction",
         )
-    named = name_stripes(images, camera.covariance, options)
-    if isinstance(named, FitFailure):
-        return named
+    named = name_stripes(images, cameras.covariance, options)
+    while not isinstance(named, FitFailure):
+        fit = _fit_named(images, named, cameras, options)
+        if not isinstance(fit, _Refused):
+            return fit
+        if not named.is_fan or len(named.names) == 1:
+            return fit.failure
+        named = named.without(fit.sheet, fit.failure.reason)
+    return named
+
+
+def _fit_named(
+    images: Sequence[BoardImage], named: NamedStripes, cameras: HeadCameras, options: SheetOptions
+) -> LaserFit | FitFailure | _Refused:
     observations = collect_observations(images, named)
-    errors = CommonErrors(
-        [board.sensor_from_board.covariance for board in boards], camera.covariance
-    )
+    errors = CommonErrors(placement_covariances(images), cameras.covariance)
     starts = _starts(images, named, observations)
-    if isinstance(starts, FitFailure):
+    if isinstance(starts, _Refused):
         return starts
     scatter = scatter_by_stripe(observations, observations.residuals_px(starts)[1])
     observations = replace(observations, sigma_px=observations.sigma_px * scatter)
@@ -81,26 +112,30 @@ def calibrate_sheets(
         own = observations.sheet == k
         chosen = _model_of(observations.select(own), start, errors, options)
         if isinstance(chosen, FitFailure):
-            return FitFailure(f"sheet {named.names[k]}: {chosen.reason}", chosen.remedy)
+            reason = f"sheet {named.names[k]}: {chosen.reason}"
+            return _Refused(k, FitFailure(reason, chosen.remedy))
         kept[own] = chosen[0]
         models.append(chosen[1])
-    return assemble_fit(
-        SheetCase(images, named, observations, scatter, kept, models, errors, camera, options)
+    fit = assemble_fit(
+        SheetCase(images, named, observations, scatter, kept, models, errors, cameras, options)
     )
+    return _Refused(fit.sheet, fit.failure) if isinstance(fit, LooseSheet) else fit
 
 
 def _starts(
     images: Sequence[BoardImage], named: NamedStripes, observations: SheetObservations
-) -> list[LightSheet] | FitFailure:
+) -> list[LightSheet] | _Refused:
+    boards = np.array(board_numbers(images))
     for k, name in enumerate(named.names):
-        failure = refuse_few_boards(name, sum(k in sheets for sheets in named.sheets))
+        shown = [k in sheets for sheets in named.sheets]
+        failure = refuse_few_boards(name, len(np.unique(boards[shown])))
         if failure is not None:
-            return failure
+            return _Refused(k, failure)
     starts: list[LightSheet] = []
     for k, name in enumerate(named.names):
         start = start_sheet(name, observations.select(observations.sheet == k), images)
         if isinstance(start, FitFailure):
-            return start
+            return _Refused(k, start)
         starts.append(start)
     return starts
 

@@ -22,7 +22,7 @@ def find_misfit_image(
     errors: CommonErrors,
     options: SheetOptions,
 ) -> int | None:
-    """Number of the image without which a plane explains all others, or None.
+    """Number of an image without whose board a plane explains all others, or None.
 
     Parameters
     ----------
@@ -36,12 +36,12 @@ def find_misfit_image(
         For the limit of the lack-of-fit test.
     """
     alone = observations.as_one_sheet()
-    images = np.unique(alone.image)
-    if len(images) < MIN_BOARDS:
+    boards = np.unique(alone.board)
+    if len(boards) < MIN_BOARDS:
         return None
     p_values = []
-    for image in images:
-        rest = alone.select(alone.image != image)
+    for board in boards:
+        rest = alone.select(alone.board != board)
         noise = stripe_noise(rest, rest.residuals_px([sheet])[1])
         solution = solve_sheets(rest, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
         if isinstance(solution, FitFailure):
@@ -49,4 +49,6 @@ def find_misfit_image(
             continue
         p_values.append(lack_of_fit(rest, solution, noise).p_value)
     best = int(np.argmax(p_values))
-    return int(images[best]) if p_values[best] >= options.lack_of_fit_p else None
+    if p_values[best] < options.lack_of_fit_p:
+        return None
+    return int(alone.image[alone.board == boards[best]][0])

@@ -6,12 +6,13 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from armscan.calibration.laser.coplanarity import CommonPlane, PosedSighting, fit_common_plane
+from armscan.calibration.laser.fan_naming import name_fan
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.geometry.arrays import FloatArray
@@ -20,6 +21,11 @@ from armscan.geometry.estimate import FitFailure
 AMBIGUOUS_CHI2 = 9.0
 """A naming must beat the next one by this much (three sigma) to be told from it by coplanarity."""
 MAX_SEEDS = 12
+LEAST_FAN = 4
+"""Lines in an image from which on they are taken for a fan of which others may be out of view."""
+LEAST_SEVERAL = 3
+"""Lines in most images of one source from which on it is taken to make several: two may be one
+line and its reflection."""
 ALPHABET = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 Naming = tuple[tuple[int, ...], ...]
@@ -28,12 +34,38 @@ Naming = tuple[tuple[int, ...], ...]
 
 @dataclass(frozen=True, slots=True)
 class NamedStripes:
-    """``sheets[i][k]`` is the sheet of sighting k of image i; ``how`` tells it in words."""
+    """Sheets of all stripes.
+
+    Parameters
+    ----------
+    names
+        Of the sheets.
+    sheets
+        ``sheets[i][k]`` is the sheet of sighting k of image i, -1 for none.
+    how
+        In words.
+    warnings
+        What is doubtful.
+    is_fan
+        True where lines of a fan were found among others: one that cannot be calibrated may then be
+        left out.
+    """
 
     names: tuple[str, ...]
     sheets: Naming
     how: str
     warnings: tuple[str, ...] = ()
+    is_fan: bool = False
+
+    def without(self, sheet: int, reason: str) -> NamedStripes:
+        """The same without a sheet, whose stripes lose their name."""
+        place = [k - (k > sheet) if k != sheet else -1 for k in range(len(self.names))]
+        return replace(
+            self,
+            names=self.names[:sheet] + self.names[sheet + 1 :],
+            sheets=tuple(tuple(place[k] if k >= 0 else -1 for k in row) for row in self.sheets),
+            warnings=(*self.warnings, f"left out: {reason}"),
+        )
 
 
 def name_stripes(
@@ -41,15 +73,22 @@ def name_stripes(
 ) -> NamedStripes | FitFailure:
     """Give every straight stripe to a sheet, without the operator where that is possible.
 
-    The caller's word comes first (one laser an image). Otherwise stripes that belong together are
-    coplanar: namings grown from pairs of images are compared by the chi-square of all stripes'
-    common planes. Where coplanarity cannot tell (parallel stripes), the order across the image
-    decides and a warning says so.
+    The caller's word comes first (one laser an image). The lines of a source that makes several
+    are numbered along their fan (`armscan.calibration.laser.fan_naming`), though no image shows
+    them all. Otherwise stripes that belong together are coplanar: namings grown from pairs of
+    images are compared by the chi-square of all stripes' common planes. Where coplanarity cannot
+    tell (parallel stripes), the order across the image decides and a warning says so.
     """
     lasers = {image.data.lasers for image in images if image.sightings}
+    posed = [
+        [PosedSighting(s, image.placed.covariance, camera_covariance) for s in image.sightings]
+        for image in images
+    ]
     if lasers and all(len(names) == 1 for names in lasers):
-        return _by_caller(images)
+        return _by_caller(images, posed, options)
     n_sheets = _count_sheets(images, options, lasers)
+    if not any(len(names) > 1 for names in lasers) and _is_fan(images, n_sheets):
+        return _one_fan(images, posed, options)
     names = _sheet_names(n_sheets, options, lasers)
     if isinstance(names, FitFailure):
         return names
@@ -63,7 +102,7 @@ def name_stripes(
             "show every line on the board in at least two placements, or switch on one laser "
             "an image and name it",
         )
-    return _by_coplanarity(images, camera_covariance, names)
+    return _by_coplanarity(posed, names)
 
 
 def _count_sheets(
@@ -98,16 +137,76 @@ def _sheet_names(
     return names
 
 
-def _by_caller(images: Sequence[BoardImage]) -> NamedStripes:
-    names = tuple(dict.fromkeys(image.data.lasers[0] for image in images if image.sightings))
-    sheets = tuple(
-        tuple(
-            names.index(image.data.lasers[0]) if chosen == 0 else -1
-            for chosen in _longest_only(image)
-        )
-        for image in images
-    )
-    return NamedStripes(names, sheets, "one laser an image, as named by the caller")
+def _is_fan(images: Sequence[BoardImage], n_sheets: int) -> bool:
+    """Many lines, of which no image need show all."""
+    largest = max((len(image.sightings) for image in images), default=0)
+    return max(n_sheets, largest) >= LEAST_FAN
+
+
+def _one_fan(
+    images: Sequence[BoardImage], posed: list[list[PosedSighting]], options: SheetOptions
+) -> NamedStripes | FitFailure:
+    """All stripes are lines of one source that has no name."""
+    n_sheets = options.n_sheets or len(options.sheet_names)
+    fan = name_fan(posed, board_numbers(images), n_sheets)
+    if isinstance(fan, FitFailure):
+        return fan
+    pool = options.sheet_names or tuple(ALPHABET)
+    if fan.numbers[-1] > len(pool):
+        return FitFailure(f"{fan.numbers[-1]} lines but {len(pool)} names", "give one name a line")
+    names = tuple(pool[number - 1] for number in fan.numbers)
+    return NamedStripes(names, fan.sheets, fan.how, fan.warnings, is_fan=True)
+
+
+def _by_caller(
+    images: Sequence[BoardImage], posed: list[list[PosedSighting]], options: SheetOptions
+) -> NamedStripes | FitFailure:
+    """One source an image; the lines of a source that makes several are numbered."""
+    sources = tuple(dict.fromkeys(image.data.lasers[0] for image in images if image.sightings))
+    boards = board_numbers(images)
+    names: list[str] = []
+    sheets: list[tuple[int, ...]] = [tuple(-1 for _ in image.sightings) for image in images]
+    how, warnings = ["one laser an image, as named by the caller"], list[str]()
+    for source in sources:
+        own = [i for i, image in enumerate(images) if image.data.lasers[:1] == (source,)]
+        if not _has_several([images[i] for i in own], options):
+            for i in own:
+                sheets[i] = tuple(len(names) if k == 0 else -1 for k in _longest_only(images[i]))
+            names.append(source)
+            continue
+        fan = name_fan([posed[i] for i in own], [boards[i] for i in own], options.n_sheets)
+        if isinstance(fan, FitFailure):
+            return FitFailure(f"source {source}: {fan.reason}", fan.remedy)
+        for i, row in zip(own, fan.sheets, strict=True):
+            sheets[i] = tuple(len(names) + k if k >= 0 else -1 for k in row)
+        names += [f"{source}.{number}" for number in fan.numbers]
+        how.append(f"source {source}: {fan.how}")
+        warnings += [f"source {source}: {warning}" for warning in fan.warnings]
+    is_fan = len(names) > len(sources)
+    if options.sheet_names:
+        if len(options.sheet_names) != len(names):
+            return FitFailure(
+                f"{len(names)} sheets were found ({', '.join(names)}), but "
+                f"{len(options.sheet_names)} names are given",
+                "give one name a sheet, or none",
+            )
+        names = list(options.sheet_names)
+    return NamedStripes(tuple(names), tuple(sheets), "; ".join(how), tuple(warnings), is_fan)
+
+
+def _has_several(images: Sequence[BoardImage], options: SheetOptions) -> bool:
+    """Does a source make several lines? As told, or as most of its images show."""
+    if options.n_sheets:
+        return options.n_sheets > 1
+    counts = [len(image.sightings) for image in images if image.sightings]
+    return float(np.median(counts)) >= LEAST_SEVERAL
+
+
+def board_numbers(images: Sequence[BoardImage]) -> list[int]:
+    """Number of each image's board placement, counted from 0."""
+    places = [image.data.place for image in images]
+    order = list(dict.fromkeys(places))
+    return [order.index(place) for place in places]
 
 
 def _longest_only(image: BoardImage) -> tuple[int, ...]:
@@ -124,16 +223,7 @@ class _Candidate:
     degrees_of_freedom: int
 
 
-def _by_coplanarity(
-    images: Sequence[BoardImage], camera_covariance: FloatArray, names: tuple[str, ...]
-) -> NamedStripes:
-    posed = [
-        [
-            PosedSighting(s, image.data.sensor_from_board.covariance, camera_covariance)
-            for s in image.sightings
-        ]
-        for image in images
-    ]
+def _by_coplanarity(posed: list[list[PosedSighting]], names: tuple[str, ...]) -> NamedStripes:
     n_sheets = len(names)
     found: dict[Naming, _Candidate] = {}
     for naming in _seeds(posed, n_sheets):

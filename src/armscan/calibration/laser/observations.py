@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.laser.naming import NamedStripes
+from armscan.calibration.laser.naming import NamedStripes, board_numbers
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.models.light_sheet import LightSheet
@@ -22,6 +22,8 @@ class SheetObservations:
     ----------
     image, row
         (N,) image, and row of its profile.
+    board
+        (N,) board placement: images of one placement share it.
     sheet
         (N,) index of the sheet.
     stripe
@@ -35,11 +37,12 @@ class SheetObservations:
     by_pose
         (N, 3, 6) derivative by the pose of the point's own board.
     by_camera
-        (N, 3, 9) total derivative by the camera, the boards' poses following it.
+        (N, 3, P) total derivative by the cameras' parameters, the boards' poses following them.
     """
 
     image: IntArray
     row: IntArray
+    board: IntArray
     sheet: IntArray
     stripe: IntArray
     points_mm: FloatArray
@@ -57,6 +60,7 @@ class SheetObservations:
         return SheetObservations(
             self.image[keep],
             self.row[keep],
+            self.board[keep],
             self.sheet[keep],
             self.stripe[keep],
             self.points_mm[keep],
@@ -103,6 +107,12 @@ class SheetObservations:
         )
 
 
+def placement_covariances(images: Sequence[BoardImage]) -> list[FloatArray]:
+    """(6, 6) covariance of the pose of each board placement, in the order of their numbers."""
+    boards = board_numbers(images)
+    return [images[boards.index(board)].placed.covariance for board in range(max(boards) + 1)]
+
+
 def collect_observations(images: Sequence[BoardImage], named: NamedStripes) -> SheetObservations:
     """Gather all named stripe points."""
     parts: list[tuple[int, IntArray, int]] = [
@@ -121,9 +131,11 @@ def collect_observations(images: Sequence[BoardImage], named: NamedStripes) -> S
     ]
     by_pose = [images[i].points.dpoint_dpose[rows] for i, rows, _ in parts]
     by_camera = [images[i].by_camera[rows] for i, rows, _ in parts]
+    boards = board_numbers(images)
     return SheetObservations(
         np.concatenate([np.full(len(rows), i) for i, rows, _ in parts]),
         np.concatenate([rows for _, rows, _ in parts]),
+        np.concatenate([np.full(len(rows), boards[i]) for i, rows, _ in parts]),
         np.concatenate([np.full(len(rows), sheet) for _, rows, sheet in parts]),
         np.concatenate([np.full(len(rows), k) for k, (_, rows, _) in enumerate(parts)]),
         np.concatenate([images[i].points.points_mm[rows] for i, rows, _ in parts]),

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.cross_ratio import cross_ratio_points
 from armscan.calibration.laser.result import PlaneComparison, PlaneMethod
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import Plane, fit_plane
-from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 
 
@@ -61,7 +61,7 @@ def compare_planes(
     points_mm: FloatArray,
     images: Sequence[BoardImage],
     stripes: Sequence[tuple[int, IntArray]],
-    camera: CameraModel,
+    cameras: HeadCameras,
 ) -> tuple[PlaneComparison, ...]:
     """Compare eq. 2.44, total least squares and the cross-ratio points with the sheet in use.
 
@@ -73,7 +73,7 @@ def compare_planes(
         (N, 3) its points.
     images, stripes
         Image number and profile rows of each of its stripes.
-    camera
+    cameras
         For the cross-ratio points.
     """
     found = [_comparison("algebraic", algebraic_plane(points_mm), sheet, points_mm)]
@@ -84,8 +84,9 @@ def compare_planes(
     crossings = []
     for i, rows in stripes:
         data = images[i].data
+        camera = cameras.model(data.camera)
         on_board = cross_ratio_points(data.view, data.profile.points_px[rows], camera)
-        pose = data.sensor_from_board.value
+        pose = images[i].placed.sensor_from_board
         crossings.append(on_board @ pose.rotation[:, :2].T + pose.translation_mm)
     crossed = fit_plane(np.concatenate(crossings))
     if not isinstance(crossed, FitFailure):

@@ -34,7 +34,8 @@ class BoardPoints:
         (N, 3, 6) by the rotation-vector increment (rad, Sensor frame, from the left) and the
         translation (mm) of ``sensor_from_board``.
     dpoint_dcamera
-        (N, 3, 9) by the camera's parameters, the pose being held.
+        (N, 3, 9) by the camera's parameters, the pose being held; (N, 3, P) by those of all
+        cameras of a head.
     """
 
     points_mm: FloatArray

@@ -16,6 +16,7 @@ from armscan.geometry.poses import Pose
 from armscan.models.calibration import (
     CameraCalibration,
     Provenance,
+    SecondCamera,
     SensorCalibration,
     SheetCalibration,
 )
@@ -62,6 +63,27 @@ _USE_LABELS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PlacedBoard:
+    """A board's pose in the Sensor frame.
+
+    Parameters
+    ----------
+    sensor_from_board
+        The pose.
+    covariance
+        (6, 6) by the noise of the target's points: rotation-vector increment (rad, Sensor frame,
+        from the left), then translation (mm).
+    by_cameras
+        (6, P) how it follows the parameters of the cameras, P as in
+        `armscan.calibration.laser.cameras.HeadCameras`.
+    """
+
+    sensor_from_board: Pose[Sensor, Board]
+    covariance: FloatArray
+    by_cameras: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BoardStripes:
     """Stripes on a flat target whose pose is known: the input of the calibration.
 
@@ -75,10 +97,18 @@ class BoardStripes:
         The board's pose with its (6, 6) covariance: rotation-vector increment (rad, Sensor frame,
         multiplied from the left), then translation (mm), the camera being held fixed.
     lasers
-        Names of the sheets that were on; empty when not known.
+        Names of the sources that were on; empty when not known.
     edges
         Edges of the target's marks; None if they are not known, and then no point is left out for
         them.
+    camera
+        The camera of profile and view: 0, or 1 for the right one of a stereo head.
+    placed
+        The pose in Sensor where it rests on more than this view; else ``sensor_from_board`` holds,
+        which is always the pose in the camera's own frame.
+    placement
+        Images of equal placement saw the board in one place, so that they share its pose and the
+        error of that; empty stands for the view's source.
     """
 
     profile: Profile
@@ -86,6 +116,14 @@ class BoardStripes:
     sensor_from_board: Estimate[Pose[Sensor, Board]]
     lasers: tuple[str, ...] = ()
     edges: TargetEdges | None = None
+    camera: int = 0
+    placed: PlacedBoard | None = None
+    placement: str = ""
+
+    @property
+    def place(self) -> str:
+        """Name of the board's placement."""
+        return self.placement or self.view.source
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +145,7 @@ class SheetImage:
     view
         The board; ``view.source`` is the image in which it was found.
     sensor_from_board
-        The board's pose before the fit.
+        The board's pose in Sensor before the fit.
     use
         (N,) `PointUse` of each stripe point.
     sheet
@@ -275,9 +313,10 @@ class LaserFit:
     images
         One entry an image, in the order given.
     camera
-        The camera that was used.
+        The camera that was used, the left one of two.
     covariance
-        (9 + 8 S, 9 + 8 S) joint covariance as `SensorCalibration` wants it.
+        Joint covariance as `SensorCalibration` wants it: (9 + 8 S, 9 + 8 S), with 15 more for a
+        second camera.
     noise_factor
         Scatter of the stripe points around smooth stripes over what their sigmas claim.
     correlation_points
@@ -290,6 +329,8 @@ class LaserFit:
         On the whole calibration; those of one sheet are with the sheet.
     skipped
         Images that gave nothing.
+    second
+        The right camera of a stereo head.
     """
 
     sheets: tuple[SheetFit, ...]
@@ -302,9 +343,10 @@ class LaserFit:
     options: SheetOptions
     warnings: tuple[str, ...]
     skipped: tuple[SkippedImage, ...] = ()
+    second: SecondCamera | None = None
 
     def __post_init__(self) -> None:
-        n = 9 + 8 * len(self.sheets)
+        n = 9 + 8 * len(self.sheets) + (15 if self.second is not None else 0)
         object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
 
     @property
@@ -315,4 +357,6 @@ class LaserFit:
     def to_calibration(self, provenance: Provenance) -> SensorCalibration:
         """Return the document that reconstruction needs."""
         sheets = tuple(sheet.calibration for sheet in self.sheets)
-        return SensorCalibration(self.camera, sheets, self.covariance, provenance)
+        return SensorCalibration(
+            self.camera, sheets, self.covariance, provenance, None, self.second
+        )

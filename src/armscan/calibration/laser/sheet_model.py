@@ -70,11 +70,9 @@ def sheet_geometry(
     sheet: LightSheet, observations: SheetObservations, images: Sequence[BoardImage]
 ) -> SheetGeometry:
     """Describe the boards on which one sheet's points lie."""
+    _, first = np.unique(observations.board, return_index=True)
     normals = np.stack(
-        [
-            images[i].data.sensor_from_board.value.rotation[:, 2]
-            for i in np.unique(observations.image)
-        ]
+        [images[i].placed.sensor_from_board.rotation[:, 2] for i in observations.image[first]]
     )
     return describe_geometry(sheet, observations.points_mm, normals)
 
@@ -83,7 +81,7 @@ def start_sheet(
     name: str, observations: SheetObservations, images: Sequence[BoardImage]
 ) -> LightSheet | FitFailure:
     """Total least squares plane of one sheet's points; refused where they are one line."""
-    few = refuse_few_boards(name, len(np.unique(observations.image)))
+    few = refuse_few_boards(name, len(np.unique(observations.board)))
     if few is not None:
         return few
     plane = fit_plane(observations.points_mm)
@@ -107,7 +105,7 @@ def _across_sigma_mm(
     total = 0.0
     for i in np.unique(observations.image):
         own = by_pose[observations.image == i]
-        covariance = images[i].data.sensor_from_board.covariance
+        covariance = images[i].placed.covariance
         total += float(np.einsum("ni,ij,nj->", own, covariance, own))
     return float(np.sqrt(max(total, 0.0) / len(observations)))
 
@@ -145,7 +143,7 @@ def choose_model(
 
     if plane_test.p_value >= options.lack_of_fit_p:
         return plane(f"a plane is enough ({test})")
-    n_boards = len(np.unique(observations.image))
+    n_boards = len(np.unique(observations.board))
     if n_boards < options.min_boards_for_bow:
         return plane(
             f"a plane does not explain the stripes ({test}), but {n_boards} boards cannot tell a "

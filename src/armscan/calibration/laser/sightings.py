@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.ray_board import BoardPoints, meet_board, pose_by_camera
-from armscan.calibration.laser.result import BoardStripes, PointUse
+from armscan.calibration.laser.ray_board import BoardPoints
+from armscan.calibration.laser.result import BoardStripes, PlacedBoard, PointUse
+from armscan.calibration.laser.second_view import meet_board_of, place_board
 from armscan.calibration.laser.straight_stripes import find_straight_stripes
 from armscan.calibration.laser.target_edges import runs_along_edge
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.models.camera import CameraModel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,7 +30,7 @@ class Sighting:
     ends_by_pose
         (2, 3, 6) their derivative by the board's pose.
     ends_by_camera
-        (2, 3, 9) their derivative by the camera, the board's pose following it.
+        (2, 3, P) their derivative by the cameras' parameters, the board's pose following them.
     noise_ends_mm2
         (2, 2) covariance of the ends across the stripe by the stripe's noise alone: one end goes
         up where the other goes down.
@@ -59,10 +60,12 @@ class BoardImage:
     ----------
     data
         What was given.
+    placed
+        The board's pose in Sensor.
     points
         The points on the board.
     by_camera
-        (N, 3, 9) their derivative by the camera, the board's pose following it.
+        (N, 3, P) their derivative by the cameras' parameters, the board's pose following them.
     sigma_mm
         (N,) stripe noise across the stripe, in space.
     use
@@ -72,6 +75,7 @@ class BoardImage:
     """
 
     data: BoardStripes
+    placed: PlacedBoard
     points: BoardPoints
     by_camera: FloatArray
     sigma_mm: FloatArray
@@ -79,12 +83,13 @@ class BoardImage:
     sightings: tuple[Sighting, ...]
 
 
-def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions) -> BoardImage:
+def sight_stripes(data: BoardStripes, cameras: HeadCameras, options: SheetOptions) -> BoardImage:
     """Carry the stripe points of one image to its board and sort them into straight stripes."""
-    profile, pose = data.profile, data.sensor_from_board.value
-    points = meet_board(profile.points_px, pose, camera)
-    follow = pose_by_camera(data.view, pose, camera)
-    by_camera = points.dpoint_dcamera + points.dpoint_dpose @ follow
+    seen = ((data.camera, data.view, data.sensor_from_board),)
+    placed = data.placed or place_board(seen, cameras)
+    profile, pose = data.profile, placed.sensor_from_board
+    points = meet_board_of(profile.points_px, data.camera, pose, cameras)
+    by_camera = points.dpoint_dcamera + points.dpoint_dpose @ placed.by_cameras
     across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
     sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
     on_board = (points.points_mm - pose.translation_mm) @ pose.rotation
@@ -111,21 +116,14 @@ def sight_stripes(data: BoardStripes, camera: CameraModel, options: SheetOptions
     )
     for stripe in stripes:
         use[candidates[stripe.rows]] = PointUse.UNNAMED
-    sightings = [
-        _sighting(data, points, by_camera, sigma_mm, candidates[stripe.rows]) for stripe in stripes
-    ]
-    return BoardImage(data, points, by_camera, sigma_mm, use, tuple(_across_image(sightings)))
+    image = BoardImage(data, placed, points, by_camera, sigma_mm, use, ())
+    sightings = [_sighting(image, candidates[stripe.rows]) for stripe in stripes]
+    return replace(image, sightings=tuple(_across_image(sightings)))
 
 
-def _sighting(
-    data: BoardStripes,
-    points: BoardPoints,
-    by_camera: FloatArray,
-    sigma_mm: FloatArray,
-    rows: IntArray,
-) -> Sighting:
+def _sighting(image: BoardImage, rows: IntArray) -> Sighting:
     """Fit a straight line in space through the points and express it by its two ends."""
-    here, weight = points.points_mm[rows], sigma_mm[rows] ** -2.0
+    here, weight = image.points.points_mm[rows], image.sigma_mm[rows] ** -2.0
     along = here - here[0]
     direction = along[-1] / np.linalg.norm(along[-1])
     t = along @ direction
@@ -133,15 +131,15 @@ def _sighting(
     normal = np.linalg.inv(design.T @ (design * weight[:, None]))
     at_ends = np.array([[1.0, t.min()], [1.0, t.max()]])
     gain = at_ends @ normal @ (design * weight[:, None]).T
-    q = data.profile.points_px[rows]
+    q = image.data.profile.points_px[rows]
     direction_px = (q[-1] - q[0]) / np.linalg.norm(q[-1] - q[0])
     return Sighting(
         rows,
         gain @ here,
-        np.einsum("ek,kij->eij", gain, points.dpoint_dpose[rows]),
-        np.einsum("ek,kij->eij", gain, by_camera[rows]),
+        np.einsum("ek,kij->eij", gain, image.points.dpoint_dpose[rows]),
+        np.einsum("ek,kij->eij", gain, image.by_camera[rows]),
         at_ends @ normal @ at_ends.T,
-        np.cross(data.sensor_from_board.value.rotation[:, 2], direction),
+        np.cross(image.placed.sensor_from_board.rotation[:, 2], direction),
         0.5 * (q[0] + q[-1]),
         direction_px,
     )

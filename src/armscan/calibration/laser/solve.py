@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.calibration.laser.observations import SheetObservations
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
@@ -35,30 +35,29 @@ N_PLANE = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonErrors:
-    """What the boards and the camera are known to.
+    """What the boards and the cameras are known to.
 
     Parameters
     ----------
     pose_covariances
-        (6, 6) for each image.
+        (6, 6) for each board placement.
     camera_covariance
-        (9, 9); rows of parameters that are taken as exact are zero.
+        (P, P) of the cameras' parameters, P = 9 for one camera; rows of parameters that are taken
+        as exact are zero.
     """
 
     pose_covariances: Sequence[FloatArray]
     camera_covariance: FloatArray
 
-    def design(self, observations: SheetObservations, dr_dpoint: FloatArray) -> FloatArray:
-        """(N, 6 M + 9) derivative of the residuals by the common errors in their own sigmas."""
-        n_images = len(self.pose_covariances)
-        columns = np.zeros((len(observations), 6 * n_images + 9))
-        for i, covariance in enumerate(self.pose_covariances):
-            own = observations.image == i
-            by_pose = np.einsum("ni,nij->nj", dr_dpoint[own], observations.by_pose[own])
-            columns[own, 6 * i : 6 * i + 6] = by_pose @ square_root(covariance)
-        by_camera = np.einsum("ni,nij->nj", dr_dpoint, observations.by_camera)
-        columns[:, 6 * n_images :] = by_camera @ square_root(self.camera_covariance)
-        return columns
+    @property
+    def n_camera(self) -> int:
+        """Count P of the cameras' parameters."""
+        return len(self.camera_covariance)
+
+    @property
+    def count(self) -> int:
+        """Count of the common errors: 6 a board, then P."""
+        return 6 * len(self.pose_covariances) + self.n_camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,13 +69,13 @@ class SheetSolution:
     sheets
         S sheets.
     covariance
-        (9 + 8 S, 9 + 8 S) joint with the camera's own covariance.
+        (P + 8 S, P + 8 S) joint with the cameras' own covariance, cameras first.
     height_mm, residual_px
         (N,) residuals with boards and camera as measured.
     remaining_px
         (N,) residuals after boards and camera are moved within their uncertainty.
     common
-        (6 M + 9,) estimated common errors, in their own sigmas.
+        (6 M + P,) estimated common errors of M boards and the cameras, in their own sigmas.
     chi2
         Weighted squares of ``remaining_px`` plus squares of ``common``.
     n_parameters
@@ -148,8 +147,8 @@ def solve_sheets(
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     for _ in range(ITERATIONS):
-        design, residual, height = _linearised(observations, sheets, errors, active)
-        solved = _weighted_step(design, residual, robust / sigma**2, int(active.sum()))
+        system = _linearised(observations, sheets, errors, active)
+        solved = system.step(robust / sigma**2, int(active.sum()))
         if solved is None:
             return _UNDETERMINED
         step, inverse = solved
@@ -160,20 +159,20 @@ def solve_sheets(
         sheets = [
             sheet.updated(full[N_SHEET * k : N_SHEET * (k + 1)]) for k, sheet in enumerate(sheets)
         ]
-        remaining = residual + design @ step
+        remaining = system.residual_px + system.times(step)
         if is_robust:
             robust = _huber(remaining / sigma)
         elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
     n_active = int(active.sum())
     common = step[n_active:]
-    design, residual, height = _linearised(observations, sheets, errors, active)
-    remaining = residual + design[:, n_active:] @ common
+    system = _linearised(observations, sheets, errors, active)
+    remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
     return SheetSolution(
         tuple(sheets),
         _joint_covariance(inverse, active, errors),
-        height,
-        residual,
+        system.height_mm,
+        system.residual_px,
         remaining,
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
@@ -198,42 +197,83 @@ def _without_bow(sheet: LightSheet) -> LightSheet:
     return LightSheet(sheet.origin_mm, sheet.axes, sheet.scale_mm, np.zeros(5))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stripe:
+    """Derivatives (K, C) of one stripe's residuals by the C unknowns that move it."""
+
+    rows: IntArray
+    columns: IntArray
+    design: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _System:
+    """All residuals with their derivatives by the active sheet parameters and common errors."""
+
+    stripes: tuple[_Stripe, ...]
+    n_columns: int
+    residual_px: FloatArray
+    height_mm: FloatArray
+
+    def times(self, unknowns: FloatArray) -> FloatArray:
+        """(N,) change of the residuals."""
+        change = np.zeros(len(self.residual_px))
+        for stripe in self.stripes:
+            change[stripe.rows] = stripe.design @ unknowns[stripe.columns]
+        return change
+
+    def step(self, weight: FloatArray, n_active: int) -> tuple[FloatArray, FloatArray] | None:
+        """Step and inverse of the normal matrix; the common errors are known to be 0 +- 1.
+
+        None where the matrix is not positive definite to rounding, so that neither means anything.
+        """
+        information = np.diag((np.arange(self.n_columns) >= n_active).astype(np.float64))
+        pull = np.zeros(self.n_columns)
+        for stripe in self.stripes:
+            weighted = stripe.design * weight[stripe.rows, None]
+            information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
+            pull[stripe.columns] += weighted.T @ self.residual_px[stripe.rows]
+        diagonal = np.diag(information)
+        if not np.isfinite(information).all() or not (diagonal > 0.0).all():
+            return None
+        scale = 1.0 / np.sqrt(diagonal)
+        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        if not values[0] > MIN_EIGENVALUE:
+            return None
+        inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
+        return np.asarray(-inverse @ pull), np.asarray(inverse)
+
+
 def _linearised(
     observations: SheetObservations,
     sheets: Sequence[LightSheet],
     errors: CommonErrors,
     active: BoolArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(N, P) design over the active sheet parameters and the common errors; residuals."""
+) -> _System:
     height, residual, by_sheet, by_point = observations.residuals_px(sheets)
-    columns = np.zeros((len(observations), N_SHEET * len(sheets)))
-    for k in range(len(sheets)):
-        own = observations.sheet == k
-        columns[own, N_SHEET * k : N_SHEET * (k + 1)] = by_sheet[own]
-    design = np.concatenate([columns[:, active], errors.design(observations, by_point)], axis=1)
-    return design, residual, height
-
-
-def _weighted_step(
-    design: FloatArray, residual: FloatArray, weight: FloatArray, n_active: int
-) -> tuple[FloatArray, FloatArray] | None:
-    """Step and inverse of the normal matrix; the common errors are known to be 0 +- 1.
-
-    None where the matrix is not positive definite to rounding, so that neither means anything.
-    """
-    weighted = design * weight[:, None]
-    information = weighted.T @ design
-    prior = np.arange(len(information)) >= n_active
-    information[prior, prior] += 1.0
-    diagonal = np.diag(information)
-    if not np.isfinite(information).all() or not (diagonal > 0.0).all():
-        return None
-    scale = 1.0 / np.sqrt(diagonal)
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if not values[0] > MIN_EIGENVALUE:
-        return None
-    inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-    return np.asarray(-inverse @ (weighted.T @ residual)), np.asarray(inverse)
+    by_camera = np.einsum("ni,nij->nj", by_point, observations.by_camera)
+    by_camera = by_camera @ square_root(errors.camera_covariance)
+    by_pose = np.einsum("ni,nij->nj", by_point, observations.by_pose)
+    pose_roots = [square_root(covariance) for covariance in errors.pose_covariances]
+    n_active = int(active.sum())
+    n_columns = n_active + errors.count
+    column = np.cumsum(active) - 1
+    order = np.argsort(observations.stripe, kind="stable")
+    starts = np.flatnonzero(np.diff(observations.stripe[order], prepend=-1))
+    stripes = []
+    for rows in np.split(order, starts[1:]):
+        sheet, board = int(observations.sheet[rows[0]]), int(observations.board[rows[0]])
+        own = np.flatnonzero(active[N_SHEET * sheet : N_SHEET * (sheet + 1)])
+        columns = np.concatenate(
+            [
+                column[N_SHEET * sheet + own],
+                n_active + 6 * board + np.arange(6),
+                np.arange(n_columns - errors.n_camera, n_columns),
+            ]
+        )
+        design = [by_sheet[rows][:, own], by_pose[rows] @ pose_roots[board], by_camera[rows]]
+        stripes.append(_Stripe(rows, columns, np.concatenate(design, axis=1)))
+    return _System(tuple(stripes), n_columns, residual, height)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:
@@ -242,18 +282,18 @@ def _huber(normalised: FloatArray) -> FloatArray:
 
 
 def _joint_covariance(inverse: FloatArray, active: BoolArray, errors: CommonErrors) -> FloatArray:
-    """Covariance of camera and sheets together, the camera as it was calibrated.
+    """Covariance of cameras and sheets together, the cameras as they were calibrated.
 
-    With the camera's error ``c = L w`` in its own sigmas, the estimate of the sheets errs by
-    ``e_s`` with ``cov(e_s, w) = -inverse[s, w]``; the calibrated camera errs by ``-L w``.
+    With the cameras' error ``c = L w`` in its own sigmas, the estimate of the sheets errs by
+    ``e_s`` with ``cov(e_s, w) = -inverse[s, w]``; the calibrated cameras err by ``-L w``.
     """
-    n_active, n_sheets = int(active.sum()), len(active)
-    camera = slice(len(inverse) - 9, len(inverse))
-    joint = np.zeros((9 + n_sheets, 9 + n_sheets))
-    joint[:9, :9] = errors.camera_covariance
-    places = 9 + np.flatnonzero(active)
+    n_active, n_sheets, p = int(active.sum()), len(active), errors.n_camera
+    camera = slice(len(inverse) - p, len(inverse))
+    joint = np.zeros((p + n_sheets, p + n_sheets))
+    joint[:p, :p] = errors.camera_covariance
+    places = p + np.flatnonzero(active)
     joint[np.ix_(places, places)] = inverse[:n_active, :n_active]
     cross = inverse[:n_active, camera] @ square_root(errors.camera_covariance).T
-    joint[np.ix_(places, np.arange(9))] = cross
-    joint[np.ix_(np.arange(9), places)] = cross.T
+    joint[np.ix_(places, np.arange(p))] = cross
+    joint[np.ix_(np.arange(p), places)] = cross.T
     return 0.5 * (joint + joint.T)

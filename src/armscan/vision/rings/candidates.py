@@ -49,8 +49,7 @@ def clusters(n: int, pairs: tuple[IntArray, IntArray]) -> IntArray:
 
 
 def _axis_mismatch(shapes_px2: FloatArray, outer: IntArray, inner: IntArray) -> FloatArray:
-    """How far two shapes are from being scaled copies: log of the ratio of axes of one seen in
-    the other, halved."""
+    """How far two shapes are from scaled copies: half the log of one's axes' ratio in the other."""
     relative = np.linalg.solve(shapes_px2[outer], shapes_px2[inner])
     ratio = np.sort(np.linalg.eigvals(relative).real, axis=1)
     return np.asarray(0.5 * np.log(np.maximum(ratio[:, 1], 1e-9) / np.maximum(ratio[:, 0], 1e-9)))

@@ -117,7 +117,7 @@ def _filtered(
             | (half[inner, 1] < _SMALLEST_DISC * half[outer, 1]),
         ]
     )
-    kept = ~fails.any(axis=0)
+    kept = np.asarray(~fails.any(axis=0))
     centres = window.to_full_sensor(centres)
     long = rims.directions[outer, :, 1]
     rings = RingImages(

@@ -109,7 +109,9 @@ class Ellipses:
         own = (points_px - self.origin_px[:, None]) / self.scale_px[:, None, None]
         return _sampson(own, self.terms)[0] * self.scale_px[:, None]
 
-    def conics_in(self, origin_px: FloatArray, unit_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def conics_in(
+        self, origin_px: FloatArray, unit_px: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Conics in coordinates shifted to (N, 2) origins and divided by (N,) units.
 
         Returns

@@ -137,4 +137,4 @@ def _most_of_others(table: FloatArray) -> FloatArray:
         return np.zeros_like(table)
     order = np.sort(table, axis=0)
     is_most = np.arange(len(table))[:, None] == table.argmax(axis=0)
-    return np.where(is_most, order[-2], order[-1])
+    return np.asarray(np.where(is_most, order[-2], order[-1]))

@@ -23,6 +23,7 @@ from armscan.reconstruction.image_memory import ImageMemory
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.piece_labels import smoothed_posterior
 from armscan.reconstruction.stretches import Pieces, cut_pieces
+from armscan.reconstruction.stripe_namer import STROKE_GAP_NS
 from armscan.reconstruction.surface_memory import SurfaceMemory
 from armscan.reconstruction.triangulate import meet_sheets
 from armscan.records.profile import Profile
@@ -57,7 +58,7 @@ class CrossOptions:
     remember_margin: float = 7.0
     undecided_share: float = 0.2
     least_between: int = 4
-    stroke_gap_ns: int = 250_000_000
+    stroke_gap_ns: int = STROKE_GAP_NS
     depths: DepthRange = field(default_factory=lambda: DepthRange(0.25))
 
     def __post_init__(self) -> None:

@@ -10,6 +10,9 @@ from armscan.geometry.poses import Pose
 from armscan.reconstruction.named_profile import NamedProfile
 from armscan.records.profile import Profile
 
+STROKE_GAP_NS = 250_000_000
+"""A longer pause between exposures begins a new stroke, of which nothing is known yet."""
+
 
 class StripeNamer(Protocol):
     """Names the stripes of one camera's exposures in order of time; it remembers the past.

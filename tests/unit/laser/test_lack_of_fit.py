@@ -27,6 +27,7 @@ def observations(n_stripes: int) -> SheetObservations:
         index,
         index,
         index,
+        index,
         stripe,
         np.zeros((n, 3)),
         np.zeros((n, 3)),

@@ -35,6 +35,7 @@ def observations(rng: np.random.Generator) -> SheetObservations:
     return SheetObservations(
         image,
         np.arange(n),
+        image,
         np.zeros(n, dtype=np.int64),
         image,
         FLAT.origin_mm + local @ FLAT.axes,

@@ -22,6 +22,7 @@ def straight_observations() -> SheetObservations:
     return SheetObservations(
         stripe,
         np.tile(np.arange(N_POINTS), N_STRIPES),
+        stripe,
         np.zeros(n, dtype=np.int64),
         stripe,
         points,

@@ -34,6 +34,9 @@ CLEAR_LEAD = 2
 """Markers that the best alignment must explain more than any other."""
 MAX_ALIGNMENTS = 20_000
 """Alignments that are scored before the search ends; only repeated patterns have as many."""
+FEW_MARKERS = 12
+ENOUGH_TRIANGLES = 20.0
+"""The search ends when so many triangles of any alignment worth naming should have been drawn."""
 LINE_SIGMAS = 15.0
 FLAT_SHARE = 0.05
 UNIFORM = float(np.sqrt(12.0))
@@ -107,13 +110,15 @@ def _search(
 ) -> list[Alignment]:
     """Different alignments, the best first; at least the two best are complete."""
     a, b = placing.first, placing.second
-    admissible = votes.count >= LEAST_TO_CHECK - 2
-    triangles = base_triangles(a, votes, options.max_triangles, LEAST_TO_CHECK - 2)
+    # among few markers three that agree are looked for too: they may be a rival of four
+    least_votes = LEAST_TO_CHECK - (2 if len(a) <= FEW_MARKERS else 1)
+    admissible = votes.count >= least_votes
+    triangles = base_triangles(a, votes, options.max_triangles, least_votes)
     finder = CongruentTriangles(a, b, admissible, options.distance_sigmas)
     flat_mm = FLAT_SHARE * float(spread_mm(a.points_mm)[1])
     most = min(int(admissible.any(axis=1).sum()), int(admissible.any(axis=0).sum()))
     known: list[Alignment] = []
-    n_scored = 0
+    n_seen = n_scored = 0
     for portion in chunks(triangles, CHUNK):
         copies = [finder.of(triangle) for triangle in portion]
         corners = np.repeat(portion, [len(item) for item in copies], axis=0)
@@ -132,9 +137,10 @@ def _search(
                 break
             if not agree_with_known(corners[k : k + 1], matches[k : k + 1], known).any():
                 _add(placing, known, placing.refined(rotation[k], translation[k], matches[k]))
-        n_scored += len(matches)
+        n_seen, n_scored = n_seen + len(portion), n_scored + len(matches)
         is_settled = len(known) > 1 and len(known[1]) >= max(options.rival_share * most, 4)
-        if is_settled or n_scored > MAX_ALIGNMENTS:
+        share = options.rival_share * len(known[0]) / len(a) if known else 0.0
+        if is_settled or n_scored > MAX_ALIGNMENTS or n_seen * share**3 > ENOUGH_TRIANGLES:
             break
     return known
 

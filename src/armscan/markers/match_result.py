@@ -43,7 +43,7 @@ class MatchOptions:
     position_sigmas: float = 4.5
     false_alarms: float = 1e-4
     rival_share: float = 0.5
-    max_triangles: int = 600
+    max_triangles: int = 400
 
     def __post_init__(self) -> None:
         if self.least_common < LEAST_TO_CHECK:

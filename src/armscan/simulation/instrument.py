@@ -11,10 +11,10 @@ from armscan.devices.twin import Preset
 from armscan.simulation.flat_pattern import CirclePattern
 from armscan.simulation.hand_path import Unsteadiness
 from armscan.simulation.head import Head, build_head
+from armscan.simulation.held_target import made_target
 from armscan.simulation.measuring_arm import ArmErrors, MeasuringArm
 from armscan.simulation.plate_probing import ProbeErrors
 from armscan.simulation.stations import Bench
-from armscan.simulation.target_scenes import made_target
 
 
 @dataclass(frozen=True, slots=True)

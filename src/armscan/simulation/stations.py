@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands before the arm: the plate, the ball, the gauge blocks, the part, all in Base."""
+"""What stands before the arm: plates, the ball, the gauge blocks, the part, all in Base."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,14 @@ from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.simulation.body import Body
 from armscan.simulation.free_form import free_form_part
+from armscan.simulation.marked_plate import MarkedPlate
 from armscan.simulation.plate import FlatPlate
+from armscan.simulation.ring_markers import RingMarker
 from armscan.simulation.shapes import Box, Placed
 from armscan.simulation.station import Station
 from armscan.simulation.surfaces import Sphere
 from armscan.simulation.thing import CERAMIC, GROUND_STEEL, MATT_PAINT, Thing
+from armscan.simulation.wavy_plate import Wave, WavyPlate
 
 BALL_DIAMETER_MM = 34.96
 STEP_HEIGHTS_MM = (20.0, 5.0)
@@ -30,9 +33,16 @@ PLATE_SIZE_MM = (200.0, 200.0)
 _PLATE_MM = (620.0, -160.0, -6.4)
 _BALL_MM = (610.0, -140.0, 60.0)
 _PART_MM = (610.0, -150.0, 20.0)
+_WAVES_MM = (612.0, -150.0, 10.0)
+_MARKED_MM = (612.0, -152.0, 6.0)
+_MARKED_AFTER_MOVE_MM = (585.0, 95.0, 21.0)
+_TURN_OF_MOVE_RAD = 0.35
+"""How the part stands in Base after the arm was put down in another place."""
 _GROUND_SIZE_MM = (120.0, 120.0)
 _GROUND_FLATNESS_MM = 0.001
 _FLATNESS_MM: dict[Preset, float] = {"clean": 0.001, "thesis": 0.015, "harsh": 0.04}
+_WAVES = (Wave(1.6, 40.0, 15.0), Wave(0.9, 26.0, 105.0), Wave(0.35, 15.0, 60.0))
+_WAVES_SIZE_MM = (110.0, 110.0)
 _WHITE = (0.8, 0.8, 0.8)
 _STEEL = (0.45, 0.45, 0.45)
 _PLACE_MM = 15.0
@@ -55,6 +65,12 @@ class Bench:
         That plate, in its frame.
     part, base_from_part
         The free-form part in its own frame, and where it stands.
+    waves, base_from_waves
+        The wavy plate in its own frame, and where it lies.
+    marked, base_from_marked
+        The plate with ring markers in its own frame, and where it stands.
+    moved_from_base
+        From Base to what Base is after the arm was put down in another place.
     """
 
     plate: FlatPlate
@@ -64,6 +80,11 @@ class Bench:
     base_from_ground: Pose[Base, Plate]
     part: Body
     base_from_part: Pose[Base, Part]
+    waves: WavyPlate
+    base_from_waves: Pose[Base, Plate]
+    marked: MarkedPlate
+    base_from_marked: Pose[Base, Part]
+    moved_from_base: Pose[Base, Base]
 
     @staticmethod
     def build(preset: Preset, rng: np.random.Generator) -> Bench:
@@ -71,14 +92,27 @@ class Bench:
         plate = FlatPlate.draw(PLATE_SIZE_MM, _FLATNESS_MM[preset], rng, _WHITE)
         ground = FlatPlate.draw(_GROUND_SIZE_MM, _GROUND_FLATNESS_MM, rng, _STEEL)
         ball = np.array(_BALL_MM) + _PLACE_MM * rng.uniform(-1.0, 1.0, 3)
+        base_from_plate = _put_down(_PLATE_MM, rng)
+        base_from_ground = _put_down(_PLATE_MM, rng)
+        base_from_part = _put_down(_PART_MM, rng)
+        base_from_waves = _put_down(_WAVES_MM, rng)
+        phases = rng.uniform(0.0, 2.0 * np.pi, len(_WAVES))
+        waves = [replace(w, phase_rad=float(p)) for w, p in zip(_WAVES, phases, strict=True)]
+        base_from_marked = _put_down(_MARKED_MM, rng)
+        moved_from_marked = _put_down(_MARKED_AFTER_MOVE_MM, rng, _TURN_OF_MOVE_RAD)
         return Bench(
             plate=plate,
-            base_from_plate=_put_down(_PLATE_MM, rng),
+            base_from_plate=base_from_plate,
             ball=Sphere(ball, 0.5 * BALL_DIAMETER_MM, _WHITE),
             ground=ground,
-            base_from_ground=_put_down(_PLATE_MM, rng),
+            base_from_ground=base_from_ground,
             part=free_form_part(),
-            base_from_part=_put_down(_PART_MM, rng),
+            base_from_part=base_from_part,
+            waves=WavyPlate(_WAVES_SIZE_MM, tuple(waves), _WHITE),
+            base_from_waves=base_from_waves,
+            marked=MarkedPlate.draw(rng),
+            base_from_marked=base_from_marked,
+            moved_from_base=moved_from_marked @ base_from_marked.inverse(),
         )
 
     @property
@@ -109,6 +143,32 @@ class Bench:
         """The free-form part alone."""
         return Station((Thing("part", Placed(self.part, self.base_from_part), MATT_PAINT),))
 
+    def with_waves(self) -> Station:
+        """The wavy plate alone."""
+        return Station((Thing("waves", Placed(self.waves, self.base_from_waves), MATT_PAINT),))
+
+    def with_markers(self, is_moved: bool = False) -> Station:
+        """The stepped plate with ring markers, in Base before or after the arm was moved."""
+        pose = self.marked_pose(is_moved)
+        things = tuple(
+            Thing(f"step {k}", Placed(shape, pose), MATT_PAINT)
+            for k, shape in enumerate(self.marked.shapes)
+        )
+        markers = tuple(
+            RingMarker(centre, pose.rotation[:, 2])
+            for centre in self.marked.centres_mm @ pose.rotation.T + pose.translation_mm
+        )
+        return Station(things, markers=markers)
+
+    def marked_pose(self, is_moved: bool = False) -> Pose[Base, Part]:
+        """Where the plate with markers stands, in Base before or after the arm was moved."""
+        return self.moved_from_base @ self.base_from_marked if is_moved else self.base_from_marked
+
+    def marker_centres_mm(self) -> FloatArray:
+        """(N, 3) middles of the ring markers, in Base before the arm was moved."""
+        pose = self.base_from_marked
+        return np.asarray(self.marked.centres_mm @ pose.rotation.T + pose.translation_mm)
+
     def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) in Base from the free-form part."""
         return self.part.distance_mm(self._in_part(points_base_mm))
@@ -123,9 +183,11 @@ class Bench:
         return np.asarray((points_base_mm - pose.translation_mm) @ pose.rotation)
 
 
-def _put_down(place_mm: tuple[float, float, float], rng: np.random.Generator) -> Pose[Base, Any]:
+def _put_down(
+    place_mm: tuple[float, float, float], rng: np.random.Generator, turn_rad: float = 0.0
+) -> Pose[Base, Any]:
     """Pose near a place, turned by hand and not quite level."""
-    turn = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-0.3, 0.3)]))
+    turn = rotation_from_vector(np.array([0.0, 0.0, turn_rad + rng.uniform(-0.3, 0.3)]))
     level = rotation_from_vector(np.array([*(_LEVEL_RAD * rng.standard_normal(2)), 0.0]))
     shift = np.array([_PLACE_MM, _PLACE_MM, 1.0]) * rng.uniform(-1.0, 1.0, 3)
     return Pose(level @ turn, np.array(place_mm) + shift)

@@ -1,32 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a person scans each object: the strokes of a hand."""
+"""How a person scans each object with one line: the strokes of a hand."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.rotation import rotation_from_vector
 from armscan.simulation.aim import Aim
-from armscan.simulation.head import Head
-from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_CENTRES_MM, Bench
+from armscan.simulation.faces import leaning, on_face, quarter_turn
+from armscan.simulation.posture import DEPTH_MM
+from armscan.simulation.stations import BALL_DIAMETER_MM, Bench
 from armscan.simulation.sweep import Stroke
 
 HALF_WAY_DEG = -21.3
 """Tilt at which laser and camera lie equally far from the face's normal."""
-UPRIGHT_DEG = -42.6
-"""Tilt at which the light sheet stands along the face's normal: one exposure shows a height only
-then."""
-DEPTH_MM = 137.0
-"""Middle of the depths that the scanning window sees."""
 
 _OVER_BALL_DEG = -26.0
 BALL_TILTS_DEG = (4.0, 26.0, 30.0, 24.0, 30.0, 26.0, 28.0)
 BALL_AZIMUTHS_DEG = (0.0, 15.0, 75.0, 135.0, 195.0, 255.0, 315.0)
 _BALL_WAY_MM = 25.0
-_PART_WAYS = ((-14.0, -25.0, 40.0), (-5.0, -6.0, 45.0), (5.0, 6.0, 50.0), (14.0, 25.0, 42.0))
-"""Place across the part (mm), lean to that side (degrees), speed (mm/s)."""
-_BALL_HEIGHT = 0.8
+BALL_HEIGHT = 0.8
 """Height, in radii, at which the stripe's middle passes over the ball's centre."""
 
 
@@ -39,7 +31,7 @@ def plate_strokes(bench: Bench) -> list[Stroke]:
         ((-65.0, 0.0), (65.0, 5.0), Aim(-34.0, 2.0, 84.0, DEPTH_MM), 38.0),
     )
     return [
-        Stroke(face, _on(face, origin, start), _on(face, origin, end), aim, speed, 8)
+        Stroke(face, on_face(face, origin, start), on_face(face, origin, end), aim, speed, 8)
         for start, end, aim, speed in ways
     ]
 
@@ -48,8 +40,8 @@ def ball_strokes(bench: Bench) -> list[Stroke]:
     """From above, then from six sides."""
     strokes = []
     for k, (tilt, azimuth) in enumerate(zip(BALL_TILTS_DEG, BALL_AZIMUTHS_DEG, strict=True)):
-        face = _leaning(tilt, azimuth)
-        middle = bench.ball.centre_mm + _BALL_HEIGHT * 0.5 * BALL_DIAMETER_MM * face[:, 2]
+        face = leaning(tilt, azimuth)
+        middle = bench.ball.centre_mm + BALL_HEIGHT * 0.5 * BALL_DIAMETER_MM * face[:, 2]
         way = (-1.0) ** k * 0.5 * _BALL_WAY_MM * face[:, 1]
         aim = Aim(_OVER_BALL_DEG, 0.0, 0.0, DEPTH_MM)
         strokes.append(Stroke(face, middle - way, middle + way, aim, 30.0 + 2.0 * k, 10))
@@ -63,8 +55,8 @@ def step_strokes(bench: Bench) -> list[Stroke]:
     return [
         Stroke(
             face,
-            _on(face, origin, (0.0, side * 11.0)) + lift,
-            _on(face, origin, (0.0, -side * 11.0)) + lift,
+            on_face(face, origin, (0.0, side * 11.0)) + lift,
+            on_face(face, origin, (0.0, -side * 11.0)) + lift,
             Aim(HALF_WAY_DEG + turn, 0.0, roll, DEPTH_MM),
             30.0,
             12,
@@ -83,7 +75,7 @@ def part_strokes(bench: Bench) -> list[Stroke]:
         (5.0, -6.0, 50.0),
         (14.0, -25.0, 42.0),
     ):
-        face = pose.rotation @ _leaning(abs(lean), -90.0 if lean > 0.0 else 90.0) @ _quarter_turn()
+        face = pose.rotation @ leaning(abs(lean), -90.0 if lean > 0.0 else 90.0) @ quarter_turn()
         start, end = (
             pose.translation_mm + pose.rotation @ np.array([x, side, 13.0]) for x in (-40.0, 40.0)
         )
@@ -92,31 +84,21 @@ def part_strokes(bench: Bench) -> list[Stroke]:
     return strokes
 
 
-def still_step(bench: Bench, head: Head) -> tuple[FloatArray, FloatArray, Aim]:
-    """Face (3, 3), spot (3,) in Base and aim of one look at the higher block and the ground.
-
-    The head is squared to the block, the laser's middle ray upright: from one stripe alone a
-    height is known only in the sheet.
-    """
-    face, origin = bench.base_from_ground.rotation, bench.base_from_ground.translation_mm
-    spot = _on(face, origin, STEP_CENTRES_MM[0]) + 10.0 * face[:, 2]
-    ray = head.lasers[0].rays(np.zeros(1))[0]
-    upright = -np.degrees(np.arcsin(ray[1]))
-    aside = np.degrees(np.arctan2(ray[0], ray[2]))
-    return face, spot, Aim(float(upright), float(aside), 0.0, DEPTH_MM)
-
-
-def _on(face: FloatArray, origin_mm: FloatArray, place_mm: tuple[float, float]) -> FloatArray:
-    return np.asarray(origin_mm + face[:, :2] @ np.array(place_mm))
-
-
-def _leaning(tilt_deg: float, azimuth_deg: float) -> FloatArray:
-    """(3, 3) axes of a face that leans towards an azimuth, without turning about the vertical."""
-    azimuth = np.radians(azimuth_deg)
-    axis = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    return rotation_from_vector(np.radians(tilt_deg) * axis)
-
-
-def _quarter_turn() -> FloatArray:
-    """A face whose y axis runs along the x of the one before it."""
-    return np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+def wave_strokes(bench: Bench) -> list[Stroke]:
+    """Two strokes over the waves, square to each other."""
+    pose = bench.base_from_waves
+    ways = (
+        ((-6.0, -35.0), (-2.0, 35.0), Aim(HALF_WAY_DEG, 2.0, 3.0, DEPTH_MM), 45.0),
+        ((35.0, 4.0), (-35.0, -3.0), Aim(-16.0, -3.0, 86.0, DEPTH_MM), 40.0),
+    )
+    return [
+        Stroke(
+            pose.rotation,
+            on_face(pose.rotation, pose.translation_mm, start),
+            on_face(pose.rotation, pose.translation_mm, end),
+            aim,
+            speed,
+            12,
+        )
+        for start, end, aim, speed in ways
+    ]

@@ -1,106 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The head before its calibration target: images for the camera, pairs for the light sheet.
+"""The head before its calibration target: images for its cameras, and for its light sheets.
 
 No arm takes part, so Base is the Sensor frame here and the target moves.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 
 import numpy as np
 
-from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Base, Sensor
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.records.session import ExposureRow
 from armscan.simulation.flat_pattern import CirclePattern
 from armscan.simulation.head import Head
+from armscan.simulation.instant import Light, Moment, instant_shots
 from armscan.simulation.scene import Lamp
-from armscan.simulation.sheet_middle import sheet_middle_mm
-from armscan.simulation.station import ExposureSettings, Station, Target
+from armscan.simulation.shared_places import (
+    CROSS_LASER_PLACES,
+    MULTI_LASER_PLACES,
+    MULTI_LEFT_PLACES,
+    STEREO_CAMERA_PLACES,
+    held_before_all,
+)
+from armscan.simulation.station import Station, Target
 from armscan.simulation.surfaces import Floor
+from armscan.simulation.target_places import (
+    CAMERA_PLACES,
+    LASER_PLACES,
+    held_before_camera,
+    held_in_sheet,
+)
 from armscan.simulation.thing import Thing
 from armscan.simulation.twin_scan import Shot
-
-PATTERN = CirclePattern(columns=11, rows=9, pitch_mm=3.75, diameter_mm=1.875)
-TARGET = "circle-grid:11x9:3.75"
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where a target is held.
-
-    Parameters
-    ----------
-    tilt_x_deg, tilt_y_deg, roll_deg
-        Turned from facing the camera upright: rolled first, then tilted about x, then about y.
-    across, down
-        Where the target's middle appears, as parts of the image's width and height.
-    depth_mm
-        Depth of its middle.
-    """
-
-    tilt_x_deg: float
-    tilt_y_deg: float
-    roll_deg: float
-    across: float
-    down: float
-    depth_mm: float
-
-
-@dataclass(frozen=True, slots=True)
-class StripePlace:
-    """Where a target is held so that the stripe crosses it.
-
-    Parameters
-    ----------
-    tilt_x_deg, tilt_y_deg, roll_deg
-        As for `Place`.
-    aside_mm
-        Middle of the target beside the middle of the stripe.
-    depth_mm
-        Depth of the middle of the stripe.
-    """
-
-    tilt_x_deg: float
-    tilt_y_deg: float
-    roll_deg: float
-    aside_mm: float
-    depth_mm: float
-
-
-CAMERA_PLACES: tuple[Place, ...] = (
-    Place(0, 0, 2, 0.50, 0.50, 124),
-    Place(0, 3, -3, 0.29, 0.35, 140),
-    Place(3, 0, 4, 0.71, 0.35, 140),
-    Place(-3, 0, 2, 0.29, 0.65, 140),
-    Place(0, -3, -5, 0.71, 0.65, 140),
-    Place(30, 0, 5, 0.50, 0.48, 138),
-    Place(-32, 2, -6, 0.50, 0.52, 140),
-    Place(2, 32, 8, 0.45, 0.50, 140),
-    Place(-2, -34, 3, 0.55, 0.50, 142),
-    Place(42, 10, 20, 0.35, 0.42, 148),
-    Place(-28, 32, -15, 0.64, 0.42, 150),
-    Place(26, -32, -35, 0.36, 0.60, 150),
-    Place(-24, -30, 40, 0.64, 0.60, 152),
-    Place(8, 44, 85, 0.50, 0.50, 150),
-    Place(-20, 12, 90, 0.50, 0.50, 164),
-)
-
-LASER_PLACES: tuple[StripePlace, ...] = (
-    StripePlace(-6, 3, 1, -12.0, 117),
-    StripePlace(-22, 10, -2, 15.0, 124),
-    StripePlace(6, -12, 3, 17.0, 131),
-    StripePlace(-26, -8, 2, -19.0, 138),
-    StripePlace(-8, 20, -5, -20.0, 145),
-    StripePlace(2, -20, 6, 21.0, 150),
-    StripePlace(-20, 5, 3, -24.0, 157),
-    StripePlace(18, 2, 0, 24.0, 164),
-)
-"""Near and far on both sides: the target is half as wide as the stripe."""
 
 _LAMP = Lamp(even=0.7, direct=0.35, position_mm=(120.0, -260.0, -250.0), up=(0.0, 0.0, -1.0))
 _BACKGROUND = Thing(
@@ -108,123 +40,73 @@ _BACKGROUND = Thing(
 )
 _WITH_LASER = 0.15
 """Room light while the stripe is photographed, over that of the target's image."""
-_JITTER_DEG = 2.0
-_JITTER_SHARE = 0.008
-_RIM_PX = 12.0
-_SLIDES, _ASIDES = 41, 11
 _INTERVAL_NS = 2_000_000_000
-
-
-def made_target(sigma_mm: float, rng: np.random.Generator) -> CirclePattern:
-    """The target with every circle a little off its place, as a maker delivers it."""
-    if sigma_mm == 0.0:
-        return PATTERN
-    missed = sigma_mm * rng.standard_normal((PATTERN.columns * PATTERN.rows, 2))
-    return replace(PATTERN, misplaced_mm=tuple((float(x), float(y)) for x, y in missed))
+_FEW_LINES = 5
 
 
 def camera_shots(head: Head, pattern: CirclePattern, rng: np.random.Generator) -> tuple[Shot, ...]:
-    """The target at all `CAMERA_PLACES`, each a little off as by hand."""
-    settings = ExposureSettings(head.full_window, room_light=head.imaging.target_light)
-    shots = []
-    for k, place in enumerate(CAMERA_PLACES):
-        row = ExposureRow(k, _INTERVAL_NS * (k + 1), 0, f"images/{k + 1:02d}.png")
-        shots.append(_shot(row, _held(head, pattern, place, rng), settings))
+    """The target at all places for the cameras, each a little off as by hand."""
+    light = Light(room_light=head.imaging.target_light)
+    is_stereo = len(head.cameras) > 1
+    if is_stereo:
+        targets = [held_before_all(head, pattern, place, rng) for place in STEREO_CAMERA_PLACES]
+    else:
+        targets = [held_before_camera(head, pattern, place, rng) for place in CAMERA_PLACES]
+    shots: list[Shot] = []
+    for k, target in enumerate(targets):
+        name = f"{k + 1:02d}"
+        moment = Moment(
+            _INTERVAL_NS * (k + 1),
+            f"{name}.png",
+            k + 1 if is_stereo else None,
+            name if is_stereo else None,
+        )
+        shots += _shots(head, len(shots), moment, target, light)
     return tuple(shots)
 
 
 def laser_shots(head: Head, pattern: CirclePattern, rng: np.random.Generator) -> tuple[Shot, ...]:
-    """The target at all `LASER_PLACES`, each with the laser on in dim light, then without it."""
-    light = head.imaging.target_light
-    names = tuple(laser.name for laser in head.lasers)
-    lit = ExposureSettings(head.full_window, names, room_light=_WITH_LASER * light)
-    unlit = ExposureSettings(head.full_window, room_light=light)
-    shots = []
-    for k, place in enumerate(LASER_PLACES):
-        target = _held_in_sheet(head, pattern, place, rng)
-        for j, (state, settings) in enumerate((("on", lit), ("off", unlit))):
-            row = ExposureRow(
-                2 * k + j,
-                _INTERVAL_NS * (2 * k + j + 1),
-                0,
-                f"images/{state}/{k + 1:02d}.png",
-                lasers=settings.lasers,
-                view=f"{k + 1:02d}",
-            )
-            shots.append(_shot(row, target, settings))
+    """The target at all places for the sheets: each source alone in dim light, then none."""
+    room = head.imaging.target_light
+    states = [
+        (source if is_named(head) else "on", Light((source,), _WITH_LASER * room))
+        for source in head.sources
+    ]
+    states.append(("off", Light(room_light=room)))
+    shots: list[Shot] = []
+    moments = 0
+    for k, target in enumerate(_before_lasers(head, pattern, rng)):
+        view = f"{k + 1:02d}"
+        for state, light in states:
+            moments += 1
+            trigger = moments if len(head.cameras) > 1 else None
+            moment = Moment(_INTERVAL_NS * moments, f"{state}/{view}.png", trigger, view)
+            shots += _shots(head, len(shots), moment, target, light)
     return tuple(shots)
 
 
-def _shot(row: ExposureRow, target: Target, settings: ExposureSettings) -> Shot:
+def is_named(head: Head) -> bool:
+    """True if folders bear the names of sources: a single line is only on or off."""
+    return len(head.lasers) > 1
+
+
+def _before_lasers(
+    head: Head, pattern: CirclePattern, rng: np.random.Generator
+) -> Iterator[Target]:
+    if len(head.lasers) == 1:
+        yield from (held_in_sheet(head, pattern, place, rng) for place in LASER_PLACES)
+        return
+    places = CROSS_LASER_PLACES
+    if len(head.cameras) > 1:
+        # A few lines in the middle are met at each place.
+        is_many = len(head.lasers) > _FEW_LINES
+        places = MULTI_LASER_PLACES + MULTI_LEFT_PLACES if is_many else MULTI_LASER_PLACES[::2]
+    yield from (held_before_all(head, pattern, place, rng) for place in places)
+
+
+def _shots(
+    head: Head, first_index: int, moment: Moment, target: Target, light: Light
+) -> list[Shot]:
     here: Pose[Base, Sensor] = Pose(np.eye(3), np.zeros(3))
-    return Shot(row, Station((_BACKGROUND,), target, _LAMP), here, settings)
-
-
-def _held(head: Head, pattern: CirclePattern, place: Place, rng: np.random.Generator) -> Target:
-    """Target near a place, moved away until all marks are in view."""
-    jitter = rng.uniform(-1.0, 1.0, 6)
-    rotation = _rotation(place, jitter[:3])
-    size = np.array([head.camera.width_px, head.camera.height_px])
-    share = np.array([place.across, place.down]) + _JITTER_SHARE * jitter[3:5]
-    ray = np.array([*head.camera.rays(share * size), 1.0])
-    depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[5])
-    while True:
-        target = _with_middle(pattern, rotation, depth * ray)
-        if _is_in_view(head, target):
-            return target
-        depth *= 1.01
-
-
-def _held_in_sheet(
-    head: Head, pattern: CirclePattern, place: StripePlace, rng: np.random.Generator
-) -> Target:
-    """Target that the stripe meets at a depth, slid in its plane until all marks are in view."""
-    jitter = rng.uniform(-1.0, 1.0, 5)
-    rotation = _rotation(place, jitter[:3])
-    depth = place.depth_mm * (1.0 + _JITTER_SHARE * jitter[3])
-    on_stripe = sheet_middle_mm(head, depth)
-    for share in np.linspace(1.0, 0.0, _ASIDES):
-        aside = _in_plane(rotation, on_stripe, share * (place.aside_mm + jitter[4]), on_stripe[1])
-        inward = _in_plane(rotation, on_stripe, aside[0], 0.0)
-        for slide in np.linspace(0.0, 1.0, _SLIDES):
-            target = _with_middle(pattern, rotation, aside + slide * (inward - aside))
-            if _is_in_view(head, target):
-                return target
-    raise InputError(f"the target at {depth:.0f} mm is larger than the camera's view")
-
-
-def _rotation(place: Place | StripePlace, jitter: FloatArray) -> FloatArray:
-    degrees = np.array([place.tilt_x_deg, place.tilt_y_deg, place.roll_deg])
-    about_x, about_y, roll = (
-        rotation_from_vector(np.radians(angle) * axis)
-        for angle, axis in zip(degrees + _JITTER_DEG * jitter, np.eye(3), strict=True)
-    )
-    return np.asarray(about_y @ about_x @ roll)
-
-
-def _in_plane(rotation: FloatArray, point_mm: FloatArray, x_mm: float, y_mm: float) -> FloatArray:
-    """(3,) point with coordinates x, y in the plane of a target through another point."""
-    normal = rotation[:, 2]
-    rest = normal @ point_mm - normal[0] * x_mm - normal[1] * y_mm
-    return np.array([x_mm, y_mm, rest / normal[2]])
-
-
-def _with_middle(pattern: CirclePattern, rotation: FloatArray, middle_mm: FloatArray) -> Target:
-    """Target whose middle is at a point (3,)."""
-    middle = np.append(PATTERN.marks_board_mm.mean(axis=0)[:2], 0.0)
-    return Target(pattern, Pose(rotation, middle_mm - rotation @ middle))
-
-
-def _is_in_view(head: Head, target: Target) -> bool:
-    pose = target.base_from_board
-    rim = head.camera.project(_corners_mm() @ pose.rotation.T + pose.translation_mm)
-    size = np.array([head.camera.width_px, head.camera.height_px])
-    return bool(((rim > _RIM_PX) & (rim < size - _RIM_PX)).all())
-
-
-def _corners_mm() -> FloatArray:
-    """(4, 3) corners around all marks, in Board; the blank rim may leave the image."""
-    x_min, y_min, x_max, y_max = PATTERN.extent_board_mm
-    rim = PATTERN.pitch_mm - PATTERN.diameter_mm
-    x_min, y_min, x_max, y_max = x_min + rim, y_min + rim, x_max - rim, y_max - rim
-    return np.array([[x_min, y_min, 0], [x_max, y_min, 0], [x_max, y_max, 0], [x_min, y_max, 0.0]])
+    station = Station((_BACKGROUND,), target, _LAMP)
+    return instant_shots(head, first_index, moment, station, light, here)

@@ -4,19 +4,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 
 from armscan.devices.twin import Preset, TwinScene
 from armscan.errors import OptionError
 from armscan.records.session import SessionKind
-from armscan.simulation.arm_scenes import Recorded, hand_eye_scene, scan_scene, still_step_scene
+from armscan.simulation.arm_scenes import (
+    Recorded,
+    hand_eye_scene,
+    marker_scene,
+    scan_scene,
+    still_step_scene,
+)
 from armscan.simulation.head import HEADS
+from armscan.simulation.held_target import TARGET
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.plate_probing import PlateProbing, probe_plate
-from armscan.simulation.strokes import ball_strokes, part_strokes, plate_strokes, step_strokes
-from armscan.simulation.target_scenes import TARGET, camera_shots, laser_shots
+from armscan.simulation.scan_plan import SweptScene
+from armscan.simulation.target_scenes import camera_shots, laser_shots
 from armscan.simulation.twin_scan import TwinScan
 from armscan.simulation.twin_truth import InstrumentTruth
 
@@ -50,6 +57,11 @@ class SimulatedInstrument:
     def target(self) -> str:
         """The calibration target as the command line names it."""
         return TARGET
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the laser sources, each switched by itself."""
+        return self.instrument.head.sources
 
     @property
     def truth(self) -> InstrumentTruth:
@@ -90,18 +102,14 @@ class SimulatedInstrument:
         return probe_plate(tools.arm, tools.bench, tools.mechanics.probe, rng)
 
     def _with_arm(self, scene: TwinScene, rng: np.random.Generator) -> Recorded:
-        tools, bench = self.instrument, self.instrument.bench
+        tools = self.instrument
         if scene == "hand-eye":
             return hand_eye_scene(tools, rng)
         if scene == "still-step":
             return still_step_scene(tools, rng)
-        if scene == "plate":
-            return scan_scene(tools, bench.with_plate(), plate_strokes(bench), rng)
-        if scene == "ball":
-            return scan_scene(tools, bench.with_ball(), ball_strokes(bench), rng)
-        if scene == "steps":
-            return scan_scene(tools, bench.with_steps(), step_strokes(bench), rng)
-        return scan_scene(tools, bench.with_part(), part_strokes(bench), rng)
+        if scene in ("markers", "markers-moved"):
+            return marker_scene(tools, scene == "markers-moved", rng)
+        return scan_scene(tools, cast(SweptScene, scene), rng)
 
 
 def build_twin(

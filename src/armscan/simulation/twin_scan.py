@@ -83,14 +83,8 @@ class TwinScan:
     @property
     def session(self) -> Session:
         """Facts that hold for all exposures."""
-        window = self.shots[0].settings.window
-        setup = CameraSetup(
-            width_px=window.width_px,
-            height_px=window.height_px,
-            window=SensorWindow(window.x_px, window.y_px),
-            bits_used=self.head.imaging.detector.bits,
-        )
-        return Session(kind=self.kind, cameras=(setup,), is_simulated=True)
+        cameras = tuple(self._setup(camera) for camera in range(len(self.head.cameras)))
+        return Session(kind=self.kind, cameras=cameras, is_simulated=True)
 
     @property
     def rows(self) -> tuple[ExposureRow, ...]:
@@ -112,7 +106,8 @@ class TwinScan:
         rng = np.random.default_rng([*self.seed, row])
         poses = shot.sub_poses or (shot.base_from_sensor,)
         settings = replace(shot.settings, lasers=lasers)
-        image = render_exposure(self.head, shot.station, poses, settings, rng)
+        camera = shot.row.camera
+        image = render_exposure(self.head, shot.station, poses, settings, rng, camera=camera)
         window = shot.settings.window
         return Exposure(
             image,
@@ -121,13 +116,28 @@ class TwinScan:
             window=SensorWindow(window.x_px, window.y_px),
             lasers=lasers,
             t_ns=shot.row.t_ns,
-            camera=shot.row.camera,
+            camera=camera,
             trigger_id=shot.row.trigger_id,
             view=shot.row.view,
         )
 
     def true_stripes(self, row: int) -> tuple[TrueStripe, ...]:
-        """Where all sheets' centres truly lie in one exposure, at its middle, on or off."""
+        """Where all sheets' centres truly lie in one exposure, at its middle, on or off.
+
+        Pixels are those of the row's own camera.
+        """
         shot = self.shots[row]
-        settings = replace(shot.settings, lasers=tuple(laser.name for laser in self.head.lasers))
-        return true_stripes(self.head, shot.station, shot.base_from_sensor, settings)
+        settings = replace(shot.settings, lasers=self.head.sources)
+        return true_stripes(
+            self.head, shot.station, shot.base_from_sensor, settings, camera=shot.row.camera
+        )
+
+    def _setup(self, camera: int) -> CameraSetup:
+        """How a camera delivers its images: all with one window."""
+        window = next(shot for shot in self.shots if shot.row.camera == camera).settings.window
+        return CameraSetup(
+            width_px=window.width_px,
+            height_px=window.height_px,
+            window=SensorWindow(window.x_px, window.y_px),
+            bits_used=self.head.imaging.detector.bits,
+        )

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray
-from armscan.simulation.light import LineLaser
+from armscan.simulation.laser_source import TracedLight
 from armscan.simulation.optics import RenderCamera, blur_image
 from armscan.simulation.region import Image32, Region
 from armscan.simulation.render import BLUR_REACH, SUBPIXELS, Speckle
@@ -26,14 +26,14 @@ _GRAIN_CELLS = 1536
 def band_light(
     views: Sequence[PosedView],
     camera: RenderCamera,
-    laser: LineLaser,
+    source: TracedLight,
     region: Region,
     *,
     speckle: Speckle,
     rng: np.random.Generator,
 ) -> Image32:
-    """Light (H, W) of one laser in a region, parts of full scale, blurred; mean over the views."""
-    sheets = [trace_sheet(view, camera, laser, region) for view in views]
+    """Light (H, W) of one source in a region, parts of full scale, blurred; mean over the views."""
+    sheets = [trace_sheet(view, camera, source, region) for view in views]
     is_lit = np.logical_or.reduce([sheet.is_lit for sheet in sheets])
     light = np.zeros(is_lit.shape, np.float32)
     margin = int(np.ceil(BLUR_REACH * camera.blur_sigma_px)) + 1

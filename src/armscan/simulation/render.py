@@ -140,13 +140,28 @@ def pixels_near_sheet(reach: FloatArray) -> BoolArray:
 
     The reach, in sigmas, is given on the coarse grid; NaN where nothing is met.
     """
-    corners = _corners(reach)
-    low = np.where(np.isnan(corners), np.inf, corners).min(axis=0)
-    high = np.where(np.isnan(corners), -np.inf, corners).max(axis=0)
-    cells = ((low <= BAND_SIGMAS) & (high >= -BAND_SIGMAS)).astype(np.uint8)
-    cells = cv2.dilate(cells, np.ones((3, 3), np.uint8))
+    cells = cells_near_sheet(reach, (reach > 0.0).astype(np.float64)).astype(np.uint8)
     size = (COARSE_STEP_PX * cells.shape[1], COARSE_STEP_PX * cells.shape[0])
     return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def cells_near_sheet(reach: FloatArray, rank: FloatArray) -> BoolArray:
+    """(H - 1, W - 1) True for cells of the coarse grid that a sheet crosses, and their neighbours.
+
+    Parameters
+    ----------
+    reach
+        (H, W) distance of the nodes from the nearest sheet, in sigmas; NaN where nothing is met.
+    rank
+        (H, W) how many of the sheets' centres lie below a node.
+    """
+    corners, ranks = np.abs(_corners(reach)), _corners(rank)
+    is_hit = np.isfinite(corners)
+    nearest = np.where(is_hit, corners, np.inf).min(axis=0)
+    low = np.where(is_hit, ranks, np.inf).min(axis=0)
+    high = np.where(is_hit, ranks, -np.inf).max(axis=0)
+    cells = ((nearest <= BAND_SIGMAS) | (high > low)).astype(np.uint8)
+    return np.asarray(cv2.dilate(cells, np.ones((3, 3), np.uint8)) > 0)
 
 
 def _corners(grid: FloatArray) -> FloatArray:

@@ -20,9 +20,12 @@ from armscan.simulation.board_photo import render_board
 from armscan.simulation.flat_pattern import FlatPattern
 from armscan.simulation.head import Head, MountedCamera, Window
 from armscan.simulation.imaging import Imaging
+from armscan.simulation.laser_source import in_sources
 from armscan.simulation.light import LineLaser
 from armscan.simulation.region import Region, to_pixels
 from armscan.simulation.render import laser_band
+from armscan.simulation.ring_image import draw_markers
+from armscan.simulation.ring_markers import Marked, RingMarker
 from armscan.simulation.scene import Lamp, Scene
 from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
 from armscan.simulation.shapes import Placed
@@ -67,11 +70,14 @@ class Station:
         A printed target, or None.
     room
         Light of the room; its brightness is scaled by each exposure.
+    markers
+        Ring markers on flat faces of the things, drawn sharply in images under room light.
     """
 
     things: tuple[Thing, ...]
     target: Target | None = None
     room: Lamp = ROOM
+    markers: tuple[RingMarker, ...] = ()
 
     def under(self, imaging: Imaging) -> Station:
         """The station with the gloss and texture that a preset makes of it."""
@@ -196,8 +202,8 @@ def exposure_light(
         slice(window.y_px - region.y_px, window.y_px - region.y_px + window.height_px),
         slice(window.x_px - region.x_px, window.x_px - region.x_px + window.width_px),
     )
-    for laser in _seen_lasers(head, eye, settings.lasers):
-        line = band_light(views, eye.camera, laser, region, speckle=imaging.speckle, rng=rng)
+    for source in in_sources(_seen_lasers(head, eye, settings.lasers)):
+        line = band_light(views, eye.camera, source, region, speckle=imaging.speckle, rng=rng)
         light += np.float32(settings.laser_gain) * line[inside]
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
@@ -268,11 +274,16 @@ def _room(
 ) -> FloatArray:
     """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
     _, (rows, columns) = region.nodes_px()
-    nodes = view.scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
+    # The nodes are too far apart for markers: they get the face's own colour.
+    scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
+    nodes = scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
     coarse = to_pixels(nodes, region)
+    camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
+    if station.markers:
+        markers = [marker.seen_from(pose) for marker in station.markers]
+        return draw_markers(coarse.astype(np.float64), markers, scene, camera)
     if station.target is None:
         return np.asarray(coarse)
-    camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     board = board_seen_from(station.target, pose)
     background = np.asarray(coarse, dtype=np.float64)[..., None]
     return render_board(board, camera, view.scene.lamp, background)[..., 0]
@@ -281,7 +292,10 @@ def _room(
 def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:
     """The station's things, then its target, in the frame of the head or of one camera."""
     sensor_from_base = base_from_sensor.inverse()
-    surfaces: list[Surface] = [Placed(thing, sensor_from_base) for thing in station.things]
+    things: Sequence[Surface] = station.things
+    if station.markers:
+        things = [replace(t, surface=Marked(t.surface, station.markers)) for t in station.things]
+    surfaces: list[Surface] = [Placed(thing, sensor_from_base) for thing in things]
     if station.target is not None:
         surfaces.append(board_seen_from(station.target, base_from_sensor))
     return Scene(tuple(surfaces), lamp=_lamp_seen_from(station.room, sensor_from_base))

@@ -17,12 +17,17 @@ from armscan.models.camera import CameraModel
 from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
+from armscan.reconstruction.identify_cross import CrossNamer
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.stripe_namer import StripeNamer
 from armscan.reconstruction.triangulate import StripePoints, meet_sheets, triangulate_stripe
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
+
+LEAST_APART_RAD = 0.5
+"""Stripes whose directions differ by more are told from each other by direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,9 +168,67 @@ def measured_again(
         yield k, stripe_points(image, sensor)
 
 
-def measurer_for(sensor: SensorCalibration, options: MeasureOptions) -> Measurer:
-    """The rule by which this sensor's stripes are named; it may remember what it saw before."""
+@dataclass(frozen=True, slots=True, eq=False)
+class ByPast:
+    """One camera whose lasers are on together: stripes are told by their past and direction.
+
+    Parameters
+    ----------
+    sensor
+        Camera and sheets.
+    options
+        Depths accepted.
+    namer
+        Remembers what it saw.
+    """
+
+    sensor: SensorCalibration
+    options: MeasureOptions
+    namer: StripeNamer
+
+    def measure(
+        self,
+        seen: Sequence[LitProfile],
+        base_from_sensor: Pose[Base, Sensor] | None = None,
+        t_ns: int = 0,
+    ) -> tuple[MeasuredImage, ...]:
+        """Measure the next exposure of a stroke; without a pose, each by itself."""
+        if base_from_sensor is None:
+            self.namer.reset()
+        measured = []
+        for lit in seen:
+            named = self.namer.name(lit.profile, lit.lasers, base_from_sensor, t_ns)
+            image = ReconstructedImage(lit.profile, fates_of(named), named.sheet, named.how)
+            measured.append(triangulated(image, self.sensor, self.options.depths))
+        return tuple(measured)
+
+
+def measurer_for(
+    sensor: SensorCalibration, options: MeasureOptions, *, is_scan: bool = False
+) -> Measurer:
+    """The rule by which this sensor's stripes are named; it may remember what it saw before.
+
+    Parameters
+    ----------
+    sensor
+        Camera or cameras and sheets.
+    options
+        Depths accepted, and the user's choice of a sheet.
+    is_scan
+        True for exposures in order of time with the arm's pose; else each is measured by itself.
+    """
+    n_sheets = len(sensor.sheets)
+    if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
+        return ByPast(sensor, options, CrossNamer(sensor))
     return ByDepth(sensor, options)
+
+
+def stripes_cross(sensor: SensorCalibration) -> bool:
+    """True if the stripes of two sheets on a wall that faces the camera run clearly apart."""
+    normals = np.array([calibrated.sheet.axes[2][:2] for calibrated in sensor.sheets])
+    angles = np.arctan2(normals[:, 1], normals[:, 0])
+    apart = np.abs(np.sin(angles[:, None] - angles))
+    return bool((apart > np.sin(LEAST_APART_RAD)).any())
 
 
 _FATES = {

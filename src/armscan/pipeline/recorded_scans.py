@@ -10,6 +10,7 @@ from pathlib import Path
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import TwinScene
 from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.adaptive_recording import record_adaptively
 from armscan.pipeline.progress import Progress
 from armscan.pipeline.render_pool import TwinName
 from armscan.pipeline.twin_recordings import record_scenes, record_touches
@@ -27,7 +28,8 @@ class RecordedScans:
     name
         The twin.
     most_views
-        The most views that are wanted of some scenes.
+        The most views that are wanted of some scenes; where lasers are chosen meanwhile, the most
+        exposures of a stroke.
     processes
         Processes that render.
     """
@@ -59,5 +61,16 @@ class RecordedScans:
     def scanned(
         self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
     ) -> ScanSource:
-        """Read what was recorded."""
+        """Read what was recorded, or record it now, with lasers chosen by the naming."""
+        if scene not in self.recordings:
+            record_adaptively(
+                self.folder / scene,
+                self.name,
+                scene,
+                scanner,
+                longest_stroke=self.most_views.get(scene),
+                processes=self.processes,
+                progress=progress,
+            )
+            self.recordings[scene] = read_recording(self.folder / scene)
         return self.recordings[scene]

@@ -3,25 +3,14 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import sys
-import threading
-from collections.abc import Generator, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Generator, Mapping
 from dataclasses import dataclass, field
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
 from typing import TypeAlias, cast
-
-import cv2
 
 from armscan.devices.registry import load_driver
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Preset, Twin, TwinScene
-from armscan.errors import EstimationError
+from armscan.pipeline.child_processes import in_processes
 from armscan.pipeline.fewer_views import FewerViews
 from armscan.storage.recording_images import encoded_png
 from armscan.storage.recording_writer import written_session
@@ -111,58 +100,12 @@ def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]
         for scene, row in rows:
             yield scenes.png(scene, row)
         return
-    spawn = get_context("spawn")
-    listener, held = spawn.Pipe(duplex=False)
-    given = (listener, name, dict(scenes.most_views))
-    pool = ProcessPoolExecutor(n_processes, spawn, initializer=_start_rendering, initargs=given)
-    try:
-        with _deaf_children():
-            images = pool.map(_render, rows)
-        yield from images
-    except BaseException as error:
-        held.close()
-        if isinstance(error, BrokenProcessPool):
-            raise EstimationError(
-                "a process that rendered images came to an end",
-                remedy="free some memory, or let one process render",
-            ) from error
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        held.close()
-        listener.close()
+    given = (name, dict(scenes.most_views))
+    yield from in_processes(_render, rows, n_processes, _start_rendering, given)
 
 
-@contextmanager
-def _deaf_children() -> Iterator[None]:
-    """Processes that are started meanwhile never hear an interrupt; this one hears it afterwards.
-
-    It is for the process that waits, which ends the others.
-    """
-    if sys.platform == "win32":
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _start_rendering(listener: Connection, name: TwinName, most_views: MostViews) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(listener,), daemon=True).start()
-    # the processes share the cores already
-    cv2.setNumThreads(1)
+def _start_rendering(name: TwinName, most_views: MostViews) -> None:
     _here.append(Scenes(name.build(), most_views))
-
-
-def _end_with(listener: Connection) -> None:
-    """End this process, in the middle of an image, as soon as the other end is closed or gone."""
-    try:
-        listener.recv_bytes()
-    except EOFError:
-        os._exit(1)
 
 
 def _render(row: tuple[TwinScene, int]) -> bytes:

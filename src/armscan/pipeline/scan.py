@@ -146,7 +146,7 @@ def measure_scan(
         stripes = options.measure.stripes
         return [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
 
-    measurer = measurer_for(scanner.sensor, options.measure)
+    measurer = measurer_for(scanner.sensor, options.measure, is_scan=True)
     hand_eye = scanner.hand_eye.tool_from_sensor
     for instant, seen in _in_threads(extract, readings(), options.threads):
         pose = poses.pose(instant.rows[0])

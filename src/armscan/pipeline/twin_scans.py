@@ -10,8 +10,10 @@ from typing import Protocol
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Twin, TwinScene
 from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.adaptive_scan import scan_adaptively
 from armscan.pipeline.fewer_views import FewerViews
 from armscan.pipeline.progress import Progress
+from armscan.reconstruction.identify_cross import CrossNamer
 
 
 class TwinScans(Protocol):
@@ -50,4 +52,7 @@ class RenderedScans:
         self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
     ) -> ScanSource:
         """See `TwinScans`."""
-        return self.calibration(scene)
+        sensor = scanner.sensor
+        if len(self.twin.sources) < 2 or scene == "still-step" or sensor is None:
+            return self.calibration(scene)
+        return scan_adaptively(self.twin.scan(scene), scanner, CrossNamer(sensor))[0]

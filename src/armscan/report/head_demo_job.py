@@ -198,9 +198,9 @@ def _summary(
 def scenes_of(twin: Twin) -> tuple[TwinScene, ...]:
     """Scenes whose exposures are known before anything is calibrated.
 
-    A head of several sources chooses its lasers while it scans.
+    A head of several sources chooses its lasers while it scans; a still has all of them on.
     """
     if len(twin.sources) > 1:
-        return CALIBRATION_SCENES
+        return (*CALIBRATION_SCENES, "still-step")
     waves: tuple[TwinScene, ...] = ("waves",) if len(twin.truth.sheet_points_mm) > 1 else ()
     return (*CALIBRATION_SCENES, *ONE_SHEET_SCENES, *waves, "still-step")

@@ -75,6 +75,34 @@ def pair_exposures(
     return list(zip(exposures, partners, strict=True))
 
 
+def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
+    """Pair exposures that have a laser on with the one of the same view and camera that has none.
+
+    Several exposures may share a partner; an exposure whose view has none is a pair by itself.
+
+    Raises
+    ------
+    InputError
+        If no exposure has a laser on, or as `pair_exposures`.
+    """
+    lit = [exposure for exposure in exposures if exposure.lasers]
+    if not lit:
+        raise InputError(
+            "no exposure has a laser on",
+            remedy="name the lasers in the column 'lasers' of exposures.csv",
+        )
+    dark = {(e.camera, e.view): e for e in exposures if not e.lasers and e.view is not None}
+    pairs: list[ExposurePair] = []
+    for camera in sorted({exposure.camera for exposure in lit}):
+        own = [exposure for exposure in lit if exposure.camera == camera]
+        partners = [dark.get((camera, exposure.view)) for exposure in own]
+        both = [(e, p) for e, p in zip(own, partners, strict=True) if p is not None]
+        if both:
+            pairs += pair_exposures([e for e, _ in both], [p for _, p in both])
+        pairs += [(e, None) for e, p in zip(own, partners, strict=True) if p is None]
+    return pairs
+
+
 WINDOW_REMEDY = (
     "use images of the camera's full size; if the sensor read a window, say where it begins by "
     "window_x_px and window_y_px under [[camera]] in session.toml"

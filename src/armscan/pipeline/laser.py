@@ -6,21 +6,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
 from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit, SkippedImage
 from armscan.calibration.laser.target_edges import find_target_edges
+from armscan.devices.scan_source import ScanSource
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
-from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes, pair_exposures
+from armscan.models.stereo import StereoCalibration
+from armscan.pipeline.board_placements import Placement, find_placements, placement_of
+from armscan.pipeline.exposure_pairs import (
+    ExposurePair,
+    check_sizes,
+    pair_by_view,
+    pair_exposures,
+)
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
-from armscan.vision.targets.circle_centres import correct_centres
 from armscan.vision.targets.definition import Target
-from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.options import TargetOptions
 
 STAGE = "boards and stripes"
@@ -35,10 +41,38 @@ class LaserOptions:
     sheets: SheetOptions = field(default_factory=SheetOptions)
 
 
+def calibrate_sheets_from_scan(
+    source: ScanSource,
+    target: Target,
+    camera: CameraCalibration | StereoCalibration,
+    *,
+    options: LaserOptions | None = None,
+    progress: Progress = silent,
+) -> LaserFit | FitFailure:
+    """Find boards and stripes in a recording and calibrate the sheets.
+
+    Exposures of one view and camera share the one that has no laser on; each source may be on
+    alone, or a source of several sheets with all of them. With the calibration of two cameras the
+    exposures of both are used, else those of camera 0.
+
+    Raises
+    ------
+    InputError
+        If no exposure has a laser on, or an exposure is not of its camera's size.
+    """
+    exposures = [
+        source.exposure(k)
+        for k, row in enumerate(source.rows)
+        if row.camera == 0 or isinstance(camera, StereoCalibration)
+    ]
+    pairs = pair_by_view(exposures)
+    return calibrate_sheets_from_pairs(pairs, target, camera, options=options, progress=progress)
+
+
 def calibrate_sheets_from_exposures(
     exposures: Sequence[Exposure],
     target: Target,
-    camera: CameraCalibration,
+    camera: CameraCalibration | StereoCalibration,
     *,
     backgrounds: Sequence[Exposure] = (),
     options: LaserOptions | None = None,
@@ -53,10 +87,12 @@ def calibrate_sheets_from_exposures(
     target
         The board.
     camera
-        Calibrated with images of the same size.
+        Calibrated with images of the same size; of two cameras, `Exposure.camera` says which one
+        took an image.
     backgrounds
-        The same placements without laser, one for each exposure, or none. The board is then found
-        in the image without laser, or in the one with it where that fails.
+        The same placements without laser, one for each exposure (one may be given several times),
+        or none. The board is then found in the image without laser, or in the one with it where
+        that fails.
     options
         Defaults if None.
     progress
@@ -67,18 +103,36 @@ def calibrate_sheets_from_exposures(
     InputError
         If images and backgrounds do not pair, or are not of the camera's size.
     """
-    options = options or LaserOptions()
     pairs = pair_exposures(exposures, backgrounds)
-    check_sizes([*exposures, *backgrounds], camera.camera)
+    return calibrate_sheets_from_pairs(pairs, target, camera, options=options, progress=progress)
+
+
+def calibrate_sheets_from_pairs(
+    pairs: Sequence[ExposurePair],
+    target: Target,
+    camera: CameraCalibration | StereoCalibration,
+    *,
+    options: LaserOptions | None = None,
+    progress: Progress = silent,
+) -> LaserFit | FitFailure:
+    """As `calibrate_sheets_from_exposures`, with each exposure's partner chosen already."""
+    options = options or LaserOptions()
+    cameras = HeadCameras.of(camera)
+    for pair in pairs:
+        images = [image for image in pair if image is not None]
+        check_sizes(images, cameras.model(pair[0].camera))
     boards: list[BoardStripes] = []
     skipped: list[SkippedImage] = []
-    for done, pair in enumerate(pairs):
-        progress(ProgressEvent(STAGE, done, len(pairs), pair[0].source))
-        found = find_board_stripes(pair, target, camera, options)
-        if isinstance(found, FitFailure):
-            skipped.append(SkippedImage(pair[0].source, found.reason))
-        else:
-            boards.append(found)
+    done = 0
+    for placement in find_placements(pairs, target, cameras, options.target):
+        for pair in (pair for pair in pairs if placement_of(pair) == placement.name):
+            progress(ProgressEvent(STAGE, done, len(pairs), pair[0].source))
+            done += 1
+            found = _board_stripes(pair, placement, target, cameras, options.stripes)
+            if isinstance(found, FitFailure):
+                skipped.append(SkippedImage(pair[0].source, found.reason))
+            else:
+                boards.append(found)
     progress(ProgressEvent(STAGE, len(pairs), len(pairs)))
     if not boards:
         return FitFailure(
@@ -93,25 +147,22 @@ def calibrate_sheets_from_exposures(
     return replace(fit, skipped=tuple(skipped))
 
 
-def find_board_stripes(
-    pair: ExposurePair, target: Target, camera: CameraCalibration, options: LaserOptions
+def _board_stripes(
+    pair: ExposurePair,
+    placement: Placement,
+    target: Target,
+    cameras: HeadCameras,
+    options: StripeOptions,
 ) -> BoardStripes | FitFailure:
-    """Board, its pose and the stripes of one placement."""
+    """Stripes of one exposure on its placement's board."""
     exposure, background = pair
-    lit = exposure if background is None else background
-    view = detect_target(lit, target, options.target)
-    if isinstance(view, FitFailure) and background is not None:
-        retried = detect_target(exposure, target, options.target)
-        view = view if isinstance(retried, FitFailure) else retried
-    if isinstance(view, FitFailure):
-        return view
-    if view.edges is not None:
-        view = correct_centres(view, camera.camera)
-    pose = estimate_board_pose(view, camera.camera)
-    if isinstance(pose, FitFailure):
-        return pose
-    profile = extract_stripes(exposure, options.stripes, background)
+    seen = placement.seen[exposure.camera]
+    if isinstance(seen, FitFailure):
+        return seen
+    camera, view, pose = seen
+    profile = extract_stripes(exposure, options, background)
     if not bool(profile.is_accepted.any()):
         return FitFailure("no stripe was found", "check the laser and the exposure")
-    edges = find_target_edges(view, target, pose.value, camera.camera)
-    return BoardStripes(profile, view, pose, exposure.lasers, edges)
+    edges = find_target_edges(view, target, pose.value, cameras.model(camera))
+    placed, name = placement.placed, placement.name
+    return BoardStripes(profile, view, pose, exposure.lasers, edges, camera, placed, name)

@@ -101,10 +101,7 @@ def place_board(
     covariance = np.linalg.inv(information[0] + information[1])
     gain = covariance @ information[1]
     a, b = first.sensor_from_board, second.sensor_from_board
-    apart = np.concatenate(
-        [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]
-    )
-    step = gain @ apart
+    step = gain @ _apart(a, b)
     pose: Pose[Sensor, Board] = Pose(
         rotation_from_vector(step[:3]) @ a.rotation, a.translation_mm + step[3:]
     )
@@ -132,3 +129,23 @@ def _in_sensor(
     follow[3:, 21:24] = -back
     pose: Pose[Sensor, Board] = Pose(back @ found.value.rotation, back @ offset)
     return PlacedBoard(pose, turned @ found.covariance @ turned.T, follow)
+
+
+def poses_chi2(
+    left: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
+    right: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
+    cameras: HeadCameras,
+) -> float:
+    """How far two cameras disagree about a board: 6 on average, the cameras' errors included."""
+    a, b = (_in_sensor(*item, cameras) for item in (left, right))
+    follow = b.by_cameras - a.by_cameras
+    covariance = a.covariance + b.covariance + follow @ cameras.covariance @ follow.T
+    apart = _apart(a.sensor_from_board, b.sensor_from_board)
+    return float(apart @ np.linalg.solve(covariance, apart))
+
+
+def _apart(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
+    """(6,) step from pose a to pose b: rotation vector from the left, then translation."""
+    return np.concatenate(
+        [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]
+    )

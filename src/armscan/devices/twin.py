@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 
 from armscan.devices.scan_source import ScanSource
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import CameraRight, Sensor, Tool
+from armscan.geometry.frames import Base, CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
@@ -64,6 +64,14 @@ class TwinTruth(Protocol):
     @property
     def step_heights_mm(self) -> tuple[float, ...]:
         """Heights of the gauge blocks over the face that they stand on."""
+
+    @property
+    def marker_centres_base_mm(self) -> FloatArray:
+        """(N, 3) middles of all ring markers of the scene ``markers``."""
+
+    @property
+    def moved_from_base(self) -> Pose[Base, Base]:
+        """From Base to the Base of the scene ``markers-moved``."""
 
     def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) in Base from the free-form part's surface."""
@@ -152,7 +160,10 @@ class Twin(Protocol):
         equal views are one posture. ``still-step`` is one exposure of a step: 20 mm, or 5 mm for
         a head of many lines. A head of two cameras takes every exposure with both at one instant:
         two rows of equal time, trigger and view. A head with several sources has all of them on
-        during scans; `SimulatedScan.expose` takes an exposure with others.
+        during scans; `SimulatedScan.expose` takes an exposure with others. ``markers`` shows a
+        part with ring markers from places named as views, each in the light of the room and then
+        with the lasers; in ``markers-moved`` the part is still there, but the arm stands in
+        another place, and so does Base.
         """
 
     def probe_plate(self) -> Probing:

@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from armscan.devices.twin import Preset
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import CameraRight, Sensor, Tool
+from armscan.geometry.frames import Base, CameraRight, Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.simulation.head import RIGHT
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.optics import RenderCamera
 from armscan.simulation.plate_probing import TIP_DIAMETER_MM, TRUE_PROBE_MM
+from armscan.simulation.ring_markers import DISC_DIAMETER_MM, RING_DIAMETER_MM
 from armscan.simulation.sheet_middle import sheet_points_mm
 from armscan.simulation.stations import BALL_DIAMETER_MM, STEP_HEIGHTS_MM
 
@@ -79,6 +80,16 @@ class InstrumentTruth:
         """Heights of the gauge blocks over the ground plate."""
         return STEP_HEIGHTS_MM
 
+    @property
+    def marker_centres_base_mm(self) -> FloatArray:
+        """(N, 3) middles of all ring markers of the scene ``markers``."""
+        return self.instrument.bench.marker_centres_mm()
+
+    @property
+    def moved_from_base(self) -> Pose[Base, Base]:
+        """From Base to the Base of the scene ``markers-moved``."""
+        return self.instrument.bench.moved_from_base
+
     def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) in Base from the free-form part's surface."""
         return self.instrument.bench.part_distance_mm(points_base_mm)
@@ -112,6 +123,14 @@ class InstrumentTruth:
                 "base_from_ground": _pose(bench.base_from_ground),
             },
             "base_from_part": _pose(bench.base_from_part),
+            "base_from_waves": _pose(bench.base_from_waves),
+            "waves": [asdict(wave) for wave in bench.waves.waves],
+            "markers": {
+                "centres_base_mm": self.marker_centres_base_mm.tolist(),
+                "disc_diameter_mm": DISC_DIAMETER_MM,
+                "ring_diameter_mm": RING_DIAMETER_MM,
+                "base_new_from_base_old": _pose(self.moved_from_base),
+            },
             "probe": {
                 "tool_from_probe_mm": TRUE_PROBE_MM.tolist(),
                 "tip_diameter_mm": TIP_DIAMETER_MM,

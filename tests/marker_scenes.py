@@ -91,7 +91,7 @@ def random_scene(seed: int, *, missing: float = MISSING, noise_px: float = NOISE
 
 
 def _surface(rng: np.random.Generator, n: int, kind: int) -> tuple[Floats, Floats]:
-    """Places and normals of markers, at least three radii apart, in the middle between the cameras."""
+    """Places and normals of markers, three radii apart or more, where the cameras look."""
     flat: list[Floats] = []
     while len(flat) < n:
         place = rng.uniform([-36.0, -22.0], [36.0, 22.0])

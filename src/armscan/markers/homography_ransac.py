@@ -128,9 +128,10 @@ def _refined(
 ) -> HomographyConsensus | FitFailure:
     """Fit to all that agree, look again who agrees, until nothing changes (step 6)."""
     for _ in range(_REFITS):
-        matrix = fit_homography(left_px[inlier], right_px[inlier])
-        if isinstance(matrix, FitFailure):
-            return matrix
+        fitted = fit_homography(left_px[inlier], right_px[inlier])
+        if isinstance(fitted, FitFailure):
+            return fitted
+        matrix = fitted
         distance = np.linalg.norm(transfer_px(matrix, left_px) - right_px, axis=1)
         before, inlier = inlier, np.asarray(distance <= threshold_px)
         count = int(inlier.sum())

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Marker sets as records and as tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.errors import FileFormatError, InputError
+from armscan.records.markers import MarkerSet
+from armscan.storage.markers import markers_csv, read_markers
+
+
+def some_markers(n: int = 4) -> MarkerSet:
+    rng = np.random.default_rng(1)
+    root = rng.standard_normal((n, 3, 3))
+    covariance = root @ root.transpose(0, 2, 1) + np.eye(3)
+    return MarkerSet(np.arange(n) * 3, rng.standard_normal((n, 3)), covariance, "Base")
+
+
+def test_a_table_reads_back_as_the_same_numbers(tmp_path: Path) -> None:
+    markers = some_markers()
+    path = tmp_path / "markers.csv"
+    path.write_bytes(markers_csv(markers))
+    again = read_markers(path)
+    np.testing.assert_array_equal(again.ids, markers.ids)
+    np.testing.assert_array_equal(again.points_mm, markers.points_mm)
+    # The table holds the upper half: the lower one may differ in the last bit.
+    upper = np.triu_indices(3)
+    np.testing.assert_array_equal(
+        again.covariance_mm2[:, upper[0], upper[1]], markers.covariance_mm2[:, upper[0], upper[1]]
+    )
+    assert again.frame == "Base"
+    assert path.read_text().splitlines()[1].startswith("id,x_mm,y_mm,z_mm,cov_xx_mm2,cov_xy_mm2")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("cov_zz_mm2", "sigma_z", "cov_zz_mm2"),
+        ("\n3,", "\n0,", "id occurs twice"),
+    ],
+)
+def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "markers.csv"
+    path.write_text(markers_csv(some_markers()).decode().replace(old, new))
+    with pytest.raises(FileFormatError, match=message):
+        read_markers(path)
+
+
+def test_a_covariance_must_be_one() -> None:
+    with pytest.raises(InputError, match="not positive definite"):
+        MarkerSet(np.arange(1), np.zeros((1, 3)), -np.eye(3)[None])

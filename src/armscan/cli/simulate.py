@@ -14,7 +14,8 @@ from armscan.cli.output import AsJson, progress_bar, show
 EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan simulate thesis-single camera -o board\n"
-    "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3"
+    "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
+    "  armscan simulate thesis-multi markers -o markers"
 )
 
 
@@ -29,6 +30,9 @@ class Scene(StrEnum):
     STEPS = "steps"
     STILL_STEP = "still-step"
     PART = "part"
+    WAVES = "waves"
+    MARKERS = "markers"
+    MARKERS_MOVED = "markers-moved"
     PROBING = "probing"
 
 
@@ -41,7 +45,14 @@ class PresetName(StrEnum):
 
 
 def simulate(
-    head: Annotated[str, typer.Argument(help="The head: thesis-single.", show_default=False)],
+    head: Annotated[
+        str,
+        typer.Argument(
+            help="The head: thesis-single, thesis-cross, thesis-multi (11 lines, two cameras) or "
+            "thesis-multi-5.",
+            show_default=False,
+        ),
+    ],
     scene: Annotated[Scene, typer.Argument(help="What it looks at.", show_default=False)],
     *,
     output: Annotated[
@@ -62,8 +73,9 @@ def simulate(
     """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
 
     Scenes: camera and laser are images of a target for the head's calibration; hand-eye is the
-    plate from many postures; plate, ball, steps and part are scans by hand; still-step is one
-    exposure; probing is the plate touched with a tip.
+    plate from many postures; plate, ball, steps, part and waves are scans by hand; still-step is
+    one exposure; markers is a part with ring markers, place by place, and markers-moved the same
+    part after the arm was put down elsewhere; probing is the plate touched with a tip.
     """
     from armscan.pipeline.simulate import SimulateOptions
     from armscan.report.simulate_job import SimulateRequest, run_simulation

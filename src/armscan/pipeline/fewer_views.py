@@ -13,7 +13,7 @@ from armscan.records.session import ExposureRow, Session
 
 
 class FewerViews:
-    """Evenly chosen views of a scan; exposures of one view stay together."""
+    """Evenly chosen views of a scan; exposures of one view or instant stay together."""
 
     def __init__(self, source: ScanSource, n_views: int) -> None:
         """Choose ``n_views`` views of ``source``; all if it has no more.
@@ -25,7 +25,7 @@ class FewerViews:
         """
         if n_views < 1:
             raise OptionError(f"{n_views} views", remedy="keep at least one")
-        names = [f"row {k}" if r.view is None else r.view for k, r in enumerate(source.rows)]
+        names = [f"at {row.t_ns}" if row.view is None else row.view for row in source.rows]
         views = list(dict.fromkeys(names))
         places = np.linspace(0, len(views) - 1, min(n_views, len(views))).round().astype(int)
         kept = {views[k] for k in places}

@@ -61,6 +61,10 @@ class SimulatedScene:
         What it holds.
     target
         The calibration target, as the command line names it.
+    n_cameras
+        Cameras that took the images.
+    sources
+        Laser sources that were on in any of them.
     """
 
     folder: Path
@@ -68,6 +72,8 @@ class SimulatedScene:
     n_images: int
     n_arm_samples: int
     target: str
+    n_cameras: int = 0
+    sources: tuple[str, ...] = ()
 
 
 def truth_path(folder: Path) -> Path:
@@ -123,17 +129,18 @@ def simulate_scene(
     name = TwinName(head, settings.preset, settings.seed)
     twin = name.build()
     beside = {truth: twin.truth.document()}
-    n_images, n_samples = 0, 0
     if scene == "probing":
-        n_samples = record_touches(folder, twin, beside)
-    else:
-        source = record_scenes(
-            {scene: folder},
-            name,
-            processes=settings.processes,
-            beside=beside,
-            progress=progress,
-        )[scene]
-        n_images = len(source.rows)
-        n_samples = 0 if source.arm is None else len(source.arm)
-    return SimulatedScene(folder, truth, n_images, n_samples, twin.target)
+        n_touches = record_touches(folder, twin, beside)
+        return SimulatedScene(folder, truth, 0, n_touches, twin.target)
+    source = record_scenes(
+        {scene: folder}, name, processes=settings.processes, beside=beside, progress=progress
+    )[scene]
+    return SimulatedScene(
+        folder,
+        truth,
+        n_images=len(source.rows),
+        n_arm_samples=0 if source.arm is None else len(source.arm),
+        target=twin.target,
+        n_cameras=len({row.camera for row in source.rows}),
+        sources=tuple(dict.fromkeys(name for row in source.rows for name in row.lasers)),
+    )

@@ -27,7 +27,8 @@ from armscan.simulation.twin_scan import Shot
 
 Recorded = tuple[tuple[Shot, ...], ArmTrack]
 
-EXPOSURES_PER_POSTURE = 2
+_EXPOSURES_PER_POSTURE = 2
+"""For one camera; two cameras see as much in one exposure."""
 _POSTURE_NS = 5_000_000_000
 _EXPOSURE_NS = 400_000_000
 _PAUSE_NS = 3_000_000_000
@@ -56,10 +57,11 @@ def hand_eye_scene(instrument: Instrument, rng: np.random.Generator) -> Recorded
     """Stills of the stripes on the plate, equal views for the exposures of one posture."""
     head, station = instrument.head, instrument.bench.with_plate()
     poses = hand_eye_poses(head, instrument.bench, rng)
+    repeats = 1 if len(head.cameras) > 1 else _EXPOSURES_PER_POSTURE
     stills = [
         Still(f"posture-{k + 1:02d}", pose, Light(head.sources))
         for k, pose in enumerate(poses)
-        for _ in range(EXPOSURES_PER_POSTURE)
+        for _ in range(repeats)
     ]
     return _recorded(instrument, station, stills, rng)
 

@@ -22,13 +22,15 @@ from armscan.cli import (
     inspect_step,
     probe,
     reconstruct,
+    register,
     simulate,
     verify,
 )
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "probe", "calibrate", "reconstruct", "inspect", "verify"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "register"),
+    *("inspect", "verify"),
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -77,6 +79,7 @@ app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
 app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate)
 app.command("probe", epilog=probe.EXAMPLE)(probe.probe)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
+app.command("register", epilog=register.EXAMPLE)(register.register)
 app.command("verify", epilog=verify.EXAMPLE)(verify.verify)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
 app.command("info", epilog=info.EXAMPLE)(info.info)

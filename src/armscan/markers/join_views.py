@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.estimate import FitFailure
+from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.frames import Part, Sensor
 from armscan.geometry.poses import Pose
 from armscan.geometry.registration import (
@@ -205,7 +205,7 @@ def _chained(
 
 def _placed(view: MarkerSet, numbers: IntArray, known: _GrowingMap) -> Pose[Part, Sensor] | None:
     common = known.is_known[numbers]
-    fit = register_points(
+    fit: Estimate[Pose[Part, Sensor]] | FitFailure = register_points(
         PointPairs(
             known.points(numbers[common]),
             view.points_mm[common],

@@ -142,7 +142,7 @@ class _Problem:
     def turned(self) -> FloatArray:
         """(K, 3) sightings turned into the frame of the map, not shifted."""
         rotation = np.stack([pose.rotation for pose in self.poses])[self.sightings.view]
-        return np.einsum("kij,kj->ki", rotation, self.sightings.point_mm)
+        return np.asarray(np.einsum("kij,kj->ki", rotation, self.sightings.point_mm))
 
     def residuals(self) -> FloatArray:
         """(K, 3) carried sighting minus marker."""
@@ -178,7 +178,8 @@ class _Problem:
         )
         np.add.at(result.poses, seen.view, by_pose @ jacobian)
         np.add.at(result.markers, seen.marker, weights)
-        np.add.at(result.coupling, (seen.view, slice(None), seen.marker), -by_pose)
+        # views and markers first, so that both indices stand side by side
+        np.add.at(result.coupling.transpose(0, 2, 1, 3), (seen.view, seen.marker), -by_pose)
         np.add.at(result.right_poses, seen.view, -np.einsum("kij,kj->ki", by_pose, residual))
         np.add.at(result.right_markers, seen.marker, np.einsum("kij,kj->ki", weights, residual))
         return result
@@ -223,7 +224,7 @@ class _Problem:
             poses[k] = joint[part, part]
         given = np.linalg.inv(normal.markers)
         own = given + np.einsum("pmi,pq,qmj->mij", spread, joint, spread)
-        return poses, given, own
+        return poses, np.asarray(given, dtype=np.float64), np.asarray(own)
 
     def worst(self) -> int | None:
         """The sighting that fits worst, if the chance of it is below `OUTLIER_LEVEL`."""

@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans joined by markers: views of a handheld scanner, and an arm that moved to a new place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.frames import Base
+from armscan.geometry.poses import Pose
+from armscan.geometry.registration import PointPairs, misfits, register_points
+from armscan.markers.join_views import JoinedViews, join_views
+from armscan.markers.match_3d import match_markers
+from armscan.markers.match_result import Matched, MatchOptions
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.records.markers import MarkerSet
+from armscan.storage.marker_files import MarkerList
+
+MOVED_LEVEL = 1e-3
+"""Chance that any marker of a list in which none moved is called moved."""
+MOVED_WITHIN_MM = 5.0
+"""Two markers without partner that lie this near to each other are one that moved."""
+LEAST_LEFT = 4
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterOptions:
+    """How scans are joined.
+
+    Parameters
+    ----------
+    match
+        How markers are matched.
+    sigma_mm
+        Standard deviation an axis of markers whose list gives no covariance.
+    is_by_id
+        Take markers with the same ``id`` in both lists as the same, instead of matching them.
+    """
+
+    match: MatchOptions = field(default_factory=MatchOptions)
+    sigma_mm: float = 0.02
+    is_by_id: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sigma_mm < 100.0:
+            raise OptionError(
+                f"a standard deviation of {self.sigma_mm} mm",
+                where="--sigma-mm",
+                remedy="give what one marker's position scatters by, as 0.02",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovedMarker:
+    """A marker that is not where the others say.
+
+    Parameters
+    ----------
+    old_id, new_id
+        Its numbers in the two lists.
+    offset_mm
+        (3,) by how much it moved, in the old frame.
+    """
+
+    old_id: int
+    new_id: int
+    offset_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceRegistration:
+    """An arm's new place in the frame of its old one.
+
+    Parameters
+    ----------
+    fit
+        ``old_from_new`` with covariance; its residuals are those of the pairs used.
+    pairs
+        (K, 2) indices of common markers, old and new.
+    residual_mm
+        (K, 3) old minus carried new, in the old frame, of all pairs.
+    is_used
+        (K,) False where the marker moved.
+    moved
+        Markers that moved, whether they were matched or not.
+    only_old, only_new
+        Numbers of markers without partner.
+    n_rival
+        Markers that the next best alignment explains; -1 where ids said which are common.
+    """
+
+    fit: Estimate[Pose[Base, Base]]
+    pairs: IntArray
+    residual_mm: FloatArray
+    is_used: BoolArray
+    moved: tuple[MovedMarker, ...]
+    only_old: tuple[int, ...]
+    only_new: tuple[int, ...]
+    n_rival: int
+
+    @property
+    def chi2_probability(self) -> float:
+        """Chance of residuals as large as these if the covariances are right."""
+        return float(chi2.sf(self.fit.chi2, self.fit.degrees_of_freedom))
+
+
+def register_place(
+    old: MarkerList, new: MarkerList, options: RegisterOptions | None = None
+) -> PlaceRegistration:
+    """Find the arm's new place from markers measured at the old and at the new one.
+
+    Raises
+    ------
+    EstimationError
+        If the markers do not determine it, or in more than one way.
+    OptionError
+        If ids are asked for that a list does not give.
+    """
+    options = options or RegisterOptions()
+    pairs, n_rival = _common(old, new, options)
+    fit, is_used, moved = _without_moved(old.markers, new.markers, pairs)
+    everything = _pairs(old.markers, new.markers, pairs)
+    pose = fit.value
+    carried = everything.points_b_mm @ pose.rotation.T + pose.translation_mm
+    strays, only_old, only_new = _without_partner(old.markers, new.markers, pairs, pose)
+    return PlaceRegistration(
+        fit,
+        pairs,
+        everything.points_a_mm - carried,
+        is_used,
+        (*moved, *strays),
+        only_old,
+        only_new,
+        n_rival,
+    )
+
+
+def register_views(
+    views: Sequence[MarkerSet],
+    options: RegisterOptions | None = None,
+    progress: Progress = silent,
+) -> JoinedViews:
+    """Join views that share markers in the frame of the first one.
+
+    Raises
+    ------
+    EstimationError
+        If no view can be joined to the first.
+    """
+    options = options or RegisterOptions()
+
+    def advance(done: int, total: int) -> None:
+        progress(ProgressEvent("matching views", done, total))
+
+    joined = join_views(views, options.match, advance)
+    if isinstance(joined, FitFailure):
+        raise EstimationError(joined.reason, where=views[0].source, remedy=joined.remedy)
+    return joined
+
+
+def _common(old: MarkerList, new: MarkerList, options: RegisterOptions) -> tuple[IntArray, int]:
+    if options.is_by_id:
+        return _same_ids(old, new), -1
+    found = match_markers(old.markers, new.markers, options.match)
+    if not isinstance(found, Matched):
+        remedy = found.remedy
+        if old.has_ids and new.has_ids:
+            remedy += "; or give --by-id if equal ids are the same marker"
+        raise EstimationError(found.reason, where=f"{old.path} and {new.path}", remedy=remedy)
+    return found.alignment.pairs, found.n_rival
+
+
+def _same_ids(old: MarkerList, new: MarkerList) -> IntArray:
+    for item in (old, new):
+        if not item.has_ids:
+            raise OptionError(
+                "the list has no column id",
+                where=f"--by-id, {item.path}",
+                remedy="number the markers in both lists, or leave --by-id out",
+            )
+    _, k_old, k_new = np.intersect1d(old.markers.ids, new.markers.ids, return_indices=True)
+    return np.stack([k_old, k_new], axis=1).astype(np.int64)
+
+
+def _pairs(old: MarkerSet, new: MarkerSet, pairs: IntArray) -> PointPairs:
+    i, k = pairs[:, 0], pairs[:, 1]
+    return PointPairs(
+        old.points_mm[i], new.points_mm[k], old.covariance_mm2[i], new.covariance_mm2[k]
+    )
+
+
+def _without_moved(
+    old: MarkerSet, new: MarkerSet, pairs: IntArray
+) -> tuple[Estimate[Pose[Base, Base]], BoolArray, list[MovedMarker]]:
+    """Register; the marker that fits worst is left out as long as it does not fit."""
+    is_used = np.ones(len(pairs), dtype=bool)
+    moved: list[MovedMarker] = []
+    while True:
+        used = pairs[is_used]
+        data = _pairs(old, new, used)
+        fit: Estimate[Pose[Base, Base]] | FitFailure = register_points(data)
+        if isinstance(fit, FitFailure):
+            raise EstimationError(
+                fit.reason, where=f"{old.source} and {new.source}", remedy=fit.remedy
+            )
+        misfit = misfits(data, fit)
+        worst = misfit.moved(MOVED_LEVEL)
+        if worst is None or len(used) <= LEAST_LEFT:
+            return fit, is_used, moved
+        i, k = (int(index) for index in used[worst])
+        moved.append(MovedMarker(int(old.ids[i]), int(new.ids[k]), -misfit.offset_mm[worst]))
+        is_used[np.flatnonzero(is_used)[worst]] = False
+
+
+def _without_partner(
+    old: MarkerSet, new: MarkerSet, pairs: IntArray, pose: Pose[Base, Base]
+) -> tuple[list[MovedMarker], tuple[int, ...], tuple[int, ...]]:
+    """Of the markers that were not matched: those that moved a little, and the others."""
+    lonely_old = np.setdiff1d(np.arange(len(old)), pairs[:, 0])
+    lonely_new = np.setdiff1d(np.arange(len(new)), pairs[:, 1])
+    carried = new.points_mm[lonely_new] @ pose.rotation.T + pose.translation_mm
+    apart = carried[None] - old.points_mm[lonely_old][:, None]
+    distance = np.linalg.norm(apart, axis=2)
+    moved: list[MovedMarker] = []
+    while distance.size and float(distance.min()) < MOVED_WITHIN_MM:
+        i, k = (int(index) for index in np.unravel_index(np.argmin(distance), distance.shape))
+        ids = int(old.ids[lonely_old[i]]), int(new.ids[lonely_new[k]])
+        moved.append(MovedMarker(*ids, apart[i, k]))
+        distance[i], distance[:, k] = np.inf, np.inf
+    gone = {item.old_id for item in moved}, {item.new_id for item in moved}
+    only_old = tuple(int(n) for n in old.ids[lonely_old] if int(n) not in gone[0])
+    only_new = tuple(int(n) for n in new.ids[lonely_new] if int(n) not in gone[1])
+    return moved, only_old, only_new

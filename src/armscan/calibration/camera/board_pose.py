@@ -143,36 +143,59 @@ def estimate_board_pose(
         over the degrees of freedom (with fewer than ten of them never below 1). Or why there is
         no pose: too few points, points on a line, or two poses that fit alike.
     """
+    found = estimate_board_poses(view, camera, camera_covariance, bow_mm)
+    if isinstance(found, FitFailure):
+        return found
+    if len(found) > 1 and not allow_ambiguous:
+        return FitFailure(
+            "two poses of the board fit alike, mirrored at the line of sight",
+            "tilt the board more, bring it nearer, or use a larger one",
+        )
+    return found[0]
+
+
+def estimate_board_poses(
+    view: TargetView,
+    camera: CameraModel,
+    camera_covariance: FloatArray | None = None,
+    bow_mm: FloatArray | None = None,
+) -> tuple[Estimate[Pose[Sensor, Board]], ...] | FitFailure:
+    """All poses of a board that one view does not refute, the best first.
+
+    Parameters and the content of each estimate as in `estimate_board_pose`.
+    """
     degrees = 2 * len(view) - 6
     candidates = board_pose_candidates(view, camera, bow_mm)
     if not isinstance(candidates, FitFailure):
-        view = _with_excess(view, camera, candidates[0], bow_mm)
-        candidates = board_pose_candidates(view, camera, bow_mm)
+        noisier = _with_excess(view, camera, candidates[0], bow_mm)
+        if noisier is not view:
+            view, candidates = noisier, board_pose_candidates(noisier, camera, bow_mm)
     if isinstance(candidates, FitFailure):
         return candidates
     best = candidates[0]
     factor = best.chi2 / max(degrees, 1)
     if degrees < SCALED_FROM_DEGREES_OF_FREEDOM:
         factor = max(factor, 1.0)
-    rivals = () if allow_ambiguous else candidates[1:]
-    if any(rival.chi2 - best.chi2 < AMBIGUOUS_CHI2 * factor for rival in rivals):
-        return FitFailure(
-            "two poses of the board fit alike, mirrored at the line of sight",
-            "tilt the board more, bring it nearer, or use a larger one",
-        )
     observations = gather([view])
-    state = State.from_poses(_shared(camera, bow_mm), [best.sensor_from_board])
-    equations = linearise(observations, state, _CAMERA, np.ones(len(view)))
-    if equations is None or not condition_number(equations.pose[0]) < 1e13:
-        return FitFailure("the points do not determine a pose", "show more of the board")
-    return Estimate(
-        best.sensor_from_board,
-        POSE_PARAMETER_NAMES,
-        _pose_covariance(equations, factor, camera_covariance),
-        residuals_px(observations, state),
-        degrees,
-        best.chi2,
-    )
+    found = []
+    for candidate in candidates:
+        if candidate.chi2 - best.chi2 >= AMBIGUOUS_CHI2 * factor and candidate is not best:
+            continue
+        state = State.from_poses(_shared(camera, bow_mm), [candidate.sensor_from_board])
+        equations = linearise(observations, state, _CAMERA, np.ones(len(view)))
+        if equations is None or not condition_number(equations.pose[0]) < 1e13:
+            return FitFailure("the points do not determine a pose", "show more of the board")
+        found.append(
+            Estimate(
+                candidate.sensor_from_board,
+                POSE_PARAMETER_NAMES,
+                _pose_covariance(equations, factor, camera_covariance),
+                residuals_px(observations, state),
+                degrees,
+                candidate.chi2,
+            )
+        )
+    return tuple(found)
 
 
 def _shared(camera: CameraModel, bow_mm: FloatArray | None) -> FloatArray:

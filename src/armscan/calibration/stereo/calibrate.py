@@ -130,7 +130,9 @@ def _own_poses(boards: Boards, relation: Relation, solution: JointSolution) -> l
         for number, pair in zip(boards.left_board, relation.pairs, strict=True)
         if pair.is_related
     ]
-    return [own_pose(boards.seen_by[number], views) for number in numbers]
+    return [
+        own_pose(boards.seen_by[number], views, solution.state.pose(number)) for number in numbers
+    ]
 
 
 def _result(

@@ -13,7 +13,7 @@ from armscan.calibration.stereo.agreement import MEDIAN_LEVEL
 from armscan.calibration.stereo.pairs import StereoPair
 from armscan.calibration.stereo.relative_pose import (
     RelativePose,
-    boards_seen,
+    board_near,
     differences,
     relative_pose,
 )
@@ -53,29 +53,35 @@ class PairLevels:
     is_misfit: BoolArray
 
 
-def own_pose(pair: StereoPair, views: TwoViews) -> RelativePose:
+def own_pose(
+    pair: StereoPair, views: TwoViews, sensor_from_board: Pose[Sensor, Board]
+) -> RelativePose:
     """``right_from_left`` by one pair alone (eqs. 4.14 to 4.16), the cameras being known.
 
-    Of the poses that two mirrored boards allow, the one nearest to that of ``views`` is taken.
+    Parameters
+    ----------
+    pair
+        Seen by both cameras.
+    views
+        The cameras; each finds the board by itself near to where both together have it.
+    sensor_from_board
+        That place.
 
     Raises
     ------
     InputError
-        If the pair lacks a view, or one shows no board.
+        If the pair lacks a view, or one does not determine the board's pose.
     """
     if pair.left is None or pair.right is None:
         raise InputError("the pair lacks a view", where=pair.name)
-    left, right = boards_seen(pair.left, views.left), boards_seen(pair.right, views.right)
+    in_right = views.right_from_left @ sensor_from_board
+    near_right: Pose[Sensor, Board] = Pose(in_right.rotation, in_right.translation_mm)
+    left = board_near(pair.left, views.left, sensor_from_board)
+    right = board_near(pair.right, views.right, near_right)
     if isinstance(left, FitFailure) or isinstance(right, FitFailure):
-        raise InputError("a view of the pair shows no board", where=pair.name)
+        raise InputError("a view of the pair does not determine the board's pose", where=pair.name)
     as_numbered: Pose[Board, Board] = Pose(np.eye(3), np.zeros(3))
-    ways = [relative_pose(a, b, as_numbered) for a in left for b in right]
-    apart = differences(
-        np.array([way.right_from_left.rotation for way in ways]),
-        np.array([way.right_from_left.translation_mm for way in ways]),
-        views.right_from_left,
-    )
-    return ways[int(np.argmin(np.linalg.norm(apart[:, :3], axis=1)))]
+    return relative_pose(left, right, as_numbered)
 
 
 def compare_pairs(relatives: Sequence[RelativePose], near: Pose[CameraRight, Sensor]) -> PairLevels:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.camera.board_pose import (
-    AMBIGUOUS_CHI2,
-    board_pose_candidates,
-    estimate_board_pose,
-)
+from armscan.calibration.camera.adjustment import adjust
+from armscan.calibration.camera.board_pose import estimate_board_poses
+from armscan.calibration.camera.covariance import SINGULAR_CONDITION, condition_number
+from armscan.calibration.camera.cross_validation import NO_SHARED
+from armscan.calibration.camera.observations import State, gather
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Board, CameraRight, Sensor
@@ -52,18 +52,24 @@ class RelativePose:
 
 def boards_seen(view: TargetView, camera: CameraModel) -> tuple[BoardSeen, ...] | FitFailure:
     """The pose of a board; also the mirrored one where the view does not refute it."""
-    best = estimate_board_pose(view, camera, allow_ambiguous=True)
-    if isinstance(best, FitFailure):
-        return best
-    candidates = board_pose_candidates(view, camera)
-    seen = [BoardSeen(best.value, best.covariance)]
-    if isinstance(candidates, FitFailure):
-        return tuple(seen)
-    factor = max(candidates[0].chi2 / max(best.degrees_of_freedom, 1), 1.0)
-    for rival in candidates[1:]:
-        if rival.chi2 - candidates[0].chi2 < AMBIGUOUS_CHI2 * factor:
-            seen.append(BoardSeen(rival.sensor_from_board, best.covariance))
-    return tuple(seen)
+    found = estimate_board_poses(view, camera)
+    if isinstance(found, FitFailure):
+        return found
+    return tuple(BoardSeen(pose.value, pose.covariance) for pose in found)
+
+
+def board_near(
+    view: TargetView, camera: CameraModel, near: Pose[Sensor, Board]
+) -> BoardSeen | FitFailure:
+    """The pose of a board by one view alone, from a pose that is nearly right."""
+    shared = np.append(camera.parameters, np.zeros(2))
+    result = adjust(gather([view]), State.from_poses(shared, [near]), NO_SHARED)
+    if isinstance(result, FitFailure):
+        return result
+    if not condition_number(result.equations.pose[0]) < SINGULAR_CONDITION:
+        return FitFailure("the points do not determine a pose", "show more of the board")
+    level = result.equations.chi2 / max(2 * len(view) - 6, 1)
+    return BoardSeen(result.state.pose(0), level * np.linalg.inv(result.equations.pose[0]))
 
 
 def relative_pose(

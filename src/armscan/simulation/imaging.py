@@ -36,6 +36,12 @@ class Imaging:
     ghost_share, ghost_sigma_px
         Part of the light that comes back from the lens mirrored at the image's centre, and how
         blurred.
+    spot_level, spot_mm
+        Undiffracted beam in the middle of a projector of several lines: its brightness over that
+        of the middle line, and the Gaussian sigma of its round section.
+    stray_share
+        Brightness, over that of the lines, of those that a glossy plate throws back to the head
+        and the head back to the plate, for a plate of gloss 1; projectors of several lines only.
     """
 
     laser_level: float = 0.8
@@ -47,13 +53,17 @@ class Imaging:
     texture: float = 1.0
     ghost_share: float = 0.0
     ghost_sigma_px: float = 5.0
+    spot_level: float = 6.0
+    spot_mm: float = 0.6
+    stray_share: float = 0.12
 
     def __post_init__(self) -> None:
         least = min(self.ambient, self.gloss, self.texture, self.ghost_share)
+        least = min(least, self.spot_level, self.stray_share)
         if least < 0.0 or min(self.laser_level, self.target_light) <= 0.0:
             raise InputError("light, gloss and texture cannot be negative")
-        if self.ghost_sigma_px <= 0.0:
-            raise InputError("a ghost image needs a blur")
+        if min(self.ghost_sigma_px, self.spot_mm) <= 0.0:
+            raise InputError("a ghost image needs a blur and a spot a size")
 
 
 IMAGING: dict[Preset, Imaging] = {
@@ -65,6 +75,8 @@ IMAGING: dict[Preset, Imaging] = {
         ),
         gloss=0.0,
         texture=0.0,
+        spot_level=0.0,
+        stray_share=0.0,
     ),
     "thesis": Imaging(),
     "harsh": Imaging(
@@ -77,5 +89,7 @@ IMAGING: dict[Preset, Imaging] = {
         gloss=2.5,
         texture=2.5,
         ghost_share=0.01,
+        spot_level=15.0,
+        spot_mm=0.8,
     ),
 }

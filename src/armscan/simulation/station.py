@@ -30,6 +30,7 @@ from armscan.simulation.scene import Lamp, Scene
 from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
 from armscan.simulation.shapes import Placed
 from armscan.simulation.sheet_light import PosedView, look
+from armscan.simulation.stray_light import stray_lights
 from armscan.simulation.stripe_truth import find_stripe
 from armscan.simulation.surfaces import Surface
 from armscan.simulation.thing import Finish, Thing
@@ -202,9 +203,13 @@ def exposure_light(
         slice(window.y_px - region.y_px, window.y_px - region.y_px + window.height_px),
         slice(window.x_px - region.x_px, window.x_px - region.x_px + window.width_px),
     )
+    middle = len(views) // 2
     for source in in_sources(_seen_lasers(head, eye, settings.lasers)):
-        line = band_light(views, eye.camera, source, region, speckle=imaging.speckle, rng=rng)
-        light += np.float32(settings.laser_gain) * line[inside]
+        stray = stray_lights(source, station.things, poses[middle], imaging)
+        # What is stray is wide or faint: motion over the exposure does not show in it.
+        for one, seen in ((source, views), *((one, [views[middle]]) for one in stray)):
+            line = band_light(seen, eye.camera, one, region, speckle=imaging.speckle, rng=rng)
+            light += np.float32(settings.laser_gain) * line[inside]
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light

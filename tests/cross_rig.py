@@ -31,7 +31,7 @@ WINDOW = (207.0, 624.0, 207.0 + 2658.0, 624.0 + 800.0)
 MIDDLE_DEPTH_MM = 138.0
 HALF_ANGLE_RAD = 0.32
 TICK_NS = 12_500_000
-N_RAYS = 1200
+N_RAYS = 800
 WIDTH_PX = 2.8
 NEIGHBOUR_PX = 4.5 * WIDTH_PX
 MERGED_PX = 4.0
@@ -221,7 +221,7 @@ class CrossStroke:
     def _first_hit(self, source: FloatArray, rays: FloatArray) -> tuple[FloatArray, BoolArray]:
         down = -rays[:, 2]
         near, far = (source[2] - HIGHEST_MM) / down, (source[2] - LOWEST_MM) / down
-        grid = near[:, None] + (far - near)[:, None] * np.linspace(0.0, 1.0, 140)
+        grid = near[:, None] + (far - near)[:, None] * np.linspace(0.0, 1.0, 110)
         below = self._height(source, rays, grid) < 0.0
         first = below.argmax(axis=1)
         is_hit = below.any(axis=1) & (first > 0)
@@ -236,7 +236,7 @@ class CrossStroke:
     def _sees(self, points: FloatArray, eye: FloatArray) -> BoolArray:
         ray = eye - points
         reach = np.clip((HIGHEST_MM + 0.1 - points[:, 2]) / ray[:, 2], 0.0, 1.0)
-        share = reach[:, None] * np.linspace(0.01, 1.0, 70)
+        share = reach[:, None] * np.linspace(0.01, 1.0, 50)
         x = points[:, :1] + share * ray[:, :1]
         y = points[:, 1:2] + share * ray[:, 1:2]
         z = points[:, 2:] + share * ray[:, 2:]

@@ -19,12 +19,12 @@ DIRECTION_RAD = np.radians(25.0)
 """Standard deviation of a stripe's direction from that on a surface that faces the camera."""
 ODD_DIRECTION = 0.1
 """Share of stripes that run in any direction: walls and edges."""
-DIRECTION_VOTES = 1.5
-"""The pieces of one stretch together count for so many directions: they are one surface's."""
+ALIKE_PIECES = 8
+"""Over so many pieces of a stretch, some 5 mm, what misleads one of them misleads all."""
+INDEPENDENT = 0.5
+"""Of sharp predictions: neighbouring pieces share some of what they err by."""
 TAKEN = -3.0
 """Log-likelihood of a piece whose place in the sheet's light is taken by another stretch."""
-TAKEN_VOTES = 1.3
-"""The pieces of one stretch together count for so many: the two cannot both be wrong."""
 RAY_MM = 1.0
 """Along the sheet, light within this counts as one ray of the laser."""
 
@@ -73,13 +73,13 @@ def still_evidence(pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibra
     """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
     depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
     direction = _direction_evidence(pieces, hypotheses.sheets, sensor)
-    return np.asarray(depth + _vote(pieces, DIRECTION_VOTES) * direction)
+    return np.asarray(depth + _vote(pieces) * direction)
 
 
-def _vote(pieces: Pieces, votes: float) -> FloatArray:
-    """(P, 1) weights of the pieces by which each stretch has so many votes at most."""
+def _vote(pieces: Pieces) -> FloatArray:
+    """(P, 1) weights by which the pieces of a stretch do not count for more than they know."""
     count = np.bincount(pieces.stretch)[pieces.stretch]
-    return np.asarray(np.minimum(1.0, votes / count)[:, None])
+    return np.asarray(np.minimum(1.0, 1.0 / count + 1.0 / ALIKE_PIECES)[:, None])
 
 
 def _direction_evidence(
@@ -106,6 +106,23 @@ def _angle_between(direction: FloatArray, line: FloatArray) -> FloatArray:
     return np.asarray(np.arccos(np.clip(np.abs(direction @ line), 0.0, 1.0)))
 
 
+def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -> FloatArray:
+    """(P, H) log-likelihood of the pieces, from how well their samples continue the past.
+
+    Sharp predictions err apart from piece to piece, vague ones in common.
+
+    Parameters
+    ----------
+    pieces
+        Of the profile.
+    log_gain, sharpness
+        (S, H) from `armscan.reconstruction.surface_memory.SurfaceMemory.evidence`.
+    """
+    sharp = INDEPENDENT * pieces.mean(log_gain * sharpness)
+    vague = _vote(pieces) * pieces.mean(log_gain * (1.0 - sharpness))
+    return np.asarray(sharp + vague)
+
+
 def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses) -> FloatArray:
     """(P, H) penalty where another stretch already holds the same rays of a sheet's light.
 
@@ -128,7 +145,7 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         table = np.zeros((int(stretch.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (stretch, ray), belief)
         penalty[:, h] = TAKEN * _most_of_others(table)[stretch, ray]
-    return np.asarray(_vote(pieces, TAKEN_VOTES) * pieces.mean(penalty))
+    return np.asarray(_vote(pieces) * pieces.mean(penalty))
 
 
 def _most_of_others(table: FloatArray) -> FloatArray:

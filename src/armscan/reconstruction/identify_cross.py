@@ -16,10 +16,11 @@ from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.cross_evidence import (
     Hypotheses,
     hypothesise,
+    past_evidence,
     still_evidence,
     taken_evidence,
 )
-from armscan.reconstruction.image_memory import ImageMemory
+from armscan.reconstruction.image_memory import SHARPNESS, ImageMemory
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.piece_labels import smoothed_posterior
 from armscan.reconstruction.stretches import Pieces, cut_pieces
@@ -28,8 +29,7 @@ from armscan.reconstruction.surface_memory import SurfaceMemory
 from armscan.reconstruction.triangulate import meet_sheets
 from armscan.records.profile import Profile
 
-INDEPENDENT = 0.5
-"""Neighbouring pieces share what the prediction errs by: each counts for half an observation."""
+MOST = 0.5
 ROUNDS = 2
 """Times that the rays held by other stretches are looked up."""
 
@@ -54,7 +54,7 @@ class CrossOptions:
         Depths that are possible.
     """
 
-    margin: float = 5.0
+    margin: float = 5.5
     remember_margin: float = 7.0
     undecided_share: float = 0.2
     least_between: int = 4
@@ -77,11 +77,12 @@ class CrossOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Verdict:
-    """Sheet (N,), log-odds (N,) and fate (N,) of the points of a profile."""
+    """Sheet (N,), log-odds (N,) and fate (N,) of points; undecided ones expected of each sheet."""
 
     sheet: IntArray
     odds: FloatArray
     fate: IntArray
+    undecided: FloatArray
 
 
 class CrossNamer:
@@ -119,7 +120,6 @@ class CrossNamer:
         self._last_ns: int | None = None
         self._next = self._sources[:1]
         self._since_single = 0
-        self._seen = dict.fromkeys(self._sources, 0)
 
     def next_lasers(self) -> tuple[str, ...]:
         """One laser alone at the start of a stroke and when names are in doubt, else all."""
@@ -152,8 +152,9 @@ class CrossNamer:
         pieces = cut_pieces(profile)
         fate = np.full(n, int(NameFate.NOT_ASKED))
         sheet, odds = np.full(n, -1), np.full(n, -np.inf)
+        undecided = np.zeros(len(self._source_of))
         if not len(pieces) or not possible:
-            return _Verdict(sheet, odds, fate)
+            return _Verdict(sheet, odds, fate, undecided)
         samples = profile.points_px[pieces.sample]
         hypotheses = hypothesise(samples, possible, self._sensor, self._options.depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
@@ -166,7 +167,9 @@ class CrossNamer:
         own = pieces.of_point[asked]
         fate[asked], odds[asked] = verdict[own], margin[own]
         sheet[asked] = np.where(verdict[own] == NameFate.NAMED, np.array(possible)[best[own]], -1)
-        return _Verdict(sheet, odds, fate)
+        doubtful = np.where(verdict == NameFate.AMBIGUOUS, pieces.size, 0)
+        undecided[list(possible)] = doubtful @ np.exp(posterior)
+        return _Verdict(sheet, odds, fate, undecided)
 
     def _posterior(
         self,
@@ -176,14 +179,16 @@ class CrossNamer:
         pose: Pose[Base, Sensor] | None,
     ) -> FloatArray:
         """(P, H) log-probability of each sheet for each piece."""
-        past = np.zeros((len(samples_px), len(hypotheses.sheets)))
+        gain = np.zeros((len(samples_px), len(hypotheses.sheets)))
+        sharpness = np.full_like(gain, SHARPNESS)
         for h, k in enumerate(hypotheses.sheets):
             if pose is None:
-                past[:, h] = self._image.log_likelihood(samples_px, k)
+                gain[:, h] = self._image.log_gain(samples_px, k)
             else:
-                past[:, h] = self._surface.log_likelihood(hypotheses.points_mm[h], pose)
-        evidence = INDEPENDENT * pieces.mean(past)
-        evidence += still_evidence(pieces, hypotheses, self._sensor)
+                points = hypotheses.points_mm[h]
+                gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
+        past = past_evidence(pieces, gain, sharpness)
+        evidence = past + still_evidence(pieces, hypotheses, self._sensor)
         posterior = smoothed_posterior(evidence, pieces.stretch)
         for _ in range(ROUNDS):
             taken = taken_evidence(posterior, pieces, hypotheses)
@@ -203,22 +208,19 @@ class CrossNamer:
         self._surface.remember((pose @ in_sensor).xyz_mm)
 
     def _plan(self, verdict: _Verdict, possible: tuple[int, ...]) -> None:
-        """Choose the lasers of the next exposure."""
+        """Choose the lasers of the next exposure: all, or the one that most undecided are of."""
         on = {self._source_of[k] for k in possible}
         self._since_single = 0 if len(on) == 1 else self._since_single + 1
-        for source in on:
-            own = [k for k in possible if self._source_of[k] == source]
-            self._seen[source] = int(np.isin(verdict.sheet, own).sum())
+        expected = dict.fromkeys(self._sources, 0.0)
+        for source, points in zip(self._source_of, verdict.undecided.tolist(), strict=True):
+            expected[source] += points
         n_asked = int((verdict.fate != int(NameFate.NOT_ASKED)).sum())
-        n_undecided = int((verdict.fate == int(NameFate.AMBIGUOUS)).sum())
-        self._next = self._sources
-        if not n_asked and not any(self._seen.values()):
-            self._next = self._sources[:1]
-        elif (
-            n_undecided > self._options.undecided_share * n_asked
-            and self._since_single > self._options.least_between
-        ):
-            self._next = (min(self._sources, key=lambda source: self._seen[source]),)
+        n_undecided = sum(expected.values())
+        # with most points undecided one stripe alone gives no less than all together
+        is_due = self._since_single > self._options.least_between or n_undecided > MOST * n_asked
+        is_in_doubt = n_undecided > self._options.undecided_share * n_asked
+        most = max(self._sources, key=lambda source: expected[source])
+        self._next = (most,) if is_in_doubt and is_due else self._sources
 
     def _how(self, possible: tuple[int, ...], has_pose: bool) -> str:
         if len(possible) == 1:

@@ -15,9 +15,10 @@ REACH_PX = 60.0
 SIGMA_PX = 5.0
 """Of the expected place across the stripe; a hand's acceleration and the surface's shape."""
 STUDENT = 3.0
-EVEN_PER_PX = 1.0 / 600.0
-"""Density of a stripe's place where nothing is known: a window is some 600 px high."""
-NEW_SURFACE = 0.05
+WINDOW_PX = 600.0
+"""A stripe of which nothing is known may be anywhere over about this width."""
+SHARPNESS = 0.15
+"""What the prediction errs by is nearly the same all along a stripe."""
 STIFFNESS = 20.0
 """Points' worth of belief that a stripe stands still, so that its motion is always determined."""
 
@@ -46,11 +47,15 @@ class ImageMemory:
             motion = self._motion(k, points_px[own], normals_px[own])
             self._last[k] = _Stripe(points_px[own], normals_px[own], motion)
 
-    def log_likelihood(self, points_px: FloatArray, sheet: int) -> FloatArray:
-        """(S,) log density, 1/px, of new points (S, 2) if they were of a sheet."""
-        density = np.full(len(points_px), EVEN_PER_PX)
+    def log_gain(self, points_px: FloatArray, sheet: int) -> FloatArray:
+        """How well new points (S, 2) continue a sheet's stripe.
+
+        The logarithm (S,) of the density of their place, if they are of the sheet, over that of
+        something new, which may be anywhere: 0 where nothing is expected.
+        """
+        gain = np.zeros(len(points_px))
         if sheet not in self._last or not len(points_px):
-            return np.asarray(np.log(density))
+            return gain
         last = self._last[sheet]
         distance, index = _nearest(last, points_px)
         known = np.flatnonzero(distance < REACH_PX)
@@ -58,8 +63,8 @@ class ImageMemory:
         across = np.einsum("ni,ni->n", points_px[known] - place, last.normals_px[index[known]])
         share = 1.0 + (across / SIGMA_PX) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / SIGMA_PX
-        density[known] = (1.0 - NEW_SURFACE) * peak / share**2 + NEW_SURFACE * EVEN_PER_PX
-        return np.asarray(np.log(density))
+        gain[known] = np.log1p(WINDOW_PX * peak / share**2)
+        return gain
 
     def _motion(self, sheet: int, points: FloatArray, normals: FloatArray) -> FloatArray:
         """(2,) motion since the last image: only its part across the stripe can be seen."""

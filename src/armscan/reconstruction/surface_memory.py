@@ -24,6 +24,8 @@ BEND_PER_MM = 0.06
 """Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
+SHARP_MM = 0.3
+"""Vaguer predictions err by the same all along a stretch."""
 STUDENT = 3.0
 """Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
 
@@ -65,35 +67,44 @@ class SurfaceMemory:
             self._kept.popleft()
         self._tree = None
 
-    def log_likelihood(
+    def evidence(
         self, points_sensor_mm: FloatArray, base_from_sensor: Pose[Base, Sensor]
-    ) -> FloatArray:
-        """(S,) log density, 1/mm, of the depths of points (S, 3) of a new exposure.
+    ) -> tuple[FloatArray, FloatArray]:
+        """How well points (S, 3) of a new exposure continue what is known.
 
         Where the surface is known nearby, it is continued by a local plane with a weak prior on
         its slope, so that the prediction is the vaguer the further it reaches.
+
+        Returns
+        -------
+        log_gain
+            (S,) logarithm of the density of the point's depth over that of a new surface, which
+            may be anywhere: 0 where nothing is known or the point does not fit.
+        sharpness
+            (S,) 1 for a prediction to within `SHARP_MM`, towards 0 the vaguer it is.
         """
-        even = 1.0 / self.depth_span_mm
-        density = np.full(len(points_sensor_mm), even)
+        n = len(points_sensor_mm)
+        gain, sharpness = np.zeros(n), np.zeros(n)
         if self._tree is None and len(self):
             self._tree = cKDTree(np.concatenate(self._kept))
-        if self._tree is None or not len(points_sensor_mm):
-            return np.asarray(np.log(density))
+        if self._tree is None or not n:
+            return gain, sharpness
         in_sensor: Points[Sensor] = Points(points_sensor_mm)
         places = (base_from_sensor @ in_sensor).xyz_mm
         found = self._tree.query(places, k=N_NEAR, distance_upper_bound=REACH_MM)
         distance, index = np.asarray(found[0]), np.asarray(found[1])
         known = np.flatnonzero(np.isfinite(distance[:, 0]))
         if not len(known):
-            return np.asarray(np.log(density))
+            return gain, sharpness
         distance = distance[known]
         is_near = np.isfinite(distance)
         near = self._tree.data[np.where(is_near, index[known], 0)] - places[known, None]
         offset, sigma = _continued(near @ base_from_sensor.rotation, distance, is_near)
         share = 1.0 + (offset / sigma) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
-        density[known] += peak / share**2
-        return np.asarray(np.log(density))
+        gain[known] = np.log1p(self.depth_span_mm * peak / share**2)
+        sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 2)
+        return gain, sharpness
 
 
 def _continued(

@@ -135,7 +135,8 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
     InputError
         If the two covariances of a point add up to none that is positive definite.
     """
-    if failure := _degenerate(pairs):
+    failure = _degenerate(pairs)
+    if failure is not None:
         return failure
     trace = np.trace(pairs.covariance_a_mm2 + pairs.covariance_b_mm2, axis1=1, axis2=2)
     if float(trace.min()) <= 0.0:

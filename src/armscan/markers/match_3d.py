@@ -73,7 +73,8 @@ def match_markers(
         # triangles of the smaller set are the likelier to be common
         return _swapped(match_markers(second, first, options))
     a, b = label_markers(first), label_markers(second)
-    if on_line := _on_a_line(a, b):
+    on_line = _on_a_line(a, b)
+    if on_line is not None:
         return on_line
     votes = vote(a, b, options.distance_sigmas)
     placing = MarkerPlacing(a, b, options.position_sigmas)

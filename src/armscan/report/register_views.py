@@ -82,8 +82,7 @@ def views_report(
             (
                 "drift",
                 f"{significant(float(sigma[last]), 'mm')} uncertainty of {placed[last]} against "
-                f"the first view; solving together moved a view by "
-                f"{_length(float(shift.max()))} at most",
+                f"the first view; {_shift_text(float(shift.max()))}",
             ),
         ),
         scans=_view_table(placed, joined, sigma=sigma, shift=shift),
@@ -134,9 +133,10 @@ def views_report(
     )
 
 
-def _length(value_mm: float) -> str:
-    """A length, or that there is none: what is left over by rounding is not shown."""
-    return significant(value_mm, "mm") if value_mm > LEAST_MM else "nothing"
+def _shift_text(largest_mm: float) -> str:
+    if largest_mm < LEAST_MM:
+        return "solving together changed nothing: no loop closes"
+    return f"solving together moved a view by {significant(largest_mm, 'mm')} at most"
 
 
 def _n_sightings(joined: JoinedViews) -> FloatArray:

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.markers.matching_options import MatchingOptions
+from armscan.markers.ring_size import diameters_mm
 from armscan.models.stereo_points import triangulate_points
 from armscan.models.two_views import TwoViews, epipolar_distances_px, sampson_distances_px
 from armscan.records.markers import RingImages
@@ -32,6 +33,8 @@ class CandidatePairs:
         (K, 3) where the marker would be, Sensor frame.
     covariance_mm2
         (K, 3, 3) its covariance from the centres alone.
+    diameter_mm
+        (K,) how large it would be: geometric mean of what the two images show.
     """
 
     left: IntArray
@@ -40,6 +43,7 @@ class CandidatePairs:
     sigma_px: FloatArray
     points_mm: FloatArray
     covariance_mm2: FloatArray
+    diameter_mm: FloatArray
 
     def __len__(self) -> int:
         """Count of pairs."""
@@ -47,14 +51,7 @@ class CandidatePairs:
 
     def subset(self, chosen: BoolArray | IntArray) -> CandidatePairs:
         """Return some of the pairs."""
-        return CandidatePairs(
-            self.left[chosen],
-            self.right[chosen],
-            self.distance_px[chosen],
-            self.sigma_px[chosen],
-            self.points_mm[chosen],
-            self.covariance_mm2[chosen],
-        )
+        return CandidatePairs(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def find_candidates(
@@ -97,10 +94,13 @@ def find_candidates(
     observed = np.concatenate([left_px, right_px], axis=1)
     distance, sigma = _misclosure(views, shown, observed, spread, calibration_covariance)
     sigma = np.hypot(sigma, options.unmodelled_px)
-    pairs = CandidatePairs(rows, columns, distance, sigma, shown, points.noise_mm2)
+    in_left = diameters_mm(left, rows, views.left, shown)
+    in_right = diameters_mm(right, columns, views.right, views.points_right_mm(shown))
     is_near = points.is_valid & (np.abs(distance) < options.max_sigmas * sigma)
     is_near &= _is_in_depth(shown, views, options)
-    is_near &= _is_of_one_size(pairs, left, right, views, options)
+    is_near &= _is_of_one_size(in_left, in_right, options)
+    diameter = np.sqrt(in_left * in_right)
+    pairs = CandidatePairs(rows, columns, distance, sigma, shown, points.noise_mm2, diameter)
     return pairs.subset(is_near)
 
 
@@ -142,20 +142,9 @@ def _is_in_depth(points_mm: FloatArray, views: TwoViews, options: MatchingOption
 
 
 def _is_of_one_size(
-    pairs: CandidatePairs,
-    left: RingImages,
-    right: RingImages,
-    views: TwoViews,
-    options: MatchingOptions,
+    in_left: FloatArray, in_right: FloatArray, options: MatchingOptions
 ) -> BoolArray:
     """True where both images show a ring of one diameter, the one given if there is one."""
-    in_left, in_right = (
-        2.0 * rings.outer_half_px[rows, 1] * points[:, 2] / np.sqrt(camera.fx_px * camera.fy_px)
-        for rings, rows, points, camera in (
-            (left, pairs.left, pairs.points_mm, views.left),
-            (right, pairs.right, views.points_right_mm(pairs.points_mm), views.right),
-        )
-    )
     tolerance = options.size_tolerance
     is_one = np.abs(np.log(in_left / in_right)) < tolerance
     if options.diameter_mm is not None:

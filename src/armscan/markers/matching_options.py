@@ -23,8 +23,11 @@ class MatchingOptions:
     diameter_mm
         Outer diameter of the markers; None if not known.
     size_tolerance
-        Largest difference of the diameters that two images of one marker show, as a fraction; a
-        tilted ring near the camera shows up to a few hundredths.
+        Largest difference, as a fraction, of the diameters that the two images of one marker show,
+        and of each from ``diameter_mm``.
+    same_size
+        Markers whose diameters differ by less than this fraction are of one make; where most are,
+        a pair of that size is believed without neighbours.
     plane_px
         T of the homography's consensus: markers on one plane agree to this, px.
     depth_tolerance
@@ -36,12 +39,16 @@ class MatchingOptions:
     unmodelled_px: float = 0.02
     depth_mm: tuple[float, float] | None = None
     diameter_mm: float | None = None
-    size_tolerance: float = 0.1
+    size_tolerance: float = 0.04
+    same_size: float = 0.015
     plane_px: float = 2.0
     depth_tolerance: float = 0.15
 
     def __post_init__(self) -> None:
-        positive = (self.max_sigmas, self.size_tolerance, self.plane_px, self.depth_tolerance)
+        positive = (
+            *(self.max_sigmas, self.size_tolerance, self.same_size),
+            *(self.plane_px, self.depth_tolerance),
+        )
         if not (min(positive) > 0.0 and self.unmodelled_px >= 0.0):
             raise OptionError("the thresholds of matching must be positive")
         if self.depth_mm is not None and not 0.0 <= self.depth_mm[0] < self.depth_mm[1]:

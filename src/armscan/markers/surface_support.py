@@ -21,6 +21,8 @@ _FARTHEST_PER_MM = 1e-6
 MAX_NEIGHBOURS = 8
 MIN_NEIGHBOURS = 3
 """Neighbours that a plane through them needs."""
+_MIN_OF_ONE_SIZE, _SHARE_OF_ONE_SIZE = 5, 0.7
+"""Seeds needed to say that markers are of one size, and the share of them that must be."""
 _RIVAL_FACTOR = 2.5
 """A pair this much further from its neighbours' plane than is allowed still speaks against
 another pair with one of its rings."""
@@ -143,7 +145,8 @@ def ranks(
     Returns
     -------
     rank
-        (K,) 3 on a plane of many seeds, 2 near its neighbours' plane, 1 not far from it, 0 else.
+        (K,) 3 on a plane of many seeds; 2 near its neighbours' plane, or as large as most markers;
+        1 not far from its neighbours' plane; 0 else.
     n_planes
         Count of homographies found.
     """
@@ -151,8 +154,26 @@ def ranks(
     misfit = depth_misfits(pairs, seeds, left)
     rank = (misfit < options.depth_tolerance).astype(np.int64)
     rank += misfit < _RIVAL_FACTOR * options.depth_tolerance
+    rank[_is_of_their_size(pairs, seeds, options)] = 2
     rank[is_on_plane] = 3
     return rank, n_planes
+
+
+def _is_of_their_size(
+    pairs: CandidatePairs, seeds: CandidatePairs, options: MatchingOptions
+) -> BoolArray:
+    """Which pairs show the diameter that most seeds show: a wrong depth changes it likewise.
+
+    With few seeds the diameter given takes the place of theirs, if there is one.
+    """
+    expected = options.diameter_mm
+    if len(seeds) >= _MIN_OF_ONE_SIZE:
+        middle = float(np.median(seeds.diameter_mm))
+        alike = np.abs(np.log(seeds.diameter_mm / middle)) < options.same_size
+        expected = middle if alike.mean() >= _SHARE_OF_ONE_SIZE else None
+    if expected is None:
+        return np.zeros(len(pairs), np.bool_)
+    return np.asarray(np.abs(np.log(pairs.diameter_mm / expected)) < options.same_size)
 
 
 def only_supported(pairs: CandidatePairs, rank: IntArray, best: IntArray) -> IntArray:

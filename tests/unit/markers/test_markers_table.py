@@ -10,21 +10,22 @@ import pytest
 
 from armscan.errors import FileFormatError, InputError
 from armscan.records.markers import MarkerSet
-from armscan.storage.markers import markers_csv, read_markers
+from armscan.storage.marker_files import read_marker_list
+from armscan.storage.markers import markers_csv
 
 
 def some_markers(n: int = 4) -> MarkerSet:
     rng = np.random.default_rng(1)
     root = rng.standard_normal((n, 3, 3))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(3)
-    return MarkerSet(np.arange(n) * 3, rng.standard_normal((n, 3)), covariance, "Base")
+    return MarkerSet(np.arange(n) * 3, 30.0 * rng.standard_normal((n, 3)), covariance, "Base")
 
 
 def test_a_table_reads_back_as_the_same_numbers(tmp_path: Path) -> None:
     markers = some_markers()
     path = tmp_path / "markers.csv"
     path.write_bytes(markers_csv(markers))
-    again = read_markers(path)
+    again = read_marker_list(path, frame="Sensor").markers
     np.testing.assert_array_equal(again.ids, markers.ids)
     np.testing.assert_array_equal(again.points_mm, markers.points_mm)
     # The table holds the upper half: the lower one may differ in the last bit.
@@ -40,14 +41,14 @@ def test_a_table_reads_back_as_the_same_numbers(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("cov_zz_mm2", "sigma_z", "cov_zz_mm2"),
-        ("\n3,", "\n0,", "id occurs twice"),
+        ("\n3,", "\n0,", "id 0 occurs 2 times"),
     ],
 )
 def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / "markers.csv"
     path.write_text(markers_csv(some_markers()).decode().replace(old, new))
     with pytest.raises(FileFormatError, match=message):
-        read_markers(path)
+        read_marker_list(path, frame="Sensor")
 
 
 def test_a_covariance_must_be_one() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.frames import CameraRight, Sensor
@@ -23,6 +24,9 @@ STEREO_PARAMETER_NAMES = (
 )
 """Order of a stereo calibration's covariance."""
 
+IntrinsicsUse = Literal["free", "prior", "fixed"]
+"""What calibrations of single cameras are for: nothing, observations beside the images, held."""
+
 
 @dataclass(frozen=True, slots=True)
 class StereoDiagnostics:
@@ -35,12 +39,25 @@ class StereoDiagnostics:
     epipolar_mean_px
         Their signed mean: a bias that no scatter explains.
     left_out
-        Pairs that were left out, with the reason.
+        Images of pairs that do not tell where the cameras are to each other, with the reason.
+    intrinsics
+        What given calibrations of the cameras were for: ``free`` (none), ``prior`` or ``fixed``.
+    hold_out_rms_px
+        Reprojection error on pairs that were not used to solve; None without such a test.
+    typical_level
+        Squared distance of the typical pair's own ``right_from_left`` from the others' over its
+        covariance and six degrees of freedom: about 1 where noise is all there is.
+    target_error_mm
+        By how much the target's points miss their places, one standard deviation an axis.
     """
 
     epipolar_rms_px: float
     epipolar_mean_px: float
     left_out: tuple[tuple[str, str], ...] = ()
+    intrinsics: IntrinsicsUse = "free"
+    hold_out_rms_px: float | None = None
+    typical_level: float = 1.0
+    target_error_mm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

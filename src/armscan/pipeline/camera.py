@@ -87,7 +87,7 @@ def calibrate_camera_from_exposures(
     total = len(exposures) if isinstance(exposures, Sized) else 0
     views: list[TargetView] = []
     not_found: list[tuple[str, str]] = []
-    for done, (source, found) in enumerate(_detected(exposures, target, target_options), 1):
+    for done, (source, found) in enumerate(detect_in_order(exposures, target, target_options), 1):
         if isinstance(found, FitFailure):
             not_found.append((source, found.reason))
         else:
@@ -102,7 +102,7 @@ def calibrate_camera_from_exposures(
     return CameraRun(run.fit, tuple(not_found), run.centre_rounds)
 
 
-def _detected(
+def detect_in_order(
     exposures: Iterable[Exposure], target: Target, options: TargetOptions | None
 ) -> Iterator[tuple[str, TargetView | FitFailure]]:
     """Detect in a few threads, in order, without holding more exposures than threads."""

@@ -24,6 +24,7 @@ from armscan.storage.calibration_schema import (
     SCANNER_SCHEMA,
     SCHEMA_VERSION,
     SENSOR_SCHEMA,
+    STEREO_SCHEMA,
     CameraDocument,
     ObservationsBody,
     SensorDocument,
@@ -40,8 +41,14 @@ KINDS = {
     CAMERA_SCHEMA: "camera calibration",
     SENSOR_SCHEMA: "sensor calibration",
     SCANNER_SCHEMA: "scanner calibration",
+    STEREO_SCHEMA: "stereo calibration",
 }
-STAGES = {CAMERA_SCHEMA: "camera", SENSOR_SCHEMA: "laser", SCANNER_SCHEMA: "hand-eye"}
+STAGES = {
+    CAMERA_SCHEMA: "camera",
+    SENSOR_SCHEMA: "laser",
+    SCANNER_SCHEMA: "hand-eye",
+    STEREO_SCHEMA: "stereo",
+}
 
 
 def camera_document(

@@ -20,6 +20,7 @@ SCHEMA_VERSION: Final = 1
 CAMERA_SCHEMA: Final = "armscan/camera-calibration"
 SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
 SCANNER_SCHEMA: Final = "armscan/scanner-calibration"
+STEREO_SCHEMA: Final = "armscan/stereo-calibration"
 
 
 def _nan_from_null(value: object) -> object:

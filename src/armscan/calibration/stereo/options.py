@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import get_args
 
 from armscan.calibration.camera.options import CameraOptions
 from armscan.errors import OptionError
+from armscan.models.stereo import IntrinsicsUse
 
-Intrinsics = Literal["free", "prior", "fixed"]
-INTRINSICS: tuple[Intrinsics, ...] = ("free", "prior", "fixed")
+INTRINSICS_USES: tuple[IntrinsicsUse, ...] = get_args(IntrinsicsUse)
 
 MIN_PAIRS = 3
 """Two pairs that disagree do not say which of them is wrong."""
@@ -39,16 +39,16 @@ class StereoOptions:
     """
 
     camera: CameraOptions = field(default_factory=CameraOptions)
-    intrinsics: Intrinsics = "free"
+    intrinsics: IntrinsicsUse = "free"
     leave_out: tuple[str, ...] = ()
     leave_out_misfits: bool = False
     n_folds: int = 5
 
     def __post_init__(self) -> None:
-        if self.intrinsics not in INTRINSICS:
+        if self.intrinsics not in INTRINSICS_USES:
             raise OptionError(
                 f"intrinsics '{self.intrinsics}' is not known",
-                remedy="choose " + ", ".join(INTRINSICS),
+                remedy="choose " + ", ".join(INTRINSICS_USES),
             )
         if self.n_folds < 0 or self.n_folds == 1:
             raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")

@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From pairs of exposures of a target to two calibrated cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armscan.calibration.stereo.calibrate import calibrate_stereo
+from armscan.calibration.stereo.options import MIN_PAIRS, StereoOptions
+from armscan.calibration.stereo.pairs import SIDES, StereoPair
+from armscan.calibration.stereo.result import SideFit, StereoFit
+from armscan.errors import InputError
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.rotation import vector_from_rotation
+from armscan.models.calibration import CameraCalibration, Provenance
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.diagnostics import CameraDiagnostics
+from armscan.models.stereo import StereoCalibration, StereoDiagnostics
+from armscan.pipeline.camera import CENTRE_ROUNDS, CENTRES_STABLE, detect_in_order
+from armscan.pipeline.instants import group_instants
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.records.exposure import Exposure
+from armscan.records.session import ExposureRow
+from armscan.vision.targets.circle_centres import correct_centres
+from armscan.vision.targets.definition import Target
+from armscan.vision.targets.options import TargetOptions
+from armscan.vision.targets.view import TargetView
+
+LISTED = 4
+
+Given = tuple[CameraCalibration, CameraCalibration]
+ExposedPair = tuple[Exposure | None, Exposure | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoRun:
+    """Two calibrated cameras, and the exposures in which no target was found.
+
+    Parameters
+    ----------
+    fit
+        The result.
+    not_found
+        (source, reason) of exposures without a usable target.
+    centre_rounds
+        How often circle centres were measured again with the cameras; 0 for other targets.
+    """
+
+    fit: StereoFit
+    not_found: tuple[tuple[str, str], ...]
+    centre_rounds: int
+
+
+def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[ExposedPair]:
+    """Pair two lists of exposures in their order.
+
+    Raises
+    ------
+    InputError
+        If the lists differ in length, or an exposure is in both.
+    """
+    if len(left) != len(right):
+        raise InputError(
+            f"{len(left)} left images ({_listed(left)}) but {len(right)} right ones "
+            f"({_listed(right)})",
+            remedy="give one right image for each left image, in the same order",
+        )
+    for a, b in zip(left, right, strict=True):
+        if a.source == b.source:
+            raise InputError(
+                "the same image is given for both cameras",
+                where=a.source,
+                remedy="give the images of the right camera as the second argument",
+            )
+    return list(zip(left, right, strict=True))
+
+
+def stereo_rows(rows: Sequence[ExposureRow], where: str) -> list[tuple[int | None, int | None]]:
+    """Rows of a recording that show a target without laser, paired by instant.
+
+    Parameters
+    ----------
+    rows
+        Of the recording.
+    where
+        Its name, for messages.
+
+    Raises
+    ------
+    InputError
+        If there are not two cameras, or a camera took two exposures at one instant.
+    """
+    cameras = sorted({row.camera for row in rows})
+    if cameras != [0, 1]:
+        listed = ", ".join(str(camera) for camera in cameras)
+        raise InputError(
+            f"two cameras are needed, 0 (left) and 1 (right); the recording has {listed}",
+            where=where,
+            remedy="name a recording of a head with two cameras",
+        )
+    dark = [k for k, row in enumerate(rows) if not row.lasers]
+    chosen = dark or list(range(len(rows)))
+    pairs = []
+    for instant in group_instants([rows[k] for k in chosen], where):
+        of_camera = {rows[chosen[k]].camera: chosen[k] for k in instant.rows}
+        pairs.append((of_camera.get(0), of_camera.get(1)))
+    return pairs
+
+
+def calibrate_stereo_from_exposures(
+    exposures: Sequence[ExposedPair],
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    target_options: TargetOptions | None = None,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """Find the target in each exposure and calibrate.
+
+    Parameters
+    ----------
+    exposures
+        Left and right exposure of each instant; None where one camera has none.
+    target
+        What to look for.
+    options, given
+        As `calibrate_stereo`.
+    target_options
+        Of the detection; None for the defaults.
+    progress
+        Is told of each exposure and of each solution.
+
+    Returns
+    -------
+    run
+        Both cameras with their evidence, or why there are none.
+
+    Raises
+    ------
+    InputError, OptionError
+        As `calibrate_stereo`.
+    """
+    every = [exposure for pair in exposures for exposure in pair if exposure is not None]
+    views: dict[str, TargetView] = {}
+    not_found: list[tuple[str, str]] = []
+    for done, (source, found) in enumerate(detect_in_order(every, target, target_options), 1):
+        if isinstance(found, FitFailure):
+            not_found.append((source, found.reason))
+        else:
+            views[source] = found
+        progress(ProgressEvent("find target", done, len(every), source))
+    pairs = _found_pairs(exposures, views)
+    missing = _too_few(exposures, pairs, not_found)
+    if missing is not None:
+        return missing
+    run = calibrate_stereo_from_pairs(pairs, target, options, given, progress=progress)
+    return replace(run, not_found=tuple(not_found)) if isinstance(run, StereoRun) else run
+
+
+def calibrate_stereo_from_pairs(
+    pairs: Sequence[StereoPair],
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """Calibrate; for circles, correct the centres with the cameras and calibrate again.
+
+    Parameters, errors and result as `calibrate_stereo_from_exposures`, with the target found.
+    """
+    has_circles = any(
+        view is not None and view.edges is not None for pair in pairs for view in pair.views
+    )
+    total = CENTRE_ROUNDS if has_circles else 1
+    fit = calibrate_stereo(pairs, target, options, given)
+    progress(ProgressEvent("solve", 1, total))
+    if isinstance(fit, FitFailure):
+        return fit
+    rounds, is_stable = 0, False
+    while rounds < total - 1 and not is_stable:
+        cameras = fit.views.left, fit.views.right
+        pairs = [StereoPair(*map(_corrected, pair.views, cameras)) for pair in pairs]
+        again = calibrate_stereo(pairs, target, options, given)
+        if isinstance(again, FitFailure):
+            return again
+        rounds += 1
+        is_stable = _moved_sigmas(fit, again) < CENTRES_STABLE
+        fit = again
+        progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
+    return StereoRun(fit, (), rounds)
+
+
+def stereo_calibration(fit: StereoFit, provenance: Provenance) -> StereoCalibration:
+    """The document's content of a fit."""
+    n = len(PARAMETER_NAMES)
+    held_out = fit.hold_out
+    pairs = [pair for pair in fit.pairs if not pair.is_related]
+    return StereoCalibration(
+        left=_camera(fit.left, fit, fit.views.left, slice(0, n), provenance),
+        right=_camera(fit.right, fit, fit.views.right, slice(n, 2 * n), provenance),
+        right_from_left=fit.views.right_from_left,
+        covariance=fit.covariance,
+        rms_px=fit.rms_px,
+        n_pairs=len(fit.related),
+        n_points=fit.n_points,
+        provenance=provenance,
+        diagnostics=StereoDiagnostics(
+            epipolar_rms_px=fit.epipolar_rms_px,
+            epipolar_mean_px=fit.epipolar_mean_px,
+            left_out=tuple((pair.pair.name, pair.note) for pair in pairs),
+            intrinsics=fit.options.intrinsics,
+            hold_out_rms_px=None if held_out is None else held_out.rms_px,
+            typical_level=fit.typical_level,
+            target_error_mm=fit.target_error_mm,
+        ),
+    )
+
+
+def _camera(
+    side: SideFit, fit: StereoFit, camera: CameraModel, rows: slice, provenance: Provenance
+) -> CameraCalibration:
+    covariance = fit.covariance[rows, rows]
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance,
+        has_covariance=bool(np.any(covariance)),
+        rms_px=side.rms_px,
+        sigma_point_px=side.sigma_point_px,
+        n_views=side.n_views,
+        n_points=side.n_points,
+        covered_px=side.coverage.covered_px,
+        provenance=provenance,
+        diagnostics=CameraDiagnostics(
+            free_parameters=side.single.free_parameters,
+            model_reason=side.single.reason,
+            hold_out_rms_px=None,
+            n_folds=0,
+            condition=fit.condition,
+            noise_scale=side.noise_scale,
+            covered_fraction=side.coverage.fraction,
+            board=None,
+        ),
+    )
+
+
+def _found_pairs(
+    exposures: Sequence[ExposedPair], views: dict[str, TargetView]
+) -> list[StereoPair]:
+    pairs = []
+    for left, right in exposures:
+        seen = [None if one is None else views.get(one.source) for one in (left, right)]
+        if any(view is not None for view in seen):
+            pairs.append(StereoPair(seen[0], seen[1]))
+    return pairs
+
+
+def _too_few(
+    exposures: Sequence[ExposedPair],
+    pairs: Sequence[StereoPair],
+    not_found: Sequence[tuple[str, str]],
+) -> FitFailure | None:
+    n_both = sum(pair.is_seen_by_both for pair in pairs)
+    if n_both >= MIN_PAIRS:
+        return None
+    reasons = "; ".join(
+        reason if reason.startswith(source) else f"{source}: {reason}"
+        for source, reason in not_found[:LISTED]
+    )
+    more = f"; and {len(not_found) - LISTED} more" if len(not_found) > LISTED else ""
+    counts = []
+    for side, word in enumerate(SIDES):
+        n_images = sum(pair[side] is not None for pair in exposures)
+        n_seen = sum(pair.views[side] is not None for pair in pairs)
+        counts.append(f"{n_seen} of {n_images} {word} images")
+    return FitFailure(
+        f"the target was found in {' and '.join(counts)}, in both of {n_both} pairs; "
+        f"{MIN_PAIRS} pairs are needed" + (f" (no target: {reasons}{more})" if reasons else ""),
+        "take 10 to 20 pairs in which both cameras see the whole target, and check its columns, "
+        "rows and kind",
+    )
+
+
+def _corrected(view: TargetView | None, camera: CameraModel) -> TargetView | None:
+    return view if view is None or view.edges is None else correct_centres(view, camera)
+
+
+def _moved_sigmas(before: StereoFit, after: StereoFit) -> float:
+    """Largest change of a parameter over its standard deviation."""
+    old, new = before.views, after.views
+    turn = new.right_from_left.rotation @ old.right_from_left.rotation.T
+    moved = np.concatenate(
+        [
+            new.left.parameters - old.left.parameters,
+            new.right.parameters - old.right.parameters,
+            vector_from_rotation(turn),
+            new.right_from_left.translation_mm - old.right_from_left.translation_mm,
+        ]
+    )
+    is_free = after.sigma > 0.0
+    if not np.array_equal(is_free, before.sigma > 0.0):
+        return float("inf")
+    return float(np.max(np.abs(moved[is_free]) / after.sigma[is_free]))
+
+
+def _listed(exposures: Sequence[Exposure]) -> str:
+    names = [exposure.source for exposure in exposures[:LISTED]]
+    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")

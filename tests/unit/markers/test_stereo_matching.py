@@ -92,19 +92,19 @@ def test_markers_are_where_they_are() -> None:
 
 
 def test_a_partner_that_was_not_seen_is_not_replaced() -> None:
-    """A ring whose only candidate is another marker: unique, and wrong."""
+    """A ring that has candidates, though its marker is not in the right image."""
     n_tried = 0
-    loose = MatchingOptions(size_tolerance=0.5)
     for seed in range(40):
         scene = random_scene(seed)
-        pairs = find_candidates(scene.left, scene.right, scene.views, CALIBRATION_COVARIANCE, loose)
-        left, right = scene.left_marker[pairs.left], scene.right_marker[pairs.right]
-        by_left, by_right = np.bincount(pairs.left), np.bincount(pairs.right)
-        alone = (by_left[pairs.left] == 1) & (by_right[pairs.right] == 1) & (left != right)
-        n_tried += int(alone.sum())
-        fates = matched(scene, loose).fates
-        assert all(fates[row] is RingFate.UNSUPPORTED for row in pairs.left[alone])
-    assert n_tried >= 10
+        pairs = find_candidates(
+            scene.left, scene.right, scene.views, CALIBRATION_COVARIANCE, MatchingOptions()
+        )
+        is_alone = ~np.isin(scene.left_marker, scene.right_marker)
+        tempted = np.unique(pairs.left[is_alone[pairs.left]])
+        n_tried += len(tempted)
+        fates = matched(scene).fates
+        assert all(fates[row] is not RingFate.MATCHED for row in tempted)
+    assert n_tried >= 5
 
 
 def test_rows_along_the_epipolar_lines_are_not_guessed() -> None:

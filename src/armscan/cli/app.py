@@ -13,6 +13,7 @@ from armscan.cli import (
     calibrate_camera,
     calibrate_hand_eye,
     calibrate_laser,
+    calibrate_stereo,
     convert,
     demo,
     doctor,
@@ -61,6 +62,7 @@ calibrate = typer.Typer(
     rich_markup_mode=None,
 )
 calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
+calibrate.command("stereo", epilog=calibrate_stereo.EXAMPLE)(calibrate_stereo.stereo)
 calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
 inspect = typer.Typer(
     help="Compare measured points with a plane, a ball or a step.",

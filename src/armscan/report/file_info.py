@@ -28,13 +28,14 @@ from armscan.report.scan_info import (
     describe_touches,
     second_camera_facts,
 )
+from armscan.report.stereo_info import describe_stereo
 from armscan.report.summary import Summary
 from armscan.storage.arm_files import ARM_MODEL_FILE
 from armscan.storage.calibration_files import (
     read_calibration,
     read_camera_calibration,
 )
-from armscan.storage.calibration_schema import SCANNER_SCHEMA
+from armscan.storage.calibration_schema import SCANNER_SCHEMA, STEREO_SCHEMA
 from armscan.storage.clouds import read_ply
 from armscan.storage.image_format import image_format
 from armscan.storage.image_paths import expand_paths
@@ -48,6 +49,7 @@ from armscan.storage.recording_exposures import EXPOSURES_FILE
 from armscan.storage.recording_reader import is_recording
 from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.stereo_files import read_stereo_calibration
 
 Facts = list[tuple[str, str]]
 
@@ -108,7 +110,7 @@ def _file(path: Path) -> dict[str, Any]:
 def _text(path: Path, data: bytes) -> dict[str, Any]:
     stripped = data.lstrip(b"\xef\xbb\xbf \t\r\n")
     if stripped.startswith(b"{") and "schema" in (content := parse_json(data, str(path))):
-        return _scanner(path) if content["schema"] == SCANNER_SCHEMA else _calibration(path)
+        return DESCRIBE_SCHEMA.get(content["schema"], _calibration)(path)
     if path.name in DESCRIBE_NAMED:
         return DESCRIBE_NAMED[path.name](path)
     if path.suffix.lower() == ".csv":
@@ -181,6 +183,17 @@ def _calibration(path: Path) -> dict[str, Any]:
 def _scanner(path: Path) -> dict[str, Any]:
     document = read_scanner_calibration(path)
     return {**describe_scanner(document), **_origin(document.provenance)}
+
+
+def _stereo(path: Path) -> dict[str, Any]:
+    document = read_stereo_calibration(path)
+    return {**describe_stereo(document), **_origin(document.provenance)}
+
+
+DESCRIBE_SCHEMA: dict[str, Callable[[Path], dict[str, Any]]] = {
+    SCANNER_SCHEMA: _scanner,
+    STEREO_SCHEMA: _stereo,
+}
 
 
 def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:

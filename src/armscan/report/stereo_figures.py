@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Charts of a stereo calibration."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from armscan.calibration.stereo.pairs import SIDES
+from armscan.calibration.stereo.result import PairFit, StereoFit, ViewResiduals
+from armscan.geometry.arrays import FloatArray
+from armscan.models.camera import CameraModel
+from armscan.records.exposure import Exposure
+from armscan.report.drawing import (
+    ACCENT,
+    ACCENT_LIGHT,
+    ALERT,
+    INK,
+    MUTED,
+    Marks,
+    chart_markup,
+    new_figure,
+    photo_markup,
+    styled,
+)
+from armscan.report.numbers import significant
+from armscan.report.page import Picture
+from armscan.vision.targets.view import TargetView
+
+ARROW_SHARE = 0.06
+"""Length on the picture, as a share of its longer side, of a residual of three sigma."""
+
+COLOUR_REACH = 3.0
+"""The colours of epipolar distances end at this many times their rms."""
+
+
+def residual_magnification(fit: StereoFit) -> float:
+    """How much residual arrows are enlarged: a round number, the same in all pictures."""
+    longest = max(fit.views.left.width_px, fit.views.left.height_px)
+    wanted = ARROW_SHARE * longest / max(3.0 * fit.rms_px, 1e-6)
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted)
+
+
+def residual_field(fit: StereoFit, side: int) -> Picture:
+    """Residual arrows of one camera over its image, and what the target covered."""
+    scale = residual_magnification(fit)
+    used = [
+        (view.points_px, residuals.residuals_px)
+        for pair in fit.pairs
+        if (view := pair.pair.views[side]) is not None
+        and (residuals := (pair.left, pair.right)[side]) is not None
+    ]
+    points = np.concatenate([pixels for pixels, _ in used])
+    arrows = scale * np.concatenate([residuals for _, residuals in used])
+    camera = (fit.views.left, fit.views.right)[side]
+    coverage = fit.sides[side].coverage
+    with styled():
+        figure = new_figure(*_size_of(camera))
+        axes = figure.add_subplot()
+        axes.quiver(
+            *points.T, *arrows.T, angles="xy", scale_units="xy", scale=1.0,
+            color=ACCENT, width=0.0022, headwidth=3.5, headlength=4.5,
+        )  # fmt: skip
+        _image_axes(axes, camera)
+    empty = f"; nothing was seen in: {', '.join(coverage.empty)}" if coverage.empty else ""
+    word = SIDES[side]
+    return Picture(
+        chart_markup(figure, f"Residual arrows over the {word} image"),
+        title=f"{word.capitalize()} camera: residuals over the image",
+        caption=f"Observed minus predicted, {scale:g} times enlarged; "
+        f"{fit.sides[side].n_views} views, {100 * coverage.fraction:.0f} % of the image "
+        f"covered{empty}.",
+    )
+
+
+def epipolar_map(fit: StereoFit) -> Picture:
+    """Distances from the epipolar lines over the left image."""
+    points, distances, _ = _matched(fit)
+    reach = COLOUR_REACH * fit.epipolar_rms_px
+    with styled():
+        figure = new_figure(*_size_of(fit.views.left))
+        axes = figure.add_subplot()
+        drawn = axes.scatter(
+            points[:, 0], points[:, 1], 9.0, distances, cmap="RdBu_r", vmin=-reach, vmax=reach,
+            linewidths=0.2, edgecolors=MUTED,
+        )  # fmt: skip
+        _image_axes(axes, fit.views.left)
+        figure.colorbar(drawn, ax=axes, label="distance, px", shrink=0.8)
+    return Picture(
+        chart_markup(figure, "Epipolar distances over the left image"),
+        title="Distance from the epipolar line, over the left image",
+        caption="Signed distance in the right image of each target point from the epipolar line of "
+        "the same point in the left image. Colours that mix show noise; a side of one colour shows "
+        "a relative pose or a lens that does not fit.",
+    )
+
+
+def epipolar_levers(fit: StereoFit) -> Picture:
+    """Distances from the epipolar lines against depth and height in the image."""
+    points, distances, depth = _matched(fit)
+    with styled():
+        figure = new_figure(7.4, 3.2)
+        left, right = figure.subplots(1, 2, sharey=True)
+        for axes, lever, label in (
+            (left, depth, "depth, mm"),
+            (right, points[:, 1], "y in the left image, px"),
+        ):
+            axes.plot(lever, distances, ".", color=ACCENT, markersize=2.5, alpha=0.6)
+            axes.axhline(0.0, color=MUTED, linewidth=0.8)
+            axes.plot(*_running_mean(lever, distances), "-", color=ALERT, linewidth=1.6)
+            axes.set_xlabel(label)
+            axes.grid(axis="y")
+        left.set_ylabel("epipolar distance, px")
+    return Picture(
+        chart_markup(figure, "Epipolar distances against depth and height"),
+        title="Epipolar distance against its levers",
+        caption="A wrong rotation about the baseline shows as a slope over y, a wrong direction of "
+        "the baseline as one over depth. The line is the mean of tenths of the points.",
+    )
+
+
+def pair_bars(fit: StereoFit) -> Picture:
+    """Root mean square of each view, and how far each pair's own pose is from the others."""
+    rows = np.arange(len(fit.pairs), dtype=np.float64)
+    levels = [math.sqrt(pair.level) if pair.is_related else 0.0 for pair in fit.pairs]
+    with styled():
+        figure = new_figure(9.0, max(2.2, 0.9 + 0.26 * len(rows)))
+        left, right = figure.subplots(1, 2, sharey=True)
+        for side, colour in enumerate((ACCENT, ACCENT_LIGHT)):
+            values = [_rms((pair.left, pair.right)[side]) for pair in fit.pairs]
+            left.barh(
+                rows + 0.19 * (2 * side - 1), values, color=colour, height=0.36, label=SIDES[side]
+            )
+        left.set_yticks(rows, [_short(pair) for pair in fit.pairs])
+        left.invert_yaxis()
+        left.set_xlabel("rms reprojection residual, px")
+        left.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderpad=0.1, ncols=2)
+        colours = [ALERT if pair.is_misfit else ACCENT for pair in fit.pairs]
+        right.barh(rows, levels, color=colours, height=0.6)
+        right.axvline(1.0, color=MUTED, linewidth=0.8, linestyle="--")
+        right.set_xlabel("own relative pose: distance from the other pairs'")
+        for axes in (left, right):
+            axes.grid(axis="x")
+    return Picture(
+        chart_markup(figure, "Residuals and relative pose of each pair"),
+        title="Pairs",
+        caption="Left: residuals of each view in the solution. Right: how far the relative pose "
+        "that a pair gives by itself lies from that of the other pairs, in standard deviations "
+        "and over that of the typical pair (dashed). Orange: the pair disagrees with the others.",
+    )
+
+
+def pair_pictures(
+    fit: StereoFit, pair: PairFit, exposures: dict[str, Exposure]
+) -> tuple[Picture, ...]:
+    """The photographs of a pair with the points found and the residual arrows."""
+    pictures = []
+    for side, word in enumerate(SIDES):
+        view, residuals = pair.pair.views[side], (pair.left, pair.right)[side]
+        if view is not None and view.source in exposures:
+            pictures.append(_photo(fit, view, residuals, exposures[view.source], word))
+    return tuple(pictures)
+
+
+def correlation_picture(fit: StereoFit) -> Picture:
+    """Correlations of the relative pose."""
+    names = ("rx", "ry", "rz", "tx", "ty", "tz")
+    block = fit.covariance[18:, 18:]
+    sigma = np.sqrt(np.diag(block))
+    correlation = block / np.outer(sigma, sigma)
+    with styled():
+        figure = new_figure(4.2, 3.8)
+        axes = figure.add_subplot()
+        axes.imshow(correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+        axes.set_xticks(range(len(names)), names)
+        axes.set_yticks(range(len(names)), names)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+        for (i, j), value in np.ndenumerate(correlation):
+            shade = "white" if abs(value) > 0.6 else INK
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7.5, color=shade)
+    return Picture(
+        chart_markup(figure, "Correlations of the relative pose"),
+        title="Correlations of the relative pose",
+        caption="Rotation (rx, ry, rz) and translation (tx, ty, tz) of right_from_left.",
+    )
+
+
+def _photo(
+    fit: StereoFit, view: TargetView, residuals: ViewResiduals | None, exposure: Exposure, word: str
+) -> Picture:
+    points = view.points_px
+    colour = "#35e0c0" if residuals is not None else "#ff8a4c"
+    marks = [Marks(points, colour, "ring", 15.0), Marks(points[:1], colour, "dot", 13.0)]
+    text = "not used"
+    if residuals is not None:
+        tips = points + residual_magnification(fit) * residuals.residuals_px
+        arrows = np.stack([points, tips], axis=1).reshape(-1, 2)
+        marks.append(Marks(arrows, "#ffb000", "line", 3.2))
+        text = f"rms {significant(residuals.rms_px)} px"
+    return Picture(
+        photo_markup(exposure, marks, f"Target points found in {view.source}", longest_px=700),
+        title=view.source,
+        caption=f"{word}, {len(view)} points, {text}",
+    )
+
+
+def _matched(fit: StereoFit) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Left pixels, distances in the right image, depths of all pairs that relate the cameras."""
+    found = [pair.matched for pair in fit.related if pair.matched is not None]
+    return (
+        np.concatenate([matched.left_px for matched in found]),
+        np.concatenate([matched.in_right_px for matched in found]),
+        np.concatenate([matched.depth_mm for matched in found]),
+    )
+
+
+def _running_mean(lever: FloatArray, values: FloatArray) -> tuple[list[float], list[float]]:
+    parts = np.array_split(np.argsort(lever), min(10, len(lever)))
+    return (
+        [float(lever[part].mean()) for part in parts],
+        [float(values[part].mean()) for part in parts],
+    )
+
+
+def _rms(residuals: ViewResiduals | None) -> float:
+    return 0.0 if residuals is None else residuals.rms_px
+
+
+def _short(pair: PairFit) -> str:
+    name = pair.pair.name
+    return name if len(name) <= 30 else "…" + name[-29:]
+
+
+def _size_of(camera: CameraModel) -> tuple[float, float]:
+    ratio = camera.height_px / camera.width_px
+    width = 6.0 if ratio <= 1.0 else 6.0 / ratio
+    return width + 0.6, width * ratio + 0.6
+
+
+def _image_axes(axes: Axes, camera: CameraModel) -> None:
+    axes.set_xlim(-0.5, camera.width_px - 0.5)
+    axes.set_ylim(camera.height_px - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, px")
+    axes.set_ylabel("y, px")
+    axes.spines[:].set_visible(True)

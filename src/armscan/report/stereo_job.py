@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From pairs of image files, or a recording, to a stereo document and its report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.calibration.stereo.options import StereoOptions
+from armscan.calibration.stereo.result import PairFit
+from armscan.errors import EstimationError, OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.models.stereo import STEREO_PARAMETER_NAMES
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.stereo import (
+    ExposedPair,
+    Given,
+    StereoRun,
+    calibrate_stereo_from_exposures,
+    pair_lists,
+    stereo_calibration,
+    stereo_rows,
+)
+from armscan.report.numbers import sentence, significant, without_source
+from armscan.report.outputs import calibration_outputs
+from armscan.report.page import render_page
+from armscan.report.stereo_page import pair_row, relative_rows, stereo_page
+from armscan.report.summary import Summary, Table
+from armscan.storage.atomic import write_files
+from armscan.storage.calibration_files import read_camera_calibration
+from armscan.storage.image_options import ImageOptions
+from armscan.storage.image_paths import expand_paths
+from armscan.storage.images import check_same_size, read_exposures
+from armscan.storage.observations import pack_observations
+from armscan.storage.provenance import fingerprint, new_provenance
+from armscan.storage.recording_reader import read_recording
+from armscan.storage.simulated import are_simulated
+from armscan.storage.stereo_files import stereo_document
+from armscan.vision.targets.specification import parse_target
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRequest:
+    """What to calibrate two cameras from, and where to write.
+
+    Parameters
+    ----------
+    left, right
+        Image file, folder or pattern of each camera; empty if a recording is given.
+    target
+        Specification of the target.
+    output
+        The document ``NAME.json``; ``NAME.npz`` and ``NAME.html`` are written beside it.
+    scan
+        Folder recording of a head with two cameras, instead of images.
+    left_camera, right_camera
+        Calibrations of the single cameras, or None.
+    options
+        Of the calibration; what given calibrations are for.
+    image_options
+        How pixels are read.
+    is_overwriting
+        Replace results that exist.
+    command
+        The command line, for the record.
+    """
+
+    left: str
+    right: str
+    target: str
+    output: Path
+    scan: Path | None = None
+    left_camera: Path | None = None
+    right_camera: Path | None = None
+    options: StereoOptions = field(default_factory=StereoOptions)
+    image_options: ImageOptions = field(default_factory=ImageOptions)
+    is_overwriting: bool = False
+    command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """Exposures in pairs, and the files that they came from."""
+
+    pairs: list[ExposedPair]
+    paths: dict[str, Path]
+    is_simulated: bool
+
+
+def run_stereo_calibration(request: StereoRequest, progress: Progress = silent) -> Summary:
+    """Read, calibrate, write ``stereo.json``, ``.npz`` and ``.html``, and say what came out.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, an option is wrong, or the images do not determine the cameras;
+        nothing is written then.
+    """
+    target = parse_target(request.target)
+    files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
+    given = _given(request)
+    images = _from_scan(request.scan) if request.scan is not None else _from_lists(request)
+    every = [exposure for pair in images.pairs for exposure in pair if exposure is not None]
+    for side in (0, 1):
+        check_same_size([one for pair in images.pairs if (one := pair[side]) is not None])
+    hashes = {source: fingerprint(path).sha256 for source, path in images.paths.items()}
+    if given is not None and request.options.intrinsics == "prior":
+        _check_not_the_same(given, hashes)
+    run = calibrate_stereo_from_exposures(
+        images.pairs, target, request.options, given, progress=progress
+    )
+    if isinstance(run, FitFailure):
+        raise EstimationError(run.reason, remedy=run.remedy)
+    cameras = [path for path in (request.left_camera, request.right_camera) if path is not None]
+    provenance = new_provenance(
+        (*images.paths.values(), *cameras),
+        command=request.command,
+        options=(target, request.options, request.image_options),
+        parent_ids=tuple(one.provenance.document_id for one in given or ()),
+        warnings=run.fit.warnings,
+    )
+    page = stereo_page(
+        run.fit,
+        run.not_found,
+        {exposure.source: exposure for exposure in every},
+        provenance,
+        is_simulated=images.is_simulated,
+    )
+    views = [view for pair in run.fit.pairs for view in pair.pair.views if view is not None]
+    observations = pack_observations(views, (), hashes)
+    document = stereo_document(
+        stereo_calibration(run.fit, provenance), (files.observations.name, observations)
+    )
+    write_files(
+        {files.document: document, files.observations: observations, files.page: render_page(page)},
+        is_overwriting=request.is_overwriting,
+    )
+    written = (files.document, files.observations, files.page)
+    return stereo_summary(run, written, is_simulated=images.is_simulated)
+
+
+def _given(request: StereoRequest) -> Given | None:
+    left, right = request.left_camera, request.right_camera
+    if left is None and right is None:
+        return None
+    if left is None or right is None:
+        raise OptionError(
+            "the calibration of one camera is given and not that of the other",
+            remedy="give both --left and --right, or neither",
+        )
+    return read_camera_calibration(left), read_camera_calibration(right)
+
+
+def _from_lists(request: StereoRequest) -> _Images:
+    if not request.left or not request.right:
+        raise OptionError(
+            "images of both cameras are needed",
+            remedy="give two folders or quoted patterns, left and right, or --scan FOLDER",
+        )
+    left, right = expand_paths([request.left]), expand_paths([request.right])
+    exposures = read_exposures((*left, *right), request.image_options)
+    pairs = pair_lists(exposures[: len(left)], exposures[len(left) :])
+    paths = {
+        exposure.source: path for exposure, path in zip(exposures, (*left, *right), strict=True)
+    }
+    return _Images(pairs, paths, are_simulated((*left, *right)))
+
+
+def _from_scan(folder: Path) -> _Images:
+    recording = read_recording(folder)
+    pairs: list[ExposedPair] = []
+    paths: dict[str, Path] = {}
+    for rows in stereo_rows(recording.rows, str(folder)):
+        pair = [None if row is None else recording.exposure(row) for row in rows]
+        pairs.append((pair[0], pair[1]))
+        paths |= {one.source: folder / one.source for one in pair if one is not None}
+    return _Images(pairs, paths, recording.is_simulated)
+
+
+def _check_not_the_same(given: Given, hashes: dict[str, str]) -> None:
+    """Raise if given calibrations rest on images that count here again."""
+    used = {item.sha256 for calibration in given for item in calibration.provenance.inputs}
+    again = [source for source, sha256 in hashes.items() if sha256 in used]
+    if again:
+        raise OptionError(
+            f"{len(again)} of these images are among those that the given calibrations rest on, "
+            f"the first is {again[0]}: their evidence would count twice",
+            remedy="leave --left and --right out, or hold them with --intrinsics fixed",
+        )
+
+
+def stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bool) -> Summary:
+    """What a person, and a program, wants to know of a calibration."""
+    fit = run.fit
+    facts = [
+        ("pairs", f"{len(fit.related)} used of {len(fit.pairs)}"),
+        ("points", str(fit.n_points)),
+        (
+            "rms",
+            f"{significant(fit.rms_px)} px (left {significant(fit.left.rms_px)}, "
+            f"right {significant(fit.right.rms_px)}; length of the residual)",
+        ),
+        (
+            "epipolar",
+            f"{significant(fit.epipolar_rms_px)} px rms, mean {fit.epipolar_mean_px:+.4f} px",
+        ),
+    ]
+    if fit.hold_out is not None:
+        facts.append(
+            ("hold-out rms", f"{significant(fit.hold_out.rms_px)} px on pairs not used to solve")
+        )
+    facts += [(name, value) for name, value, _ in relative_rows(fit)]
+    noted = tuple(pair_row(pair) for pair in fit.pairs if pair.note)
+    tables = []
+    if noted:
+        rows = tuple((row[0], row[5], row[6]) for row in noted)
+        tables.append(Table(("pair", "level", "remark"), rows, "Pairs to look at", (2,)))
+    if run.not_found:
+        reasons = tuple((source, without_source(source, why)) for source, why in run.not_found)
+        tables.append(Table(("image", "why"), reasons, "Images without the target", (1,)))
+    return Summary(
+        title="Two cameras calibrated" + (" from simulated images." if is_simulated else "."),
+        facts=tuple(facts),
+        tables=tuple(tables),
+        warnings=tuple(sentence(warning) for warning in fit.warnings),
+        written=tuple(written),
+        next_step=f"open {written[-1]}, then `armscan calibrate laser -h`",
+        data=_data(run, is_simulated),
+    )
+
+
+def _data(run: StereoRun, is_simulated: bool) -> dict[str, Any]:
+    fit = run.fit
+    pose = fit.views.right_from_left
+    return {
+        "kind": "stereo calibration",
+        "simulated": is_simulated,
+        "intrinsics": fit.options.intrinsics,
+        "right_from_left": {
+            "rotation": pose.rotation.tolist(),
+            "translation_mm": pose.translation_mm.tolist(),
+        },
+        "parameters": _named(fit.parameters.tolist()),
+        "sigmas": _named(fit.sigma.tolist()),
+        "rms_px": fit.rms_px,
+        "left_rms_px": fit.left.rms_px,
+        "right_rms_px": fit.right.rms_px,
+        "epipolar_rms_px": fit.epipolar_rms_px,
+        "epipolar_mean_px": fit.epipolar_mean_px,
+        "hold_out_rms_px": None if fit.hold_out is None else fit.hold_out.rms_px,
+        "typical_level": fit.typical_level,
+        "target_error_mm": fit.target_error_mm,
+        "n_pairs": len(fit.related),
+        "n_points": fit.n_points,
+        "pairs": [_pair_data(pair) for pair in fit.pairs],
+        "not_found": [{"source": source, "reason": reason} for source, reason in run.not_found],
+    }
+
+
+def _named(values: Sequence[float]) -> dict[str, float]:
+    return dict(zip(STEREO_PARAMETER_NAMES, values, strict=True))
+
+
+def _pair_data(pair: PairFit) -> dict[str, Any]:
+    sources = [None if view is None else view.source for view in pair.pair.views]
+    return {
+        "left": sources[0],
+        "right": sources[1],
+        "left_rms_px": None if pair.left is None else pair.left.rms_px,
+        "right_rms_px": None if pair.right is None else pair.right.rms_px,
+        "epipolar_rms_px": None if pair.matched is None else pair.matched.rms_px,
+        "rotation_off_deg": float(np.rad2deg(np.linalg.norm(pair.apart[:3]))),
+        "translation_off_mm": float(np.linalg.norm(pair.apart[3:])),
+        "level": pair.level,
+        "right_numbers_turned_deg": 90 * pair.quarter_turns,
+        "is_related": pair.is_related,
+        "is_misfit": pair.is_misfit,
+        "note": pair.note,
+    }

@@ -110,8 +110,7 @@ def _cover(
     reach = (marker.centre_mm @ marker.normal) / (cells @ marker.normal)
     offset = reach[..., None] * cells - marker.centre_mm
     radius = np.sqrt(np.einsum("hwi,hwi->hw", offset, offset))
-    edge = np.hypot(*np.gradient(radius))
-    covers = marker.covers(radius, np.maximum(edge, 1e-9))
+    covers = marker.covers(radius, np.stack(np.gradient(radius), axis=-1))
     sigma = SUBPIXELS * camera.blur_sigma_px
     disc, ring = (_binned(blur_image(covers[..., k], sigma)) for k in (0, 1))
     return disc, ring, np.asarray(visible)

@@ -26,6 +26,8 @@ RING_DIAMETER_MM = 5.6
 _LIGHT, _DARK = 0.85, 0.06
 _EDGE_MM = 0.05
 """Width over which a sample of laser light averages the two tones: about two pixels."""
+_LEAST_SIDE_MM = 1e-9
+_FLAT_SHARE = 1e-3
 _OFF_FACE_MM = 0.5
 """A point farther from the marker's plane is on another face."""
 
@@ -62,19 +64,36 @@ class RingMarker:
         turn, place = base_from_camera.rotation, base_from_camera.translation_mm
         return replace(self, centre_mm=(self.centre_mm - place) @ turn, normal=self.normal @ turn)
 
-    def covers(self, radius_mm: FloatArray, edge_mm: FloatArray | float) -> FloatArray:
-        """(N, 2) parts of samples that disc and ring cover.
+    def covers(self, radius_mm: FloatArray, sides_mm: FloatArray) -> FloatArray:
+        """(..., 2) parts of square samples that disc and ring cover.
 
         Parameters
         ----------
         radius_mm
-            (N,) distances from the centre.
-        edge_mm
-            Width of a sample across the circles, (N,) or one for all.
+            (...) distances of the samples' middles from the centre.
+        sides_mm
+            (..., 2) by how much the distance changes along each side of a sample.
         """
-        disc = np.clip(0.5 + (0.5 * self.disc_mm - radius_mm) / edge_mm, 0.0, 1.0)
-        whole = np.clip(0.5 + (0.5 * self.ring_mm - radius_mm) / edge_mm, 0.0, 1.0)
+        disc = _covered(0.5 * self.disc_mm - radius_mm, sides_mm)
+        whole = _covered(0.5 * self.ring_mm - radius_mm, sides_mm)
         return np.stack([disc, whole - disc], axis=-1)
+
+
+def _covered(inside_mm: FloatArray, sides_mm: FloatArray) -> FloatArray:
+    """Part of a square on one side of a straight edge, whichever way the edge runs.
+
+    A ramp as wide as the square would leave errors that do not average out along an edge at 45
+    degrees, which meets all squares alike.
+    """
+    sides = np.abs(sides_mm)
+    first = np.maximum(sides.max(axis=-1), _LEAST_SIDE_MM)
+    second = np.maximum(sides.min(axis=-1), _FLAT_SHARE * first)
+    total, rest = 0.5 * (first + second), 0.5 * (first - second)
+    area = sum(
+        sign * np.maximum(inside_mm + shift, 0.0) ** 2
+        for sign, shift in ((1.0, total), (-1.0, rest), (-1.0, -rest), (1.0, -total))
+    )
+    return np.asarray(np.clip(0.5 * area / (first * second), 0.0, 1.0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,7 +129,8 @@ class Marked:
             reach = 0.5 * marker.ring_mm + _EDGE_MM
             near = np.flatnonzero((square < reach**2) & (np.abs(height) < _OFF_FACE_MM))
             radius = np.sqrt(np.maximum(square[near], 0.0))
-            disc, ring = marker.covers(radius, _EDGE_MM).T[:, :, None]
+            sides = np.broadcast_to([_EDGE_MM, 0.0], (len(near), 2))
+            disc, ring = marker.covers(radius, sides).T[:, :, None]
             albedo[near] = (
                 disc * marker.light + ring * marker.dark + (1.0 - disc - ring) * albedo[near]
             )

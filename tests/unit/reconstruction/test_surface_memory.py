@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the last exposures predict: near, further away, beside the surface, after forgetting."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Base, Sensor
+from armscan.geometry.poses import Points, Pose
+from armscan.reconstruction.surface_memory import REACH_MM, SPACING_MM, SurfaceMemory
+
+BASE_FROM_SENSOR: Pose[Base, Sensor] = Pose.from_vectors([2.9, 0.3, -0.2], [600.0, -150.0, 140.0])
+SLOPE_X, SLOPE_Y = 0.4, -0.3
+
+
+def surface(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Points (N, 3), in Sensor, of a plane that slopes towards the camera."""
+    return np.stack([x, y, 140.0 + SLOPE_X * x + SLOPE_Y * y], axis=1)
+
+
+def stripe(y: float) -> FloatArray:
+    x = np.linspace(-15.0, 15.0, 601)
+    return surface(x, np.full_like(x, y))
+
+
+def taught(*rows_y: float, pose: Pose[Base, Sensor] = BASE_FROM_SENSOR) -> SurfaceMemory:
+    memory = SurfaceMemory()
+    for y in rows_y:
+        in_sensor: Points[Sensor] = Points(stripe(y))
+        memory.remember((pose @ in_sensor).xyz_mm)
+    return memory
+
+
+def at(x: float, y: float, off_mm: float = 0.0) -> FloatArray:
+    return surface(np.array([x]), np.array([y])) + np.array([0.0, 0.0, off_mm])
+
+
+def gain(memory: SurfaceMemory, point: FloatArray) -> float:
+    return float(memory.evidence(point, BASE_FROM_SENSOR)[0][0])
+
+
+def sharpness(memory: SurfaceMemory, point: FloatArray) -> float:
+    return float(memory.evidence(point, BASE_FROM_SENSOR)[1][0])
+
+
+def test_a_plane_is_continued_along_its_slope() -> None:
+    memory = taught(-3.0, -2.0, -1.0, 0.0)
+    on = gain(memory, at(2.0, 1.5))
+    assert on > np.log(60.0 * 0.37 / 0.3)
+    for off in (-1.0, 1.0):
+        assert gain(memory, at(2.0, 1.5, off)) < on - 3.0
+    # a horizontal continuation would be 0.45 mm off: it fits worse
+    assert gain(memory, at(2.0, 1.5, -1.5 * SLOPE_Y)) < on - 1.0
+
+
+def test_the_further_the_vaguer() -> None:
+    memory = taught(-3.0, -2.0, -1.0, 0.0)
+    near, middle, far = (sharpness(memory, at(0.0, y)) for y in (0.3, 1.5, 3.0))
+    assert near > 0.8 > middle > far > 0.0
+
+
+def test_one_stripe_alone_does_not_tell_the_slope_across_it() -> None:
+    assert sharpness(taught(0.0), at(0.0, 2.0)) < 0.1
+    assert sharpness(taught(-2.0, -1.0, 0.0), at(0.0, 2.0)) > 0.2
+    assert sharpness(taught(0.0), at(0.0, 0.0)) > 0.9
+
+
+def test_beyond_reach_nothing_is_known() -> None:
+    memory = taught(0.0)
+    assert gain(memory, at(0.0, 1.1 * REACH_MM)) == 0.0
+    assert sharpness(memory, at(0.0, 1.1 * REACH_MM)) == 0.0
+    assert gain(SurfaceMemory(), at(0.0, 0.0)) == 0.0
+
+
+def test_a_level_elsewhere_neither_helps_nor_harms() -> None:
+    """At an edge both levels are known; a point on either fits its own."""
+    memory = taught(-2.0, -1.0, 0.0)
+    low: Points[Sensor] = Points(stripe(-1.0) + np.array([0.0, 0.0, 20.0]))
+    memory.remember((BASE_FROM_SENSOR @ low).xyz_mm)
+    assert gain(memory, at(0.0, -1.0)) > 4.0
+    assert gain(memory, at(0.0, -1.0, 20.0)) > 4.0
+    assert gain(memory, at(0.0, -1.0, 10.0)) == 0.0
+
+
+def test_where_the_base_lies_does_not_matter() -> None:
+    moved: Pose[Base, Base] = Pose.from_vectors([0.4, -0.8, 0.1], [-80.0, 55.0, 30.0])
+    pose = moved @ BASE_FROM_SENSOR
+    points = np.concatenate([at(1.0, 1.0), at(3.0, 2.0, 0.4)])
+    here = taught(-1.0, 0.0).evidence(points, BASE_FROM_SENSOR)
+    there = taught(-1.0, 0.0, pose=pose).evidence(points, pose)
+    assert there[0] == pytest.approx(here[0], rel=1e-6)
+    assert there[1] == pytest.approx(here[1], rel=1e-6)
+
+
+def test_it_is_thinned_and_forgets_the_oldest() -> None:
+    memory = taught(0.0)
+    length = 30.0 * np.sqrt(1.0 + SLOPE_X**2)
+    assert len(memory) == pytest.approx(length / SPACING_MM, abs=2)
+    memory = SurfaceMemory(n_exposures=2)
+    for y in (0.0, 20.0, 40.0):
+        in_sensor: Points[Sensor] = Points(stripe(y))
+        memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+    assert gain(memory, at(0.0, 0.0)) == 0.0
+    assert gain(memory, at(0.0, 20.0)) > 4.0
+    memory.forget()
+    assert len(memory) == 0
+    assert gain(memory, at(0.0, 40.0)) == 0.0
+
+
+def test_stripes_that_follow_each_other_in_one_exposure_are_both_kept() -> None:
+    memory = SurfaceMemory()
+    short = [surface(np.linspace(x, x + 0.2, 5), np.zeros(5)) for x in (0.0, 8.0)]
+    in_sensor: Points[Sensor] = Points(np.concatenate(short))
+    memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+    assert gain(memory, at(0.1, 0.0)) > 4.0
+    assert gain(memory, at(8.1, 0.0)) > 4.0

@@ -102,18 +102,18 @@ def epipolar_levers(fit: StereoFit) -> Picture:
     """Distances from the epipolar lines against depth and height in the image."""
     points, distances, depth = _matched(fit)
     with styled():
-        figure = new_figure(7.4, 3.2)
-        left, right = figure.subplots(1, 2, sharey=True)
+        figure = new_figure(6.6, 5.2)
+        upper, lower = figure.subplots(2, 1, sharey=True)
         for axes, lever, label in (
-            (left, depth, "depth, mm"),
-            (right, points[:, 1], "y in the left image, px"),
+            (upper, depth, "depth, mm"),
+            (lower, points[:, 1], "y in the left image, px"),
         ):
             axes.plot(lever, distances, ".", color=ACCENT, markersize=2.5, alpha=0.6)
             axes.axhline(0.0, color=MUTED, linewidth=0.8)
             axes.plot(*_running_mean(lever, distances), "-", color=ALERT, linewidth=1.6)
             axes.set_xlabel(label)
+            axes.set_ylabel("distance, px")
             axes.grid(axis="y")
-        left.set_ylabel("epipolar distance, px")
     return Picture(
         chart_markup(figure, "Epipolar distances against depth and height"),
         title="Epipolar distance against its levers",

@@ -204,7 +204,7 @@ def _pairs_section(fit: StereoFit, exposures: dict[str, Exposure]) -> Section:
         picture for pair in fit.pairs for picture in figures.pair_pictures(fit, pair, exposures)
     ]
     bars = Gallery((figures.pair_bars(fit),), 700)
-    return Section("The pairs", (bars, table, text, Gallery(tuple(pictures), 300)))
+    return Section("The pairs", (bars, table, text, Gallery(tuple(pictures), 440)))
 
 
 def pair_row(pair: PairFit) -> tuple[str, ...]:
@@ -249,11 +249,7 @@ def _covariance_section(fit: StereoFit) -> Section:
             ("Condition number", f"{fit.condition:.3g} (boards eliminated, unit diagonal)"),
         )
     )
-    names = STEREO_PARAMETER_NAMES[N_INTRINSICS:]
-    short = [
-        f"{name.removeprefix('right.')[0]}{axis}"
-        for name, axis in zip(names, 2 * AXES, strict=True)
-    ]
+    short = [f"{kind}{axis}" for kind in "rt" for axis in AXES]
     block = fit.covariance[N_INTRINSICS:, N_INTRINSICS:]
     table = Table(
         ("covariance (rad, mm)", *short),

@@ -12,8 +12,8 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks
 from armscan.models.scanner import ArmNoise, ScannerCalibration
-from armscan.pipeline.measure import measured_again
 from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.sheet_rules import measured_again
 from armscan.reconstruction.place import place_with_jacobian
 from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.cloud import PointCloud

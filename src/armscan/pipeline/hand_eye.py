@@ -20,9 +20,10 @@ from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import ScanInstants
-from armscan.pipeline.measure import MeasuredImage, cameras_of, measurer_for, see
+from armscan.pipeline.measure import MeasuredImage, cameras_of, collected, see
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.sheet_rules import measurer_for
 from armscan.reconstruction.result import ReconstructedImage
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns
@@ -181,6 +182,7 @@ def observe_stripes(
         if not known
     ]
     n_unreadable = 0
+    weak: list[str] = []
     for done, (instant, posture) in enumerate(zip(chosen, postures, strict=True)):
         first = source.rows[instant.rows[0]].source
         progress(ProgressEvent(STAGE, done, len(chosen), first))
@@ -196,6 +198,7 @@ def observe_stripes(
         ]
         # Each still is named by itself: where the sensor is on the arm is not known yet.
         for one in measurer_for(sensor, options.measure).measure(seen, None, instant.t_ns):
+            weak += one.warnings
             if len(one.points.row) < options.hand_eye.min_points:
                 not_used.append((one.image.profile.source, "no stripe was measured in it"))
                 continue
@@ -205,7 +208,12 @@ def observe_stripes(
     if n_unreadable == len(chosen) > 0:
         raise EstimationError(f"no exposure with a pose could be read: {not_used[-1][1]}")
     n_posed = int(has_pose.sum())
-    warnings = (*poses.warnings, *_left_out(len(chosen), n_posed, not_used), *merged)
+    warnings = (
+        *poses.warnings,
+        *_left_out(len(chosen), n_posed, not_used),
+        *merged,
+        *collected(weak),
+    )
     return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
 
 

@@ -16,14 +16,19 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.models.probe_tip import tip_centres, tool_from_probe
 from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.models.stereo import StereoCalibration
+from armscan.pipeline.camera import calibrate_camera_from_exposures
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.pipeline.hand_eye import HandEyeRun, calibrate_hand_eye_from_scan
-from armscan.pipeline.laser import calibrate_sheets_from_exposures
+from armscan.pipeline.laser import calibrate_sheets_from_scan
 from armscan.pipeline.progress import Progress
+from armscan.pipeline.stereo import (
+    calibrate_stereo_from_exposures,
+    stereo_calibration,
+    stereo_rows,
+)
 from armscan.pipeline.stopwatch import Stopwatch
 from armscan.pipeline.twin_scans import TwinScans
-from armscan.records.exposure import Exposure
 from armscan.records.probing import ProbedPoints
 from armscan.vision.targets.definition import Target
 from armscan.vision.targets.specification import parse_target
@@ -39,18 +44,17 @@ class Instrument:
 
     Parameters
     ----------
-    camera_run, camera
-        The camera's calibration, and what its document keeps.
+    camera
+        The camera, or two.
     laser, sensor
-        The light sheet's, and camera and sheet together.
+        The light sheets, and cameras and sheets together.
     plate
         The plate as it was probed.
     hand_eye
         The hand-eye's.
     """
 
-    camera_run: CameraRun
-    camera: CameraCalibration
+    camera: CameraCalibration | StereoCalibration
     laser: LaserFit
     sensor: SensorCalibration
     plate: PlateReference
@@ -60,7 +64,8 @@ class Instrument:
     def cameras(self) -> tuple[CameraCalibration, ...]:
         """The camera or cameras, left first."""
         second = self.sensor.second
-        return (self.camera,) if second is None else (self.camera, second.camera)
+        left = self.sensor.camera
+        return (left,) if second is None else (left, second.camera)
 
     @property
     def scanner(self) -> ScannerCalibration:
@@ -71,7 +76,7 @@ class Instrument:
 def calibrate_head(
     twin: Twin, scans: TwinScans, progress: Progress, watch: Stopwatch
 ) -> Instrument:
-    """Camera, light sheets, plate and hand-eye of a twin.
+    """Camera or cameras, light sheets, plate and hand-eye of a twin.
 
     Raises
     ------
@@ -79,14 +84,17 @@ def calibrate_head(
         If a scan does not determine what rests on it.
     """
     target = parse_target(twin.target)
-    camera_run = watch.timed(
-        "calibrate_camera",
-        lambda: calibrate_camera_of(scans.calibration("camera"), target, progress),
+    camera = watch.timed(
+        "calibrate_camera", lambda: _cameras_of(scans.calibration("camera"), target, progress)
     )
-    camera = camera_calibration(camera_run.fit, IN_MEMORY)
     laser = watch.timed(
         "calibrate_laser",
-        lambda: calibrate_sheets_of(scans.calibration("laser"), target, camera, progress),
+        lambda: succeeded(
+            calibrate_sheets_from_scan(
+                scans.calibration("laser"), target, camera, progress=progress
+            ),
+            "laser",
+        ),
     )
     sensor = sensor_calibration(laser, IN_MEMORY)
     plate = watch.timed("probe_plate", lambda: plate_of(twin.probe_plate()))
@@ -96,40 +104,23 @@ def calibrate_head(
             scans.calibration("hand-eye"), sensor, plate, progress=progress
         ),
     )
-    return Instrument(camera_run, camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
+    return Instrument(camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
 
 
-def calibrate_camera_of(source: ScanSource, target: Target, progress: Progress) -> CameraRun:
-    """Camera from all exposures of a scan of the target.
-
-    Raises
-    ------
-    EstimationError
-        If the scan does not determine the camera.
-    """
-    return succeeded(
-        calibrate_camera_from_exposures(_all(source), target, progress=progress), source.name
-    )
-
-
-def calibrate_sheets_of(
-    source: ScanSource, target: Target, camera: CameraCalibration, progress: Progress
-) -> LaserFit:
-    """Light sheets from pairs of exposures with and without laser; equal views are a pair.
-
-    Raises
-    ------
-    EstimationError
-        If the scan does not determine the sheets.
-    """
-    exposures = _all(source)
-    lit = [exposure for exposure in exposures if exposure.lasers]
-    dark = {exposure.view: exposure for exposure in exposures if not exposure.lasers}
-    backgrounds = [dark[exposure.view] for exposure in lit if exposure.view in dark]
-    fit = calibrate_sheets_from_exposures(
-        lit, target, camera, backgrounds=backgrounds, progress=progress
-    )
-    return succeeded(fit, source.name)
+def _cameras_of(
+    source: ScanSource, target: Target, progress: Progress
+) -> CameraCalibration | StereoCalibration:
+    """Camera, or two cameras, from all exposures of a scan of the target."""
+    exposures = [source.exposure(row) for row in range(len(source.rows))]
+    if {row.camera for row in source.rows} == {0}:
+        run = calibrate_camera_from_exposures(exposures, target, progress=progress)
+        return camera_calibration(succeeded(run, source.name).fit, IN_MEMORY)
+    pairs = [
+        (None if left is None else exposures[left], None if right is None else exposures[right])
+        for left, right in stereo_rows(source.rows, source.name)
+    ]
+    found = calibrate_stereo_from_exposures(pairs, target, progress=progress)
+    return stereo_calibration(succeeded(found, source.name).fit, IN_MEMORY)
 
 
 def plate_of(probing: Probing) -> PlateReference:
@@ -159,7 +150,3 @@ def succeeded(result: T | FitFailure, what: str) -> T:
     if isinstance(result, FitFailure):
         raise EstimationError(result.reason, where=what, remedy=result.remedy)
     return result
-
-
-def _all(source: ScanSource) -> list[Exposure]:
-    return [source.exposure(row) for row in range(len(source.rows))]

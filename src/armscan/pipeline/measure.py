@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the stripes of one instant to measured points: the rule that names sheets, by head."""
+"""From the stripes of one exposure with their sheets to measured points."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -15,19 +15,13 @@ from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
-from armscan.pipeline.measure_options import MeasureOptions
-from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
-from armscan.reconstruction.identify_cross import CrossNamer
+from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.result import PointFate, ReconstructedImage
-from armscan.reconstruction.stripe_namer import StripeNamer
 from armscan.reconstruction.triangulate import StripePoints, meet_sheets, triangulate_stripe
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.options import StripeOptions
-
-LEAST_APART_RAD = 0.5
-"""Stripes whose directions differ by more are told from each other by direction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,10 +50,13 @@ class MeasuredImage:
         Its stripe points, the sheet of each and what became of it.
     points
         The measured ones in the Sensor frame.
+    warnings
+        What is weak, in words.
     """
 
     image: ReconstructedImage
     points: StripePoints
+    warnings: tuple[str, ...] = ()
 
 
 class Measurer(Protocol):
@@ -94,50 +91,6 @@ def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
     return sensor.camera.camera, sensor.second.camera.camera
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ByDepth:
-    """One camera whose sheets are told by the laser that was on, or by depth.
-
-    Parameters
-    ----------
-    sensor
-        Camera and sheets.
-    options
-        Depths accepted, and the user's choice of a sheet.
-    """
-
-    sensor: SensorCalibration
-    options: MeasureOptions
-
-    def measure(
-        self,
-        seen: Sequence[LitProfile],
-        base_from_sensor: Pose[Base, Sensor] | None = None,
-        t_ns: int = 0,
-    ) -> tuple[MeasuredImage, ...]:
-        """Measure each exposure by itself.
-
-        Raises
-        ------
-        EstimationError
-            If the sheet of a stripe is ambiguous.
-        """
-        return tuple(self._one(lit) for lit in seen)
-
-    def _one(self, lit: LitProfile) -> MeasuredImage:
-        choice = choose_sheets(
-            lit.profile,
-            self.sensor,
-            self.options.depths,
-            sheet_name=self.options.sheet,
-            lasers=lit.lasers,
-        )
-        fate = np.where(choice.sheet < 0, int(PointFate.OUT_OF_DEPTH), int(PointFate.MEASURED))
-        fate[~lit.profile.is_accepted] = int(PointFate.FLAGGED)
-        image = ReconstructedImage(lit.profile, fate, choice.sheet, choice.how)
-        return triangulated(image, self.sensor, self.options.depths)
-
-
 def triangulated(
     image: ReconstructedImage, sensor: SensorCalibration, depths: DepthRange
 ) -> MeasuredImage:
@@ -160,83 +113,19 @@ def stripe_points(image: ReconstructedImage, sensor: SensorCalibration) -> Strip
     return triangulate_stripe(image.profile, sheet, sensor)
 
 
-def measured_again(
-    images: Sequence[ReconstructedImage], sensor: SensorCalibration
-) -> Iterator[tuple[int, StripePoints]]:
-    """Number and measured points of each image: what a scan does not keep of them."""
-    for k, image in enumerate(images):
-        yield k, stripe_points(image, sensor)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ByPast:
-    """One camera whose lasers are on together: stripes are told by their past and direction.
-
-    Parameters
-    ----------
-    sensor
-        Camera and sheets.
-    options
-        Depths accepted.
-    namer
-        Remembers what it saw.
-    """
-
-    sensor: SensorCalibration
-    options: MeasureOptions
-    namer: StripeNamer
-
-    def measure(
-        self,
-        seen: Sequence[LitProfile],
-        base_from_sensor: Pose[Base, Sensor] | None = None,
-        t_ns: int = 0,
-    ) -> tuple[MeasuredImage, ...]:
-        """Measure the next exposure of a stroke; without a pose, each by itself."""
-        if base_from_sensor is None:
-            self.namer.reset()
-        measured = []
-        for lit in seen:
-            named = self.namer.name(lit.profile, lit.lasers, base_from_sensor, t_ns)
-            image = ReconstructedImage(lit.profile, fates_of(named), named.sheet, named.how)
-            measured.append(triangulated(image, self.sensor, self.options.depths))
-        return tuple(measured)
-
-
-def measurer_for(
-    sensor: SensorCalibration, options: MeasureOptions, *, is_scan: bool = False
-) -> Measurer:
-    """The rule by which this sensor's stripes are named; it may remember what it saw before.
-
-    Parameters
-    ----------
-    sensor
-        Camera or cameras and sheets.
-    options
-        Depths accepted, and the user's choice of a sheet.
-    is_scan
-        True for exposures in order of time with the arm's pose; else each is measured by itself.
-    """
-    n_sheets = len(sensor.sheets)
-    if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
-        return ByPast(sensor, options, CrossNamer(sensor))
-    return ByDepth(sensor, options)
-
-
-def stripes_cross(sensor: SensorCalibration) -> bool:
-    """True if the stripes of two sheets on a wall that faces the camera run clearly apart."""
-    normals = np.array([calibrated.sheet.axes[2][:2] for calibrated in sensor.sheets])
-    angles = np.arctan2(normals[:, 1], normals[:, 0])
-    apart = np.abs(np.sin(angles[:, None] - angles))
-    return bool((apart > np.sin(LEAST_APART_RAD)).any())
-
-
 _FATES = {
     NameFate.NAMED: PointFate.MEASURED,
     NameFate.AMBIGUOUS: PointFate.AMBIGUOUS,
     NameFate.UNEXPLAINED: PointFate.STRAY,
     NameFate.NOT_ASKED: PointFate.FLAGGED,
 }
+
+
+def collected(warnings: Sequence[str]) -> tuple[str, ...]:
+    """Of warnings of single exposures, how many there are and what the first says."""
+    if not warnings:
+        return ()
+    return (f"{len(warnings)} exposures: {warnings[0]}",)
 
 
 def fates_of(named: NamedProfile) -> IntArray:

@@ -37,13 +37,13 @@ def measurement_warnings(
 
 def _image_warnings(images: Sequence[ReconstructedImage]) -> list[str]:
     warnings = []
-    empty = [image.profile.source for image in images if image.count(PointFate.MEASURED) == 0]
+    empty = [image.profile.source for image in images if _n_measured(image) == 0]
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
     doubtful = [
         image.profile.source
         for image in images
-        if 0 < image.count(PointFate.MEASURED) < CLEAN_SHARE * len(image.profile)
+        if 0 < _n_measured(image) < CLEAN_SHARE * len(image.profile)
     ]
     if doubtful:
         warnings.append(
@@ -54,6 +54,10 @@ def _image_warnings(images: Sequence[ReconstructedImage]) -> list[str]:
     if n_outside:
         warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
     return warnings
+
+
+def _n_measured(image: ReconstructedImage) -> int:
+    return image.count(PointFate.MEASURED) + image.count(PointFate.SHARED)
 
 
 def _sensor_warnings(depths_mm: Sequence[FloatArray], sensor: SensorCalibration) -> list[str]:

@@ -36,7 +36,8 @@ class NamingErrors:
     n_instants
         Instants checked.
     n_named
-        Points that were measured and lie on a true stripe.
+        Points that were measured and lie on a true stripe; one that two cameras see counts in both
+        images.
     n_wrong
         Of these, with the name of another sheet.
     n_stray
@@ -151,7 +152,8 @@ def _of_image(
 
 
 def _measured(image: ReconstructedImage) -> BoolArray:
-    return np.asarray(image.fate == int(PointFate.MEASURED))
+    """(N,) points whose name counts: measured here or with the other camera's."""
+    return np.isin(image.fate, (int(PointFate.MEASURED), int(PointFate.SHARED)))
 
 
 def _distances(points: FloatArray, stripes: Sequence[TrueStripe]) -> tuple[FloatArray, IntArray]:

@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair, pair_exposures
-from armscan.pipeline.measure import cameras_of, measurer_for, see
+from armscan.pipeline.measure import cameras_of, collected, see
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.sheet_rules import measurer_for
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.result import PointFate, ReconstructedImage, Reconstruction
 from armscan.reconstruction.triangulate import cloud_in_sensor
@@ -62,6 +63,7 @@ def reconstruct(
     cameras = cameras_of(sensor)
     images: list[ReconstructedImage] = []
     clouds: list[PointCloud] = []
+    weak: list[str] = []
     for done, pairs in enumerate(instants):
         progress(ProgressEvent(STAGE, done, len(instants), pairs[0][0].source))
         measurer = measurer_for(sensor, options)
@@ -70,13 +72,15 @@ def reconstruct(
         ]
         for one in measurer.measure(seen):
             images.append(one.image)
+            weak += one.warnings
             clouds.append(cloud_in_sensor(one.points, one.image.profile, sensor))
     progress(ProgressEvent(STAGE, len(instants), len(instants)))
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
         raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
     depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
-    return Reconstruction(cloud, tuple(images), measurement_warnings(images, depths, sensor))
+    warnings = (*measurement_warnings(images, depths, sensor), *collected(weak))
+    return Reconstruction(cloud, tuple(images), warnings)
 
 
 def _instants(

@@ -18,7 +18,13 @@ from armscan.geometry.poses import Pose
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair
 from armscan.pipeline.instants import Instant, ScanInstants
-from armscan.pipeline.measure import LitProfile, MeasuredImage, cameras_of, measurer_for, see
+from armscan.pipeline.measure import (
+    LitProfile,
+    MeasuredImage,
+    cameras_of,
+    collected,
+    see,
+)
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
@@ -30,6 +36,7 @@ from armscan.pipeline.scan_result import (
     scan_exposure,
     scan_warnings,
 )
+from armscan.pipeline.sheet_rules import measurer_for
 from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
@@ -148,15 +155,21 @@ def measure_scan(
 
     measurer = measurer_for(scanner.sensor, options.measure, is_scan=True)
     hand_eye = scanner.hand_eye.tool_from_sensor
+    weak: list[str] = []
     for instant, seen in _in_threads(extract, readings(), options.threads):
         pose = poses.pose(instant.rows[0])
         measured = measurer.measure(seen, pose @ hand_eye, instant.t_ns)
         for row, one in zip(instant.rows, measured, strict=True):
             placed[row] = place_image(one, pose, placing, options.volume)
+            weak += one.warnings
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
     exposures = _records(source, images.is_lit, poses, placed, reasons)
     found = _joined(placed, exposures, poses, placing, options)
-    return replace(found, cloud=replace(found.cloud, is_simulated=source.is_simulated))
+    return replace(
+        found,
+        cloud=replace(found.cloud, is_simulated=source.is_simulated),
+        warnings=(*found.warnings, *collected(weak)),
+    )
 
 
 def place_image(
@@ -224,7 +237,7 @@ def _joined(
     options: ScanOptions,
 ) -> ScanReconstruction:
     sensor = placing.scanner.sensor
-    rows = sorted(placed)
+    rows = list(placed)
     if sensor is None or not rows:
         broken = "; ".join(e.reason for e in exposures if e.fate is ScanExposureFate.UNREADABLE)
         raise EstimationError(f"no exposure with a pose could be measured: {broken or 'no laser'}")

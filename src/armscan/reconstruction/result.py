@@ -25,6 +25,10 @@ class PointFate(IntEnum):
     """Several sheets explain it about as well."""
     STRAY = 5
     """No sheet explains it: a reflection, or the laser's bright centre."""
+    SHARED = 6
+    """The other camera saw the same point: it is measured there, from both images."""
+    INCONSISTENT = 7
+    """The two cameras contradict each other, or it lies too far outside the calibrated depths."""
 
     @property
     def label(self) -> str:
@@ -39,6 +43,8 @@ _FATE_LABELS = {
     PointFate.OUT_OF_DEPTH: "too far outside the calibrated depths",
     PointFate.AMBIGUOUS: "on several sheets about as likely",
     PointFate.STRAY: "on no sheet: stray light",
+    PointFate.SHARED: "in the other camera's point",
+    PointFate.INCONSISTENT: "contradicted by the other camera, or out of depth",
 }
 
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armscan.devices.twin import TwinScene
-from armscan.models.calibration import Provenance
+from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.scanner import ScannerCalibration
+from armscan.models.stereo import StereoCalibration
 from armscan.pipeline.head_demo import HeadDemo
 from armscan.storage.calibration_files import camera_document, sensor_document
 from armscan.storage.clouds import ply_bytes
@@ -18,6 +19,7 @@ from armscan.storage.recording_exposures import EXPOSURES_FILE
 from armscan.storage.recording_reader import FolderRecording
 from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.scanner_files import scanner_document
+from armscan.storage.stereo_files import stereo_document
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +58,31 @@ def demo_documents(
 ) -> dict[Path, bytes]:
     """Files to write: camera or cameras, sensor, scanner, and the part's cloud."""
     found, place = demo.instrument, origin.place
-    camera = replace(found.camera, provenance=origin.of_recording(scans["camera"]))
+    base = origin.of_recording(scans["camera"])
     sensor = replace(
         found.sensor,
-        camera=camera,
-        provenance=origin.of_recording(scans["laser"], camera.provenance.document_id),
+        camera=replace(found.sensor.camera, provenance=base),
+        provenance=origin.of_recording(scans["laser"], base.document_id),
     )
+    if sensor.second is not None:
+        right = replace(sensor.second.camera, provenance=base)
+        sensor = replace(sensor, second=replace(sensor.second, camera=right))
     scanner = ScannerCalibration(
         sensor,
         found.hand_eye.fit.calibration,
         origin.of_recording(scans["hand-eye"], sensor.provenance.document_id),
     )
     return {
-        place / "camera.json": camera_document(camera),
+        **_cameras(found.camera, place, base),
         place / "sensor.json": sensor_document(sensor),
         place / "scanner.json": scanner_document(scanner),
         place / "cloud.ply": ply_bytes(demo.part.scan.cloud),
     }
+
+
+def _cameras(
+    found: CameraCalibration | StereoCalibration, place: Path, provenance: Provenance
+) -> dict[Path, bytes]:
+    if isinstance(found, CameraCalibration):
+        return {place / "camera.json": camera_document(replace(found, provenance=provenance))}
+    return {place / "stereo.json": stereo_document(replace(found, provenance=provenance))}

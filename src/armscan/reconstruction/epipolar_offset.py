@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.stereo_residuals import Crossings, Projections
 from armscan.reconstruction.triangulate import sensor_columns
@@ -81,7 +81,7 @@ def drift_directions(projected: Projections, sensor: SensorCalibration) -> Float
     size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
     place = (projected.q_px - 0.5 * size) / (HALF_IMAGE * size)
     basis = np.concatenate([np.ones((len(place), 1)), place], axis=1)
-    return across[:, :, None] * basis[:, None, :]
+    return np.asarray(across[:, :, None] * basis[:, None, :])
 
 
 def residual_derivatives(
@@ -93,10 +93,10 @@ def residual_derivatives(
     adding them to its parameters, what a drift made by shifting the projected points with it.
     """
     by_own = np.einsum("ni,nij->nj", crossings.normal, projected.q_by_sensor())
-    result = np.zeros((len(projected.sheet), len(sensor.covariance) + 3))
-    for k in np.unique(projected.sheet):
-        own = np.flatnonzero(projected.sheet == k)
-        result[np.ix_(own, sensor_columns(sensor, int(k)))] = by_own[own]
+    n = len(projected.sheet)
+    result = np.zeros((n, len(sensor.covariance) + 3))
+    columns = np.stack([sensor_columns(sensor, k) for k in range(len(sensor.sheets))])
+    result[np.arange(n)[:, None], columns[projected.sheet]] = by_own
     drift = drift_directions(projected, sensor)
     result[:, -3:] = np.einsum("ni,nij->nj", crossings.normal, drift)
     return result
@@ -181,18 +181,20 @@ class _Equations:
         sensor: SensorCalibration,
         prior: EpipolarOffset,
         floor_px: float,
+        is_used: BoolArray | None = None,
     ) -> _Equations:
         by_all = residual_derivatives(projected, crossings, sensor)
         design = by_all @ prior.factor
         sigma = CORRELATION * np.hypot(crossings.sigma_px, floor_px)
         wanted = -crossings.residual_px
-        weight = np.ones(len(wanted))
+        used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
+        weight = used
         state = np.zeros(design.shape[1])
         for _ in range(ROUNDS):
             found = _Equations(by_all, design, wanted, sigma, weight, state)
             state = np.linalg.solve(found.information(), found.right_side())
             score = np.abs(wanted - design @ state) / sigma * CORRELATION
-            weight = np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
+            weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
         return _Equations(by_all, design, wanted, sigma, found.weight, state)
 
     def information(self) -> FloatArray:
@@ -209,6 +211,7 @@ def left_out_scores(
     projected: Projections,
     crossings: Crossings,
     stretch: IntArray,
+    is_used: BoolArray,
     sensor: SensorCalibration,
     prior: EpipolarOffset,
     floor_px: float,
@@ -224,6 +227,8 @@ def left_out_scores(
         (H,) as for `estimate_offset`.
     stretch
         (H,) number of the stretch of stripe, counted from 0.
+    is_used
+        (H,) False for stretches that are asked but have no say.
     sensor, prior, floor_px
         As for `estimate_offset`.
 
@@ -232,7 +237,7 @@ def left_out_scores(
     FloatArray
         (B,) chi-square of mean, slope and bend of the stretch's residuals, over their count.
     """
-    equations = _Equations.of(projected, crossings, sensor, prior, floor_px)
+    equations = _Equations.of(projected, crossings, sensor, prior, floor_px, is_used)
     information, right_side = equations.information(), equations.right_side()
     n_stretches = int(stretch.max()) + 1 if len(stretch) else 0
     scores = np.zeros(n_stretches)
@@ -250,6 +255,7 @@ def left_out_scores(
         gain = moments @ design
         missed = moments @ equations.wanted[own] - gain @ state
         spread = gain @ np.linalg.solve(others, gain.T) + (moments * sigma**2) @ moments.T
+        spread[0, 0] += floor_px**2
         scores[b] = float(missed @ np.linalg.solve(spread, missed)) / len(missed)
     return scores
 

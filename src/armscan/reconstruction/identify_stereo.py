@@ -90,6 +90,14 @@ class _Found:
     crossings: Crossings
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Doubts:
+    """Pairs (H,) of stretches in doubt, and the number of each one's stretch."""
+
+    pair: BoolArray
+    stretch: IntArray
+
+
 def residual_and_sigma(
     projected: Projections,
     crossings: Crossings,
@@ -143,38 +151,45 @@ def name_stripes(
     found = _Found(at, projected, crossings)
     n_sheets = len(sensor.sheets)
     prior = offset = no_offset(sensor, options.drift_px)
-    doubted = np.zeros(len(at), dtype=np.bool_)
+    none = np.zeros(len(at), dtype=np.bool_)
+    doubts = _Doubts(none, np.full(len(at), -1))
+    ever = none
     for _ in range(ROUNDS):
-        pairs = _pairs(found, doubted, stripes, sides[1], sensor, offset, options)
+        pairs = _pairs(found, doubts.pair, stripes, sides[1], sensor, offset, options)
         verdicts = _decide_both(pairs, sides, n_sheets, options)
         used = pairs.is_match & (verdicts[0].name[at] == projected.sheet)
-        doubt = _doubtful(found, used, verdicts[0].stretch[at], row, left, sensor, prior, options)
-        doubted |= doubt
-        sure = used & ~doubt
+        doubts = _doubtful(
+            found,
+            used,
+            verdicts[0].stretch[at],
+            doubts,
+            left.points_px[row],
+            sensor,
+            prior,
+            options,
+        )
+        ever = ever | doubts.pair
+        sure = used & ~doubts.pair
         offset = estimate_offset(
             projected.select(sure), crossings.select(sure), sensor, prior, options.floor_px
         )
-    is_doubted = np.zeros(len(row), dtype=np.bool_)
-    is_doubted[at[doubted]] = True
-    # the last round's doubts have not been asked again
-    last = np.zeros(len(row), dtype=np.bool_)
-    last[at[doubt]] = True
+    unasked, doubted = used & doubts.pair, ever
     return StereoNames(
-        _named(sides[0], verdicts[0], last, is_doubted),
-        _named(sides[1], verdicts[1], *_of_right(pairs, doubt, doubted, len(sides[1]))),
+        _named(sides[0], verdicts[0], *_marked(pairs.left, unasked, doubted, len(sides[0]))),
+        _named(sides[1], verdicts[1], *_marked(pairs.right, unasked, doubted, len(sides[1]))),
         offset,
     )
 
 
-def _of_right(
-    pairs: _Pairs, doubt: BoolArray, doubted: BoolArray, n: int
+def _marked(
+    sample: IntArray, unasked: BoolArray, doubted: BoolArray, n: int
 ) -> tuple[BoolArray, BoolArray]:
-    """(n,) right samples beside which pairs in doubt fall: of the last round, and of any."""
+    """(n,) samples of the pairs that two masks (H,) name; those of number -1 are none."""
     masks = []
-    for mask in (doubt, doubted):
-        found = np.zeros(n + 1, dtype=np.bool_)
-        found[pairs.right[mask]] = True
-        masks.append(found[:n])
+    for mask in (unasked, doubted):
+        marked = np.zeros(n + 1, dtype=np.bool_)
+        marked[sample[mask]] = True
+        masks.append(marked[:n])
     return masks[0], masks[1]
 
 
@@ -182,34 +197,43 @@ def _doubtful(
     found: _Found,
     used: BoolArray,
     stretch: IntArray,
-    row: IntArray,
-    left: Profile,
+    before: _Doubts,
+    points_px: FloatArray,
     sensor: SensorCalibration,
     prior: EpipolarOffset,
     options: StereoNamingOptions,
-) -> BoolArray:
-    """(H,) pairs of stretches that do not fit the others: by their offset, or by the surface."""
+) -> _Doubts:
+    """Pairs of stretches that do not fit the others: by their offset, or by the surface.
+
+    Stretches that were in doubt before are asked again, now that the others may be known better.
+    """
+    number = np.where(used, stretch, np.where(before.pair, before.stretch + len(points_px), -1))
+    at = np.flatnonzero(number >= 0)
     doubt = np.zeros(len(used), dtype=np.bool_)
-    at = np.flatnonzero(used)
     if not len(at):
-        return doubt
-    numbers, own = np.unique(stretch[at], return_inverse=True)
+        return _Doubts(doubt, number)
+    numbers, own = np.unique(number[at], return_inverse=True)
     projected = found.projected
     scores = left_out_scores(
-        projected.select(at), found.crossings.select(at), own, sensor, prior, options.floor_px
+        projected.select(at),
+        found.crossings.select(at),
+        own,
+        used[at],
+        sensor,
+        prior,
+        options.floor_px,
     )
     is_bad = scores > options.offset_chi_square
-    pixels = left.points_px[row[found.sample]]
-    known = at[~is_bad[own]]
-    number = np.full(int(stretch.max()) + 1, -1)
-    number[numbers] = np.arange(len(numbers))
-    depth = projected.points_mm[:, 2]
-    expected, sigma = expected_depths(
-        pixels[at], own, pixels[known], depth[known], number[stretch[known]]
-    )
-    place = np.full(len(row), -1)
-    place[found.sample[at]] = np.arange(len(at))
-    rivals = np.flatnonzero((place[found.sample] >= 0) & ~used)
+    pixels, depth = points_px[found.sample], projected.points_mm[:, 2]
+    is_known = used[at] & ~is_bad[own]
+    known = at[is_known]
+    expected, sigma = expected_depths(pixels[at], own, pixels[known], depth[known], own[is_known])
+    samples, first = np.unique(found.sample[at], return_index=True)
+    place = np.full(len(points_px), -1)
+    place[samples] = first
+    is_own = np.zeros(len(used), dtype=np.bool_)
+    is_own[at] = True
+    rivals = np.flatnonzero((place[found.sample] >= 0) & ~is_own)
     is_bad |= has_rival_on_surface(
         own,
         depth[at],
@@ -220,7 +244,9 @@ def _doubtful(
         depth[rivals],
     )
     doubt[at] = is_bad[own]
-    return doubt
+    kept = np.full(len(used), -1)
+    kept[at] = own
+    return _Doubts(doubt, kept)
 
 
 def _pairs(

@@ -13,9 +13,11 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 
-NEIGHBOURS = 30
-REACH_PX = 400.0
-"""Neighbouring lines of eleven over a field of 2658 px lie within about half of this."""
+NEIGHBOURS = 24
+THINNING = 5
+"""Of the samples along a line, so that the nearest are of several lines."""
+REACH_PX = 500.0
+"""Neighbouring lines of eleven over a field of 2658 px lie within about a third of this."""
 SURFACE_MM = 0.1
 """By how much a surface between neighbouring lines differs from a plane, at least."""
 SLOPE_MM_PER_PX = 0.03
@@ -24,7 +26,7 @@ OFF_SIGMAS = 4.0
 LEAST_OFF_MM = 1.5
 """Nearer to the surface than this, a stretch may well be on it."""
 ON_SIGMAS = 2.0
-MOST_SIGMA_MM = 0.3
+MOST_SIGMA_MM = 0.5
 """A surface that is known no better puts any sheet within reach of it."""
 MOST = 0.5
 """Part of a stretch that has to be off, and on for its rival."""
@@ -58,7 +60,7 @@ def expected_depths(
     depth, sigma = np.ones(len(points_px)), np.full(len(points_px), np.inf)
     for b in np.unique(stretch):
         own = np.flatnonzero(stretch == b)
-        others = np.flatnonzero(known_stretch != b)
+        others = np.flatnonzero(known_stretch != b)[::THINNING]
         if len(others) < NEIGHBOURS:
             continue
         distance, nearest = cKDTree(known_px[others]).query(points_px[own], NEIGHBOURS)

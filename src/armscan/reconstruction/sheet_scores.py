@@ -18,8 +18,6 @@ IMPOSSIBLE = -8.0
 """Score of a sheet that is out of depth at a sample."""
 CHANGE_COST = 20.0
 """Against the sheet changing along an unbroken piece: once in a thousand million samples."""
-CUT_COST = 3.0
-"""Against it changing where the stripe is cut: once in twenty."""
 LEAST_SCORE = 5.0
 """Least log-likelihood ratio to a stripe on no sheet that makes a name certain."""
 
@@ -44,13 +42,13 @@ class Verdict:
     Parameters
     ----------
     state
-        (S,) sheet of each sample by itself and its stretch; -1 for none.
+        (S,) most likely sheet of each sample's piece.
     is_sure
-        (S,) True where the stretch's sheet is far ahead of any other.
+        (S,) True where it is far ahead of any other.
     is_tied
-        (S,) True where some sheet explains the stretch, but not far enough ahead of another.
+        (S,) True where some sheet explains the sample, but not far enough ahead of another.
     stretch
-        (S,) number of the stretch, unbroken and of one sheet, counted from 0.
+        (S,) number of the piece, counted from 0.
     """
 
     state: IntArray
@@ -71,7 +69,11 @@ def decide(
     samples: Samples,
     options: StereoNamingOptions,
 ) -> Verdict:
-    """Most likely sequence of sheets along each stripe, and how sure each stretch of it is.
+    """Most likely sheet of each unbroken piece, and how sure it is.
+
+    A piece is one line of light, so it has one sheet. Where along it another sheet is far more
+    likely, the other camera may see another stripe there by chance, or two lines may have been
+    linked unnoticed: such samples are ambiguous.
 
     Parameters
     ----------
@@ -90,42 +92,27 @@ def decide(
         empty = np.zeros(0, dtype=np.int64)
         return Verdict(empty, none, none, empty)
     weighted = scores * (INDEPENDENT_SHARE * samples.weight)[:, None]
-    table = np.concatenate([weighted, np.zeros((n, 1))], axis=1)
-    piece, segment = pieces.piece[samples.at], pieces.segment[samples.at]
-    cost = np.full(n, CHANGE_COST)
-    cost[1:][np.diff(piece) != 0] = CUT_COST
-    cost[0] = 0.0
-    cost[1:][np.diff(segment) != 0] = 0.0
-    state = np.zeros(n, dtype=np.int64)
-    best_states(np.ascontiguousarray(table), cost, state)
-    return _judge(state, weighted, is_match, piece, samples, options)
-
-
-def _judge(
-    state: IntArray,
-    weighted: FloatArray,
-    is_match: BoolArray,
-    piece: IntArray,
-    samples: Samples,
-    options: StereoNamingOptions,
-) -> Verdict:
-    """A stretch is what has one state and is unbroken."""
-    n, n_sheets = weighted.shape
-    start = np.concatenate([[True], (np.diff(state) != 0) | (np.diff(piece) != 0)])
-    first = np.flatnonzero(start)
-    stretch = np.cumsum(start) - 1
+    piece = pieces.piece[samples.at]
+    is_first = np.concatenate([[True], np.diff(piece) != 0])
+    first, number = np.flatnonzero(is_first), np.cumsum(is_first) - 1
     total = np.add.reduceat(weighted, first, axis=0)
     matches = np.add.reduceat(is_match * samples.weight[:, None], first, axis=0)
-    own = state[first]
-    rows = np.arange(len(first))
-    has_sheet = own < n_sheets
-    column = np.minimum(own, n_sheets - 1)
-    best = np.where(has_sheet, total[rows, column], 0.0)
+    rows, winner = np.arange(len(first)), total.argmax(axis=1)
+    best = total[rows, winner]
     others = total.copy()
-    others[rows, column] = -np.inf
-    second = others.max(axis=1) if n_sheets > 1 else np.zeros(len(first))
-    enough = (matches[rows, column] >= options.least_matches) & (best >= LEAST_SCORE)
-    sure = has_sheet & enough & (second <= options.runner_up * best)
-    tied = ~sure & (np.where(has_sheet, best, total.max(axis=1)) > 0.0)
-    state = np.where(state < n_sheets, state, -1)
-    return Verdict(state, sure[stretch], tied[stretch], stretch)
+    others[rows, winner] = 0.0
+    is_ahead = others.max(axis=1) <= options.runner_up * best
+    is_sure = is_ahead & (best >= LEAST_SCORE) & (matches[rows, winner] >= options.least_matches)
+    state, path = winner[number], _path(weighted, is_first)
+    is_other = (path < n_sheets) & (path != state)
+    is_tied = ~is_sure & (best > 0.0)
+    return Verdict(state, is_sure[number] & ~is_other, is_tied[number] | is_other, number)
+
+
+def _path(weighted: FloatArray, is_first: BoolArray) -> IntArray:
+    """(S,) most likely sheet of each sample if it may change along a piece; K for none."""
+    table = np.concatenate([weighted, np.zeros((len(weighted), 1))], axis=1)
+    cost = np.where(is_first, 0.0, CHANGE_COST)
+    path = np.zeros(len(weighted), dtype=np.int64)
+    best_states(np.ascontiguousarray(table), cost, path)
+    return path

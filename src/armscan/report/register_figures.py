@@ -73,6 +73,7 @@ def marker_view(scene: MarkerScene) -> Picture:
     for text, place in scene.stations:
         x, y, z = (float(value) for value in place)
         dots.append(uniform_dots(place[None], PALETTE[2]))
+        lines.append(_rings(place[None], 0.008 * extent, PALETTE[2]))
         labels.append((text, (x, y, z)))
     markup = scene_markup(dots, lines, labels, "Markers in space", is_z_up=scene.is_z_up)
     return Picture(

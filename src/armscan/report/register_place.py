@@ -155,6 +155,21 @@ def _residual_table(old: MarkerList, new: MarkerList, place: PlaceRegistration) 
                 "" if place.is_used[row] else "moved, left out",
             )
         )
+    matched = {int(n) for n in old.markers.ids[place.pairs[:, 0]]}
+    for item in place.moved:
+        if item.old_id not in matched:
+            x, y, z = -item.offset_mm
+            length_mm = float(np.linalg.norm(item.offset_mm))
+            rows.insert(
+                0,
+                (
+                    str(item.old_id),
+                    str(item.new_id),
+                    *(f"{value:+.4f}" for value in (x, y, z)),
+                    f"{length_mm:.4f}",
+                    "moved, left out",
+                ),
+            )
     columns = ("old", "new", "dx mm", "dy mm", "dz mm", "length mm", "")
     return Table(columns, tuple(rows), "Old minus carried new", (6,))
 
@@ -166,10 +181,13 @@ def _scene(
     lonely_old = old.markers.points_mm[np.isin(old.markers.ids, place.only_old)]
     lonely_new = new.markers.points_mm[np.isin(new.markers.ids, place.only_new)]
     stations = [("old base", np.zeros(3)), ("new base", np.array(pose.translation_mm))]
+    matched = set(old.markers.ids[place.pairs[:, 0]].tolist())
+    strays = [item for item in place.moved if item.old_id not in matched]
+    at = np.isin(old.markers.ids, [item.old_id for item in strays])
     return MarkerScene(
-        old.markers.points_mm[place.pairs[:, 0]],
-        -place.residual_mm,
-        place.is_used,
+        np.concatenate([old.markers.points_mm[place.pairs[:, 0]], old.markers.points_mm[at]]),
+        np.concatenate([-place.residual_mm, np.zeros((int(at.sum()), 3))]),
+        np.concatenate([place.is_used, np.zeros(int(at.sum()), dtype=bool)]),
         np.concatenate([lonely_old, lonely_new @ pose.rotation.T + pose.translation_mm]),
         stations,
         [item.cloud for item in carried],

@@ -112,7 +112,7 @@ def test_full_covariances_agree_with_a_general_solver() -> None:
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:
-    """Normalised errors are chi-square of six degrees: their mean over 300 runs is 6 +- 0.2 (one sigma)."""
+    """Normalised errors are chi-square of six degrees: their mean of 300 is 6 +- 0.2 (sigma)."""
     generator = np.random.default_rng(3)
     values, squares = [], []
     for _ in range(300):

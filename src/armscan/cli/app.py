@@ -21,6 +21,7 @@ from armscan.cli import (
     inspect_plane,
     inspect_sphere,
     inspect_step,
+    markers,
     probe,
     reconstruct,
     register,
@@ -30,7 +31,7 @@ from armscan.cli import (
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "probe", "calibrate", "reconstruct", "register"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
     *("inspect", "verify"),
     *("convert", "info", "doctor"),
 )
@@ -82,6 +83,7 @@ app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate)
 app.command("probe", epilog=probe.EXAMPLE)(probe.probe)
 app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
 app.command("register", epilog=register.EXAMPLE)(register.register)
+app.command("markers", epilog=markers.EXAMPLE)(markers.markers)
 app.command("verify", epilog=verify.EXAMPLE)(verify.verify)
 app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
 app.command("info", epilog=info.EXAMPLE)(info.info)

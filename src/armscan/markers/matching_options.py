@@ -58,3 +58,20 @@ class MatchingOptions:
             )
         if self.diameter_mm is not None and not self.diameter_mm > 0.0:
             raise OptionError(f"a marker of {self.diameter_mm:g} mm diameter")
+
+
+def parse_depth(text: str) -> tuple[float, float]:
+    """Nearest and farthest depth in mm from ``NEAR:FAR``.
+
+    Raises
+    ------
+    OptionError
+        If the text is not two numbers with a colon between them.
+    """
+    try:
+        near, far = (float(word) for word in text.split(":"))
+    except ValueError as error:
+        raise OptionError(
+            f"'{text}' is no range of depths", remedy="write it as 100:180, in mm"
+        ) from error
+    return near, far

@@ -73,6 +73,28 @@ class Marks:
     size: float = 4.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Labels:
+    """Words on a photograph.
+
+    Parameters
+    ----------
+    points_px
+        (N, 2) middle of each word's lower edge, in pixels of its exposure.
+    texts
+        N words.
+    colour
+        CSS colour.
+    size
+        Height of a letter as a share of the picture's longer side, in thousandths.
+    """
+
+    points_px: FloatArray
+    texts: tuple[str, ...]
+    colour: str
+    size: float = 14.0
+
+
 def new_figure(width: float = 6.0, height: float = 4.0) -> Figure:
     """Return an empty figure in the house's style; sizes in inches."""
     with mpl.rc_context(STYLE):
@@ -105,6 +127,7 @@ def photo_markup(
     marks: Iterable[Marks],
     alt: str,
     *,
+    labels: Iterable[Labels] = (),
     longest_px: int = 900,
     is_grey: bool = False,
 ) -> str:
@@ -122,6 +145,7 @@ def photo_markup(
         f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" href="{photo}"/>',
     ]
     parts += [_mark_path(layer, exposure, unit) for layer in marks if len(layer.points_px)]
+    parts += [_label_texts(layer, exposure, unit) for layer in labels]
     return "".join([*parts, "</svg>"])
 
 
@@ -173,6 +197,21 @@ def _mark_path(layer: Marks, exposure: Exposure, unit: float) -> str:
     return (
         f'<path d="{path}" fill="none" stroke="{layer.colour}" stroke-width="{width:.3g}" '
         'stroke-linecap="round"/>'
+    )
+
+
+def _label_texts(layer: Labels, exposure: Exposure, unit: float) -> str:
+    """Words with a dark rim, so that they are read on light and dark ground."""
+    points = np.round(exposure.window.to_image(np.asarray(layer.points_px)), 1)
+    size = layer.size * unit
+    words = "".join(
+        f'<text x="{x:g}" y="{y:g}">{escape(text)}</text>'
+        for (x, y), text in zip(points, layer.texts, strict=True)
+    )
+    return (
+        f'<g fill="{layer.colour}" stroke="{INK}" stroke-width="{0.2 * size:.3g}" '
+        f'paint-order="stroke" font-size="{size:.3g}" font-family="sans-serif" '
+        f'text-anchor="middle">{words}</g>'
     )
 
 

@@ -73,7 +73,7 @@ def still_evidence(pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibra
     """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
     depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
     direction = _direction_evidence(pieces, hypotheses.sheets, sensor)
-    return np.asarray(depth + _vote(pieces) * direction)
+    return np.asarray(_vote(pieces) * (depth + direction))
 
 
 def _vote(pieces: Pieces) -> FloatArray:

@@ -59,7 +59,7 @@ class CrossOptions:
     undecided_share: float = 0.2
     least_between: int = 4
     stroke_gap_ns: int = STROKE_GAP_NS
-    depths: DepthRange = field(default_factory=lambda: DepthRange(0.25))
+    depths: DepthRange = field(default_factory=lambda: DepthRange(0.5))
 
     def __post_init__(self) -> None:
         if not 0.0 < self.margin <= self.remember_margin:

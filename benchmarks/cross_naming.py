@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names of crossed stripes under a moving hand: the thesis's rule beside ours, at feature level.
+
+    python benchmarks/cross_naming.py [--seeds 20] [--preset harsh] [--no-arm] [--scenes plate,ball]
+
+The head of the thesis's printed numbers (two sheets, camera of 5.1.2, window 2658 x 800, 80
+exposures a second) is moved by an unsteady hand over analytic height fields, 48 exposures a stroke,
+one stroke a seed, at 50-150 mm/s. Stripe points err by 0.06 px (harsh 0.15), the arm's pose by
+0.010 mm and 2e-5 rad (0.030, 6e-5), each sheet by 0.01 mm (0.03); chains have holes, half of them
+follow the other line past a crossing, and with harsh every third exposure has a stray line. The
+lasers that are on are those that each rule asks for. Columns, each the mean over the seeds and,
+in brackets, the seed that is worst but one in twenty (95th percentile):
+
+- *stripes*: stripes named in an exposure, over those of one laser of the same head that is always
+  on. A stripe counts if it has 20 points and at least half of them have its name;
+- *points*: points named rightly, over those of one laser that is always on (its points without
+  those that the extraction drops near another line: one laser has none);
+- *wrong*: per cent of the named points that bear the other sheet's name;
+- *unnamed*: per cent of the accepted points without a name, in exposures with both lasers;
+- *single*: exposures with one laser alone, a stroke;
+- *ms*: processor time to name an exposure, the longest of a stroke.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from armscan.reconstruction.identify_cross import CrossNamer
+from armscan.reconstruction.identify_rows import RowNamer
+from armscan.reconstruction.named_profile import NamedProfile, NameFate
+from armscan.reconstruction.stripe_namer import StripeNamer
+from cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
+
+LEAST_POINTS = 20
+RULES = {"thesis": RowNamer, "ours": CrossNamer}
+
+
+@dataclass
+class Tally:
+    """Counts over the exposures of one stroke."""
+
+    stripes: int = 0
+    in_view: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    right: int = 0
+    alone: np.ndarray = field(default_factory=lambda: np.zeros(2))
+    named: int = 0
+    wrong: int = 0
+    asked: int = 0
+    without: int = 0
+    singles: int = 0
+    seconds: float = 0.0
+
+    def add(self, exposure: CrossExposure, named: NamedProfile, alone: list[int]) -> None:
+        """Take in one exposure; ``alone`` points has each laser's stripe if it alone is on."""
+        is_named = named.fate == int(NameFate.NAMED)
+        is_right = is_named & (named.sheet == exposure.true_sheet)
+        for k, n_points in enumerate(alone):
+            n_right = int((is_right & (named.sheet == k)).sum())
+            self.in_view[k] += n_points >= LEAST_POINTS
+            self.alone[k] += n_points
+            self.stripes += n_points >= LEAST_POINTS and n_right >= 0.5 * n_points
+        self.right += int(is_right.sum())
+        self.named += int(is_named.sum())
+        self.wrong += int((is_named & (exposure.true_sheet >= 0) & ~is_right).sum())
+        if len(exposure.lasers) == len(NAMES):
+            n_asked = int(exposure.profile.is_accepted.sum())
+            self.asked += n_asked
+            self.without += n_asked - int(is_named.sum())
+        else:
+            self.singles += 1
+
+    def row(self) -> list[float]:
+        """Figures of the table's columns."""
+        return [
+            self.stripes / max(self.in_view.mean(), 1.0),
+            self.right / max(self.alone.mean(), 1.0),
+            100.0 * self.wrong / max(self.named, 1),
+            100.0 * self.without / max(self.asked, 1),
+            self.singles,
+            1e3 * self.seconds,
+        ]
+
+
+def scanned(stroke: CrossStroke, namer: StripeNamer, has_arm: bool) -> Tally:
+    """Take a stroke with the lasers that its rule asks for."""
+    tally = Tally()
+    for k in range(stroke.n_exposures):
+        exposure = stroke.expose(k, namer.next_lasers())
+        pose = exposure.base_from_sensor if has_arm else None
+        start = time.process_time()
+        named = namer.name(exposure.profile, exposure.lasers, pose, exposure.t_ns)
+        tally.seconds = max(tally.seconds, time.process_time() - start)
+        alone = [
+            int((stroke.expose(k, (name,)).true_sheet == s).sum()) for s, name in enumerate(NAMES)
+        ]
+        tally.add(exposure, named, alone)
+    return tally
+
+
+def table_row(scene: str, rule: str, rows: list[list[float]]) -> str:
+    """One line of the table: mean and the worse end of the seeds."""
+    values = np.array(rows)
+    worse = [np.percentile(values[:, c], 5.0 if c < 2 else 95.0) for c in range(values.shape[1])]
+    formats = ("{:.3f}", "{:.3f}", "{:.3f}", "{:.2f}", "{:.1f}", "{:.0f}")
+    cells = [
+        f"{form.format(mean)} ({form.format(end)})"
+        for form, mean, end in zip(formats, values.mean(axis=0), worse, strict=True)
+    ]
+    return f"{scene:6s} {rule:7s} " + " ".join(f"{cell:>15s}" for cell in cells)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--preset", choices=("thesis", "harsh"), default="thesis")
+    parser.add_argument("--no-arm", action="store_true")
+    parser.add_argument("--scenes", default=",".join(SCENES))
+    options = parser.parse_args()
+    disturbance = {"thesis": THESIS, "harsh": HARSH}[options.preset]
+    print(
+        f"preset {options.preset}, seeds 1-{options.seeds}, "
+        f"{'without' if options.no_arm else 'with'} the arm's pose"
+    )
+    columns = ("stripes", "points", "wrong %", "unnamed %", "single", "ms")
+    print(" " * 15 + " ".join(f"{name:>15s}" for name in columns))
+    for scene in options.scenes.split(","):
+        found: dict[str, list[list[float]]] = {rule: [] for rule in RULES}
+        for seed in range(1, options.seeds + 1):
+            stroke = CrossStroke(scene, seed, disturbance)
+            for rule, kind in RULES.items():
+                found[rule].append(scanned(stroke, kind(stroke.sensor), not options.no_arm).row())
+        for rule, rows in found.items():
+            print(table_row(scene, rule, rows), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -89,7 +89,17 @@ class Tally:
         ]
 
 
-def scanned(stroke: CrossStroke, namer: StripeNamer, has_arm: bool) -> Tally:
+def seen_alone(stroke: CrossStroke) -> list[list[int]]:
+    """Points of each laser's stripe in each exposure, if it alone is on."""
+    return [
+        [int((stroke.expose(k, (name,)).true_sheet == s).sum()) for s, name in enumerate(NAMES)]
+        for k in range(stroke.n_exposures)
+    ]
+
+
+def scanned(
+    stroke: CrossStroke, namer: StripeNamer, alone: list[list[int]], has_arm: bool
+) -> Tally:
     """Take a stroke with the lasers that its rule asks for."""
     tally = Tally()
     for k in range(stroke.n_exposures):
@@ -98,10 +108,7 @@ def scanned(stroke: CrossStroke, namer: StripeNamer, has_arm: bool) -> Tally:
         start = time.process_time()
         named = namer.name(exposure.profile, exposure.lasers, pose, exposure.t_ns)
         tally.seconds = max(tally.seconds, time.process_time() - start)
-        alone = [
-            int((stroke.expose(k, (name,)).true_sheet == s).sum()) for s, name in enumerate(NAMES)
-        ]
-        tally.add(exposure, named, alone)
+        tally.add(exposure, named, alone[k])
     return tally
 
 
@@ -136,8 +143,10 @@ def main() -> None:
         found: dict[str, list[list[float]]] = {rule: [] for rule in RULES}
         for seed in range(1, options.seeds + 1):
             stroke = CrossStroke(scene, seed, disturbance)
+            alone = seen_alone(stroke)
             for rule, kind in RULES.items():
-                found[rule].append(scanned(stroke, kind(stroke.sensor), not options.no_arm).row())
+                tally = scanned(stroke, kind(stroke.sensor), alone, not options.no_arm)
+                found[rule].append(tally.row())
         for rule, rows in found.items():
             print(table_row(scene, rule, rows), flush=True)
 

@@ -171,6 +171,26 @@ def test_without_the_arm_stripes_are_predicted_in_the_image(
     assert "continues the surface" in with_arm.named[-1].how
 
 
+def test_a_stripe_that_vanishes_for_a_while_is_found_again(
+    strokes: dict[str, CrossStroke],
+) -> None:
+    """B is hidden in four exposures; meanwhile nothing is taken for it, then it has its name."""
+    stroke = strokes["waves"]
+    namer = CrossNamer(stroke.sensor)
+    for k in range(N_EXPOSURES):
+        lasers = namer.next_lasers()
+        exposure = stroke.expose(k, lasers)
+        is_hidden = 6 <= k < 10
+        seen = exposure.true_sheet == 0 if is_hidden else exposure.true_sheet >= 0
+        profile = exposure.profile.select(seen)
+        named = namer.name(profile, lasers, exposure.base_from_sensor, exposure.t_ns)
+        is_named = named.sheet >= 0
+        assert np.array_equal(named.sheet[is_named], exposure.true_sheet[seen][is_named])
+        if k > 2:
+            assert lasers == BOTH
+            assert is_named.sum() > 0.95 * profile.is_accepted.sum()
+
+
 def test_harsh_stripes_with_strays_and_holes() -> None:
     stroke = CrossStroke("steps", 5, HARSH, N_EXPOSURES)
     found = take(stroke, CrossNamer(stroke.sensor))

@@ -67,9 +67,11 @@ class Strip:
         self.is_rough = np.zeros_like(self.is_lit)
         self._near = cv2.dilate(self.is_lit.astype(np.uint8), _SQUARE) > 0
 
-    def near_nodes(self) -> tuple[IntArray, ...]:
+    def near_nodes(self, rim_px: int) -> tuple[IntArray, ...]:
         """Rows and columns of the nodes, `STRIDE_PX` apart, that are to be traced."""
-        return np.nonzero(self._near[::STRIDE_PX, ::STRIDE_PX])
+        square = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
+        near = cv2.dilate(self.is_lit.astype(np.uint8), square)
+        return np.nonzero(near[::STRIDE_PX, ::STRIDE_PX])
 
     def interpolate(self, nodes: tuple[IntArray, ...], reach: FloatArray, peak: FloatArray) -> None:
         """Fill the strip between traced nodes, and tell where that will not do."""

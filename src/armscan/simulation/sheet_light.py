@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.simulation.laser_source import TracedLight
+from armscan.simulation.laser_source import NARROW_RIM_PX, TracedLight
 from armscan.simulation.light_strips import FAR_SIGMAS, STRIDE_PX, Strip, cut_strips
 from armscan.simulation.optics import RenderCamera
 from armscan.simulation.region import Image32, Region
@@ -113,7 +113,7 @@ class _Shader:
 
     def fill_nodes(self, strips: list[Strip]) -> None:
         """Trace every second pixel of every second row that is asked for; interpolate."""
-        places = [strip.near_nodes() for strip in strips]
+        places = [strip.near_nodes(self.light.rim_px) for strip in strips]
         found = self._shade(strips, [(STRIDE_PX * r, STRIDE_PX * c) for r, c in places])
         for strip, place, (reach, peak) in zip(strips, places, found, strict=True):
             strip.interpolate(place, reach, peak)
@@ -164,12 +164,17 @@ def shade(
     normals = view.scene.normals(at)
     near, strength = light.reach_and_peak(at.points_mm, normals)
     reach[met] = near
-    lit = np.flatnonzero((np.abs(near) < BAND_SIGMAS + 1.0) & (strength > FAINTEST))
+    lit = np.flatnonzero((np.abs(near) < _lit_sigmas(light)) & (strength > FAINTEST))
     lit = lit[view.scene.sees(light.source_of_mm(at.points_mm[lit]), at.points_mm[lit])]
     chosen = at.select(lit)
     reflected = view.scene.albedo(chosen)[:, 0] + _gloss(view, light, chosen, normals[lit])
     peak[met[lit]] = strength[lit] * reflected
     return reach, peak
+
+
+def _lit_sigmas(light: TracedLight) -> float:
+    """Reach up to which light is computed: all that is traced, if the rim is wide."""
+    return FAR_SIGMAS if light.rim_px > NARROW_RIM_PX else BAND_SIGMAS + 1.0
 
 
 def _gloss(view: PosedView, light: TracedLight, hits: Hits, normals: FloatArray) -> FloatArray:

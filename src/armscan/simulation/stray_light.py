@@ -16,7 +16,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.frames import Base
 from armscan.geometry.poses import Pose
 from armscan.simulation.imaging import Imaging
-from armscan.simulation.laser_source import LaserSource, TracedLight
+from armscan.simulation.laser_source import WIDE_RIM_PX, LaserSource, TracedLight
 from armscan.simulation.light import LineLaser
 from armscan.simulation.plate import FlatPlate
 from armscan.simulation.shapes import Placed
@@ -49,6 +49,11 @@ class CentreSpot:
     direction: FloatArray
     sigma_mm: float
     irradiance: float
+
+    @property
+    def rim_px(self) -> int:
+        """As for `TracedLight`."""
+        return WIDE_RIM_PX
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

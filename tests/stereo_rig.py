@@ -13,6 +13,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Board, CameraRight, Sensor
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
 from armscan.vision.targets.definition import CircleGrid, Target
@@ -119,9 +120,7 @@ def pair_at(
     )
 
 
-def make_pairs(
-    scene: StereoScene, seed: int
-) -> tuple[list[StereoPair], list[Pose[Sensor, Board]]]:
+def make_pairs(scene: StereoScene, seed: int) -> tuple[list[StereoPair], list[Pose[Sensor, Board]]]:
     """Pairs whose images each show at least half of the target, and the poses of the board."""
     rng = np.random.default_rng(seed)
     missed = np.zeros_like(scene.target.points_board_mm)
@@ -138,6 +137,15 @@ def make_pairs(
             pairs.append(pair)
             poses.append(pose)
     return pairs, poses
+
+
+def held(camera: CameraModel, covariance: FloatArray | None = None) -> CameraCalibration:
+    """The camera's calibration by itself, exact unless a covariance (9, 9) is given."""
+    known = np.zeros((9, 9)) if covariance is None else covariance
+    origin = Provenance("id", "2026-01-01T00:00:00+00:00", "0", (), ())
+    return CameraCalibration(
+        camera, known, covariance is not None, 0.1, 0.1, 9, 99, np.zeros(4), origin
+    )
 
 
 def increments(truth: TwoViews, found: TwoViews) -> FloatArray:

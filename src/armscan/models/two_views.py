@@ -131,8 +131,8 @@ def epipolar_distances_px(
     in_left_px, in_right_px
         (N,) distance of the left point from the right point's curve in the left image, and of the
         right point from the left point's curve in the right image. Both have the sign of
-        ``x_r' E x_l``; swapping the cameras turns it. NaN where a pixel lies beyond the part of
-        the image that the distortion model can invert, and in an epipole.
+        ``x_r' E x_l``, which swapping the cameras leaves as it is. NaN where a pixel lies beyond
+        the part of the image that the distortion model can invert, and in an epipole.
     """
     left, left_ok, left_by_px, _ = views.left.undistort_with_jacobian(left_px)
     right, right_ok, right_by_px, _ = views.right.undistort_with_jacobian(right_px)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a hand holds the head over a part with ring markers: places that overlap their neighbours.
 
-Half of them are taken along the part's front and half along its back, each way once before the
-arm is moved and once after it, never twice in the same way.
+They go along the part's front and return along its back, once before the arm is moved, and after
+it the other way round, the head held differently: the first place after it is near the last before.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def marker_poses(
             facing.roll_deg + side * roll + _JITTER_ROLL_DEG * jitter[2],
             depth + _JITTER_MM * jitter[3],
         )
-        place = np.array([side * x, side * y, _HIGH_MM]) + _JITTER_MM * np.array([*jitter[4:], 0.0])
+        place = np.array([x, side * y, _HIGH_MM]) + _JITTER_MM * np.array([*jitter[4:], 0.0])
         spot = part.translation_mm + part.rotation @ place
         middle = aim_point_mm(head, aim.depth_mm)
         poses.append((f"place-{first + k:02d}", sensor_over(part.rotation, spot, aim, middle)))

@@ -23,28 +23,43 @@ EXAMPLE = (
     "  armscan calibrate laser --camera camera.json --on 'on/*.png' --off 'off/*.png' \\\n"
     "      --target chessboard:11x6:13 -o sensor.json\n\n"
     "\b\nPut the board at several depths and tilts in the laser. If the laser outshines it,\n"
-    "take each placement twice, with and without laser; images pair by name, else by order."
+    "take each placement twice, with and without laser; images pair by name, else by order.\n"
+    "Of a source of many lines no image need show them all; a recording (--scan) says which\n"
+    "laser and which camera took part."
 )
 
 
 def laser(
     *,
     camera: Annotated[
-        Path, typer.Option(help="Camera calibration, also of OpenCV or ROS.", show_default=False)
-    ],
-    on: Annotated[
-        list[str],
-        typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
+        Path,
+        typer.Option(
+            help="Camera calibration, also of OpenCV or ROS; stereo.json for two cameras.",
+            show_default=False,
+        ),
     ],
     target: Target,
+    on: Annotated[
+        list[str] | None,
+        typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
+    ] = None,
     off: Annotated[
         list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
+    ] = None,
+    scan: Annotated[
+        Path | None,
+        typer.Option(help="Recording of the board instead of images; paired by its views."),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
     ] = Path("sensor.json"),
     sheets: Annotated[
-        int, typer.Option(help="Light sheets that were on together; 0 finds out.")
+        int,
+        typer.Option(
+            "--sheets",
+            "--lines",
+            help="Light sheets that were on together, or lines of each source; 0 finds out.",
+        ),
     ] = 0,
     name: Annotated[
         list[str] | None,
@@ -69,8 +84,9 @@ def laser(
 
     request = LaserRequest(
         camera=camera,
-        on=tuple(on),
+        on=tuple(on or ()),
         off=tuple(off or ()),
+        scan=scan,
         target=target,
         output=output,
         options=LaserOptions(

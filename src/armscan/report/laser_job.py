@@ -11,12 +11,16 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
-from armscan.errors import EstimationError
+from armscan.errors import EstimationError, OptionError
 from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import CameraCalibration
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
+from armscan.models.stereo import StereoCalibration
 from armscan.pipeline.documents import sensor_calibration
-from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_exposures
+from armscan.pipeline.exposure_pairs import ExposurePair, pair_by_view, pair_exposures
+from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_pairs
 from armscan.pipeline.progress import Progress, silent
+from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.report.laser_page import laser_page, sheet_facts
 from armscan.report.numbers import sentence
@@ -24,14 +28,26 @@ from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
-from armscan.storage.calibration_files import read_camera_calibration, sensor_document
+from armscan.storage.calibration_files import (
+    document_schema,
+    read_camera_calibration,
+    sensor_document,
+)
+from armscan.storage.calibration_schema import STEREO_SCHEMA
 from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.provenance import new_provenance
+from armscan.storage.recording_arm import ARM_FILE
+from armscan.storage.recording_exposures import EXPOSURES_FILE
+from armscan.storage.recording_reader import read_recording
+from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.simulated import are_simulated
+from armscan.storage.stereo_files import read_stereo_calibration
 from armscan.vision.targets.specification import parse_target
+
+SCAN_TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +57,16 @@ class LaserRequest:
     Parameters
     ----------
     camera
-        The camera's calibration: ``camera.json``, or one that OpenCV or ROS wrote.
+        The camera's calibration: ``camera.json``, or one that OpenCV or ROS wrote; or
+        ``stereo.json`` of a head with two cameras.
     on
-        Images with the laser on the board: files, folders or patterns.
+        Images with the laser on the board: files, folders or patterns; empty if a recording is
+        given.
     off
         The same placements without laser, one for each, or none.
+    scan
+        Folder recording of the board, instead of images: its columns ``lasers`` and ``view`` say
+        what belongs together.
     target
         Specification of the board's target.
     output
@@ -67,6 +88,7 @@ class LaserRequest:
     output: Path
     options: LaserOptions = field(default_factory=LaserOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
+    scan: Path | None = None
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
 
@@ -82,29 +104,23 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     """
     target = parse_target(request.target)
     files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
-    camera = read_camera_calibration(request.camera)
-    on = expand_paths(request.on)
-    off = expand_paths(request.off) if request.off else ()
-    exposures = read_exposures((*on, *off), request.image_options)
-    fit = calibrate_sheets_from_exposures(
-        exposures[: len(on)],
-        target,
-        camera,
-        backgrounds=exposures[len(on) :],
-        options=request.options,
-        progress=progress,
+    camera = read_cameras(request.camera)
+    images = _read_images(request, is_stereo=isinstance(camera, StereoCalibration))
+    exposures = images.exposures
+    fit = calibrate_sheets_from_pairs(
+        images.pairs, target, camera, options=request.options, progress=progress
     )
     if isinstance(fit, FitFailure):
         raise EstimationError(fit.reason, remedy=fit.remedy)
     options = request.options
     provenance = new_provenance(
-        (*on, *off, request.camera),
+        (*images.paths, *images.tables, request.camera),
         command=request.command,
         options=(target, options.target, options.stripes, fit.options, request.image_options),
         parent_ids=(camera.provenance.document_id,),
-        warnings=all_warnings(fit),
+        warnings=(*images.warnings, *all_warnings(fit)),
     )
-    is_simulated = are_simulated((*on, *off))
+    is_simulated = are_simulated(images.paths)
     by_source = {exposure.source: exposure for exposure in exposures}
     page = laser_page(fit, by_source, provenance, is_simulated=is_simulated)
     hashes = {
@@ -125,6 +141,75 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     )
     written = (files.document, files.observations, files.page)
     return laser_summary(fit, written, is_simulated=is_simulated)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """What was read.
+
+    Parameters
+    ----------
+    exposures, paths
+        All images.
+    pairs
+        Each image with a laser on and its partner.
+    tables
+        Other files that went in.
+    warnings
+        What is odd about a recording.
+    """
+
+    exposures: tuple[Exposure, ...]
+    paths: tuple[Path, ...]
+    pairs: list[ExposurePair]
+    tables: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def read_cameras(path: Path) -> CameraCalibration | StereoCalibration:
+    """Read the calibration of one camera, or of the two of a stereo head.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is damaged or is neither.
+    """
+    if document_schema(path) == STEREO_SCHEMA:
+        return read_stereo_calibration(path)
+    return read_camera_calibration(path)
+
+
+def _read_images(request: LaserRequest, *, is_stereo: bool) -> _Images:
+    if request.scan is not None and (request.on or request.off):
+        raise OptionError(
+            "a recording and images are given", remedy="give --scan, or --on with --off"
+        )
+    if request.scan is not None:
+        return _read_scan(request.scan, is_stereo=is_stereo)
+    if is_stereo:
+        raise OptionError(
+            "images of a head with two cameras come as a recording, which says which camera took "
+            "which and what belongs together",
+            remedy="give --scan FOLDER",
+        )
+    on = expand_paths(request.on)
+    off = expand_paths(request.off) if request.off else ()
+    exposures = read_exposures((*on, *off), request.image_options)
+    pairs = pair_exposures(exposures[: len(on)], exposures[len(on) :])
+    return _Images(exposures, (*on, *off), pairs)
+
+
+def _read_scan(folder: Path, *, is_stereo: bool) -> _Images:
+    recording = read_recording(folder)
+    rows = [k for k, row in enumerate(recording.rows) if row.camera == 0 or is_stereo]
+    exposures = tuple(recording.exposure(k) for k in rows)
+    return _Images(
+        exposures,
+        tuple(folder / recording.rows[k].source for k in rows),
+        pair_by_view(exposures),
+        tuple(folder / name for name in SCAN_TABLES if (folder / name).is_file()),
+        (*recording.warnings, *recording.session.assumed),
+    )
 
 
 def _with_edge_flags(image: SheetImage) -> Profile:
@@ -168,6 +253,8 @@ def laser_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool)
             "simulated": is_simulated,
             "sheets": [_sheet_data(sheet) for sheet in fit.sheets],
             "naming": fit.naming,
+            "cameras": 1 if fit.second is None else 2,
+            "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
             "noise_factor": fit.noise_factor,
             "skipped": [{"source": item.source, "reason": item.reason} for item in fit.skipped],
         },

@@ -80,6 +80,21 @@ def sensor_document(
     return json_bytes(document.model_dump(mode="json", by_alias=True))
 
 
+def document_schema(path: Path) -> str | None:
+    """Name of the schema that a document says it has; None for a file without one.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, or JSON that is damaged.
+    """
+    data = read_bytes(path)
+    if not data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        return None
+    found = parse_json(data, str(path)).get("schema")
+    return found if isinstance(found, str) else None
+
+
 def read_calibration(path: Path) -> CameraCalibration | SensorCalibration:
     """Read any calibration document of armscan.
 

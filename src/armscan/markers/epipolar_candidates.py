@@ -32,7 +32,7 @@ class CandidatePairs:
     points_mm
         (K, 3) where the marker would be, Sensor frame.
     covariance_mm2
-        (K, 3, 3) its covariance from the centres alone.
+        (K, 3, 3) its covariance from the centres alone, ``unmodelled_px`` included.
     diameter_mm
         (K,) how large it would be: geometric mean of what the two images show.
     """
@@ -86,14 +86,15 @@ def find_candidates(
     is_near = np.abs(rough) < _FIRST_LOOK_PX
     rows, columns = rows[is_near], columns[is_near]
     left_px, right_px = left.centres_px[rows], right.centres_px[columns]
-    left_spread, right_spread = left.covariance_px2[rows], right.covariance_px2[columns]
+    unmodelled = options.unmodelled_px**2 * np.eye(2)
+    left_spread = left.covariance_px2[rows] + unmodelled
+    right_spread = right.covariance_px2[columns] + unmodelled
     points = triangulate_points(views, left_px, right_px, left_spread, right_spread)
     shown = np.where(points.is_valid[:, None], points.points_sensor_mm, [0.0, 0.0, 1.0])
     spread = np.zeros((len(rows), 4, 4))
     spread[:, :2, :2], spread[:, 2:, 2:] = left_spread, right_spread
     observed = np.concatenate([left_px, right_px], axis=1)
     distance, sigma = _misclosure(views, shown, observed, spread, calibration_covariance)
-    sigma = np.hypot(sigma, options.unmodelled_px)
     in_left = diameters_mm(left, rows, views.left, shown)
     in_right = diameters_mm(right, columns, views.right, views.points_right_mm(shown))
     is_near = points.is_valid & (np.abs(distance) < options.max_sigmas * sigma)

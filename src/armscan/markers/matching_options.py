@@ -17,7 +17,8 @@ class MatchingOptions:
     max_sigmas
         Threshold on the epipolar distance (delta of eq. 4.27), in its standard deviations.
     unmodelled_px
-        Part of that standard deviation which neither the centres nor the calibration account for.
+        Standard deviation, an axis, that is added to each centre for what its covariance cannot
+        know: print, light and lens across the ring.
     depth_mm
         Nearest and farthest Z of a marker in the Sensor frame; None for all that lie ahead.
     diameter_mm
@@ -36,7 +37,7 @@ class MatchingOptions:
     """
 
     max_sigmas: float = 4.0
-    unmodelled_px: float = 0.02
+    unmodelled_px: float = 0.01
     depth_mm: tuple[float, float] | None = None
     diameter_mm: float | None = None
     size_tolerance: float = 0.04

@@ -245,7 +245,7 @@ def _measured_summary(
         facts=(
             ("markers", f"{len(markers)} of {n_left} rings left and {n_right} right"),
             ("epipolar distance", f"{significant(epipolar_rms_px(matches))} px rms"),
-            ("depth sigma", f"{significant(float(np.median(sigma[:, 2])))} mm, median"),
+            ("depth sigma", f"{significant(1000.0 * float(np.median(sigma[:, 2])))} µm, median"),
         ),
         tables=(_counts(detections), fate_table(matches)),
         warnings=warnings,

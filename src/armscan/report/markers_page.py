@@ -94,7 +94,7 @@ def stereo_page(
             Card(
                 "Depth sigma",
                 significant(1000.0 * float(np.median(sigma[:, 2])), "µm"),
-                "median, from the centres alone",
+                "median, of the centres; the calibration's share is common to all",
             ),
             Card("Flat faces", str(matches.n_planes), "on which six markers or more agree"),
         ),
@@ -142,7 +142,7 @@ def marker_table(matches: StereoMatches) -> Table:
         (
             str(markers.ids[k]),
             *(f"{value:.4f}" for value in markers.points_mm[k]),
-            *(f"{1000.0 * value:.1f}" for value in sigma[k]),
+            *(significant(1000.0 * value) for value in sigma[k]),
             f"{matches.distance_px[k]:+.3f}",
         )
         for k in order

@@ -7,6 +7,7 @@ to the light before the blur.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -124,15 +125,23 @@ def laser_band(scene: Scene, camera: RenderCamera, laser: LineLaser) -> BoolArra
     A coarse grid of rays is traced; a cell belongs to the band if the sheet lies, within its
     thickness, between the nearest and the farthest of the cell's corners; so do its neighbours.
     """
+    return next(laser_bands(scene, camera, (laser,)))
+
+
+def laser_bands(
+    scene: Scene, camera: RenderCamera, lasers: Sequence[LineLaser]
+) -> Iterator[BoolArray]:
+    """The band of each laser; the coarse grid is traced once."""
     u = np.arange(0, camera.width_px + COARSE_STEP_PX, COARSE_STEP_PX)
     v = np.arange(0, camera.height_px + COARSE_STEP_PX, COARSE_STEP_PX)
     grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(np.float64)
     hits = scene.trace(np.zeros(3), camera_rays(camera, grid))
-    reach = np.full(len(grid), np.nan)
     is_hit = hits.surface >= 0
-    reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
-    band = pixels_near_sheet(reach.reshape(len(v), len(u)))
-    return np.asarray(band[: camera.height_px, : camera.width_px])
+    for laser in lasers:
+        reach = np.full(len(grid), np.nan)
+        reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
+        band = pixels_near_sheet(reach.reshape(len(v), len(u)))
+        yield np.asarray(band[: camera.height_px, : camera.width_px])
 
 
 def pixels_near_sheet(reach: FloatArray) -> BoolArray:

@@ -23,7 +23,7 @@ from armscan.simulation.imaging import Imaging
 from armscan.simulation.laser_source import in_sources
 from armscan.simulation.light import LineLaser
 from armscan.simulation.region import Region, to_pixels
-from armscan.simulation.render import laser_band
+from armscan.simulation.render import laser_bands
 from armscan.simulation.ring_image import draw_markers
 from armscan.simulation.ring_markers import Marked, RingMarker
 from armscan.simulation.scene import Lamp, Scene
@@ -234,8 +234,9 @@ def true_stripes(
     lens = eye.camera.cropped(*_corners(window))
     scene = seen_from(station, pose)
     stripes = []
-    for laser in _seen_lasers(head, eye, settings.lasers):
-        found = find_stripe(scene, lens, laser, laser_band(scene, lens, laser))
+    lasers = _seen_lasers(head, eye, settings.lasers)
+    for laser, band in zip(lasers, laser_bands(scene, lens, lasers), strict=True):
+        found = find_stripe(scene, lens, laser, band)
         in_eye: Points[Any] = Points(found.points_mm)
         in_sensor = found.points_mm if camera == 0 else (sensor_from_eye @ in_eye).xyz_mm
         stripes.append(

@@ -66,14 +66,9 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
 
 def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
     folder = found.folder
-    if scene == "camera":
-        return (
-            f"armscan calibrate camera {folder / 'images'} --target {found.target} -o camera.json"
-        )
-    if scene == "laser":
-        return (
-            f"armscan calibrate laser --camera camera.json --on {folder / 'images' / 'on'} "
-            f"--off {folder / 'images' / 'off'} --target {found.target} -o sensor.json"
+    if scene in ("camera", "laser"):
+        return f"{_next_calibration(scene, found)} --target {found.target} -o " + (
+            "sensor.json" if scene == "laser" else _cameras_document(found)
         )
     if scene == "probing":
         return f"armscan probe {folder} -o plate.csv"
@@ -82,4 +77,33 @@ def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
             f"armscan calibrate hand-eye {folder} --sensor sensor.json --plate plate.csv "
             "-o scanner.json"
         )
+    if scene in ("markers", "markers-moved"):
+        return _next_for_markers(found)
     return f"armscan reconstruct {folder} --scanner scanner.json -o cloud.ply"
+
+
+def _next_calibration(scene: TwinScene, found: SimulatedScene) -> str:
+    images = found.folder / "images"
+    if scene == "camera":
+        is_pair = found.n_cameras > 1
+        return (
+            f"armscan calibrate stereo --scan {found.folder}"
+            if is_pair
+            else f"armscan calibrate camera {images}"
+        )
+    given = f"armscan calibrate laser --camera {_cameras_document(found)}"
+    if found.n_cameras > 1 or len(found.sources) > 1:
+        return f"{given} --scan {found.folder}"
+    return f"{given} --on {images / 'on'} --off {images / 'off'}"
+
+
+def _cameras_document(found: SimulatedScene) -> str:
+    return "stereo.json" if found.n_cameras > 1 else "camera.json"
+
+
+def _next_for_markers(found: SimulatedScene) -> str:
+    images = found.folder / "images"
+    if found.n_cameras == 1:
+        return f"armscan markers {images} -o rings.html"
+    left, right = (images / side / "0001.png" for side in ("left", "right"))
+    return f"armscan markers {left} {right} --stereo stereo.json -o markers.csv"

@@ -7,6 +7,7 @@ The twin here is a fake one that is found by the real one's name, so that no ima
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -18,14 +19,21 @@ from armscan.cli.simulate import PresetName, Scene
 from armscan.devices.twin import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
 from armscan.pipeline import render_pool
+from armscan.pipeline.fewer_views import FewerViews
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.simulate import SimulateOptions, simulate_scene, truth_path
+from armscan.pipeline.simulate import (
+    SimulatedScene,
+    SimulateOptions,
+    simulate_scene,
+    truth_path,
+)
+from armscan.report import simulate_job
 from armscan.report.simulate_job import SimulateRequest, run_simulation
 from armscan.storage import atomic_folder
 from armscan.storage.probe_files import read_probe_tip
 from armscan.storage.recording_reader import read_arm_track, read_recording
 from armscan.storage.simulated import are_simulated
-from recording_folders import pixels
+from recording_folders import memory_scan, pixels
 
 HEAD = "thesis-single"
 
@@ -145,6 +153,35 @@ def test_the_command_knows_all_scenes_and_presets() -> None:
 def test_the_report_says_what_comes_next(tmp_path: Path, scene: TwinScene) -> None:
     summary = run_simulation(SimulateRequest(HEAD, scene, tmp_path / "scan"))
     word = {"camera": "camera", "laser": "laser", "hand-eye": "hand-eye", "probing": "probe"}
+    word |= {"markers": "markers", "markers-moved": "markers"}
     assert f" {word.get(scene, 'reconstruct')} " in summary.next_step
     assert str(tmp_path / "scan") in summary.next_step
     assert summary.data["simulated"] is True and summary.data["seed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("scene", "step"),
+    [
+        ("camera", "calibrate stereo --scan board --target"),
+        ("laser", "calibrate laser --camera stereo.json --scan board --target"),
+        ("markers", "markers board/images/left/0001.png board/images/right/0001.png --stereo"),
+    ],
+)
+def test_two_cameras_are_calibrated_as_a_pair(
+    monkeypatch: pytest.MonkeyPatch, scene: TwinScene, step: str
+) -> None:
+    found = SimulatedScene(Path("board"), Path("t.json"), 4, 0, "circle-grid:11x9:3.75", 2, ("A",))
+    monkeypatch.setattr(simulate_job, "simulate_scene", lambda *_: found)
+    summary = run_simulation(SimulateRequest("thesis-multi", scene, Path("board")))
+    assert step in summary.next_step.replace("\\", "/")
+
+
+def test_views_of_two_cameras_stay_together() -> None:
+    """Rows of one instant are one view, named or not."""
+    whole = memory_scan(6)
+    rows = tuple(
+        replace(row, camera=k % 2, t_ns=1000 * (k // 2), view=None)
+        for k, row in enumerate(whole.rows)
+    )
+    kept = FewerViews(replace(whole, rows=rows), 2).rows
+    assert [(row.t_ns, row.camera) for row in kept] == [(0, 0), (0, 1), (2000, 0), (2000, 1)]

@@ -18,6 +18,7 @@ from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
 from armscan.inspection.options import InspectionOptions, StepOptions
+from armscan.markers.matching_options import MatchingOptions
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
@@ -25,6 +26,7 @@ from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.report.hand_eye_request import HandEyeRequest
 from armscan.report.head_demo_job import HeadDemoRequest
 from armscan.storage.image_options import ImageOptions
+from armscan.vision.rings.options import RingOptions
 from armscan.vision.stripe.options import StripeOptions
 
 
@@ -65,6 +67,14 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
     ("inspect", "plane"): FEATURE,
     ("inspect", "sphere"): FEATURE,
     ("inspect", "step"): {**FEATURE, "margin": StepOptions().margin_mm},
+    ("markers",): {
+        "diameter": MatchingOptions().diameter_mm,
+        "min_perimeter": RingOptions().min_perimeter_px,
+        "max_perimeter": RingOptions().max_perimeter_px,
+        "max_roundness": RingOptions().max_roundness,
+        "disc": RingOptions().disc,
+        **IMAGES,
+    },
     ("verify",): {
         **FEATURE,
         "mpe": VerifyOptions().mpe_mm,

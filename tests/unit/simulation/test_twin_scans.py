@@ -57,9 +57,10 @@ def test_every_scene_lists_its_exposures_without_rendering(scene: TwinScene):
     assert scan.is_simulated and scan.session.is_simulated
     assert (scan.arm is None) == (scene in ("camera", "laser"))
     setup = scan.session.cameras[0]
-    is_still = scene in ("camera", "laser", "hand-eye")
-    assert (setup.width_px, setup.height_px) == ((3072, 2048) if is_still else (2658, 800))
-    assert scan.session.kind == ("calibration" if is_still else "scan")
+    is_calibration = scene in ("camera", "laser", "hand-eye")
+    is_full = is_calibration or scene in ("markers", "markers-moved")
+    assert (setup.width_px, setup.height_px) == ((3072, 2048) if is_full else (2658, 800))
+    assert scan.session.kind == ("calibration" if is_calibration else "scan")
 
 
 def test_laser_views_are_pairs_with_and_without_laser():

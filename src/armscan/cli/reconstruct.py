@@ -42,6 +42,13 @@ def reconstruct(
     background: Annotated[
         list[str] | None, typer.Option(help="The same views without laser; repeatable.")
     ] = None,
+    right: Annotated[
+        list[str] | None,
+        typer.Option(help="Right camera's images of the same instants; of a stereo head."),
+    ] = None,
+    right_background: Annotated[
+        list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
+    ] = None,
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
     depth_margin: Annotated[
         float | None,
@@ -81,6 +88,8 @@ def reconstruct(
         sensor=sensor,
         images=tuple(images),
         background=tuple(background or ()),
+        right=tuple(right or ()),
+        right_background=tuple(right_background or ()),
         output=output,
         options=MeasureOptions(
             stripes=StripeOptions(

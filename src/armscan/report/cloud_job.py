@@ -11,25 +11,22 @@ import numpy as np
 
 from armscan.errors import InputError
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.instants import ScanInstants
+from armscan.pipeline.measure import cameras_of
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.reconstruction.result import Reconstruction
-from armscan.records.exposure import Exposure
 from armscan.report.cloud_page import cloud_page, fate_table
 from armscan.report.numbers import sentence, significant
 from armscan.report.outputs import cloud_outputs
 from armscan.report.page import render_page
+from armscan.report.still_images import StillPaths, read_stills
 from armscan.report.summary import Summary
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import read_sensor_calibration
 from armscan.storage.clouds import XYZ_LOSES, ply_bytes, xyz_bytes
 from armscan.storage.image_options import ImageOptions
-from armscan.storage.image_paths import expand_paths
-from armscan.storage.images import read_exposures
 from armscan.storage.provenance import new_provenance
-from armscan.storage.recording_reader import is_recording, read_recording
 from armscan.storage.scanner_files import is_scanner_document, read_scanner_calibration
 from armscan.storage.simulated import are_simulated
 
@@ -56,6 +53,8 @@ class CloudRequest:
         Part of Base to measure in a recording, ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all.
     arm
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
+    right, right_background
+        The right camera's images of the same instants, for a sensor of two cameras.
     is_overwriting
         Replace results that exist.
     command
@@ -70,6 +69,8 @@ class CloudRequest:
     image_options: ImageOptions = field(default_factory=ImageOptions)
     volume: str = ""
     arm: Path | None = None
+    right: tuple[str, ...] = ()
+    right_background: tuple[str, ...] = ()
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
 
@@ -85,12 +86,15 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     """
     files = cloud_outputs(request.output, is_overwriting=request.is_overwriting)
     sensor = _sensor(request.sensor)
-    read = _read_images(request)
-    images, background, exposures = read.images, read.background, read.exposures
+    paths = StillPaths(request.images, request.background, request.right, request.right_background)
+    read = read_stills(paths, request.image_options, len(cameras_of(sensor)))
+    images, background, exposures = read.lit_paths, read.dark_paths, read.exposures
     result = reconstruct(
-        exposures[: len(images)],
+        read.left.lit,
         sensor,
-        backgrounds=exposures[len(images) :],
+        backgrounds=read.left.dark,
+        rights=read.right.lit,
+        right_backgrounds=read.right.dark,
         options=request.options,
         progress=progress,
     )
@@ -114,41 +118,6 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     written = (files.document, files.page)
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
     return cloud_summary(result, written, losses, is_simulated=is_simulated)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Images:
-    """Files with laser and without, and their exposures, those with laser first."""
-
-    images: tuple[Path, ...]
-    background: tuple[Path, ...]
-    exposures: tuple[Exposure, ...]
-
-
-def _read_images(request: CloudRequest) -> _Images:
-    """Images of files and folders, or the exposures of one recording."""
-    folder = Path(request.images[0]) if len(request.images) == 1 else None
-    if folder is not None and is_recording(folder) and not request.background:
-        return _of_recording(folder)
-    images = expand_paths(request.images)
-    background = expand_paths(request.background) if request.background else ()
-    exposures = read_exposures((*images, *background), request.image_options)
-    return _Images(images, background, tuple(exposures))
-
-
-def _of_recording(folder: Path) -> _Images:
-    recording = read_recording(folder)
-    scan = ScanInstants(recording, 1)
-    pairs = [scan.pair(row) for row in np.flatnonzero(scan.is_lit).tolist()]
-    on = [exposure for exposure, _ in pairs]
-    off = [background for _, background in pairs if background is not None]
-    if len(off) < len(on):
-        off = []
-    return _Images(
-        tuple(folder / exposure.source for exposure in on),
-        tuple(folder / exposure.source for exposure in off),
-        (*on, *off),
-    )
 
 
 def _sensor(path: Path) -> SensorCalibration:

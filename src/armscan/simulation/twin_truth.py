@@ -100,13 +100,17 @@ class InstrumentTruth:
 
     def document(self) -> bytes:
         """All of it as JSON, with the mark ``"simulated": true``."""
-        arm, bench = self.instrument.arm, self.instrument.bench
+        arm, bench, head = self.instrument.arm, self.instrument.bench, self.instrument.head
         content: dict[str, Any] = {
             "simulated": True,
-            "head": self.instrument.head.name,
+            "head": head.name,
             "preset": self.preset,
             "seed": self.seed,
             "camera_parameters": self.camera_parameters.tolist(),
+            "sources": {
+                source: [sheet.name for sheet in head.sheets_of((source,))]
+                for source in head.sources
+            },
             "sheet_points_sensor_mm": {
                 name: points.tolist() for name, points in self.sheet_points_mm.items()
             },

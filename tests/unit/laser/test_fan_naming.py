@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lines of one source are named over images that each show a few of them, or refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.laser.cameras import HeadCameras
+from armscan.calibration.laser.coplanarity import PosedSighting
+from armscan.calibration.laser.fan_naming import FanNames, name_fan
+from armscan.calibration.laser.naming import board_numbers, name_stripes
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import BoardStripes
+from armscan.calibration.laser.sightings import BoardImage, sight_stripes
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector
+from fan_rig import MIDDLE_MM, FanRig, fan_rig
+
+Named = FanNames | FitFailure
+
+
+def images_of(rig: FanRig, seed: int, *, dropped: float = 0.0, n_strays: int = 0,
+              has_right: bool = False) -> tuple[list[BoardImage], list[list[int]]]:  # fmt: skip
+    """Stripes on their boards, and the true sheet of each sighting."""
+    rng = np.random.default_rng(seed)
+    stereo = rig.drawn_stereo(rng)
+    calibration = stereo if has_right else stereo.left
+    boards, truth = rig.boards(calibration, rng, dropped=dropped, n_strays=n_strays)
+    cameras = HeadCameras.of(calibration)
+    images = [sight_stripes(board, cameras, SheetOptions()) for board in boards]
+    return images, [true_sheets(image, names) for image, names in zip(images, truth, strict=True)]
+
+
+def true_sheets(image: BoardImage, of_segment: list[int]) -> list[int]:
+    segment = image.data.profile.segment
+    return [of_segment[int(np.bincount(segment[s.rows]).argmax())] for s in image.sightings]
+
+
+def named(images: list[BoardImage], n_sheets: int = 0) -> Named:
+    cameras = HeadCameras.of(fan_rig(0, 1).stereo().left)
+    n = images[0].by_camera.shape[2]
+    camera = np.zeros((n, n)) if n != len(cameras.covariance) else cameras.covariance
+    posed = [[PosedSighting(s, image.placed.covariance, camera) for s in image.sightings]
+             for image in images]  # fmt: skip
+    return name_fan(posed, board_numbers(images), n_sheets)
+
+
+def offsets(names: FanNames, truth: list[list[int]]) -> set[int]:
+    """True number less given number of every named stripe: one value if all are right."""
+    return {
+        true - names.numbers[k] if true >= 0 else -100
+        for row, sheets in zip(truth, names.sheets, strict=True)
+        for true, k in zip(row, sheets, strict=True)
+        if k >= 0
+    }
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_few_lines_an_image_are_named_over_all(seed: int) -> None:
+    """Eleven bowed lines, 3 to 6 of them on each board; the numbers run along the head in order."""
+    images, truth = images_of(fan_rig(seed, 7), seed)
+    names = named(images)
+    assert isinstance(names, FanNames), names
+    assert len(offsets(names, truth)) == 1
+    assert max(len(row) for row in truth) <= 6
+    assert sum(k >= 0 for row in names.sheets for k in row) >= 0.85 * sum(map(len, truth))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_lost_lines_and_stray_stripes_mislead_no_one(seed: int) -> None:
+    """A sixth of the stripes is not found, and each image has a straight stripe of no sheet."""
+    images, truth = images_of(fan_rig(40 + seed, 8), seed, dropped=0.16, n_strays=1)
+    names = named(images)
+    assert isinstance(names, FanNames), names
+    assert len(offsets(names, truth) - {-100}) == 1
+    # A stray stripe that happens to lie in a sheet is not to be told from its line.
+    assert sum(true < 0 for row, sheets in zip(truth, names.sheets, strict=True)
+               for true, k in zip(row, sheets, strict=True) if k >= 0) <= 1  # fmt: skip
+
+
+def test_both_cameras_name_together() -> None:
+    images, truth = images_of(fan_rig(3, 6), 3, has_right=True)
+    assert {image.data.camera for image in images} == {0, 1}
+    names = named(images)
+    assert isinstance(names, FanNames), names
+    assert len(offsets(names, truth)) == 1
+
+
+def test_a_line_that_is_never_seen_keeps_its_number() -> None:
+    rig = fan_rig(1, 10)
+    lost = replace(rig, sheets=rig.sheets[:4] + rig.sheets[5:])
+    images, truth = images_of(lost, 1)
+    names = named(images)
+    assert isinstance(names, FanNames), names
+    was = [[k + (k >= 4) for k in row] for row in truth]
+    assert len(offsets(names, was)) == 1
+    number = 4 - offsets(names, was).pop()
+    assert number not in names.numbers
+    assert any(f"line {number}:" in warning for warning in names.warnings)
+
+
+def test_parallel_boards_are_refused_with_the_reason() -> None:
+    """Facing boards at two depths: which stripe follows which is open; no numbering is guessed."""
+    rig = fan_rig(2, 1)
+    poses = tuple(Pose(np.eye(3), np.array([0.0, 0.0, z]) - MIDDLE_MM) for z in (118.0, 165.0))
+    images, _ = images_of(replace(rig, poses=poses), 2)
+    names = named(images)
+    assert isinstance(names, FitFailure)
+    assert "too parallel" in names.reason
+    assert "tilts" in names.remedy
+
+
+def test_boards_that_share_no_line_are_refused() -> None:
+    """Two groups of boards on either side of the fan, tilted well, without a common line."""
+    rig = fan_rig(4, 1)
+    poses = []
+    for x, tilt in ((-26.0, 0.2), (-26.0, -0.3), (27.0, 0.25), (27.0, -0.2)):
+        turn = rotation_from_vector(np.array([tilt, 0.5 * tilt, 0.1]))
+        middle = np.array([x, 0.3 * x, 140.0 + 30.0 * tilt])
+        poses.append(Pose(turn, middle - turn @ MIDDLE_MM))
+    images, truth = images_of(replace(rig, poses=tuple(poses)), 4)
+    assert not set(truth[0] + truth[1]) & set(truth[2] + truth[3]), truth
+    names = named(images)
+    if isinstance(names, FanNames):
+        assert len(offsets(names, truth)) == 1
+    else:
+        assert "share too few lines" in names.reason
+
+
+def test_a_source_named_by_the_caller_gives_numbered_sheets() -> None:
+    images, _ = images_of(fan_rig(5, 6, 5), 5)
+    found = name_stripes(images, np.zeros((9, 9)), SheetOptions(n_sheets=5))
+    assert not isinstance(found, FitFailure), found
+    assert found.names == ("A.1", "A.2", "A.3", "A.4", "A.5")
+    assert found.is_fan
+
+
+def test_more_lines_than_announced_are_refused() -> None:
+    images, _ = images_of(fan_rig(5, 6, 5), 5)
+    found = name_stripes(images, np.zeros((9, 9)), SheetOptions(n_sheets=4))
+    assert isinstance(found, FitFailure)
+    assert "5 lines, and 4 were announced" in found.reason
+
+
+def test_one_line_and_a_reflection_are_one_sheet() -> None:
+    """Two stripes in each image of a source: the longer one is its line, as before."""
+    rig = fan_rig(6, 4)
+    images, _ = images_of(replace(rig, sheets=rig.sheets[5:6]), 6, n_strays=1)
+    found = name_stripes(images, np.zeros((9, 9)), SheetOptions())
+    assert not isinstance(found, FitFailure), found
+    assert found.names == ("A",)
+
+
+def test_numbers_run_from_left_to_right() -> None:
+    images, _ = images_of(fan_rig(7, 7), 7)
+    names = named(images)
+    assert isinstance(names, FanNames), names
+    for image, sheets in zip(images, names.sheets, strict=True):
+        where = [float(sighting.middle_px.sum()) for sighting in image.sightings]
+        ordered = [at for k, at in sorted(zip(sheets, where, strict=True)) if k >= 0]
+        assert ordered == sorted(ordered)
+
+
+def test_two_images_of_one_placement_are_one_board() -> None:
+    boards = [BoardStripes(i.data.profile, i.data.view, i.data.sensor_from_board)
+              for i in images_of(fan_rig(8, 2), 8)[0]]  # fmt: skip
+    cameras = HeadCameras.of(fan_rig(8, 1).stereo().left)
+    twice = [sight_stripes(board, cameras, SheetOptions()) for board in (boards[0], *boards)]
+    assert board_numbers(twice) == [0, 0, 1]

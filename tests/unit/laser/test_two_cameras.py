@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sheets of a head with two cameras: one solve, one covariance of cameras and sheets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.rotation import vector_from_rotation
+from armscan.models.stereo import StereoCalibration
+from fan_rig import FanRig, LaserTruth, fan_rig
+from sheet_rig import PROVENANCE
+
+GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
+
+
+def flat(rig: FanRig) -> FanRig:
+    """The rig with sheets that are planes, so that the model is exact."""
+    plane = [replace(sheet.laser, skew_rad=0.0, cubic_rad=0.0) for sheet in rig.sheets]
+    return replace(rig, sheets=tuple(LaserTruth(laser) for laser in plane), points_per_stripe=40)
+
+
+def fitted(
+    rig: FanRig, seed: int, *, n_sheets: int = 5
+) -> tuple[LaserFit, StereoCalibration, list[int]]:
+    """The fit, the calibration it rests on, and the true sheet of each of its sheets."""
+    rng = np.random.default_rng(seed)
+    stereo = rig.drawn_stereo(rng)
+    boards, truth = rig.boards(stereo, rng)
+    fit = calibrate_sheets(boards, stereo, SheetOptions(n_sheets=n_sheets))
+    assert isinstance(fit, LaserFit), fit
+    of = []
+    for k in range(len(fit.sheets)):
+        found = {
+            truth[i][int(s)]
+            for i, image in enumerate(fit.images)
+            for s in image.profile.segment[(image.use == PointUse.USED) & (image.sheet == k)]
+        }
+        assert len(found) == 1, "points of two sheets under one name"
+        of.append(found.pop())
+    return fit, stereo, of
+
+
+def errors(
+    fit: LaserFit, stereo: StereoCalibration, of: list[int], rig: FanRig
+) -> tuple[FloatArray, IntArray]:
+    """Errors of all free parameters, and their places in the covariance."""
+    pose = stereo.right_from_left
+    error = [stereo.left.camera.parameters - rig.left.parameters]
+    place = [np.arange(9)]
+    for k, sheet in enumerate(fit.sheets):
+        truth, model = rig.sheets[of[k]].laser, sheet.sheet
+        points = model.origin_mm + GRID * model.scale_mm @ model.axes[:2]
+        height = -truth.offset_mm(points) / float(truth.normal @ model.axes[2])
+        design = np.column_stack([GRID, np.ones(len(GRID))])
+        error.append(-np.linalg.lstsq(design, height, rcond=None)[0])
+        place.append(9 + 8 * k + np.arange(3))
+    error += [
+        stereo.right.camera.parameters - rig.right.parameters,
+        vector_from_rotation(pose.rotation @ rig.right_from_left.rotation.T),
+        pose.translation_mm - rig.right_from_left.translation_mm,
+    ]
+    place.append(9 + 8 * len(fit.sheets) + np.arange(15))
+    return np.concatenate(error), np.concatenate(place)
+
+
+def test_joint_errors_of_cameras_and_sheets_are_as_large_as_stated() -> None:
+    """Normalised error over all 39 free parameters, 8 calibrations of five sheets."""
+    squares = []
+    for seed in range(8):
+        rig = flat(fan_rig(500 + seed, 6, 5))
+        fit, stereo, of = fitted(rig, seed)
+        assert not any(sheet.sheet.is_bowed for sheet in fit.sheets)
+        error, place = errors(fit, stereo, of, rig)
+        covariance = fit.covariance[np.ix_(place, place)]
+        sigma = np.sqrt(np.diag(covariance))
+        correlation = covariance / np.outer(sigma, sigma)
+        squares.append(float((error / sigma) @ np.linalg.solve(correlation, error / sigma)))
+        assert len(error) == 24 + 3 * len(fit.sheets)
+    low, high = chi2.ppf([0.0005, 0.9995], 8 * len(error))
+    assert low < sum(squares) < high
+
+
+def test_the_right_camera_makes_the_sheets_better_known() -> None:
+    rig = flat(fan_rig(2, 6, 5))
+    fit, _, of = fitted(rig, 2)
+    rng = np.random.default_rng(2)
+    left = rig.drawn_stereo(rng).left
+    boards, _ = rig.boards(left, rng)
+    alone = calibrate_sheets(boards, left, SheetOptions(n_sheets=5))
+    assert isinstance(alone, LaserFit)
+    assert of == [0, 1, 2, 3, 4]
+    offsets = [[s.offset_sigma_mm for s in found.sheets] for found in (fit, alone)]
+    assert sum(offsets[0]) < 0.8 * sum(offsets[1])
+
+
+def test_the_document_has_both_cameras_and_their_order() -> None:
+    rig = fan_rig(3, 6, 5)
+    fit, stereo, _ = fitted(rig, 3)
+    sensor = fit.to_calibration(PROVENANCE)
+    assert sensor.second is not None
+    assert sensor.second.camera is stereo.right
+    known = sensor.covariance
+    own = [*range(9), *range(*sensor.second_parameter_slice.indices(len(known)))]
+    np.testing.assert_allclose(known[np.ix_(own, own)], stereo.covariance, rtol=1e-12)
+    sheet = sensor.sheet_parameter_slice(0)
+    assert np.abs(known[sheet, sensor.second_parameter_slice]).max() > 0.0
+
+
+def test_a_sheet_that_the_boards_do_not_determine_is_left_out_of_the_fan() -> None:
+    """Its line on two boards, the same piece of it: one line in space. The others stay."""
+    rig = fan_rig(6, 6, 5)
+    rng = np.random.default_rng(6)
+    left = rig.stereo().left
+    boards, truth = rig.boards(left, rng)
+    last = [names.index(4) if 4 in names else -1 for names in truth]
+    kept = [i for i, k in enumerate(last) if k >= 0][:1]
+    for i, board in enumerate(boards):
+        if last[i] >= 0 and i not in kept:
+            rows = board.profile.segment != last[i]
+            boards[i] = replace(board, profile=board.profile.select(rows))
+    twin = replace(boards[kept[0]], placement="again")
+    fit = calibrate_sheets([*boards, twin], left, SheetOptions(n_sheets=5))
+    assert isinstance(fit, LaserFit), fit
+    assert fit.sheet_names == ("A.1", "A.2", "A.3", "A.4")
+    assert any("left out" in warning and "A.5" in warning for warning in fit.warnings)

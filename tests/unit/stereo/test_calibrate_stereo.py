@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two cameras together: the truth within the stated covariance, and OpenCV's answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from armscan.calibration.camera.calibrate import calibrate_camera
+from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.stereo.calibrate import calibrate_stereo
+from armscan.calibration.stereo.options import StereoOptions
+from armscan.calibration.stereo.pairs import StereoPair, views_of
+from armscan.calibration.stereo.result import StereoFit
+from armscan.errors import InputError, OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import CameraCalibration
+from armscan.models.camera import CameraModel
+from armscan.models.stereo import IntrinsicsUse
+from stereo_rig import (
+    CONVERGING,
+    LEFT,
+    RIGHT,
+    StereoScene,
+    held,
+    increments,
+    make_pairs,
+    normalised_stereo_error,
+)
+
+ALL_FREE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
+OPTIONS = StereoOptions(ALL_FREE, n_folds=0)
+N_RUNS = 6
+
+
+def solved(
+    pairs: list[StereoPair],
+    scene: StereoScene,
+    options: StereoOptions = OPTIONS,
+    given: tuple[CameraCalibration, CameraCalibration] | None = None,
+) -> StereoFit:
+    fit = calibrate_stereo(pairs, scene.target, options, given)
+    assert isinstance(fit, StereoFit), fit
+    return fit
+
+
+def single(scene: StereoScene, side: int, seed: int) -> CameraCalibration:
+    """A camera calibrated by itself, from other images."""
+    fit = calibrate_camera(views_of(make_pairs(scene, seed)[0], side), ALL_FREE)
+    assert isinstance(fit, CameraFit)
+    return held(fit.camera, fit.covariance)
+
+
+def test_without_noise_the_truth_is_found() -> None:
+    scene = StereoScene(n_pairs=6, noise_px=(0.0, 0.0))
+    fit = solved(make_pairs(scene, 0)[0], scene)
+    assert fit.rms_px < 1e-8
+    assert np.abs(increments(scene.views, fit.views) / np.maximum(1.0, fit.parameters)).max() < 1e-6
+    assert fit.epipolar_rms_px < 1e-8
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        StereoScene(),
+        StereoScene(noise_px=(0.03, 0.15)),
+        StereoScene(missed_mm=0.02),
+    ],
+    ids=["noise", "unequal noise", "target error"],
+)
+def test_the_covariance_holds_the_truth(scene: StereoScene) -> None:
+    """Mean of the normalised error over 24 parameters; ``benchmarks/stereo_coverage.py`` has more.
+
+    Noise that is taken to be equal in both cameras, or target errors taken for noise of each view,
+    raise the mean far beyond the limit.
+    """
+    errors = [
+        normalised_stereo_error(scene.views, solved(make_pairs(scene, seed)[0], scene))
+        for seed in range(N_RUNS)
+    ]
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 24 * N_RUNS) / N_RUNS
+    assert low < float(np.mean(errors)) < high
+
+
+def test_agrees_with_opencv_on_the_same_points() -> None:
+    """Equal noise: both minimise the same sum, OpenCV without outliers or levels."""
+    scene = StereoScene(n_pairs=8)
+    pairs = [p for p in make_pairs(scene, 3)[0] if all(len(v) == 99 for v in p.views if v)]
+    fit = solved(pairs, scene)
+    boards = [scene.target.points_board_mm.astype(np.float32)] * len(pairs)
+    images = [[v.points_px.astype(np.float32) for v in views_of(pairs, side)] for side in (0, 1)]
+    found = cv2.stereoCalibrate(
+        boards,
+        images[0],
+        images[1],
+        LEFT.matrix,
+        LEFT.distortion.copy(),
+        RIGHT.matrix,
+        RIGHT.distortion.copy(),
+        (2048, 1536),
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-12),
+    )
+    rms, left, left_k, right, right_k, rotation, translation = found[:7]
+    theirs = np.concatenate(
+        [
+            [left[0, 0], left[1, 1], left[0, 2], left[1, 2], *left_k.ravel()[:5]],
+            [right[0, 0], right[1, 1], right[0, 2], right[1, 2], *right_k.ravel()[:5]],
+            cv2.Rodrigues(rotation)[0].ravel(),
+            translation.ravel(),
+        ]
+    )
+    # Single-precision points and noise levels that are estimated move both by far less than sigma.
+    assert np.abs((theirs - fit.parameters) / fit.sigma).max() < 0.15
+    # OpenCV counts both cameras' points under one root.
+    assert fit.rms_px == pytest.approx(rms, rel=0.01)
+
+
+def test_views_of_one_camera_count_for_it() -> None:
+    scene = StereoScene(n_pairs=9)
+    pairs = make_pairs(scene, 5)[0]
+    lonely = [StereoPair(pair.left, None) for pair in pairs[:5]] + pairs[5:]
+    without = solved(pairs[5:], scene)
+    fit = solved(lonely, scene)
+    assert len(fit.related) == 4
+    assert fit.left.n_views == 9
+    assert fit.right.n_views == 4
+    assert fit.sigma[0] < 0.8 * without.sigma[0]
+    assert normalised_stereo_error(scene.views, fit) < stats.chi2.ppf(0.9995, 24)
+    assert sum("did not see the target" in warning for warning in fit.warnings) == 5
+
+
+@pytest.mark.parametrize("use", ["prior", "fixed"])
+def test_given_cameras_as_prior_and_held(use: IntrinsicsUse) -> None:
+    scene = StereoScene(n_pairs=6)
+    options = replace(OPTIONS, intrinsics=use)
+    errors = []
+    for seed in range(8):
+        given = single(scene, 0, 100 + seed), single(scene, 1, 200 + seed)
+        fit = solved(make_pairs(scene, seed)[0], scene, options, given)
+        errors.append(normalised_stereo_error(scene.views, fit))
+        free = solved(make_pairs(scene, seed)[0], scene)
+        assert fit.sigma[0] < free.sigma[0]
+        if use == "fixed":
+            assert np.array_equal(fit.views.left.parameters, given[0].camera.parameters)
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 24 * len(errors)) / len(errors)
+    assert low < float(np.mean(errors)) < high
+
+
+def test_held_cameras_without_covariance_leave_their_rows_empty() -> None:
+    scene = StereoScene(n_pairs=5)
+    given = held(LEFT), held(RIGHT)
+    pairs = make_pairs(scene, 0)[0]
+    fit = solved(pairs, scene, replace(OPTIONS, intrinsics="fixed"), given)
+    assert not fit.covariance[:18].any()
+    apart = increments(scene.views, fit.views)[18:]
+    error = apart @ np.linalg.solve(fit.covariance[18:, 18:], apart)
+    assert error < stats.chi2.ppf(0.9995, 6)
+    with pytest.raises(OptionError, match="brings no covariance"):
+        calibrate_stereo(pairs, scene.target, replace(OPTIONS, intrinsics="prior"), given)
+
+
+def test_swapped_calibrations_are_noticed() -> None:
+    scene = StereoScene(n_pairs=5)
+    given = held(RIGHT), held(LEFT)
+    options = replace(OPTIONS, intrinsics="fixed")
+    fit = calibrate_stereo(make_pairs(scene, 0)[0], scene.target, options, given)
+    assert isinstance(fit, FitFailure)
+    assert "left images do not fit" in fit.reason
+    assert "they fit that of the right camera" in fit.reason
+    assert "swap" in fit.remedy
+
+
+def test_a_calibration_of_another_size_is_refused() -> None:
+    scene = StereoScene(n_pairs=5)
+    other = CameraModel.from_parameters(LEFT.parameters, 1024, 768)
+    given = held(other), held(RIGHT)
+    options = replace(OPTIONS, intrinsics="fixed")
+    with pytest.raises(InputError, match="1024x768"):
+        calibrate_stereo(make_pairs(scene, 0)[0], scene.target, options, given)
+
+
+def test_swapped_lists_are_named() -> None:
+    scene = StereoScene(n_pairs=5)
+    swapped = [StereoPair(pair.right, pair.left) for pair in make_pairs(scene, 0)[0]]
+    fit = solved(swapped, scene)
+    centre = CONVERGING.translation_mm
+    assert any("LEFT of the left one" in warning for warning in fit.warnings)
+    assert np.abs(fit.views.right_from_left.inverse().translation_mm - centre).max() < 1.0
+
+
+def test_hold_out_predicts_pairs_that_were_not_used() -> None:
+    """With 24 unknowns from 99 points a view, unseen pairs fit nearly as the noise allows."""
+    scene = StereoScene(n_pairs=8)
+    fit = solved(make_pairs(scene, 2)[0], scene, replace(OPTIONS, n_folds=4))
+    assert fit.hold_out is not None
+    noise = 0.05 * np.sqrt(2.0)
+    assert fit.hold_out.rms_in_sample_px < fit.hold_out.rms_px < 1.1 * noise
+    assert fit.hold_out.rms_px > 0.9 * noise
+
+
+def test_outliers_are_left_out_and_counted() -> None:
+    scene = StereoScene(n_pairs=6)
+    pairs = make_pairs(scene, 0)[0]
+    spoilt = pairs[2].right
+    assert spoilt is not None
+    points = spoilt.points_px.copy()
+    points[[4, 50]] += [3.0, -2.0]
+    pairs[2] = StereoPair(pairs[2].left, replace(spoilt, points_px=points))
+    fit = solved(pairs, scene)
+    found = fit.pairs[2].right
+    assert found is not None
+    assert np.flatnonzero(found.is_outlier).tolist() == [4, 50]
+    assert any("right camera: 2 points lie too far out" in warning for warning in fit.warnings)
+    assert normalised_stereo_error(scene.views, fit) < stats.chi2.ppf(0.9995, 24)

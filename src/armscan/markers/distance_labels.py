@@ -39,14 +39,18 @@ class LabelledMarkers:
 
 def label_markers(markers: MarkerSet) -> LabelledMarkers:
     """Give each marker its label: steps (1) to (3) of 4.3.1."""
-    points = markers.points_mm
-    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-    n = len(points)
-    others = distance[~np.eye(n, dtype=bool)].reshape(n, max(n - 1, 0))
     sigma = np.zeros(0)
-    if n:
+    if len(markers):
         sigma = np.sqrt(np.linalg.eigvalsh(markers.covariance_mm2)[:, -1])
-    return LabelledMarkers(points, sigma, distance, np.sort(others, axis=1))
+    return label_points(markers.points_mm, sigma)
+
+
+def label_points(points_mm: FloatArray, sigma_mm: FloatArray) -> LabelledMarkers:
+    """Give each of (N, 3) points its label; ``sigma_mm`` (N,) as in `LabelledMarkers`."""
+    distance = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
+    n = len(points_mm)
+    others = distance[~np.eye(n, dtype=bool)].reshape(n, max(n - 1, 0))
+    return LabelledMarkers(points_mm, sigma_mm, distance, np.sort(others, axis=1))
 
 
 def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float) -> int:

@@ -14,9 +14,17 @@ import numpy as np
 from scipy.special import gammaln
 from scipy.stats import binom
 
+from armscan.geometry.poses import Pose
 from armscan.geometry.registration import spread_mm
-from armscan.markers.alignments import MarkerPlacing, agree_with_known, keeps_side
-from armscan.markers.distance_labels import LabelledMarkers, LabelVotes, label_markers, vote
+from armscan.markers.alignment_search import find_alignments
+from armscan.markers.alignments import MarkerPlacing
+from armscan.markers.distance_labels import (
+    LabelledMarkers,
+    LabelVotes,
+    label_markers,
+    label_points,
+    vote,
+)
 from armscan.markers.match_result import (
     LEAST_TO_CHECK,
     Alignment,
@@ -26,19 +34,11 @@ from armscan.markers.match_result import (
     NoMatch,
     NotUnique,
 )
-from armscan.markers.triangles import CongruentTriangles, base_triangles, chunks
 from armscan.records.markers import MarkerSet
 
-CHUNK = 40
 CLEAR_LEAD = 2
 """Markers that the best alignment must explain more than any other."""
-MAX_ALIGNMENTS = 20_000
-"""Alignments that are scored before the search ends; only repeated patterns have as many."""
-FEW_MARKERS = 12
-ENOUGH_TRIANGLES = 20.0
-"""The search ends when so many triangles of any alignment worth naming should have been drawn."""
 LINE_SIGMAS = 15.0
-FLAT_SHARE = 0.05
 UNIFORM = float(np.sqrt(12.0))
 """Extent of a uniform distribution over its standard deviation."""
 ENOUGH_MARKERS = "give six or more common markers at unequal distances"
@@ -79,8 +79,9 @@ def match_markers(
     votes = vote(a, b, options.distance_sigmas)
     placing = MarkerPlacing(a, b, options.position_sigmas)
     are_seen = first.frame == second.frame == "Sensor"
-    found = _search(placing, votes, options, are_seen=are_seen)
-    return _judged(placing, votes, found, options)
+    found = find_alignments(placing, votes, options, are_seen=are_seen)
+    result = _judged(placing, votes, found, options)
+    return _unless_symmetric(result, placing, options) if isinstance(result, Matched) else result
 
 
 def log10_false_alarms(
@@ -104,60 +105,6 @@ def log10_false_alarms(
     extent = np.maximum(UNIFORM * spread_mm(first.points_mm), 2.0 * gate_mm)
     hit = min(n_a * float(np.prod(np.minimum(2.0 * gate_mm / extent, 1.0))), 1.0)
     return float((log_triangles + binom.logsf(n - 4, n_b - 3, hit)) / np.log(10.0))
-
-
-def _search(
-    placing: MarkerPlacing, votes: LabelVotes, options: MatchOptions, *, are_seen: bool
-) -> list[Alignment]:
-    """Different alignments, the best first; at least the two best are complete."""
-    a, b = placing.first, placing.second
-    # among few markers three that agree are looked for too: they may be a rival of four
-    least_votes = LEAST_TO_CHECK - (2 if len(a) <= FEW_MARKERS else 1)
-    admissible = votes.count >= least_votes
-    triangles = base_triangles(a, votes, options.max_triangles, least_votes)
-    finder = CongruentTriangles(a, b, admissible, options.distance_sigmas)
-    flat_mm = FLAT_SHARE * float(spread_mm(a.points_mm)[1])
-    most = min(int(admissible.any(axis=1).sum()), int(admissible.any(axis=0).sum()))
-    known: list[Alignment] = []
-    n_seen = n_scored = 0
-    for portion in chunks(triangles, CHUNK):
-        copies = [finder.of(triangle) for triangle in portion]
-        corners = np.repeat(portion, [len(item) for item in copies], axis=0)
-        matches = np.concatenate(copies)
-        new = ~agree_with_known(corners, matches, known)
-        corners, matches = corners[new], matches[new]
-        rotation, translation = placing.poses(corners, matches)
-        if are_seen:
-            seen = keeps_side(a, translation, flat_mm)
-            corners, matches = corners[seen], matches[seen]
-            rotation, translation = rotation[seen], translation[seen]
-        counts = placing.counts(rotation, translation, matches)
-        for k in np.argsort(-counts, kind="stable"):
-            second_best = len(known[1]) if len(known) > 1 else 2
-            if counts[k] <= second_best:
-                break
-            if not agree_with_known(corners[k : k + 1], matches[k : k + 1], known).any():
-                _add(placing, known, placing.refined(rotation[k], translation[k], matches[k]))
-        n_seen, n_scored = n_seen + len(portion), n_scored + len(matches)
-        is_settled = len(known) > 1 and len(known[1]) >= max(options.rival_share * most, 4)
-        share = options.rival_share * len(known[0]) / len(a) if known else 0.0
-        if is_settled or n_scored > MAX_ALIGNMENTS or n_seen * share**3 > ENOUGH_TRIANGLES:
-            break
-    return known
-
-
-def _add(placing: MarkerPlacing, known: list[Alignment], alignment: Alignment) -> None:
-    """Keep an alignment unless a better one is the same; best first."""
-    if len(alignment) < 3:
-        return
-    for k, other in enumerate(known):
-        if placing.are_same(alignment, other):
-            if len(alignment) > len(other):
-                known[k] = alignment
-            break
-    else:
-        known.append(alignment)
-    known.sort(key=len, reverse=True)
 
 
 def _judged(
@@ -221,6 +168,37 @@ def _swapped(result: MatchResult) -> MatchResult:
 
 def _inverse(alignment: Alignment) -> Alignment:
     return Alignment(alignment.pairs[:, ::-1], alignment.first_from_second.inverse())
+
+
+def _unless_symmetric(
+    result: Matched, placing: MarkerPlacing, options: MatchOptions
+) -> Matched | NotUnique:
+    """Refuse a match on a part that fits on itself in another way.
+
+    The two views may show different halves of a symmetric part: then the right alignment explains
+    few markers, and no rival warns of the wrong one. All markers of both views together do.
+    """
+    first, second = placing.first, placing.second
+    pose = result.alignment.first_from_second
+    lonely = np.setdiff1d(np.arange(len(second)), result.alignment.pairs[:, 1])
+    carried = second.points_mm[lonely] @ pose.rotation.T + pose.translation_mm
+    points = np.concatenate([first.points_mm, carried])
+    sigma = np.concatenate([first.sigma_mm, second.sigma_mm[lonely]])
+    both = label_points(points, sigma)
+    everything = np.tile(np.arange(len(points))[:, None], (1, 2))
+    itself = Alignment(everything, Pose(np.eye(3), np.zeros(3)))
+    onto_itself = MarkerPlacing(both, both, options.position_sigmas)
+    votes = vote(both, both, options.distance_sigmas)
+    found = find_alignments(onto_itself, votes, options, known=(itself,))
+    n = len(found[1]) if len(found) > 1 else 0
+    if n <= max(options.rival_share * len(points), 3.0):
+        return result
+    return NotUnique(
+        f"{n} of all {len(points)} markers seen fit on themselves in another way: the part is "
+        "symmetric",
+        "add a marker where it breaks the symmetry",
+        (result.alignment,),
+    )
 
 
 def _on_a_line(first: LabelledMarkers, second: LabelledMarkers) -> NotUnique | None:

@@ -13,9 +13,11 @@ from armscan.markers.distance_labels import LabelledMarkers, LabelVotes
 
 LEAST_HEIGHT_SIGMAS = 15.0
 """A triangle lower than this many standard deviations of a marker fixes no turn."""
-BROAD = 0.1
+BROAD = 0.03
 """Heights above this share of the whole set's extent: the alignment errs elsewhere by no more than
-ten times what a marker does."""
+some thirty times what a marker does. Flatter triangles are used only where there are no others, or
+few markers, so that each triangle counts."""
+FEW_MARKERS = 12
 MAX_COPIES = 48
 """Congruent triangles of one triangle that are looked at; only repeated patterns have more."""
 DRAWS = 20
@@ -45,7 +47,8 @@ def base_triangles(
     height = triangle_heights(first, chosen)
     lowest = LEAST_HEIGHT_SIGMAS * float(first.sigma_mm.max())
     extent = float(first.distance_mm.max())
-    for limit in (max(lowest, BROAD * extent), lowest):
+    broad = 0.0 if len(first) <= FEW_MARKERS else BROAD * extent
+    for limit in (max(lowest, broad), lowest):
         if (height > limit).any():
             return chosen[height > limit][:max_triangles]
     return chosen[:0]

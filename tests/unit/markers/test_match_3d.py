@@ -209,3 +209,24 @@ def test_the_eight_steps_confuse_markers_at_equal_distances() -> None:
     found = match_markers(first, second)
     assert isinstance(found, Matched)
     np.testing.assert_array_equal(found.alignment.pairs[:, 0], found.alignment.pairs[:, 1])
+
+
+@pytest.mark.parametrize(
+    ("of_first", "of_second", "said"),
+    [
+        ([0, 1, 2, 3, 5, 6], [0, 1, 5, 6, 7, 8], "another 4"),
+        ([0, 1, 2, 3, 4, 5, 6, 7], [5, 6, 7, 8, 9], "the part is symmetric"),
+    ],
+)
+def test_different_halves_of_a_symmetric_part_are_not_matched(
+    of_first: list[int], of_second: list[int], said: str
+) -> None:
+    """The wrong alignment explains more markers than the right one.
+
+    In the second case the right one explains three only: nothing but the part's symmetry warns.
+    """
+    half = np.array([(25, 10, 0), (60, 22, 0), (48, 71, 0), (81, 55, 0), (33, 44, 0)], float)
+    part = np.vstack([half, half * [-1.0, 1.0, 1.0]])
+    found = match_markers(marker_set(part[of_first]), marker_set(part[of_second]))
+    assert isinstance(found, NotUnique)
+    assert said in found.reason

@@ -7,9 +7,8 @@ Command: ``OMP_NUM_THREADS=1 python benchmarks/render_speed.py [seeds [heads]]``
 Each row is one kind of image of one head with all its lasers on, standing still, or moving with
 three poses over the exposure; the processor time is the best of four, and for two cameras the sum
 of both. The bias is the mean over seeds and lines of the light's centroid less the true centre,
-along the column or, where lines are slanted, the row, without speckle, stray light and sensor
-noise; on curved things the light itself is lopsided (a ball of 17.5 mm: 0.016 px), so only the
-plate has it.
+counted across the line, without speckle, stray light and sensor noise; on curved things the light
+itself is lopsided (a ball of 17.5 mm: 0.016 px), so only the plate has it.
 """
 
 from __future__ import annotations
@@ -90,7 +89,7 @@ def quiet(head: Head) -> Head:
 
 
 def line_bias_px(light: FloatArray, points_px: FloatArray) -> float:
-    """Mean centroid less truth, along columns if the points lie on columns, else along rows."""
+    """Mean centroid less truth across the line; profiles along the columns or rows of the truth."""
     on_columns = np.abs(points_px[:, 0] - np.rint(points_px[:, 0])).max() < 1e-6
     image, points = (light, points_px) if on_columns else (light.T, points_px[:, ::-1])
     errors = []
@@ -99,7 +98,9 @@ def line_bias_px(light: FloatArray, points_px: FloatArray) -> float:
         if rows[0] >= 0 and rows[-1] < len(image):
             profile = image[rows, round(x)]
             errors.append(profile @ rows / profile.sum() - y)
-    return float(np.mean(errors)) if len(errors) >= LEAST_POINTS else np.nan
+    slope = np.polyfit(points[:, 0], points[:, 1], 1)[0] if len(points) > 1 else 0.0
+    across = float(np.mean(errors) / np.hypot(1.0, slope)) if errors else np.nan
+    return across if len(errors) >= LEAST_POINTS else np.nan
 
 
 def plate_bias_px(name: str, seeds: range) -> tuple[float, float]:

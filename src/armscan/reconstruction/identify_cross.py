@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from armscan.errors import OptionError
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.frames import Base, Sensor
 from armscan.geometry.poses import Points, Pose
@@ -30,6 +30,7 @@ from armscan.reconstruction.triangulate import meet_sheets
 from armscan.records.profile import Profile
 
 MOST = 0.5
+"""With a larger share undecided, one stripe alone gives no less than all of them together."""
 ROUNDS = 2
 """Times that the rays held by other stretches are looked up."""
 
@@ -132,13 +133,26 @@ class CrossNamer:
         base_from_sensor: Pose[Base, Sensor] | None,
         t_ns: int,
     ) -> NamedProfile:
-        """Name the points of the next exposure; see `StripeNamer`."""
+        """Name the points of the next exposure; see `StripeNamer`.
+
+        Raises
+        ------
+        InputError
+            If the calibration has no sheet of any laser that was on.
+        """
         if self._last_ns is not None and t_ns - self._last_ns > self._options.stroke_gap_ns:
             self.reset()
         self._last_ns = t_ns
         possible = tuple(
             k for k, source in enumerate(self._source_of) if not lasers or source in lasers
         )
+        if not possible:
+            raise InputError(
+                f"the laser that was on is {' and '.join(lasers)}, the calibration has "
+                f"{', '.join(self._sources)}",
+                where=profile.source,
+                remedy="give a calibration of this head",
+            )
         verdict = self._judge(profile, possible, base_from_sensor)
         self._learn(profile, verdict, base_from_sensor)
         self._plan(verdict, possible)
@@ -153,7 +167,7 @@ class CrossNamer:
         fate = np.full(n, int(NameFate.NOT_ASKED))
         sheet, odds = np.full(n, -1), np.full(n, -np.inf)
         undecided = np.zeros(len(self._source_of))
-        if not len(pieces) or not possible:
+        if not len(pieces):
             return _Verdict(sheet, odds, fate, undecided)
         samples = profile.points_px[pieces.sample]
         hypotheses = hypothesise(samples, possible, self._sensor, self._options.depths)
@@ -216,7 +230,6 @@ class CrossNamer:
             expected[source] += points
         n_asked = int((verdict.fate != int(NameFate.NOT_ASKED)).sum())
         n_undecided = sum(expected.values())
-        # with most points undecided one stripe alone gives no less than all together
         is_due = self._since_single > self._options.least_between or n_undecided > MOST * n_asked
         is_in_doubt = n_undecided > self._options.undecided_share * n_asked
         most = max(self._sources, key=lambda source: expected[source])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from armscan.errors import OptionError
+from armscan.errors import InputError, OptionError
 from armscan.reconstruction.identify_cross import CrossNamer, CrossOptions
 from armscan.reconstruction.identify_rows import RowNamer
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
@@ -207,6 +207,13 @@ def test_a_dark_exposure_and_one_without_stripes_are_survived() -> None:
     assert namer.next_lasers() == BOTH
     found = take(stroke, namer)
     assert found.wrong_share == 0.0
+
+
+def test_a_laser_of_another_head_is_refused() -> None:
+    stroke = CrossStroke("plate", 1, THESIS, 1)
+    profile = stroke.expose(0, BOTH).profile
+    with pytest.raises(InputError, match="laser that was on is C, the calibration has A, B"):
+        CrossNamer(stroke.sensor).name(profile, ("C",), None, 0)
 
 
 def test_wrong_options_are_refused() -> None:

@@ -32,6 +32,7 @@ from armscan.pipeline.truth_errors import (
     camera_errors,
     hand_eye_errors,
     sheet_errors,
+    true_names,
 )
 from armscan.pipeline.twin_scans import RenderedScans, TwinScans
 
@@ -158,10 +159,11 @@ def run_head(
         ),
     )
     naming: dict[TwinScene, NamingErrors] = {}
+    names = true_names(instrument.sensor, truth.sheet_points_mm)
     if len(scenes) > len(ONE_SHEET_SCENES):
         naming = {
             scene: watch.timed(
-                "compare_names", partial(naming_errors, found[scene], twin.scan(scene))
+                "compare_names", partial(naming_errors, found[scene], twin.scan(scene), names)
             )
             for scene in scenes
         }
@@ -191,10 +193,10 @@ def calibration_errors(twin: Twin, instrument: Instrument) -> HeadErrors:
     cameras = [camera_errors(sensor.camera, truth.camera_parameters)]
     if sensor.second is not None and truth.right_camera_parameters is not None:
         cameras.append(camera_errors(sensor.second.camera, truth.right_camera_parameters))
-    sheets = []
+    sheets, names = [], true_names(sensor, truth.sheet_points_mm)
     for k, sheet in enumerate(sensor.sheets):
         own = sensor.sheet_parameter_slice(k)
-        points = truth.sheet_points_mm[sheet.name]
+        points = truth.sheet_points_mm[names[sheet.name]]
         low, high = sheet.depth_range_mm
         inside = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
         sheets.append(sheet_errors(sheet, sensor.covariance[own, own], inside))

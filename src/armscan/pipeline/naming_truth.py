@@ -72,8 +72,8 @@ class NamingErrors:
 
     @property
     def wrong_share(self) -> float:
-        """Share of the measured points that bear a wrong name, those on no stripe included."""
-        return (self.n_wrong + self.n_stray) / max(self.n_named + self.n_stray, 1)
+        """Share of the measured points that bear a wrong name."""
+        return self.n_wrong / max(self.n_named, 1)
 
     @property
     def named_share(self) -> float:
@@ -81,7 +81,9 @@ class NamingErrors:
         return self.n_shared_named / max(self.n_shared, 1)
 
 
-def naming_errors(scan: ScanReconstruction, truth: SimulatedScan) -> NamingErrors:
+def naming_errors(
+    scan: ScanReconstruction, truth: SimulatedScan, true_names: Mapping[str, str]
+) -> NamingErrors:
     """Compare the names of a scan with the truth of the same exposures.
 
     Parameters
@@ -90,6 +92,8 @@ def naming_errors(scan: ScanReconstruction, truth: SimulatedScan) -> NamingError
         What was measured; its rows bear the numbers that they have in the twin's scan.
     truth
         The scan as the twin has it.
+    true_names
+        The true name of each calibrated sheet, by the name that it was given.
     """
     image_of = dict(zip(scan.image_rows, scan.images, strict=True))
     rows = [exposure.row for exposure in scan.exposures]
@@ -104,7 +108,8 @@ def naming_errors(scan: ScanReconstruction, truth: SimulatedScan) -> NamingError
         own = [rows[row] for row in instants[k].rows]
         true = [_lit(truth.true_stripes(row.index), row.lasers) for row in own]
         images = [image_of[row] for row in instants[k].rows]
-        total += _of_instant(images, true, scan.cloud.sheet_names)
+        names = tuple(true_names[name] for name in scan.cloud.sheet_names)
+        total += _of_instant(images, true, names)
     return total
 
 

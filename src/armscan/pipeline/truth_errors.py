@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.frames import Sensor, Tool
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import vector_from_rotation
-from armscan.models.calibration import CameraCalibration, SheetCalibration
+from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.scanner import ScannerCalibration
 
 
@@ -116,6 +117,27 @@ def sheet_errors(
         normalised=normalised_length(error, covariance, is_free),
         n_parameters=int(is_free.sum()),
     )
+
+
+def true_names(
+    sensor: SensorCalibration, true_points_mm: Mapping[str, FloatArray]
+) -> dict[str, str]:
+    """The true sheet that each calibrated one is, by its name: the nearest of all.
+
+    A calibration numbers the lines of a source as it finds them; a line that no target ever saw
+    shifts the numbers of those after it.
+    """
+    found = {}
+    for calibrated in sensor.sheets:
+        low, high = calibrated.depth_range_mm
+        distance = {}
+        for name, points in true_points_mm.items():
+            inside = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+            if len(inside):
+                height = calibrated.sheet.height_with_jacobian(inside)[0]
+                distance[name] = float(np.mean(height**2))
+        found[calibrated.name] = min(distance, key=lambda name: distance[name])
+    return found
 
 
 def hand_eye_errors(scanner: ScannerCalibration, truth: Pose[Tool, Sensor]) -> HandEyeErrors:

@@ -17,7 +17,6 @@ from armscan.calibration.laser.result import BoardStripes
 from armscan.calibration.laser.sightings import BoardImage, sight_stripes
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
 from fan_rig import MIDDLE_MM, FanRig, fan_rig
 
 Named = FanNames | FitFailure
@@ -59,7 +58,7 @@ def offsets(names: FanNames, truth: list[list[int]]) -> set[int]:
     }
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_few_lines_an_image_are_named_over_all(seed: int) -> None:
     """Eleven bowed lines, 3 to 6 of them on each board; the numbers run along the head in order."""
     images, truth = images_of(fan_rig(seed, 7), seed)
@@ -70,7 +69,7 @@ def test_few_lines_an_image_are_named_over_all(seed: int) -> None:
     assert sum(k >= 0 for row in names.sheets for k in row) >= 0.85 * sum(map(len, truth))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_lost_lines_and_stray_stripes_mislead_no_one(seed: int) -> None:
     """A sixth of the stripes is not found, and each image has a straight stripe of no sheet."""
     images, truth = images_of(fan_rig(40 + seed, 8), seed, dropped=0.16, n_strays=1)
@@ -103,6 +102,25 @@ def test_a_line_that_is_never_seen_keeps_its_number() -> None:
     assert any(f"line {number}:" in warning for warning in names.warnings)
 
 
+def test_a_line_seen_on_one_board_counts_in_the_numbering() -> None:
+    """The first line is on one board: no sheet comes of it, and the next one is still line 2."""
+    images, truth = images_of(fan_rig(5, 6, 5), 5)
+    first = next(i for i, row in enumerate(truth) if 0 in row)
+    cut = [
+        image if i == first else without(image, row, {0})[0]
+        for i, (image, row) in enumerate(zip(images, truth, strict=True))
+    ]
+    names = named(cut)
+    assert isinstance(names, FanNames), names
+    assert names.numbers == (2, 3, 4, 5)
+    assert any("line 1:" in warning for warning in names.warnings)
+
+
+def without(image: BoardImage, truth: list[int], sheets: set[int]) -> tuple[BoardImage, list[int]]:
+    kept = [s for s, true in zip(image.sightings, truth, strict=True) if true not in sheets]
+    return replace(image, sightings=tuple(kept)), [true for true in truth if true not in sheets]
+
+
 def test_parallel_boards_are_refused_with_the_reason() -> None:
     """Facing boards at two depths: which stripe follows which is open; no numbering is guessed."""
     rig = fan_rig(2, 1)
@@ -114,19 +132,17 @@ def test_parallel_boards_are_refused_with_the_reason() -> None:
     assert "tilts" in names.remedy
 
 
-def test_boards_that_share_no_line_are_refused() -> None:
-    """Two groups of boards on either side of the fan, tilted well, without a common line."""
-    rig = fan_rig(4, 1)
-    poses = []
-    for x, tilt in ((-26.0, 0.2), (-26.0, -0.3), (27.0, 0.25), (27.0, -0.2)):
-        turn = rotation_from_vector(np.array([tilt, 0.5 * tilt, 0.1]))
-        middle = np.array([x, 0.3 * x, 140.0 + 30.0 * tilt])
-        poses.append(Pose(turn, middle - turn @ MIDDLE_MM))
-    images, truth = images_of(replace(rig, poses=tuple(poses)), 4)
-    assert not set(truth[0] + truth[1]) & set(truth[2] + truth[3]), truth
-    names = named(images)
+def test_boards_that_share_no_line_are_placed_by_the_fan_or_refused() -> None:
+    """Half of the images show lines up to the fifth only, the others those after it."""
+    images, truth = images_of(fan_rig(4, 8), 4)
+    parts = [
+        without(image, row, set(range(5) if i % 2 else range(5, 11)))
+        for i, (image, row) in enumerate(zip(images, truth, strict=True))
+    ]
+    assert not set(parts[0][1]) & set(parts[1][1])
+    names = named([image for image, _ in parts])
     if isinstance(names, FanNames):
-        assert len(offsets(names, truth)) == 1
+        assert len(offsets(names, [row for _, row in parts])) == 1
     else:
         assert "share too few lines" in names.reason
 
@@ -166,7 +182,8 @@ def test_numbers_run_from_left_to_right() -> None:
 
 
 def test_two_images_of_one_placement_are_one_board() -> None:
-    boards = [BoardStripes(i.data.profile, i.data.view, i.data.sensor_from_board)
+    boards = [BoardStripes(i.data.profile, i.data.view, i.data.sensor_from_board,
+                           placement=i.data.placement)
               for i in images_of(fan_rig(8, 2), 8)[0]]  # fmt: skip
     cameras = HeadCameras.of(fan_rig(8, 1).stereo().left)
     twice = [sight_stripes(board, cameras, SheetOptions()) for board in (boards[0], *boards)]

@@ -223,7 +223,8 @@ def _numbers(kept: list[int], sure: _Sure, n_sheets: int) -> tuple[list[int], li
     """Numbers from 1 of the sheets kept, and what is doubtful about them."""
     warnings: list[str] = []
     slots = [int(s) for s in sure.numbering.fan.slots]
-    known = slots if n_sheets and slots[-1] - slots[0] + 1 == n_sheets else kept
+    # A line seen on one board cannot be calibrated, and still counts, unless it is one too many.
+    known = kept if n_sheets and slots[-1] - slots[0] >= n_sheets else slots
     if len(kept) == n_sheets:
         return list(range(1, n_sheets + 1)), warnings
     heights = sure.numbering.fan.planes[[slots.index(s) for s in known], 2]

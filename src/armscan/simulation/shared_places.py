@@ -99,6 +99,15 @@ MULTI_LEFT_PLACES: tuple[SharedPlace, ...] = (
     SharedPlace(2, 0, 6, -60, -26, -15, is_for_left=True),
 )
 """The first lines leave the view that both cameras share; the left one sees them nearer."""
+MULTI_FAR_PLACES: tuple[SharedPlace, ...] = (
+    SharedPlace(-4, 6, -3, 60, 26, -22, is_for_left=True),
+    SharedPlace(6, -10, 3, 60, 26, -15, is_for_left=True),
+    SharedPlace(-8, -16, 5, 60, 26, -7, is_for_left=True),
+    SharedPlace(4, 12, -2, 60, 26, 2, is_for_left=True),
+    SharedPlace(-10, 2, 2, 60, 26, 11, is_for_left=True),
+    SharedPlace(8, -6, -6, 60, 26, 20, is_for_left=True),
+)
+"""The last lines, near and far, as far aside as the left camera sees the target."""
 
 _JITTER_DEG = 2.0
 _JITTER_MM = 1.0

@@ -18,6 +18,7 @@ from armscan.simulation.instant import Light, Moment, instant_shots
 from armscan.simulation.scene import Lamp
 from armscan.simulation.shared_places import (
     CROSS_LASER_PLACES,
+    MULTI_FAR_PLACES,
     MULTI_LASER_PLACES,
     MULTI_LEFT_PLACES,
     STEREO_CAMERA_PLACES,
@@ -100,7 +101,8 @@ def _before_lasers(
     if len(head.cameras) > 1:
         # A few lines in the middle are met at each place.
         is_many = len(head.lasers) > _FEW_LINES
-        places = MULTI_LASER_PLACES + MULTI_LEFT_PLACES if is_many else MULTI_LASER_PLACES[::2]
+        outer = MULTI_LEFT_PLACES + MULTI_FAR_PLACES
+        places = MULTI_LASER_PLACES + outer if is_many else MULTI_LASER_PLACES[::2]
     yield from (held_before_all(head, pattern, place, rng) for place in places)
 
 

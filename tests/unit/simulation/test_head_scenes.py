@@ -22,7 +22,7 @@ from armscan.simulation.instrument import Instrument
 from armscan.simulation.marker_plan import PLACES, marker_poses
 from armscan.simulation.posture import aim_point_mm
 from armscan.simulation.scan_plan import SweptScene, strokes_of
-from armscan.simulation.shared_places import MULTI_LEFT_PLACES
+from armscan.simulation.shared_places import MULTI_FAR_PLACES, MULTI_LEFT_PLACES
 from armscan.simulation.sweep import CAMERA_CLOCK_NS
 from armscan.simulation.twin import build_twin
 from armscan.simulation.twin_scan import Shot, TwinScan
@@ -109,7 +109,7 @@ def test_both_cameras_see_all_marks_half_way_between_them(seed: int):
             assert into[2, 2] > np.cos(np.radians(55.0))
     laser_views = twin.scan("laser").shots[::4]
     seen_by_both = [all(_marks_in_view(shot, eye) for eye in cameras) for shot in laser_views]
-    assert sum(seen_by_both) >= len(laser_views) - len(MULTI_LEFT_PLACES) == 24
+    assert sum(seen_by_both) >= len(laser_views) - len(MULTI_LEFT_PLACES + MULTI_FAR_PLACES) == 24
     assert all(_marks_in_view(shot, cameras[0]) for shot in laser_views)
 
 

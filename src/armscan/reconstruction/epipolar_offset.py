@@ -87,7 +87,7 @@ def drift_directions(projected: Projections, sensor: SensorCalibration) -> Float
 def residual_derivatives(
     projected: Projections, crossings: Crossings, sensor: SensorCalibration
 ) -> FloatArray:
-    """(H, P + 3) of the residuals by steps of the calibration's parameters and of a picture's shift.
+    """(H, P + 3) of the residuals by steps of the parameters and of the right picture.
 
     The true steps take the residuals to zero: what the calibration's errors made is undone by
     adding them to its parameters, what a drift made by shifting the projected points with it.
@@ -146,7 +146,7 @@ def estimate_offset(
     """
     if not len(projected.sheet):
         return prior
-    equations = _Equations.of(projected, crossings, sensor, prior, floor_px)
+    equations = _Equations.of(projected, crossings, sensor, prior, floor_px=floor_px)
     information = equations.information()
     step = prior.factor @ equations.state
     n = len(sensor.covariance)
@@ -180,6 +180,7 @@ class _Equations:
         crossings: Crossings,
         sensor: SensorCalibration,
         prior: EpipolarOffset,
+        *,
         floor_px: float,
         is_used: BoolArray | None = None,
     ) -> _Equations:
@@ -189,10 +190,10 @@ class _Equations:
         wanted = -crossings.residual_px
         used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
         weight = used
-        state = np.zeros(design.shape[1])
+        state: FloatArray = np.zeros(design.shape[1])
         for _ in range(ROUNDS):
             found = _Equations(by_all, design, wanted, sigma, weight, state)
-            state = np.linalg.solve(found.information(), found.right_side())
+            state = np.asarray(np.linalg.solve(found.information(), found.right_side()))
             score = np.abs(wanted - design @ state) / sigma * CORRELATION
             weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
         return _Equations(by_all, design, wanted, sigma, found.weight, state)
@@ -213,6 +214,7 @@ def left_out_scores(
     stretch: IntArray,
     is_used: BoolArray,
     sensor: SensorCalibration,
+    *,
     prior: EpipolarOffset,
     floor_px: float,
 ) -> FloatArray:
@@ -237,7 +239,9 @@ def left_out_scores(
     FloatArray
         (B,) chi-square of mean, slope and bend of the stretch's residuals, over their count.
     """
-    equations = _Equations.of(projected, crossings, sensor, prior, floor_px, is_used)
+    equations = _Equations.of(
+        projected, crossings, sensor, prior, floor_px=floor_px, is_used=is_used
+    )
     information, right_side = equations.information(), equations.right_side()
     n_stretches = int(stretch.max()) + 1 if len(stretch) else 0
     scores = np.zeros(n_stretches)

@@ -48,6 +48,7 @@ def fuse_points(
     normals_px: FloatArray,
     sigma_px: FloatArray,
     right_sigma_px: FloatArray,
+    *,
     sensor: SensorCalibration,
     shift_px: FloatArray,
 ) -> FusedPoints:
@@ -89,9 +90,7 @@ def fuse_points(
     missed = np.zeros((n, 1 + N_OBSERVED))
     missed[:, 2] = crossings.residual_px - shift_px
     points = projected.points_mm - np.einsum("nij,nj->ni", gain, missed)
-    return FusedPoints(
-        points, gain[:, :, 1:] * (noise[:, None, :] * [-1.0, -1.0, 1.0]), -gain @ by_sensor
-    )
+    return FusedPoints(points, gain[:, :, 1:] * noise[:, None, :], -gain @ by_sensor)
 
 
 def _observations(

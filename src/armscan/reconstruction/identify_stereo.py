@@ -17,7 +17,7 @@ from armscan.reconstruction.epipolar_offset import (
     predicted_residuals,
 )
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
-from armscan.reconstruction.near_surface import expected_depths, has_rival_on_surface
+from armscan.reconstruction.near_surface import OFF_MM, fit_planes, surface_distance
 from armscan.reconstruction.sheet_scores import IMPOSSIBLE, Verdict, decide, log_ratio
 from armscan.reconstruction.stereo_options import StereoNamingOptions
 from armscan.reconstruction.stereo_residuals import (
@@ -90,14 +90,6 @@ class _Found:
     crossings: Crossings
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Doubts:
-    """Pairs (H,) of stretches in doubt, and the number of each one's stretch."""
-
-    pair: BoolArray
-    stretch: IntArray
-
-
 def residual_and_sigma(
     projected: Projections,
     crossings: Crossings,
@@ -152,28 +144,29 @@ def name_stripes(
     n_sheets = len(sensor.sheets)
     prior = offset = no_offset(sensor, options.drift_px)
     none = np.zeros(len(at), dtype=np.bool_)
-    doubts = _Doubts(none, np.full(len(at), -1))
-    ever = none
+    doubt = ever = none
     for _ in range(ROUNDS):
-        pairs = _pairs(found, doubts.pair, stripes, sides[1], sensor, offset, options)
+        pairs = _pairs(found, doubt, stripes, sides[1], sensor, offset=offset, options=options)
         verdicts = _decide_both(pairs, sides, n_sheets, options)
         used = pairs.is_match & (verdicts[0].name[at] == projected.sheet)
-        doubts = _doubtful(
+        asked = used | doubt | _is_tied(pairs, verdicts[0])
+        piece = verdicts[0].piece[at]
+        doubt = _doubtful(
             found,
             used,
-            verdicts[0].stretch[at],
-            doubts,
+            asked,
+            piece,
             left.points_px[row],
-            sensor,
-            prior,
-            options,
+            sensor=sensor,
+            prior=prior,
+            options=options,
         )
-        ever = ever | doubts.pair
-        sure = used & ~doubts.pair
+        ever = ever | doubt
+        sure = used & ~doubt
         offset = estimate_offset(
             projected.select(sure), crossings.select(sure), sensor, prior, options.floor_px
         )
-    unasked, doubted = used & doubts.pair, ever
+    unasked, doubted = used & doubt, ever
     return StereoNames(
         _named(sides[0], verdicts[0], *_marked(pairs.left, unasked, doubted, len(sides[0]))),
         _named(sides[1], verdicts[1], *_marked(pairs.right, unasked, doubted, len(sides[1]))),
@@ -193,60 +186,55 @@ def _marked(
     return masks[0], masks[1]
 
 
+def _is_tied(pairs: _Pairs, verdict: Verdict) -> BoolArray:
+    """(H,) pairs of pieces that several sheets explain, on one of these sheets."""
+    open_piece = ~verdict.is_sure & verdict.is_tied
+    candidate = verdict.is_candidate[verdict.piece[pairs.left], pairs.sheet]
+    return np.asarray(pairs.is_match & open_piece[pairs.left] & candidate)
+
+
 def _doubtful(
     found: _Found,
     used: BoolArray,
-    stretch: IntArray,
-    before: _Doubts,
+    asked: BoolArray,
+    piece: IntArray,
     points_px: FloatArray,
+    *,
     sensor: SensorCalibration,
     prior: EpipolarOffset,
     options: StereoNamingOptions,
-) -> _Doubts:
-    """Pairs of stretches that do not fit the others: by their offset, or by the surface.
+) -> BoolArray:
+    """(H,) pieces on sheets that do not fit the others, by their offset or by the surface.
 
-    Stretches that were in doubt before are asked again, now that the others may be known better.
+    ``used`` pairs are those of certain names; ``asked`` ones are also those in doubt before, now
+    that the others may be known better, and the candidates of pieces that several sheets explain.
     """
-    number = np.where(used, stretch, np.where(before.pair, before.stretch + len(points_px), -1))
-    at = np.flatnonzero(number >= 0)
     doubt = np.zeros(len(used), dtype=np.bool_)
+    at = np.flatnonzero(asked)
     if not len(at):
-        return _Doubts(doubt, number)
-    numbers, own = np.unique(number[at], return_inverse=True)
-    projected = found.projected
+        return doubt
+    projected, n_sheets = found.projected, len(sensor.sheets)
+    keys, own = np.unique(piece[at] * n_sheets + projected.sheet[at], return_inverse=True)
     scores = left_out_scores(
         projected.select(at),
         found.crossings.select(at),
         own,
         used[at],
         sensor,
-        prior,
-        options.floor_px,
+        prior=prior,
+        floor_px=options.floor_px,
     )
     is_bad = scores > options.offset_chi_square
+    known = at[used[at] & ~is_bad[own]]
     pixels, depth = points_px[found.sample], projected.points_mm[:, 2]
-    is_known = used[at] & ~is_bad[own]
-    known = at[is_known]
-    expected, sigma = expected_depths(pixels[at], own, pixels[known], depth[known], own[is_known])
-    samples, first = np.unique(found.sample[at], return_index=True)
-    place = np.full(len(points_px), -1)
-    place[samples] = first
-    is_own = np.zeros(len(used), dtype=np.bool_)
-    is_own[at] = True
-    rivals = np.flatnonzero((place[found.sample] >= 0) & ~is_own)
-    is_bad |= has_rival_on_surface(
-        own,
-        depth[at],
-        expected,
-        sigma,
-        place[found.sample[rivals]],
-        projected.sheet[rivals],
-        depth[rivals],
-    )
+    planes = fit_planes(pixels[known], depth[known], piece[known])
+    shape = (int(piece.max()) + 1, n_sheets)
+    distance, is_on = surface_distance(pixels, depth, piece, projected.sheet, planes, shape=shape)
+    of_piece, of_sheet = np.divmod(keys, n_sheets)
+    off = distance[of_piece, of_sheet]
+    is_bad |= (off > OFF_MM) & np.isfinite(off) & is_on[of_piece].any(axis=1)
     doubt[at] = is_bad[own]
-    kept = np.full(len(used), -1)
-    kept[at] = own
-    return _Doubts(doubt, kept)
+    return doubt
 
 
 def _pairs(
@@ -255,6 +243,7 @@ def _pairs(
     stripes: RightStripes,
     right: _Side,
     sensor: SensorCalibration,
+    *,
     offset: EpipolarOffset,
     options: StereoNamingOptions,
 ) -> _Pairs:
@@ -288,15 +277,15 @@ def _decide_both(
     missing = float(np.log(1.0 - options.seen_share))
     alive_left = alive_right = pairs.is_match
     for _ in range(EXCHANGES):
-        left = _decide_left(pairs, alive_left, sides[0], n_sheets, missing, options)
+        left = _decide_left(pairs, alive_left, sides[0], n_sheets, missing, options=options)
         by_left = left.name[pairs.left]
-        right = _decide_right(pairs, alive_right, sides[1], n_sheets, missing, options)
-        by_right = np.where(pairs.right >= 0, right.name[pairs.right], -1)
+        right = _decide_right(pairs, alive_right, sides[1], n_sheets, missing, options=options)
+        by_right = np.append(right.name, -1)[pairs.right]
         alive_left = pairs.is_match & ((by_right == -1) | (by_right == pairs.sheet))
         alive_right = pairs.is_match & ((by_left == -1) | (by_left == pairs.sheet))
-    left = _decide_left(pairs, alive_left, sides[0], n_sheets, missing, options)
+    left = _decide_left(pairs, alive_left, sides[0], n_sheets, missing, options=options)
     agreed = alive_left & (left.name[pairs.left] == pairs.sheet)
-    return left, _decide_right(pairs, agreed, sides[1], n_sheets, missing, options)
+    return left, _decide_right(pairs, agreed, sides[1], n_sheets, missing, options=options)
 
 
 def _decide_left(
@@ -305,6 +294,7 @@ def _decide_left(
     side: _Side,
     n_sheets: int,
     missing: float,
+    *,
     options: StereoNamingOptions,
 ) -> Verdict:
     scores = np.full((len(side), n_sheets), IMPOSSIBLE)
@@ -320,6 +310,7 @@ def _decide_right(
     side: _Side,
     n_sheets: int,
     missing: float,
+    *,
     options: StereoNamingOptions,
 ) -> Verdict:
     """The same pairs, seen from the right stripes: each sample takes its best partner."""
@@ -342,10 +333,10 @@ def _named(side: _Side, verdict: Verdict, unasked: BoolArray, doubted: BoolArray
     fate = np.full(n, int(NameFate.NOT_ASKED))
     nearest = side.samples.nearest
     if len(side):
-        lost = np.zeros(int(verdict.stretch.max()) + 1, dtype=np.bool_)
-        lost[verdict.stretch[unasked]] = True
-        sure = verdict.is_sure & ~lost[verdict.stretch]
-        is_tied = verdict.is_tied | doubted | lost[verdict.stretch]
+        lost = np.zeros(int(verdict.piece.max()) + 1, dtype=np.bool_)
+        lost[verdict.piece[unasked]] = True
+        sure = verdict.is_sure & ~lost[verdict.piece]
+        is_tied = verdict.is_tied | doubted | lost[verdict.piece]
         of_sample = np.where(is_tied, int(NameFate.AMBIGUOUS), int(NameFate.UNEXPLAINED))
         of_sample[sure] = int(NameFate.NAMED)
         sheet[side.pieces.row] = np.where(sure, verdict.state, -1)[nearest]

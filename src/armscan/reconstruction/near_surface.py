@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stripes that another sheet would put on the surface of their neighbours.
+"""Which sheets put a stripe on a plane that other stripes lie on.
 
-Where a thing in front hides a stripe from the right camera, and another from the left, the two
-that are left over may fit one another on a sheet of neither: a line of points floating off the
-surface, millimetres from it. The sheet that the stripe is really of puts it on the surface.
+The sheets are evenly spread and the laser stands between the cameras: on a plane, the left
+stripe of sheet i, put on sheet (i + m) / 2, falls within about a pixel of the right stripe of
+sheet m, all along. Where a thing in front hides the true partners of both, or where the
+calibration's errors are of that size, the residuals alone do not tell. But that point floats
+millimetres off the plane on which the neighbours lie, and the stripe's true sheet puts it there.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,105 +20,134 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 NEIGHBOURS = 24
 THINNING = 5
 """Of the samples along a line, so that the nearest are of several lines."""
-REACH_PX = 500.0
-"""Neighbouring lines of eleven over a field of 2658 px lie within about a third of this."""
-SURFACE_MM = 0.1
-"""By how much a surface between neighbouring lines differs from a plane, at least."""
-SLOPE_MM_PER_PX = 0.03
-"""A surface tilted by about 45 degrees at 140 mm: the slope's prior standard deviation."""
-OFF_SIGMAS = 4.0
-LEAST_OFF_MM = 1.5
-"""Nearer to the surface than this, a stretch may well be on it."""
-ON_SIGMAS = 2.0
-MOST_SIGMA_MM = 0.5
-"""A surface that is known no better puts any sheet within reach of it."""
-MOST = 0.5
-"""Part of a stretch that has to be off, and on for its rival."""
+SCALE_PX = 500.0
+NOISE_MM = 0.03
+"""Of a named point's depth, without the calibration."""
+FLAT_MM = 0.12
+"""Neighbours that scatter more about their plane are on a bent surface, or on two."""
+ON_MM = 0.15
+SIGMAS = 3.0
+KNOWN_MM = 0.5
+"""A plane that is known no better at a point puts many sheets within reach of it."""
+OFF_MM = 2.0
+"""Less far off its neighbours' plane than this, a stripe may well be on their bent surface."""
 
 
-def expected_depths(
-    points_px: FloatArray,
-    stretch: IntArray,
-    known_px: FloatArray,
-    known_depth_mm: FloatArray,
-    known_stretch: IntArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Depth of the surface through the named points around each point, without its own stretch.
+@dataclass(frozen=True, slots=True, eq=False)
+class Planes:
+    """Planes seen by the camera: the inverse depth is linear over the image.
 
-    The inverse depth of a plane is linear over the image; it is fitted to the nearest points.
+    Parameters
+    ----------
+    middle_px
+        (B, 2) about which the numbers are given.
+    inverse
+        (B, 3) inverse depth in the middle (1/mm) and its change to the right and downwards over
+        `SCALE_PX`.
+    covariance
+        (B, 3, 3).
+    stretch
+        (B,) number of the stripe around whose middle the plane was fitted.
+    """
+
+    middle_px: FloatArray
+    inverse: FloatArray
+    covariance: FloatArray
+    stretch: IntArray
+
+
+def fit_planes(points_px: FloatArray, depth_mm: FloatArray, stretch: IntArray) -> Planes:
+    """Plane through the nearest named points around the middle of each stripe, where it is flat.
 
     Parameters
     ----------
     points_px
-        (N, 2) undistorted enough: the lens bends a plane by less than the tolerance.
+        (N, 2) of named samples. The lens bends a plane by less than the tolerance.
+    depth_mm
+        (N,) on the sheet of their name.
     stretch
-        (N,) number of the stretch that each point is of.
-    known_px, known_depth_mm, known_stretch
-        (K, 2), (K,) and (K,) of points whose sheet is known.
-
-    Returns
-    -------
-    depth_mm, sigma_mm
-        (N,); infinite sigma where there are too few neighbours.
+        (N,) number of the stripe.
     """
-    depth, sigma = np.ones(len(points_px)), np.full(len(points_px), np.inf)
-    for b in np.unique(stretch):
-        own = np.flatnonzero(stretch == b)
-        others = np.flatnonzero(known_stretch != b)[::THINNING]
-        if len(others) < NEIGHBOURS:
-            continue
-        distance, nearest = cKDTree(known_px[others]).query(points_px[own], NEIGHBOURS)
-        near = others[nearest]
-        offset = (known_px[near] - points_px[own][:, None, :]) / REACH_PX
-        inverse = 1.0 / known_depth_mm[near]
-        middle = np.median(inverse, axis=1)
-        design = np.concatenate([np.ones((*near.shape, 1)), offset], axis=2)
-        noise = SURFACE_MM * middle**2
-        slope = SLOPE_MM_PER_PX * REACH_PX * middle**2
-        prior = np.zeros((len(own), 3, 3))
-        prior[:, 1, 1] = prior[:, 2, 2] = (noise / slope) ** 2
-        normal = design.transpose(0, 2, 1) @ design + prior
-        right = np.einsum("nkj,nk->nj", design, inverse - middle[:, None])
-        fitted = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
-        misfit = inverse - middle[:, None] - np.einsum("nkj,nj->nk", design, fitted)
-        spread = np.maximum(np.sqrt((misfit**2).mean(axis=1)), noise)
-        share = np.linalg.inv(normal)[:, 0, 0]
-        depth[own] = 1.0 / (middle + fitted[:, 0])
-        is_near = distance[:, NEIGHBOURS // 2] < REACH_PX
-        error = spread * np.sqrt(1.0 + NEIGHBOURS / 3.0 * share) * depth[own] ** 2
-        sigma[own] = np.where(is_near, error, np.inf)
-    return depth, sigma
+    none = Planes(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0, np.int64))
+    thin = np.arange(0, len(points_px), THINNING)
+    if len(thin) < NEIGHBOURS:
+        return none
+    numbers = np.unique(stretch)
+    middle = np.stack([np.median(points_px[stretch == b], axis=0) for b in numbers])
+    _, nearest = cKDTree(points_px[thin]).query(middle, NEIGHBOURS)
+    near = thin[nearest]
+    place = (points_px[near] - middle[:, None, :]) / SCALE_PX
+    design = np.concatenate([np.ones((*near.shape, 1)), place], axis=2)
+    inverse = 1.0 / depth_mm[near]
+    normal = design.transpose(0, 2, 1) @ design
+    is_spread = np.linalg.cond(normal) < 1e6
+    normal[~is_spread] = np.eye(3)
+    fitted = np.linalg.solve(normal, (design.transpose(0, 2, 1) @ inverse[:, :, None]))[:, :, 0]
+    misfit = inverse - np.einsum("nkj,nj->nk", design, fitted)
+    scatter = np.sqrt((misfit**2).mean(axis=1)) * np.median(depth_mm[near], axis=1) ** 2
+    n_lines = np.array([len(np.unique(row)) for row in stretch[near]])
+    kept = is_spread & (scatter < FLAT_MM) & (n_lines > 1)
+    noise = np.maximum(scatter, NOISE_MM) / np.median(depth_mm[near], axis=1) ** 2
+    covariance = np.linalg.inv(normal) * (noise**2)[:, None, None]
+    return Planes(middle[kept], fitted[kept], covariance[kept], numbers[kept])
 
 
-def has_rival_on_surface(
-    stretch: IntArray,
-    own_depth_mm: FloatArray,
-    expected_mm: FloatArray,
-    sigma_mm: FloatArray,
-    rival_sample: IntArray,
-    rival_sheet: IntArray,
-    rival_depth_mm: FloatArray,
-) -> BoolArray:
-    """(B,) True where a stretch is off its neighbours' surface and another sheet puts it on.
+def depths_off(
+    points_px: FloatArray, depth_mm: FloatArray, planes: Planes
+) -> tuple[FloatArray, FloatArray]:
+    """How far points are off each plane in depth (N, B), mm, and its standard deviation (N, B)."""
+    place = (points_px[:, None, :] - planes.middle_px[None, :, :]) / SCALE_PX
+    design = np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2)
+    expected = np.einsum("nbj,bj->nb", design, planes.inverse)
+    variance = np.einsum("nbj,bjk,nbk->nb", design, planes.covariance, design)
+    square = depth_mm[:, None] ** 2
+    return (expected - 1.0 / depth_mm[:, None]) * square, np.sqrt(variance) * square
+
+
+def surface_distance(
+    points_px: FloatArray,
+    depth_mm: FloatArray,
+    piece: IntArray,
+    sheet: IntArray,
+    planes: Planes,
+    *,
+    shape: tuple[int, int],
+) -> tuple[FloatArray, BoolArray]:
+    """How near each sheet puts each piece of stripe to a plane of others.
 
     Parameters
     ----------
-    stretch
-        (N,) number of each sample's stretch, counted from 0.
-    own_depth_mm, expected_mm, sigma_mm
-        (N,) depth on its own sheet, and that of `expected_depths`.
-    rival_sample, rival_sheet, rival_depth_mm
-        (R,) other sheets on which a sample may lie.
+    points_px, depth_mm, piece, sheet
+        (H,) samples on sheets.
+    planes
+        From `fit_planes`.
+    shape
+        Count of pieces and of sheets.
+
+    Returns
+    -------
+    distance_mm
+        (pieces, sheets) mean distance in depth from the nearest plane that was fitted around
+        another piece; infinite where none is known there.
+    is_on
+        (pieces, sheets) True where that is no more than the plane's own uncertainty.
     """
-    n = int(stretch.max()) + 1 if len(stretch) else 0
-    count = np.maximum(np.bincount(stretch, minlength=n), 1)
-    is_off = np.abs(own_depth_mm - expected_mm) > np.maximum(OFF_SIGMAS * sigma_mm, LEAST_OFF_MM)
-    off_share = np.bincount(stretch, is_off, n) / count
-    if not len(rival_sample):
-        return np.zeros(n, dtype=np.bool_)
-    away = np.abs(rival_depth_mm - expected_mm[rival_sample])
-    is_on = away < ON_SIGMAS * np.where(sigma_mm < MOST_SIGMA_MM, sigma_mm, 0.0)[rival_sample]
-    n_sheets = int(rival_sheet.max()) + 1
-    key = stretch[rival_sample] * n_sheets + rival_sheet
-    on_share = np.bincount(key, is_on, n * n_sheets).reshape(n, n_sheets) / count[:, None]
-    return np.asarray((off_share > MOST) & (on_share.max(axis=1) > MOST))
+    distance = np.full(shape, np.inf)
+    is_on = np.zeros(shape, dtype=np.bool_)
+    if not len(planes.inverse) or not len(piece):
+        return distance, is_on
+    off, sigma = depths_off(points_px, depth_mm, planes)
+    key = piece * shape[1] + sheet
+    size = shape[0] * shape[1]
+    count = np.maximum(np.bincount(key, minlength=size), 1)
+    for b in range(len(planes.inverse)):
+        # a tilted line is off at its ends only: the mean of the sizes, not of the signs
+        mean = np.bincount(key, np.abs(off[:, b]), size) / count
+        spread = np.bincount(key, sigma[:, b], size) / count
+        seen = (np.bincount(key, minlength=size) > 0) & (spread < KNOWN_MM)
+        seen &= np.repeat(np.arange(shape[0]), shape[1]) != planes.stretch[b]
+        mean, spread = mean.reshape(shape), spread.reshape(shape)
+        seen = seen.reshape(shape)
+        distance = np.where(seen, np.minimum(distance, mean), distance)
+        is_on |= seen & (mean <= np.maximum(ON_MM, SIGMAS * spread))
+    return distance, is_on

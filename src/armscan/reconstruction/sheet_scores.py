@@ -47,14 +47,17 @@ class Verdict:
         (S,) True where it is far ahead of any other.
     is_tied
         (S,) True where some sheet explains the sample, but not far enough ahead of another.
-    stretch
+    piece
         (S,) number of the piece, counted from 0.
+    is_candidate
+        (pieces, K) True for sheets that explain a piece nearly as well as the best one.
     """
 
     state: IntArray
     is_sure: BoolArray
     is_tied: BoolArray
-    stretch: IntArray
+    piece: IntArray
+    is_candidate: BoolArray
 
     @property
     def name(self) -> IntArray:
@@ -90,7 +93,7 @@ def decide(
     if n == 0:
         none = np.zeros(0, dtype=np.bool_)
         empty = np.zeros(0, dtype=np.int64)
-        return Verdict(empty, none, none, empty)
+        return Verdict(empty, none, none, empty, np.zeros((0, n_sheets), dtype=np.bool_))
     weighted = scores * (INDEPENDENT_SHARE * samples.weight)[:, None]
     piece = pieces.piece[samples.at]
     is_first = np.concatenate([[True], np.diff(piece) != 0])
@@ -101,12 +104,15 @@ def decide(
     best = total[rows, winner]
     others = total.copy()
     others[rows, winner] = 0.0
+    is_candidate = (total > options.runner_up * best[:, None]) & (total >= LEAST_SCORE)
     is_ahead = others.max(axis=1) <= options.runner_up * best
     is_sure = is_ahead & (best >= LEAST_SCORE) & (matches[rows, winner] >= options.least_matches)
     state, path = winner[number], _path(weighted, is_first)
     is_other = (path < n_sheets) & (path != state)
     is_tied = ~is_sure & (best > 0.0)
-    return Verdict(state, is_sure[number] & ~is_other, is_tied[number] | is_other, number)
+    return Verdict(
+        state, is_sure[number] & ~is_other, is_tied[number] | is_other, number, is_candidate
+    )
 
 
 def _path(weighted: FloatArray, is_first: BoolArray) -> IntArray:

@@ -134,7 +134,9 @@ def measure_stereo(
     fused = np.flatnonzero(is_pair & agrees)
     alone = np.flatnonzero(~is_pair)
     inside = _inside(projected.select(alone), sensor, options)
-    both = _fused(projected, crossings, fused, row, (left, right), sensor, names.offset)
+    both = _fused(
+        projected, crossings, fused, row, (left, right), sensor=sensor, offset=names.offset
+    )
     single = _left_alone(projected, alone[inside], row, left, sensor)
     left_points, is_fused = _in_order(both, single)
     taken = _taken(crossings.row[is_pair], right)
@@ -202,6 +204,7 @@ def _fused(
     fused: IntArray,
     row: IntArray,
     profiles: tuple[Profile, Profile],
+    *,
     sensor: SensorCalibration,
     offset: EpipolarOffset,
 ) -> StripePoints:
@@ -218,8 +221,8 @@ def _fused(
         left.normals_px[row[fused]],
         left.sigma_px[row[fused]],
         right.sigma_px[beside.row],
-        sensor,
-        shift,
+        sensor=sensor,
+        shift_px=shift,
     )
     return StripePoints(row[fused], found.points_mm, found.noise_mm, found.by_sensor, there.sheet)
 

@@ -112,7 +112,8 @@ def project_on_sheets(
         if not len(own):
             continue
         found, met, by_xy, by_parameters = calibrated.sheet.intersect_with_jacobian(xy[own])
-        own, is_met[own] = own[met], met
+        own = own[met]
+        is_met[own] = True
         points[own], point_by_xy[own], by_sheet[own] = found[met], by_xy[met], by_parameters[met]
     by_sensor = np.zeros((n, 3, N_CAMERA + N_SHEET))
     by_sensor[:, :, :N_CAMERA] = point_by_xy @ xy_by_camera
@@ -226,7 +227,8 @@ def find_crossings(
     distance, nearest = right.tree.query(
         projected.q_px[asked], distance_upper_bound=float(np.hypot(reach_px, ALONG_PX))
     )
-    asked, nearest = asked[np.isfinite(distance)], nearest[np.isfinite(distance)]
+    is_near = np.isfinite(distance)
+    asked, nearest = asked[is_near], np.asarray(nearest)[is_near]
     found = right.row[nearest]
     n_right = right.profile.normals_px[found]
     away = projected.q_px[asked] - right.profile.points_px[found]

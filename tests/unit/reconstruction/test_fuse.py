@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A point from left stripe, right stripe and sheet: derivatives, covariance, and who wins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from armscan.geometry.arrays import FloatArray
+from armscan.models.calibration import SensorCalibration
+from armscan.models.two_views import TwoViews
+from armscan.reconstruction.fuse import FusedPoints, fuse_points, misfit_mm
+from armscan.reconstruction.right_sheet import triangulate_right
+from armscan.reconstruction.stereo_residuals import (
+    RightStripes,
+    find_crossings,
+    project_on_sheets,
+)
+from armscan.reconstruction.triangulate import sensor_columns, sensor_covariance
+from sheet_rig import make_profile
+from stereo_head import StereoHead
+
+SHEET = 5
+SIGMA_PX = 0.07
+STEPS = np.array(
+    [1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-3, 1e-6, 1e-6, 1e-2]
+    + [1e-4] * 8
+    + [1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-3, 1e-6, 1e-6, 1e-2]
+    + [1e-6] * 3
+    + [1e-4] * 3
+)
+
+
+@cache
+def head() -> StereoHead:
+    return StereoHead.thesis()
+
+
+def pixels() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Left pixels, their normals, and the right pixels of points on the middle sheet."""
+    left = np.array([[1400.0, 900.0], [1600.0, 1030.0], [1250.0, 1180.0], [1500.0, 1100.0]])
+    normals = np.tile(np.array([0.68, 0.73]) / np.hypot(0.68, 0.73), (len(left), 1))
+    found = project_on_sheets(left, np.full(len(left), SHEET), head().calibration())
+    assert found.is_met.all()
+    return left, normals, found.q_px
+
+
+def fused(
+    sensor: SensorCalibration,
+    left_px: FloatArray,
+    right_px: FloatArray,
+    *,
+    right_sigma_px: float = SIGMA_PX,
+) -> FusedPoints:
+    _, normals, _ = pixels()
+    right_normals = np.tile([np.sqrt(0.5), np.sqrt(0.5)], (len(left_px), 1))
+    right = RightStripes.of(make_profile("right", [(right_px, right_normals)], right_sigma_px))
+    there = project_on_sheets(left_px, np.full(len(left_px), SHEET), sensor)
+    n = len(left_px)
+    beside = find_crossings(there, normals, np.full(n, SIGMA_PX), right, 30.0)
+    assert (beside.row == np.arange(n)).all()
+    return fuse_points(
+        there,
+        beside,
+        normals,
+        np.full(n, SIGMA_PX),
+        np.full(n, right_sigma_px),
+        sensor=sensor,
+        shift_px=np.zeros(n),
+    )
+
+
+def parameter_error(column: int, size: float) -> FloatArray:
+    error = np.zeros(len(head().covariance))
+    error[sensor_columns(head().calibration(), SHEET)[column]] = size
+    return error
+
+
+@pytest.mark.parametrize("column", range(32))
+def test_derivative_by_each_parameter_equals_differences(column: int) -> None:
+    left, _, right = pixels()
+    here = fused(head().calibration(), left, right)
+    step = STEPS[column]
+    up = fused(head().calibration(parameter_error(column, step)), left, right).points_mm
+    down = fused(head().calibration(parameter_error(column, -step)), left, right).points_mm
+    expected = (up - down) / (2.0 * step)
+    size = np.abs(expected).max() + 1e-6 / step
+    assert np.abs(here.by_sensor[:, :, column] - expected).max() < 2e-3 * size
+
+
+def test_noises_are_the_moves_by_one_sigma_of_each_stripe() -> None:
+    sensor = head().calibration()
+    left, normals, right = pixels()
+    here = fused(sensor, left, right)
+    by_left = fused(sensor, left + SIGMA_PX * normals, right).points_mm - here.points_mm
+    across = SIGMA_PX * np.sqrt(0.5)
+    by_right = fused(sensor, left, right + across).points_mm - here.points_mm
+    by_sheet = here.by_sensor[:, :, 11] * misfit_mm(sensor, SHEET)
+    for column, moved in enumerate((by_left, by_right, by_sheet)):
+        size = np.abs(moved).max()
+        same = np.abs(here.noise_mm[:, :, column] - moved).max()
+        turned = np.abs(here.noise_mm[:, :, column] + moved).max()
+        # the sheet's own shape has no sign
+        assert (min(same, turned) if column == 2 else same) < 0.01 * size
+
+
+def predicted(found: FusedPoints, sensor: SensorCalibration) -> FloatArray:
+    noise = found.noise_mm @ found.noise_mm.transpose(0, 2, 1)
+    joint = sensor_covariance(sensor, SHEET)
+    return np.asarray(noise + found.by_sensor @ joint @ found.by_sensor.transpose(0, 2, 1))
+
+
+def test_covariance_holds_and_the_fused_point_beats_each_camera_alone() -> None:
+    true_sensor = head().calibration()
+    left, normals, right = pixels()
+    truth = fused(true_sensor, left, right).points_mm
+    rng = np.random.default_rng(5)
+    n, n_draws = len(left), 250
+    blind, scores = [], []
+    errors = {"fused": [], "left": [], "right": []}
+    right_normals = np.tile([np.sqrt(0.5), np.sqrt(0.5)], (n, 1))
+    for _ in range(n_draws):
+        sensor = head().drawn_calibration(rng)
+        q_left = left + SIGMA_PX * rng.standard_normal((n, 1)) * normals
+        q_right = right + SIGMA_PX * rng.standard_normal((n, 1)) * right_normals
+        found = fused(sensor, q_left, q_right)
+        covariance = predicted(found, sensor)
+        error = found.points_mm - truth
+        scores.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error))
+        there = project_on_sheets(q_left, np.full(n, SHEET), sensor)
+        other = triangulate_right(
+            make_profile("right", [(q_right, right_normals)], SIGMA_PX),
+            np.arange(n),
+            np.full(n, SHEET),
+            sensor,
+        )
+        errors["fused"].append(error[:, 2])
+        errors["left"].append(there.points_mm[:, 2] - truth[:, 2])
+        errors["right"].append(other.points_mm[:, 2] - truth[:, 2])
+        blind.append(covariance[:, 2, 2])
+    mean = np.mean(scores, axis=0)
+    # the mean of 250 chi-squares of three degrees of freedom
+    assert np.abs(mean - 3.0).max() < 4.0 * np.sqrt(6.0 / n_draws)
+    rms = {name: np.sqrt(np.mean(np.square(e), axis=0)) for name, e in errors.items()}
+    assert (rms["fused"] < rms["left"]).all()
+    assert (rms["fused"] < rms["right"]).all()
+    ratio = rms["fused"] / np.sqrt(np.mean(blind, axis=0))
+    assert np.abs(ratio - 1.0).max() < 4.0 / np.sqrt(2.0 * n_draws)
+
+
+def with_rms(sensor: SensorCalibration, rms_mm: float) -> SensorCalibration:
+    sheets = tuple(replace(sheet, rms_mm=rms_mm) for sheet in sensor.sheets)
+    return replace(sensor, sheets=sheets)
+
+
+def test_a_sheet_of_no_weight_leaves_the_two_cameras_alone() -> None:
+    left, _, right = pixels()
+    truth = fused(head().calibration(), left, right).points_mm
+    moved = head().calibration(parameter_error(11, 0.02))
+    by_cameras = fused(with_rms(moved, 1e4), left, right).points_mm
+    by_sheet = project_on_sheets(left, np.full(len(left), SHEET), moved).points_mm
+    assert np.abs(by_sheet - truth).max() > 0.02
+    assert np.abs(by_cameras - truth).max() < 2e-5
+
+
+def test_a_right_stripe_of_no_weight_leaves_the_left_camera_on_its_sheet() -> None:
+    left, _, right = pixels()
+    sensor = head().calibration()
+    found = fused(sensor, left, right + 0.3, right_sigma_px=1e5).points_mm
+    alone = project_on_sheets(left, np.full(len(left), SHEET), sensor).points_mm
+    assert np.abs(found - alone).max() < 1e-6
+
+
+def test_the_left_pixel_along_the_stripe_is_kept() -> None:
+    left, normals, right = pixels()
+    sensor = head().calibration()
+    found = fused(sensor, left, right + np.array([0.2, -0.1])).points_mm
+    moved = sensor.camera.camera.project(found) - left
+    along = moved[:, 0] * -normals[:, 1] + moved[:, 1] * normals[:, 0]
+    assert np.abs(along).max() < 1e-3
+    assert np.abs(moved).max() > 1e-3
+
+
+@pytest.mark.parametrize("column", range(9, 32))
+def test_right_alone_derivatives_equal_differences(column: int) -> None:
+    _, _, right = pixels()
+    normals = np.tile([np.sqrt(0.5), np.sqrt(0.5)], (len(right), 1))
+    profile = make_profile("right", [(right, normals)], SIGMA_PX)
+    rows, sheet = np.arange(len(right)), np.full(len(right), SHEET)
+    step = STEPS[column]
+
+    def at(size: float) -> FloatArray:
+        sensor = head().calibration(parameter_error(column, size))
+        return triangulate_right(profile, rows, sheet, sensor).points_mm
+
+    here = triangulate_right(profile, rows, sheet, head().calibration())
+    expected = (at(step) - at(-step)) / (2.0 * step)
+    size = np.abs(expected).max() + 1e-6 / step
+    assert np.abs(here.by_sensor[:, :, column] - expected).max() < 2e-3 * size
+
+
+def test_right_alone_meets_the_point_that_it_is_the_picture_of() -> None:
+    left, _, right = pixels()
+    sensor = head().calibration()
+    normals = np.tile([np.sqrt(0.5), np.sqrt(0.5)], (len(right), 1))
+    profile = make_profile("right", [(right, normals)], SIGMA_PX)
+    found = triangulate_right(profile, np.arange(len(right)), np.full(len(right), SHEET), sensor)
+    back = TwoViews.of_sensor(sensor).left.project(found.points_mm)
+    assert np.abs(back - left).max() < 1e-4

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where stripes are cut, which points stand for them, and the most likely sheets along them."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from armscan.geometry.arrays import FloatArray
+from armscan.kernels.stripe_names import best_states
+from armscan.reconstruction.unbroken import cut_stripes, take_samples
+from armscan.records.profile import Profile
+from sheet_rig import make_profile
+
+
+def line(points: FloatArray) -> Profile:
+    tangent = np.gradient(points, axis=0)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
+    return make_profile("line", [(points, normal / np.linalg.norm(normal, axis=1)[:, None])], 0.07)
+
+
+def course(bend: FloatArray) -> FloatArray:
+    x = np.arange(len(bend), dtype=np.float64)
+    noise = np.random.default_rng(1).normal(0.0, 0.07, len(bend))
+    return np.stack([x, bend + noise], axis=1)
+
+
+def test_a_straight_and_a_round_line_stay_whole() -> None:
+    x = np.arange(200.0)
+    for bend in (0.3 * x, 120.0 - np.sqrt(130.0**2 - (x - 100.0) ** 2)):
+        assert cut_stripes(line(course(bend))).piece.max() == 0
+
+
+@pytest.mark.parametrize("jump", [1.2, -2.0])
+def test_a_step_cuts_where_it_is(jump: float) -> None:
+    pieces = cut_stripes(line(course(np.where(np.arange(200.0) < 90, 0.0, jump))))
+    assert pieces.piece.max() == 1
+    assert abs(int((pieces.piece == 0).sum()) - 90) <= 2
+
+
+def test_a_kink_cuts_where_it_is() -> None:
+    x = np.arange(200.0)
+    pieces = cut_stripes(line(course(np.where(x < 90, 0.0, 0.6 * (x - 90)))))
+    assert pieces.piece.max() == 1
+    assert abs(int((pieces.piece == 0).sum()) - 90) <= 2
+
+
+def test_a_gap_cuts() -> None:
+    whole = line(course(np.zeros(100)))
+    pieces = cut_stripes(whole.select(np.abs(np.arange(100) - 50) > 5))
+    assert pieces.piece.max() == 1
+
+
+def test_samples_stand_for_every_point_of_their_own_piece() -> None:
+    whole = line(course(np.zeros(100)))
+    pieces = cut_stripes(whole.select(np.abs(np.arange(100) - 92) > 3))
+    samples = take_samples(pieces, 6)
+    assert (pieces.piece[samples.at[samples.nearest]] == pieces.piece).all()
+    assert samples.weight.sum() == pytest.approx(len(pieces.row) / 6)
+    assert (pieces.piece[samples.at] == 1).sum() >= 4
+
+
+def test_best_states_equal_those_of_a_search_over_all_sequences() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        scores = rng.normal(0.0, 2.0, (6, 3))
+        cost = np.array([0.0, *rng.choice([0.0, 1.0, 5.0], 5)])
+        found = np.zeros(6, dtype=np.int64)
+        best_states(scores, cost, found)
+
+        def value(states: tuple[int, ...], scores=scores, cost=cost) -> float:
+            changes = np.flatnonzero(np.diff(states)) + 1
+            return float(scores[np.arange(6), states].sum() - cost[changes].sum())
+
+        best = max(value(states) for states in product(range(3), repeat=6))
+        assert value(tuple(found.tolist())) == pytest.approx(best)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo of a single-line scanner once more by hand, command by command."""
+"""The demo of a head once more by hand, command by command."""
 
 from __future__ import annotations
 
@@ -13,13 +13,9 @@ from armscan.report.summary import Table
 def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
     """Each step on the demo's recordings; results go to the current folder."""
     normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
-    target, truth = twin.target, twin.truth
-    laser = recordings / "laser" / "images"
+    truth, still = twin.truth, demo.still_step.nominal_height_mm
     lines = [
-        f"armscan calibrate camera {recordings / 'camera' / 'images'} --target {target} "
-        "-o camera.json",
-        f"armscan calibrate laser --camera camera.json --on {laser / 'on'} --off {laser / 'off'} "
-        f"--target {target} -o sensor.json",
+        *_calibrated(recordings, twin, demo),
         f"armscan probe {recordings / 'probing'} -o plate.csv",
         f"armscan calibrate hand-eye {recordings / 'hand-eye'} --sensor sensor.json "
         "--plate plate.csv -o scanner.json",
@@ -33,11 +29,35 @@ def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
         lines += found if k == 0 else found[1:]
     lines += [
         f"armscan reconstruct {recordings / 'still-step'} --sensor sensor.json -o still.ply",
-        f"armscan inspect step still.ply --height 20 --normal={normal}",
+        f"armscan inspect step still.ply --height {still:g} --normal={normal}",
         f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
     ]
     columns = ("The same, command by command",)
     return Table(columns, tuple((line,) for line in lines), "", (0,))
+
+
+def _calibrated(recordings: Path, twin: Twin, demo: HeadDemo) -> list[str]:
+    """Cameras and sheets: of one camera and one laser from images, else from the recordings."""
+    target, laser = twin.target, recordings / "laser"
+    if demo.instrument.sensor.second is not None:
+        return [
+            f"armscan calibrate stereo --scan {recordings / 'camera'} --target {target} "
+            "-o stereo.json",
+            f"armscan calibrate laser --camera stereo.json --scan {laser} --target {target} "
+            "-o sensor.json",
+        ]
+    camera = (
+        f"armscan calibrate camera {recordings / 'camera' / 'images'} --target {target} "
+        "-o camera.json"
+    )
+    if len(demo.instrument.sensor.sheets) > 1:
+        images = f"--scan {laser}"
+    else:
+        images = f"--on {laser / 'images' / 'on'} --off {laser / 'images' / 'off'}"
+    return [
+        camera,
+        f"armscan calibrate laser --camera camera.json {images} --target {target} -o sensor.json",
+    ]
 
 
 def _measured(recordings: Path, scene: str, inspection: str) -> list[str]:

@@ -15,12 +15,11 @@ from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.simulation.light import LineLaser
 from armscan.simulation.optics import RenderCamera
-from armscan.simulation.printed_heads import PrintedSheet
+from armscan.simulation.printed_heads import BLUE_MM, PrintedSheet
 
 _THICKNESS_MM = 0.075
 _BLUE_DIVERGENCE_RAD = 4.3e-4
 """Far field of a 405 nm beam of that waist."""
-_BLUE_MM = 405e-6
 _ORDER_SHARE = 0.25
 """Lines of one projector sit firmly on each other: this part of the tolerance is each one's own."""
 
@@ -133,7 +132,7 @@ def _draw_laser(
         skew_rad=skew,
         waist_mm=_THICKNESS_MM,
         waist_distance_mm=float(np.linalg.norm(aim - source)),
-        divergence_rad=_BLUE_DIVERGENCE_RAD * (printed.wavelength_mm / _BLUE_MM),
+        divergence_rad=_BLUE_DIVERGENCE_RAD * (printed.wavelength_mm / BLUE_MM),
         irradiance=printed.brightness * level,
         colour=(1.0, 1.0, 1.0),
         source=printed.source,

@@ -6,7 +6,7 @@ Lengths in mm, in the Sensor frame: that of the only or left camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -196,7 +196,8 @@ def printed_heads() -> dict[str, PrintedHead]:
     right: Pose[CameraRight, Sensor] = Pose(nearest_rotation(_R_LR), _T_LR_MM)
     multi = _multi_sheets()
     middle = tuple(
-        _renamed(sheet, f"A.{k + 1}") for k, sheet in enumerate(multi[_OUTER_SHEETS:-_OUTER_SHEETS])
+        replace(sheet, name=f"A.{k + 1}")
+        for k, sheet in enumerate(multi[_OUTER_SHEETS:-_OUTER_SHEETS])
     )
     on_multi = _hand_eye(_TOOL_FROM_MULTI)
     return {
@@ -297,19 +298,4 @@ def _multi_sheet(order: int, plane: FloatArray, axis: FloatArray) -> PrintedShee
         cubic_rad=_CUBIC_BOW_MM / (distance * fan_rad**3),
         brightness=1.0 - _LOST_AT_OUTERMOST * outward**2,
         wavelength_mm=RED_MM,
-    )
-
-
-def _renamed(sheet: PrintedSheet, name: str) -> PrintedSheet:
-    return PrintedSheet(
-        name,
-        sheet.source,
-        sheet.plane,
-        sheet.source_mm,
-        sheet.aim_mm,
-        sheet.half_angle_rad,
-        sheet.skew_rad,
-        sheet.cubic_rad,
-        sheet.brightness,
-        sheet.wavelength_mm,
     )

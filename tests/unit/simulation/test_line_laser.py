@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from armscan.simulation.light import LineLaser
 SKEW_RAD = 0.02
 
 
-def laser(**changes: float) -> LineLaser:
+def laser(**changes: Any) -> LineLaser:
     return LineLaser(
         "A", np.zeros(3), np.array([0.0, 0.0, 2.0]), np.array([0.0, 3.0, 1.0]), **changes
     )
@@ -40,6 +42,18 @@ def test_offset_vanishes_on_the_sheet_and_counts_millimetres_off_it() -> None:
         points = 250.0 * rays + shift_mm * off_sheet
         # the arc and the tangent differ in the third order: 250 (shift / 250)^3 / 3
         np.testing.assert_allclose(source.offset_mm(points), shift_mm, atol=1e-5)
+
+
+def test_a_cubic_bend_raises_one_end_of_the_line_and_lowers_the_other() -> None:
+    bent = laser(cubic_rad=0.3)
+    angle = np.linspace(-0.3, 0.3, 7)
+    points = 200.0 * bent.rays(angle)
+    np.testing.assert_allclose(points @ bent.normal, 200.0 * np.sin(0.3 * angle**3), atol=1e-10)
+    np.testing.assert_allclose(bent.offset_mm(points), 0.0, atol=1e-10)
+    reach, peak = bent.reach_and_peak(points, -bent.rays(angle))
+    np.testing.assert_allclose(reach, 0.0, atol=1e-9)
+    assert peak.min() > 0.0
+    assert (laser().source, laser(source="red").source) == ("A", "red")
 
 
 def test_without_skew_the_sheet_is_a_plane_through_the_source() -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,7 +33,7 @@ def camera(blur_px: float = 0.8, **distortion: float) -> RenderCamera:
     )
 
 
-def side_laser(skew_rad: float = 0.0, waist_mm: float = 0.8, **changes: float) -> LineLaser:
+def side_laser(skew_rad: float = 0.0, waist_mm: float = 0.8, **changes: Any) -> LineLaser:
     return LineLaser(
         "A",
         np.array([-120.0, 0.0, 10.0]),

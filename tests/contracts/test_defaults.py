@@ -18,8 +18,10 @@ from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.laser.options import SheetOptions
 from armscan.cli.app import command
 from armscan.inspection.options import InspectionOptions, StepOptions
+from armscan.markers.match_result import MatchOptions
 from armscan.markers.matching_options import MatchingOptions
 from armscan.pipeline.measure_options import MeasureOptions
+from armscan.pipeline.register import RegisterOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
@@ -58,6 +60,11 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         "preset": SimulateOptions().preset,
         "seed": SimulateOptions().seed,
         "processes": SimulateOptions().processes,
+    },
+    ("register",): {
+        "sigma_mm": RegisterOptions().sigma_mm,
+        "least_common": MatchOptions().least_common,
+        "by_id": RegisterOptions().is_by_id,
     },
     ("probe",): {
         "side": ProbingOptions().side,

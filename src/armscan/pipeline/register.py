@@ -20,7 +20,7 @@ from armscan.markers.match_3d import match_markers
 from armscan.markers.match_result import Matched, MatchOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import MarkerList
+from armscan.storage.marker_files import ASSUMED_SIGMA_MM, MarkerList
 
 MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
@@ -44,7 +44,7 @@ class RegisterOptions:
     """
 
     match: MatchOptions = field(default_factory=MatchOptions)
-    sigma_mm: float = 0.02
+    sigma_mm: float = ASSUMED_SIGMA_MM
     is_by_id: bool = False
 
     def __post_init__(self) -> None:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -28,6 +29,7 @@ from armscan.storage.registration_files import (
     MovedBody,
     NotJoinedBody,
     ResidualBody,
+    TransformBody,
     transform_body,
 )
 
@@ -52,64 +54,30 @@ def views_report(
 ) -> RegisterReport:
     """Describe the registration; ``carried`` are the clouds in the common frame."""
     views = [item.markers for item in lists]
-    sigma, shift, rms = joined.sigma_mm(views), joined.shift_mm(views), _rms_mm(joined)
     placed = [names[view] for view in joined.placed]
-    n_shared = _n_shared(joined)
-    used = joined.map.residual_mm[joined.map.is_used & _is_shared(joined)]
-    all_rms = float(np.sqrt((used**2).sum(axis=1).mean()))
-    n_map = len(joined.map.markers_mm)
-    last = int(np.argmax(sigma))
-    by_name = {item.name.removesuffix(".ply"): item.name for item in carried}
+    sigma, shift = joined.sigma_mm(views), joined.shift_mm(views)
+    shared = _is_shared(joined)
+    figures = _figures(names, joined, sigma=sigma, shift=shift)
     return RegisterReport(
         title="Views joined by markers",
         subtitle=f"{len(placed)} of {len(views)} views in the frame of {lists[0].path.name}",
         common_frame=frame,
         common_frame_of=lists[0].path.as_posix(),
-        cards=(
-            Card("Views joined", f"{len(placed)} of {len(views)}", f"{joined.n_links} pairs match"),
-            Card("Markers", str(n_map), f"{int(_n_sightings(joined).max())} views at most see one"),
-            Card("Residuals", significant(all_rms, "mm"), "root mean square, three axes together"),
-            Card(
-                "Drift",
-                significant(float(sigma[last]), "mm"),
-                f"uncertainty of {placed[last]} against the first view",
-            ),
-        ),
-        facts=(
-            ("views", f"{len(placed)} of {len(views)} joined, {joined.n_links} pairs match"),
-            ("markers", f"{n_map}, seen {len(joined.sightings)} times"),
-            ("residuals", f"{significant(all_rms, 'mm')} rms, three axes together"),
-            (
-                "drift",
-                f"{significant(float(sigma[last]), 'mm')} uncertainty of {placed[last]} against "
-                f"the first view; {_shift_text(float(shift.max()))}",
-            ),
-        ),
+        cards=_cards(joined, figures),
+        facts=_facts(joined, figures),
         scans=_view_table(placed, joined, sigma=sigma, shift=shift),
         residuals_table=_residual_table(lists, placed, joined),
         pictures=(
             marker_view(_scene(placed, joined, carried, frame)),
-            drift_chart(placed, sigma, rms),
+            drift_chart(placed, sigma, _rms_mm(joined)),
             residual_chart(
-                np.linalg.norm(joined.map.residual_mm, axis=1)[_is_shared(joined)],
-                _expected(joined)[_is_shared(joined)],
-                joined.map.is_used[_is_shared(joined)],
+                np.linalg.norm(joined.map.residual_mm, axis=1)[shared],
+                _expected(joined)[shared],
+                joined.map.is_used[shared],
             ),
         ),
         warnings=_warnings(lists, names, joined),
-        transforms=tuple(
-            transform_body(
-                name,
-                lists[view].path,
-                views[view].frame,
-                joined.map.part_from_view[k],
-                joined.map.pose_covariance[k],
-                n_markers=int(n_shared[k]),
-                rms_mm=float(rms[k]),
-                cloud=by_name.get(name),
-            )
-            for k, (view, name) in enumerate(zip(joined.placed, placed, strict=True))
-        ),
+        transforms=_transforms(lists, placed, joined, carried),
         residuals=_residual_bodies(lists, placed, joined),
         moved=_moved(lists, joined),
         not_joined=tuple(
@@ -117,19 +85,90 @@ def views_report(
         ),
         chi2=joined.map.chi2,
         degrees_of_freedom=joined.map.degrees_of_freedom,
-        data={
-            "n_views": len(views),
-            "n_joined": len(placed),
-            "not_joined": [names[item.view] for item in joined.left],
-            "n_markers": n_map,
-            "n_sightings": len(joined.sightings),
-            "n_left_out": int((~joined.map.is_used).sum()),
-            "n_contradictions": joined.n_contradictions,
-            "rms_mm": all_rms,
-            "drift_sigma_mm": float(sigma[last]),
-            "drift_of": placed[last],
-            "largest_shift_mm": float(shift.max()),
-        },
+        data=figures,
+    )
+
+
+def _figures(
+    names: Sequence[str], joined: JoinedViews, *, sigma: FloatArray, shift: FloatArray
+) -> dict[str, Any]:
+    used = joined.map.residual_mm[joined.map.is_used & _is_shared(joined)]
+    last = int(np.argmax(sigma))
+    return {
+        "n_views": len(names),
+        "n_joined": len(joined.placed),
+        "not_joined": [names[item.view] for item in joined.left],
+        "n_links": joined.n_links,
+        "n_markers": len(joined.map.markers_mm),
+        "n_sightings": len(joined.sightings),
+        "n_left_out": int((~joined.map.is_used).sum()),
+        "n_contradictions": joined.n_contradictions,
+        "rms_mm": float(np.sqrt((used**2).sum(axis=1).mean())),
+        "drift_sigma_mm": float(sigma[last]),
+        "drift_of": names[joined.placed[last]],
+        "largest_shift_mm": float(shift.max()),
+    }
+
+
+def _cards(joined: JoinedViews, figures: Mapping[str, Any]) -> tuple[Card, ...]:
+    most = int(_n_sightings(joined).max())
+    return (
+        Card(
+            "Views joined",
+            f"{figures['n_joined']} of {figures['n_views']}",
+            f"{joined.n_links} pairs match",
+        ),
+        Card("Markers", str(figures["n_markers"]), f"{most} views at most see one"),
+        Card(
+            "Residuals",
+            significant(figures["rms_mm"], "mm"),
+            "root mean square, three axes together",
+        ),
+        Card(
+            "Drift",
+            significant(figures["drift_sigma_mm"], "mm"),
+            f"uncertainty of {figures['drift_of']} against the first view",
+        ),
+    )
+
+
+def _facts(joined: JoinedViews, figures: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    return (
+        (
+            "views",
+            f"{figures['n_joined']} of {figures['n_views']} joined, {joined.n_links} pairs match",
+        ),
+        ("markers", f"{figures['n_markers']}, seen {len(joined.sightings)} times"),
+        ("residuals", f"{significant(figures['rms_mm'], 'mm')} rms, three axes together"),
+        (
+            "drift",
+            f"{significant(figures['drift_sigma_mm'], 'mm')} uncertainty of "
+            f"{figures['drift_of']} against the first view; "
+            f"{_shift_text(figures['largest_shift_mm'])}",
+        ),
+    )
+
+
+def _transforms(
+    lists: Sequence[MarkerList],
+    placed: Sequence[str],
+    joined: JoinedViews,
+    carried: Sequence[NamedCloud],
+) -> tuple[TransformBody, ...]:
+    clouds = {item.name.removesuffix(".ply"): item.name for item in carried}
+    n_shared, rms = _n_shared(joined), _rms_mm(joined)
+    return tuple(
+        transform_body(
+            name,
+            lists[view].path,
+            lists[view].markers.frame,
+            joined.map.part_from_view[k],
+            joined.map.pose_covariance[k],
+            n_markers=int(n_shared[k]),
+            rms_mm=float(rms[k]),
+            cloud=clouds.get(name),
+        )
+        for k, (view, name) in enumerate(zip(joined.placed, placed, strict=True))
     )
 
 

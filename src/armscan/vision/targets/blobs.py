@@ -53,9 +53,7 @@ class Blobs:
         return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
 
 
-def find_blobs(
-    grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA
-) -> Blobs:
+def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA) -> Blobs:
     """Return every contour that is an ellipse within the range of sizes, once.
 
     A blob found at several threshold scales is kept where its contour is roundest.

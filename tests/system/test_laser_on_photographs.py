@@ -2,13 +2,14 @@
 """Both light sheets of a desktop scanner from real photographs, and the stripe on a bust."""
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from armscan.calibration.laser.result import LaserFit, PointUse
-from armscan.errors import EstimationError
+from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.laser import calibrate_sheets_from_exposures
@@ -16,6 +17,8 @@ from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.result import PointFate
+from armscan.report.laser_job import LaserRequest, run_laser_calibration
+from armscan.storage.calibration_files import camera_document, read_sensor_calibration
 from armscan.storage.images import read_exposure
 from armscan.vision.targets.definition import Chessboard
 
@@ -79,6 +82,39 @@ def test_both_sheets_fit_their_two_boards(laser: LaserFit) -> None:
     for image in laser.images:
         assert image.pose_shift_sigma < 4.0
         assert image.count(PointUse.OFF_LINE) < 0.1 * len(image.profile)
+
+
+def test_a_recording_gives_the_same_sheets(laser: LaserFit, tmp_path: Path) -> None:
+    """The same photographs as a folder recording: lasers and views say what belongs together."""
+    scan = tmp_path / "scan"
+    (scan / "images").mkdir(parents=True)
+    rows = ["index,t_ns,camera,file,lasers,view"]
+    for k, name in enumerate(PLACEMENTS):
+        for j, kind in enumerate(("laser", "laser-background")):
+            photo = f"images/{kind}-{name}.png"
+            shutil.copy(DATA / "laser_pattern" / Path(photo).name, scan / photo)
+            lit = "A+B" if kind == "laser" else ""
+            rows.append(f"{2 * k + j},{1000 * (2 * k + j)},0,{photo},{lit},{k}")
+    (scan / "exposures.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    session = 'kind = "calibration"\n[[camera]]\nwidth_px = 960\nheight_px = 1280\ncolour = "rgb"\n'
+    (scan / "session.toml").write_text(session, encoding="utf-8")
+    camera = tmp_path / "camera.json"
+    camera.write_bytes(camera_document(laser.camera))
+    output = tmp_path / "sensor.json"
+    summary = run_laser_calibration(
+        LaserRequest(camera, (), (), "chessboard:11x6:13", output, scan=scan)
+    )
+    found = read_sensor_calibration(output)
+    assert [sheet.name for sheet in found.sheets] == ["A", "B"]
+    for ours, theirs in zip(found.sheets, laser.sheets, strict=True):
+        np.testing.assert_allclose(ours.sheet.plane, theirs.sheet.plane, atol=1e-9)
+    assert len(found.provenance.inputs) == 4 + 2 + 1
+    assert summary.data["cameras"] == 1
+    with pytest.raises(OptionError, match="a recording and images"):
+        run_laser_calibration(
+            LaserRequest(camera, ("x.png",), (), "chessboard:11x6:13", output, scan=scan,
+                         is_overwriting=True)
+        )  # fmt: skip
 
 
 def test_the_sheets_lie_as_the_scanner_is_built(laser: LaserFit) -> None:

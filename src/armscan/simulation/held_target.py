@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.poses import Points, Pose
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.poses import Pose
 from armscan.simulation.flat_pattern import CirclePattern
 from armscan.simulation.head import MountedCamera
 from armscan.simulation.station import Target
@@ -29,21 +29,33 @@ def made_target(sigma_mm: float, rng: np.random.Generator) -> CirclePattern:
 
 def with_middle(pattern: CirclePattern, rotation: FloatArray, middle_mm: FloatArray) -> Target:
     """Target, turned by (3, 3), whose middle is at a point (3,)."""
+    return Target(pattern, Pose(rotation, first_marks_mm(rotation, middle_mm)))
+
+
+def first_marks_mm(rotation: FloatArray, middles_mm: FloatArray) -> FloatArray:
+    """(..., 3) places of the first mark for middles (..., 3) of the target."""
     middle = np.append(PATTERN.marks_board_mm.mean(axis=0)[:2], 0.0)
-    return Target(pattern, Pose(rotation, middle_mm - rotation @ middle))
+    return np.asarray(middles_mm - rotation @ middle)
 
 
 def is_in_view(target: Target, cameras: Sequence[MountedCamera]) -> bool:
     """True if each of some cameras sees all marks; the blank rim may leave the image."""
-    corners = target.base_from_board @ Points(_corners_mm())
+    pose = target.base_from_board
+    return bool(are_in_view(pose.rotation, pose.translation_mm[None, :], cameras)[0])
+
+
+def are_in_view(
+    rotation: FloatArray, origins_mm: FloatArray, cameras: Sequence[MountedCamera]
+) -> BoolArray:
+    """(N,) the same for targets of one rotation whose first marks are at (N, 3), in Sensor."""
+    corners = _corners_mm() @ rotation.T + origins_mm[:, None, :]
+    result = np.ones(len(origins_mm), dtype=np.bool_)
     for mounted in cameras:
-        camera = mounted.camera
-        seen = mounted.camera_from_sensor @ Points(corners.xyz_mm)
-        rim = camera.project(seen.xyz_mm)
+        camera, place = mounted.camera, mounted.camera_from_sensor
+        rim = camera.project(corners @ place.rotation.T + place.translation_mm)
         size = np.array([camera.width_px, camera.height_px])
-        if not bool(((rim > _RIM_PX) & (rim < size - _RIM_PX)).all()):
-            return False
-    return True
+        result &= ((rim > _RIM_PX) & (rim < size - _RIM_PX)).all(axis=(1, 2))
+    return result
 
 
 def _corners_mm() -> FloatArray:

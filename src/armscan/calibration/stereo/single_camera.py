@@ -22,6 +22,11 @@ from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.vision.targets.view import TargetView
 
+WRONG_LEVEL = 100.0
+"""Given intrinsics ten standard deviations from what the images say are of another camera, if those
+given for the other camera lie within three..."""
+RIGHT_LEVEL = 9.0
+
 STRANGE_RATIO = 2.0
 """Given intrinsics under which the images fit twice as badly as with a camera of their own belong
 to another camera, or to another focus."""
@@ -47,6 +52,9 @@ class SingleCamera:
         The camera by itself; None if its views do not determine one and it was given.
     reason
         Why these parameters are free.
+    given_level
+        Squared distance of given intrinsics from what the images say by themselves, over both
+        covariances and the degrees of freedom; NaN where there is none.
     """
 
     camera: CameraModel
@@ -56,6 +64,7 @@ class SingleCamera:
     left_out: Mapping[str, str]
     fit: CameraFit | None
     reason: str
+    given_level: float = float("nan")
 
     def kept(self, view: TargetView | None) -> TargetView | None:
         """The view if it can be used."""
@@ -93,7 +102,8 @@ def prepare_cameras(
             continue
         _check_size(views[side], given[side].camera, word)
         own = None if isinstance(fit, FitFailure) else fit
-        if own is not None and (strange := _strange(views[side], own, given, side)):
+        strange = None if own is None else _strange(views[side], own, given, side)
+        if strange is not None:
             return strange
         prepared.append(_given(views[side], given[side], own, options))
     return prepared[0], prepared[1]
@@ -147,6 +157,7 @@ def _given(
         left_out,
         fit,
         f"the given calibration is {word}",
+        float("nan") if fit is None else _level(fit, given),
     )
 
 
@@ -169,10 +180,16 @@ def _strange(
     side: int,
 ) -> FitFailure | None:
     """Why the given camera cannot be the one that took the images."""
+    word, other = SIDES[side], SIDES[1 - side]
+    if _level(own, given[side]) > WRONG_LEVEL and _level(own, given[1 - side]) < RIGHT_LEVEL:
+        return FitFailure(
+            f"the {word} images fit the calibration given for the {other} camera, and not that "
+            f"given for the {word} one: left and right are swapped",
+            "swap the lists of images, or the two calibrations",
+        )
     with_given, with_other = (_rms_px(views, given[k].camera) for k in (side, 1 - side))
     if with_given < STRANGE_RATIO * own.rms_px:
         return None
-    word, other = SIDES[side], SIDES[1 - side]
     reason = (
         f"the {word} images do not fit the calibration given for the {word} camera: rms "
         f"{with_given:.2f} px, and {own.rms_px:.2f} px with a camera of their own"
@@ -183,6 +200,19 @@ def _strange(
             "swap the lists of images, or the two calibrations",
         )
     return FitFailure(reason, "calibrate the cameras as they are focused now, or give none")
+
+
+def _level(own: CameraFit, given: CameraCalibration) -> float:
+    """Squared distance of given intrinsics from the camera's own, per degree of freedom."""
+    a, b = own.camera, given.camera
+    if (a.width_px, a.height_px) != (b.width_px, b.height_px):
+        return float("inf")
+    free = np.flatnonzero(own.sigma > 0.0)
+    apart = (a.parameters - b.parameters)[free]
+    covariance = (own.covariance + given.covariance)[np.ix_(free, free)]
+    sigma = np.sqrt(np.diag(covariance))
+    white = np.linalg.solve(covariance / np.outer(sigma, sigma), apart / sigma)
+    return float(white @ (apart / sigma)) / len(free)
 
 
 def _rms_px(views: Sequence[TargetView], camera: CameraModel) -> float:

@@ -11,12 +11,21 @@ import typer
 
 from armscan.cli.image_arguments import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption
 from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.reconstruct_arguments import (
+    Background,
+    DepthMargin,
+    Right,
+    RightBackground,
+    Sheet,
+    Volume,
+)
 
 EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
     "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
-    "      --sheet A -o cloud.ply"
+    "      --sheet A -o cloud.ply\n"
+    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply"
 )
 
 
@@ -39,29 +48,12 @@ def reconstruct(
             show_default=False,
         ),
     ],
-    background: Annotated[
-        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
-    ] = None,
-    right: Annotated[
-        list[str] | None,
-        typer.Option(help="Right camera's images of the same instants; of a stereo head."),
-    ] = None,
-    right_background: Annotated[
-        list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
-    ] = None,
-    sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
-    depth_margin: Annotated[
-        float | None,
-        typer.Option(
-            help="Widen the calibrated depth range by this part of its width at either end; "
-            "points beyond are left out. Without it 3; 0 refuses every extrapolation.",
-            show_default=False,
-        ),
-    ] = None,
-    volume: Annotated[
-        str,
-        typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm."),
-    ] = "",
+    background: Background = None,
+    right: Right = None,
+    right_background: RightBackground = None,
+    sheet: Sheet = "",
+    depth_margin: DepthMargin = None,
+    volume: Volume = "",
     arm: Annotated[
         Path | None,
         typer.Option(help="arm.toml, for recordings of joint angles.", show_default=False),

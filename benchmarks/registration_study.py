@@ -3,7 +3,7 @@
 
     python benchmarks/registration_study.py strip  [--views 8] [--pitch 15] [--seeds 20]
     python benchmarks/registration_study.py around [--views 8] [--pitch 15] [--seeds 20]
-    python benchmarks/registration_study.py leapfrog [--seeds 200]
+    python benchmarks/registration_study.py leapfrog --seeds 200
 
 Simulated at feature level. A head with a field of 80 x 55 mm looks at a part from places 40 mm
 apart: along a strip, or once around a drum. Markers stand every ``--pitch`` mm at random, nine in

@@ -140,7 +140,7 @@ def _scan_table(
 
 def _residual_table(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> Table:
     length = np.linalg.norm(place.residual_mm, axis=1)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for row in np.argsort(-length):
         i, k = place.pairs[row]
         x, y, z = place.residual_mm[row]

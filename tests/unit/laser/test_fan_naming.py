@@ -16,6 +16,7 @@ from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes
 from armscan.calibration.laser.sightings import BoardImage, sight_stripes
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.frames import Board, Sensor
 from armscan.geometry.poses import Pose
 from fan_rig import MIDDLE_MM, FanRig, fan_rig
 
@@ -124,7 +125,9 @@ def without(image: BoardImage, truth: list[int], sheets: set[int]) -> tuple[Boar
 def test_parallel_boards_are_refused_with_the_reason() -> None:
     """Facing boards at two depths: which stripe follows which is open; no numbering is guessed."""
     rig = fan_rig(2, 1)
-    poses = tuple(Pose(np.eye(3), np.array([0.0, 0.0, z]) - MIDDLE_MM) for z in (118.0, 165.0))
+    poses: tuple[Pose[Sensor, Board], ...] = tuple(
+        Pose(np.eye(3), np.array([0.0, 0.0, z]) - MIDDLE_MM) for z in (118.0, 165.0)
+    )
     images, _ = images_of(replace(rig, poses=poses), 2)
     names = named(images)
     assert isinstance(names, FitFailure)

@@ -12,6 +12,7 @@ from armscan.calibration.laser.result import PlacedBoard
 from armscan.calibration.laser.second_view import meet_board_of, place_board, poses_chi2
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Board, Sensor
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
@@ -128,8 +129,10 @@ def test_two_views_place_the_board_within_their_covariance() -> None:
 def test_cameras_that_saw_different_places_are_told() -> None:
     cameras = HeadCameras.of(RIG.stereo())
     seen = views(RIG, 2)
-    own = [(c, v, estimate_board_pose(v, cameras.model(c))) for c, v in enumerate(seen)]
-    (left, right) = [(c, v, p) for c, v, p in own if p]
+    first, second = (estimate_board_pose(v, cameras.model(c)) for c, v in enumerate(seen))
+    assert not isinstance(first, FitFailure)
+    assert not isinstance(second, FitFailure)
+    left, right = (0, seen[0], first), (1, seen[1], second)
     assert poses_chi2(left, right, cameras) < 40.0
     other = moved(POSE, np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0]))
     view = RIG._camera_rig(other, 1).view(0, np.random.default_rng(3))

@@ -83,7 +83,7 @@ def test_joint_errors_of_cameras_and_sheets_are_as_large_as_stated() -> None:
         correlation = covariance / np.outer(sigma, sigma)
         squares.append(float((error / sigma) @ np.linalg.solve(correlation, error / sigma)))
         assert len(error) == 24 + 3 * len(fit.sheets)
-    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(error))
+    low, high = (float(chi2.ppf(p, 6 * len(error))) for p in (0.0005, 0.9995))
     assert low < sum(squares) < high
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,6 +77,13 @@ CAMERA_PLACES: tuple[Place, ...] = (
     Place(8, 44, 85, 0.50, 0.50, 150),
     Place(-20, 12, 90, 0.50, 0.50, 164),
 )
+
+TURNED_CAMERA_PLACES: tuple[Place, ...] = tuple(
+    replace(place, roll_deg=place.roll_deg + 90.0 * (k % 4))
+    for k, place in enumerate(CAMERA_PLACES)
+)
+"""The same with the target turned from place to place: where its marks miss their places, they do so
+to other sides each time. Slanted sheets need it: what is left bends their depths apart."""
 
 LASER_PLACES: tuple[StripePlace, ...] = (
     StripePlace(-6, 3, 1, -12.0, 117),

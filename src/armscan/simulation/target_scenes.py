@@ -29,6 +29,7 @@ from armscan.simulation.surfaces import Floor
 from armscan.simulation.target_places import (
     CAMERA_PLACES,
     LASER_PLACES,
+    TURNED_CAMERA_PLACES,
     held_before_camera,
     held_in_sheet,
 )
@@ -52,7 +53,8 @@ def camera_shots(head: Head, pattern: CirclePattern, rng: np.random.Generator) -
     if is_stereo:
         targets = [held_before_all(head, pattern, place, rng) for place in STEREO_CAMERA_PLACES]
     else:
-        targets = [held_before_camera(head, pattern, place, rng) for place in CAMERA_PLACES]
+        places = CAMERA_PLACES if len(head.lasers) == 1 else TURNED_CAMERA_PLACES
+        targets = [held_before_camera(head, pattern, place, rng) for place in places]
     shots: list[Shot] = []
     for k, target in enumerate(targets):
         name = f"{k + 1:02d}"

@@ -91,7 +91,9 @@ def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
             "no exposure has a laser on",
             remedy="name the lasers in the column 'lasers' of exposures.csv",
         )
-    dark = {(e.camera, e.view): e for e in exposures if not e.lasers and e.view is not None}
+    dark: dict[tuple[int, str | None], Exposure] = {
+        (e.camera, e.view): e for e in exposures if not e.lasers and e.view is not None
+    }
     pairs: list[ExposurePair] = []
     for camera in sorted({exposure.camera for exposure in lit}):
         own = [exposure for exposure in lit if exposure.camera == camera]

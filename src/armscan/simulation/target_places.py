@@ -82,8 +82,8 @@ TURNED_CAMERA_PLACES: tuple[Place, ...] = tuple(
     replace(place, roll_deg=place.roll_deg + 90.0 * (k % 4))
     for k, place in enumerate(CAMERA_PLACES)
 )
-"""The same with the target turned from place to place: where its marks miss their places, they do so
-to other sides each time. Slanted sheets need it: what is left bends their depths apart."""
+"""The same, the target turned from place to place: marks that miss their places then miss them to
+other sides. Slanted sheets need it: what the camera is left with bends their depths apart."""
 
 LASER_PLACES: tuple[StripePlace, ...] = (
     StripePlace(-6, 3, 1, -12.0, 117),

@@ -39,12 +39,13 @@ def photographs_of(demo: HeadDemo, photographs: Mapping[str, Exposure]) -> Galle
     pictures = []
     for scene, exposure in photographs.items():
         marks: list[Marks] = []
+        text = SCENE_TEXTS[scene]
         if scene == "laser" and exposure.source in on_target:
             points = on_target[exposure.source].points_px
             marks = [Marks(points, sheet_colour(0), "dot", 5.0)]
         elif demo.naming:
             marks = _named_marks(demo, scene, exposure.source)
-        text = SCENE_TEXTS[scene] + (", coloured by sheet" if demo.naming and marks else "")
+            text += ", coloured by sheet" if marks else ""
         markup = photo_markup(exposure, marks, f"Rendered image: {text}", longest_px=900)
         pictures.append(Picture(markup, text, scene))
     return Gallery(tuple(pictures), 300)

@@ -113,6 +113,8 @@ def test_an_arm_that_moved_goes_on_in_its_old_frame(
     assert carried.sigma_mm.min() > 0.01
     joint = read_marker_list(folder / "markers.csv", frame="").markers
     assert len(joint) == len(scene.a) + len(scene.b) - 12
+    assert main(["info", str(folder / "registration.json")]) == 0
+    assert "registration by markers (moved arm)" in capsys.readouterr().out
 
 
 def test_what_cannot_be_joined_gets_one_sentence(

@@ -19,6 +19,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.report.numbers import with_sigma
+from armscan.report.registration_info import describe_registration
 from armscan.report.scan_info import (
     describe_arm,
     describe_points,
@@ -48,6 +49,7 @@ from armscan.storage.recording_arm import ARM_FILE
 from armscan.storage.recording_exposures import EXPOSURES_FILE
 from armscan.storage.recording_reader import is_recording
 from armscan.storage.recording_session import SESSION_FILE
+from armscan.storage.registration_files import REGISTRATION_SCHEMA, read_registration
 from armscan.storage.scanner_files import read_scanner_calibration
 from armscan.storage.stereo_files import read_stereo_calibration
 
@@ -190,9 +192,14 @@ def _stereo(path: Path) -> dict[str, Any]:
     return {**describe_stereo(document), **_origin(document.provenance)}
 
 
+def _registration(path: Path) -> dict[str, Any]:
+    return describe_registration(read_registration(path))
+
+
 DESCRIBE_SCHEMA: dict[str, Callable[[Path], dict[str, Any]]] = {
     SCANNER_SCHEMA: _scanner,
     STEREO_SCHEMA: _stereo,
+    REGISTRATION_SCHEMA: _registration,
 }
 
 

@@ -98,7 +98,8 @@ def _names(demo: HeadDemo) -> tuple[Section, ...]:
         return ()
     text = (
         "Which light sheet drew each stripe, against the truth, over some instants of each scene. "
-        "What is in doubt is dropped and counted, not guessed."
+        "What is in doubt is dropped and counted, not guessed. Stray light is what lies more than "
+        "2 px from every true stripe: faint light along a silhouette or an edge, or a reflection."
     )
     return (Section("The names of the stripes", (Text(text), naming_table(demo.naming))),)
 

@@ -152,13 +152,14 @@ def naming_table(naming: Mapping[Any, NamingErrors]) -> Table:
             "scene",
             "stripes named of those in view",
             "points named that every camera sees",
-            "wrong name or stray",
+            "wrong name",
+            "stray light measured",
             "dropped: ambiguous",
             "dropped: on no sheet",
         ),
         tuple(rows),
         "",
-        (1, 2, 3, 4, 5),
+        (1, 2, 3, 4, 5, 6),
     )
 
 
@@ -196,12 +197,13 @@ def _sheet_row(name: str, sheet: SheetErrors) -> tuple[str, str, str]:
 
 def _naming_row(scene: str, found: NamingErrors) -> tuple[str, ...]:
     named = f"{100.0 * found.named_share:.2f} % of {found.n_shared:,}"
-    n_checked = found.n_named + found.n_stray
+    n_measured = found.n_named + found.n_stray
     return (
         scene,
         f"{found.n_stripes_named} of {found.n_stripes_in_view}",
         named,
-        f"{found.n_wrong + found.n_stray} of {n_checked:,} ({100.0 * found.wrong_share:.3f} %)",
+        f"{found.n_wrong} of {found.n_named:,} ({100.0 * found.wrong_share:.3f} %)",
+        f"{found.n_stray} of {n_measured:,} ({100.0 * found.n_stray / max(n_measured, 1):.2f} %)",
         f"{found.n_ambiguous:,}",
         f"{found.n_unexplained:,}",
     )

@@ -174,8 +174,8 @@ def _wrong(_: str, head: Figures) -> str:
     naming = head["naming"].values()
     if not naming:
         return "one sheet"
-    n_wrong = sum(found["n_wrong"] + found["n_stray"] for found in naming)
-    n_checked = sum(found["n_named"] + found["n_stray"] for found in naming)
+    n_wrong = sum(found["n_wrong"] for found in naming)
+    n_checked = sum(found["n_named"] for found in naming)
     return f"{n_wrong} of {n_checked:,}"
 
 

@@ -143,19 +143,18 @@ def run_head(
     instrument = calibrate_head(twin, given, progress, watch)
     scanner, truth = instrument.scanner, twin.truth
     scenes = scanned_scenes(instrument)
-    sources = {
-        scene: watch.timed(f"take_{scene}", partial(given.scanned, scene, scanner, progress))
-        for scene in (*scenes, "still-step")
-    }
-    found = {
-        scene: watch.timed(scene, partial(measure_scan, sources[scene], scanner, progress=progress))
-        for scene in scenes
-    }
+    found: dict[TwinScene, ScanReconstruction] = {}
+    for scene in scenes:
+        source = watch.timed(f"take_{scene}", partial(given.scanned, scene, scanner, progress))
+        found[scene] = watch.timed(scene, partial(measure_scan, source, scanner, progress=progress))
     steps = inspect_steps(found["steps"], truth.step_heights_mm)
     still, still_normal = watch.timed(
         "still_step",
         lambda: measure_still_step(
-            sources["still-step"], instrument, steps[0].normal, still_height_mm(instrument)
+            given.scanned("still-step", scanner, progress),
+            instrument,
+            steps[0].normal,
+            still_height_mm(instrument),
         ),
     )
     naming: dict[TwinScene, NamingErrors] = {}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from armscan.devices.scan_source import ScanSource
@@ -14,6 +14,7 @@ from armscan.pipeline.adaptive_scan import scan_adaptively
 from armscan.pipeline.fewer_views import FewerViews
 from armscan.pipeline.progress import Progress
 from armscan.reconstruction.identify_cross import CrossNamer
+from armscan.records.exposure import Exposure
 
 
 class TwinScans(Protocol):
@@ -55,4 +56,7 @@ class RenderedScans:
         sensor = scanner.sensor
         if len(self.twin.sources) < 2 or scene == "still-step" or sensor is None:
             return self.calibration(scene)
-        return scan_adaptively(self.twin.scan(scene), scanner, CrossNamer(sensor))[0]
+        taken: dict[int, Exposure] = {}
+        namer = CrossNamer(sensor)
+        chosen, _ = scan_adaptively(self.twin.scan(scene), scanner, namer, keep=taken.__setitem__)
+        return replace(chosen, taken=taken)

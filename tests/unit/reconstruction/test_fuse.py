@@ -148,6 +148,7 @@ def test_covariance_holds_and_the_fused_point_beats_each_camera_alone() -> None:
     assert (rms["fused"] < rms["left"]).all()
     assert (rms["fused"] < rms["right"]).all()
     ratio = rms["fused"] / np.sqrt(np.mean(blind, axis=0))
+    print(f"mean normalised error of 3: {mean}, depth rms over predicted: {ratio}")
     assert np.abs(ratio - 1.0).max() < 4.0 / np.sqrt(2.0 * n_draws)
 
 

@@ -19,7 +19,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.instants import ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import MeasuredImage, cameras_of, collected, see
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
@@ -162,7 +162,8 @@ def observe_stripes(
     """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
 
     Whatever reference the stripes lie on: a plate or a sphere. An image that cannot be read is
-    left out and named, as `armscan.pipeline.scan.measure_scan` does.
+    left out and named, as `armscan.pipeline.scan.measure_scan` does, and so is one without its
+    partner of the other camera.
     """
     poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
     cameras = cameras_of(sensor)
@@ -181,6 +182,7 @@ def observe_stripes(
         for row in one.rows
         if not known
     ]
+    not_used += [(source.rows[row].source, PARTNER_MISSING) for row in exposures.without_partner]
     n_unreadable = 0
     weak: list[str] = []
     for done, (instant, posture) in enumerate(zip(chosen, postures, strict=True)):

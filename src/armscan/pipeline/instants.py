@@ -15,6 +15,14 @@ from armscan.pipeline.exposure_pairs import ExposurePair
 from armscan.records.exposure import Exposure
 from armscan.records.session import ExposureRow
 
+SAME_TIME_NS = 1_000_000
+"""Times of two cameras that differ by no more are one instant: those of cameras with one trigger
+agree far better, and frames are some 10 ms apart."""
+PERIOD_SHARE = 4
+"""Nor may they differ by more than this part of the shortest time between two frames."""
+PARTNER_MISSING = "the other camera's image is missing"
+"""Why a row of a head with two cameras is not measured."""
+
 
 @dataclass(frozen=True, slots=True)
 class Instant:
@@ -33,7 +41,7 @@ class Instant:
 
 
 def group_instants(rows: Sequence[ExposureRow], where: str) -> tuple[Instant, ...]:
-    """Group exposures by instant: by trigger id where they have one, else by time.
+    """Group exposures by instant: by trigger id where they have one, else by nearly equal time.
 
     Raises
     ------
@@ -41,23 +49,45 @@ def group_instants(rows: Sequence[ExposureRow], where: str) -> tuple[Instant, ..
         If a camera took two exposures at one instant.
     """
     groups: dict[tuple[str, int], list[int]] = {}
+    untriggered = []
     for k, row in enumerate(rows):
-        by_trigger = row.trigger_id is not None
-        key = ("trigger", int(row.trigger_id or 0)) if by_trigger else ("time", row.t_ns)
-        groups.setdefault(key, []).append(k)
+        if row.trigger_id is None:
+            untriggered.append(k)
+        else:
+            groups.setdefault(("trigger", row.trigger_id), []).append(k)
+    groups |= _by_time(rows, untriggered)
     instants = []
     for (kind, value), members in groups.items():
         cameras = [rows[k].camera for k in members]
         if len(set(cameras)) != len(cameras):
+            most = max(cameras, key=cameras.count)
             raise InputError(
-                f"camera {max(cameras, key=cameras.count)} has {len(members)} exposures of one "
-                f"instant ({kind} {value})",
+                f"camera {most} has {cameras.count(most)} exposures of one instant "
+                f"({kind} {value})",
                 where=where,
                 remedy="give each exposure of a camera its own time and trigger_id",
             )
         ordered = tuple(sorted(members, key=lambda k: rows[k].camera))
         instants.append(Instant(ordered, rows[ordered[0]].t_ns))
     return tuple(sorted(instants, key=lambda instant: instant.t_ns))
+
+
+def _by_time(rows: Sequence[ExposureRow], chosen: list[int]) -> dict[tuple[str, int], list[int]]:
+    """Rows whose times differ by no more than the tolerance from the first of their group."""
+    ordered = sorted(chosen, key=lambda k: (rows[k].t_ns, rows[k].camera))
+    last: dict[int, int] = {}
+    apart_ns = SAME_TIME_NS * PERIOD_SHARE
+    for k in ordered:
+        step = rows[k].t_ns - last.get(rows[k].camera, rows[k].t_ns)
+        apart_ns = min(apart_ns, step or apart_ns)
+        last[rows[k].camera] = rows[k].t_ns
+    groups: dict[tuple[str, int], list[int]] = {}
+    first_ns = None
+    for k in ordered:
+        if first_ns is None or rows[k].t_ns - first_ns > apart_ns // PERIOD_SHARE:
+            first_ns = rows[k].t_ns
+        groups.setdefault(("time", first_ns), []).append(k)
+    return groups
 
 
 class ScanInstants:
@@ -74,7 +104,8 @@ class ScanInstants:
     Raises
     ------
     InputError
-        If the scan's cameras are not the scanner's.
+        If the scan's cameras are not the scanner's, or none of its instants with the laser on has
+        the images of all of them.
     """
 
     def __init__(self, source: ScanSource, n_cameras: int) -> None:
@@ -95,12 +126,24 @@ class ScanInstants:
             if not self.is_lit[k] and row.view is not None
         }
         self._dark: dict[int, tuple[int, Exposure]] = {}
-
-    @property
-    def lit(self) -> tuple[Instant, ...]:
-        """Instants at which a laser was on."""
-        groups = group_instants(self._source.rows, self._source.name)
-        return tuple(group for group in groups if self.is_lit[list(group.rows)].all())
+        self.lit: tuple[Instant, ...] = tuple(
+            one
+            for one in group_instants(source.rows, source.name)
+            if len(one.rows) == n_cameras and self.is_lit[list(one.rows)].all()
+        )
+        """Instants at which a laser was on and of which every camera has an image."""
+        complete = {row for one in self.lit for row in one.rows}
+        lit_rows = np.flatnonzero(self.is_lit).tolist()
+        self.without_partner: tuple[int, ...] = tuple(k for k in lit_rows if k not in complete)
+        """Rows with the laser on whose instant lacks the image of another camera."""
+        if self.without_partner and not self.lit:
+            raise InputError(
+                f"no instant has the images of all {n_cameras} cameras: "
+                f"{len(self.without_partner)} images with laser stand alone",
+                where=source.name,
+                remedy="give the images of one instant the same trigger_id, or, without trigger "
+                f"ids, times within {SAME_TIME_NS / 1e6:g} ms and a quarter of the frame period",
+            )
 
     def pair(self, row: int) -> ExposurePair:
         """Read one exposure and its background, if there is one.

@@ -12,12 +12,12 @@ import numpy as np
 
 from armscan.devices.scan_source import ScanSource
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair
-from armscan.pipeline.instants import Instant, ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
 from armscan.pipeline.measure import (
     LitProfile,
     MeasuredImage,
@@ -102,7 +102,8 @@ def measure_scan(
     """Measure the stripes of every exposure that has a pose and place them in Base.
 
     Instants are read one after another and dropped once measured; an image that cannot be read
-    is counted and named, and so is its partner of the same instant. Where rows name lasers, rows
+    is counted and named, and so is its partner of the same instant, or an image of one camera of
+    which the other has none. Where rows name lasers, rows
     without any serve as background of the exposures of their view.
 
     Parameters
@@ -163,7 +164,7 @@ def measure_scan(
             placed[row] = place_image(one, pose, placing, options.volume)
             weak += one.warnings
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
-    exposures = _records(source, images.is_lit, poses, placed, reasons)
+    exposures = _records(source, images, poses, placed, reasons)
     found = _joined(placed, exposures, poses, placing, options)
     return replace(
         found,
@@ -210,21 +211,25 @@ def _in_threads(
 
 def _records(
     source: ScanSource,
-    is_lit: BoolArray,
+    images: ScanInstants,
     poses: ExposurePoses,
     placed: dict[int, PlacedImage],
     reasons: dict[int, str],
 ) -> tuple[ScanExposure, ...]:
     records = []
+    alone = set(images.without_partner)
     for k, row in enumerate(source.rows):
         if k in placed:
             records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
         elif k in reasons:
             records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
-        elif not is_lit[k]:
+        elif not images.is_lit[k]:
             records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
+        elif k in alone:
+            records.append(ScanExposure(row, ScanExposureFate.NO_PARTNER, PARTNER_MISSING))
         else:
-            reason = PoseFate(int(poses.fate[k])).label
+            own = PoseFate(int(poses.fate[k]))
+            reason = "the other camera's image has none" if own is PoseFate.FOUND else own.label
             records.append(ScanExposure(row, ScanExposureFate.NO_POSE, reason))
     return tuple(records)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from armscan.pipeline.instants import PARTNER_MISSING
 from armscan.reconstruction.exposure_poses import ExposurePoses
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.records.cloud import PointCloud
@@ -22,6 +23,7 @@ class ScanExposureFate(Enum):
     NO_POSE = "without pose"
     LASER_OFF = "laser off"
     UNREADABLE = "image cannot be read"
+    NO_PARTNER = PARTNER_MISSING
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +120,12 @@ def scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tu
     if broken:
         named = "; ".join(exposure.reason.rstrip(".") for exposure in broken[:LISTED])
         warnings.append(f"{len(broken)} of {len(exposures)} images cannot be read: {named}")
+    alone = [e.row.source for e in exposures if e.fate is ScanExposureFate.NO_PARTNER]
+    if alone:
+        warnings.append(
+            f"{len(alone)} of {len(exposures)} images were not used, {PARTNER_MISSING}: "
+            f"{', '.join(alone[:LISTED])}"
+        )
     n_outside = sum(exposure.n_outside_volume for exposure in exposures)
     if n_outside:
         warnings.append(f"{n_outside} measured points lie outside the volume asked for")

@@ -98,6 +98,7 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
         options=request.options,
         progress=progress,
     )
+    result = replace(result, warnings=(*read.warnings, *result.warnings))
     provenance = new_provenance(
         (*images, *background, request.sensor),
         command=request.command,

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from armscan.pipeline.instants import ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.records.exposure import Exposure
 from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import read_exposures
-from armscan.storage.recording_reader import is_recording, read_recording
+from armscan.storage.recording_reader import FolderRecording, is_recording, read_recording
+
+LISTED = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,12 +35,15 @@ class StillImages:
         Files with laser and without.
     left, right
         Exposures; of the right camera none where there is one only.
+    warnings
+        What was left out, in words.
     """
 
     lit_paths: tuple[Path, ...]
     dark_paths: tuple[Path, ...]
     left: CameraImages
     right: CameraImages
+    warnings: tuple[str, ...] = ()
 
     @property
     def exposures(self) -> tuple[Exposure, ...]:
@@ -70,7 +75,8 @@ def read_stills(paths: StillPaths, options: ImageOptions, n_cameras: int) -> Sti
     Raises
     ------
     ArmscanError
-        If an image cannot be read, or a recording has not that many cameras.
+        If an image cannot be read, or a recording has not that many cameras, or not one instant of
+        which all have an image.
     """
     folder = Path(paths.images[0]) if len(paths.images) == 1 else None
     if folder is not None and is_recording(folder) and not (paths.background or paths.right):
@@ -96,10 +102,13 @@ def _of_recording(folder: Path, n_cameras: int) -> StillImages:
     recording = read_recording(folder)
     scan = ScanInstants(recording, n_cameras)
     cameras = []
+    warnings = list(_alone(recording, scan))
     for camera in range(n_cameras):
         pairs = [scan.pair(one.rows[camera]) for one in scan.lit]
         dark = [background for _, background in pairs if background is not None]
         is_complete = len(dark) == len(pairs)
+        if dark and not is_complete:
+            warnings.append(_dark_left_out(camera, n_cameras, len(pairs) - len(dark), len(pairs)))
         cameras.append(
             CameraImages(tuple(on for on, _ in pairs), tuple(dark) if is_complete else ())
         )
@@ -109,6 +118,23 @@ def _of_recording(folder: Path, n_cameras: int) -> StillImages:
         _paths(folder, (*left.dark, *right.dark)),
         left,
         right,
+        tuple(warnings),
+    )
+
+
+def _alone(recording: FolderRecording, scan: ScanInstants) -> tuple[str, ...]:
+    names = [recording.rows[row].source for row in scan.without_partner]
+    if not names:
+        return ()
+    named = ", ".join(names[:LISTED])
+    return (f"{len(names)} images were not used, {PARTNER_MISSING}: {named}",)
+
+
+def _dark_left_out(camera: int, n_cameras: int, n_without: int, n: int) -> str:
+    whose = f" of camera {camera}" if n_cameras > 1 else ""
+    return (
+        f"{n_without} of {n} images{whose} have no image without laser of their view: none of its "
+        "images had a background subtracted"
     )
 
 

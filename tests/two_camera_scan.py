@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan of a head with two cameras of which rows can be lost, without any rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from armscan.geometry.poses import Pose
+from armscan.models.camera import CameraModel
+from armscan.models.scanner import ArmNoise, HandEyeCalibration, ScannerCalibration
+from armscan.models.two_views import TwoViews
+from armscan.pipeline.exposure_pairs import ExposurePair
+from armscan.pipeline.measure import LitProfile
+from armscan.records.arm_track import ArmTrack
+from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile
+from armscan.records.session import CameraSetup, ExposureRow, Session
+from armscan.vision.stripe.options import StripeOptions
+from scan_fake import TOOL_FROM_SENSOR
+from sheet_rig import PROVENANCE
+from stereo_head import LEFT, RIGHT, RIGHT_FROM_LEFT, StereoHead, fitted_sheet, sheet_lasers
+from stereo_scenes import Noise, draw_surfaces, expose
+
+PERIOD_NS = 10_000_000
+N_SHEETS = 3
+SIGMA = 1e-5
+"""Of every parameter of the calibration; too small to matter."""
+WIDTH_PX, HEIGHT_PX = 8, 6
+
+
+def small_head() -> StereoHead:
+    """Three sheets, all but perfectly known."""
+    lasers = sheet_lasers(N_SHEETS)
+    covariance = SIGMA**2 * np.eye(9 + 8 * N_SHEETS + 15)
+    views = TwoViews(LEFT, RIGHT, RIGHT_FROM_LEFT)
+    return StereoHead(views, lasers, tuple(fitted_sheet(laser) for laser in lasers), covariance)
+
+
+def plate_profiles(head: StereoHead) -> tuple[Profile, Profile]:
+    """What both cameras see of a plate."""
+    rng = np.random.default_rng(1)
+    left, right = expose(head, draw_surfaces("plate", rng), Noise(), rng)
+    return left.profile, right.profile
+
+
+def stereo_scanner(head: StereoHead) -> ScannerCalibration:
+    """The head on an arm."""
+    hand_eye = HandEyeCalibration(
+        TOOL_FROM_SENSOR, np.zeros((6, 6)), None, ArmNoise(0.005, 2e-5), 0.007, 12, 12, 8000
+    )
+    return ScannerCalibration(head.calibration(), hand_eye, PROVENANCE)
+
+
+@dataclass(frozen=True)
+class TwoCameraScan:
+    """Rows of both cameras, the arm moving evenly; the images are empty."""
+
+    rows: tuple[ExposureRow, ...]
+    arm: ArmTrack | None
+    session: Session = field(
+        default_factory=lambda: Session(cameras=(CameraSetup(WIDTH_PX, HEIGHT_PX),) * 2)
+    )
+    name: str = "two cameras"
+    is_simulated: bool = False
+
+    def exposure(self, row: int) -> Exposure:
+        """An empty image."""
+        of = self.rows[row]
+        image = np.full((HEIGHT_PX, WIDTH_PX), 10, np.uint8)
+        return Exposure(image, of.source, lasers=of.lasers, t_ns=of.t_ns, camera=of.camera)
+
+
+def two_camera_scan(
+    n: int = 3, *, lost: Sequence[tuple[int, int]] = (), late_ns: int = 0
+) -> TwoCameraScan:
+    """``n`` instants without trigger ids, less the (instant, camera) that were lost.
+
+    The right camera's times are ``late_ns`` after the left one's.
+    """
+    times = PERIOD_NS * np.arange(1, n + 2)
+    poses: list[Pose] = [Pose.from_vectors([2.9, 0.0, 0.0], [float(k), 0, 0]) for k in range(n + 1)]
+    arm = ArmTrack(
+        times,
+        np.array([pose.rotation for pose in poses]),
+        np.array([pose.translation_mm for pose in poses]),
+        np.ones(n + 1, dtype=bool),
+    )
+    taken = [(k, camera) for k in range(n) for camera in (0, 1) if (k, camera) not in lost]
+    rows = tuple(
+        ExposureRow(
+            index,
+            int(times[k]) + PERIOD_NS // 2 + camera * late_ns,
+            camera,
+            f"images/{k}{'lr'[camera]}.png",
+            ("A",),
+        )
+        for index, (k, camera) in enumerate(taken)
+    )
+    return TwoCameraScan(rows, arm)
+
+
+@dataclass(frozen=True)
+class SeenAs:
+    """Takes the place of the stripe extraction: every image of a camera shows its profile."""
+
+    profiles: tuple[Profile, Profile]
+
+    def __call__(
+        self, pair: ExposurePair, camera: CameraModel, options: StripeOptions
+    ) -> LitProfile:
+        """The camera's profile under the image's name."""
+        exposure = pair[0]
+        return LitProfile(
+            replace(self.profiles[exposure.camera], source=exposure.source), exposure.lasers
+        )

@@ -88,7 +88,7 @@ def reconstruct(
                 method=cast(StripeMethod, stripe_method),
                 laser_colour=cast(LaserColour, laser_colour),
             ),
-            depths=DepthRange() if depth_margin is None else DepthRange(depth_margin),
+            depths=None if depth_margin is None else DepthRange(depth_margin),
             sheet=sheet,
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),

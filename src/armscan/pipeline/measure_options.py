@@ -18,11 +18,12 @@ class MeasureOptions:
     stripes
         Stripe extraction.
     depths
-        Depths that are accepted; points outside are left out and counted.
+        Depths that are accepted; points outside are left out and counted. None for those that the
+        head's own rule takes: `DepthRange` of one camera, `StereoNamingOptions.depths` of two.
     sheet
-        Name of the sheet that drew all stripes; empty to find it.
+        Name of the sheet that drew all stripes; empty to find it. For one camera only.
     """
 
     stripes: StripeOptions = field(default_factory=StripeOptions)
-    depths: DepthRange = field(default_factory=DepthRange)
+    depths: DepthRange | None = None
     sheet: str = ""

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from armscan.errors import OptionError
+from armscan.geometry.arrays import IntArray
 from armscan.geometry.frames import Base, Sensor
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
@@ -20,11 +22,13 @@ from armscan.pipeline.measure import (
     triangulated,
 )
 from armscan.pipeline.measure_options import MeasureOptions
-from armscan.reconstruction.choose_sheet import choose_sheets
+from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
 from armscan.reconstruction.identify_cross import CrossNamer
 from armscan.reconstruction.named_profile import NamedProfile
 from armscan.reconstruction.result import PointFate, ReconstructedImage
+from armscan.reconstruction.stereo_fate import StereoFate
 from armscan.reconstruction.stereo_measure import measure_stereo
+from armscan.reconstruction.stereo_options import StereoNamingOptions
 from armscan.reconstruction.stripe_namer import StripeNamer
 from armscan.reconstruction.triangulate import StripePoints
 
@@ -45,9 +49,20 @@ def measurer_for(
         Depths accepted, and the user's choice of a sheet.
     is_scan
         True for exposures in order of time with the arm's pose; else each is measured by itself.
+
+    Raises
+    ------
+    OptionError
+        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves.
     """
     if sensor.second is not None:
-        return ByTwoCameras(sensor)
+        if options.sheet:
+            raise OptionError(
+                f"sheet {options.sheet!r} was asked for, but two cameras tell each stripe's sheet",
+                where="--sheet",
+                remedy="leave --sheet out",
+            )
+        return ByTwoCameras(sensor, _stereo_options(options))
     n_sheets = len(sensor.sheets)
     if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
         return ByPast(sensor, options, CrossNamer(sensor))
@@ -77,6 +92,11 @@ class ByDepth:
     sensor: SensorCalibration
     options: MeasureOptions
 
+    @property
+    def depths(self) -> DepthRange:
+        """Depths accepted."""
+        return self.options.depths or DepthRange()
+
     def measure(
         self,
         seen: Sequence[LitProfile],
@@ -96,14 +116,14 @@ class ByDepth:
         choice = choose_sheets(
             lit.profile,
             self.sensor,
-            self.options.depths,
+            self.depths,
             sheet_name=self.options.sheet,
             lasers=lit.lasers,
         )
         fate = np.where(choice.sheet < 0, int(PointFate.OUT_OF_DEPTH), int(PointFate.MEASURED))
         fate[~lit.profile.is_accepted] = int(PointFate.FLAGGED)
         image = ReconstructedImage(lit.profile, fate, choice.sheet, choice.how)
-        return triangulated(image, self.sensor, self.options.depths)
+        return triangulated(image, self.sensor, self.depths)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,14 +150,20 @@ class ByPast:
         base_from_sensor: Pose[Base, Sensor] | None = None,
         t_ns: int = 0,
     ) -> tuple[MeasuredImage, ...]:
-        """Measure the next exposure of a stroke; without a pose, each by itself."""
+        """Measure the next exposure of a stroke; without a pose, each by itself.
+
+        An exposure without pose makes the namer forget the stroke before it. That is right for
+        stills and for hand-eye calibration, which give no pose at all; a scan leaves exposures
+        without pose out and so never asks for it in the middle of a stroke.
+        """
         if base_from_sensor is None:
             self.namer.reset()
+        depths = self.options.depths or DepthRange()
         measured = []
         for lit in seen:
             named = self.namer.name(lit.profile, lit.lasers, base_from_sensor, t_ns)
             image = ReconstructedImage(lit.profile, fates_of(named), named.sheet, named.how)
-            measured.append(triangulated(image, self.sensor, self.options.depths))
+            measured.append(triangulated(image, self.sensor, depths))
         return tuple(measured)
 
 
@@ -149,9 +175,12 @@ class ByTwoCameras:
     ----------
     sensor
         Both cameras and all sheets.
+    options
+        Limits of the naming.
     """
 
     sensor: SensorCalibration
+    options: StereoNamingOptions = field(default_factory=StereoNamingOptions)
 
     def measure(
         self,
@@ -161,26 +190,41 @@ class ByTwoCameras:
     ) -> tuple[MeasuredImage, ...]:
         """Measure one instant by itself; points that both cameras see belong to the left one."""
         left, right = (lit.profile for lit in seen)
-        found = measure_stereo(left, right, self.sensor)
+        found = measure_stereo(left, right, self.sensor, self.options)
         return (
             MeasuredImage(
-                _of_camera(found.left, found.left_points, PointFate.INCONSISTENT),
+                _of_camera(found.left, found.left_points, found.left_fate),
                 found.left_points,
                 found.warnings,
             ),
             MeasuredImage(
-                _of_camera(found.right, found.right_points, PointFate.SHARED), found.right_points
+                _of_camera(found.right, found.right_points, found.right_fate), found.right_points
             ),
         )
 
 
-def _of_camera(
-    named: NamedProfile, points: StripePoints, otherwise: PointFate
-) -> ReconstructedImage:
+_FATES = {
+    StereoFate.FUSED: PointFate.MEASURED,
+    StereoFate.ALONE: PointFate.MEASURED,
+    StereoFate.TAKEN: PointFate.SHARED,
+    StereoFate.OUT_OF_DEPTH: PointFate.OUT_OF_DEPTH,
+    StereoFate.INCONSISTENT: PointFate.INCONSISTENT,
+    StereoFate.NO_RAY: PointFate.NO_RAY,
+}
+
+
+def _stereo_options(options: MeasureOptions) -> StereoNamingOptions:
+    """Limits of the naming; its own depths unless a person chose others."""
+    if options.depths is None:
+        return StereoNamingOptions()
+    return StereoNamingOptions(depths=options.depths)
+
+
+def _of_camera(named: NamedProfile, points: StripePoints, became: IntArray) -> ReconstructedImage:
     """What became of the stripe points of one of two cameras."""
     fate = fates_of(named)
-    fate[fate == int(PointFate.MEASURED)] = int(otherwise)
-    fate[points.row] = int(PointFate.MEASURED)
+    for stereo_fate, point_fate in _FATES.items():
+        fate[became == int(stereo_fate)] = int(point_fate)
     sheet = np.array(named.sheet)
     sheet[points.row] = points.sheet
     return ReconstructedImage(named.profile, fate, sheet, named.how)

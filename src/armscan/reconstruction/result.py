@@ -28,7 +28,7 @@ class PointFate(IntEnum):
     SHARED = 6
     """The other camera saw the same point: it is measured there, from both images."""
     INCONSISTENT = 7
-    """The two cameras contradict each other, or it lies too far outside the calibrated depths."""
+    """The two cameras contradict each other."""
 
     @property
     def label(self) -> str:
@@ -44,7 +44,7 @@ _FATE_LABELS = {
     PointFate.AMBIGUOUS: "on several sheets about as likely",
     PointFate.STRAY: "on no sheet: stray light",
     PointFate.SHARED: "in the other camera's point",
-    PointFate.INCONSISTENT: "contradicted by the other camera, or out of depth",
+    PointFate.INCONSISTENT: "contradicted by the other camera",
 }
 
 

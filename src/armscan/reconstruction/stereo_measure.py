@@ -14,6 +14,7 @@ from armscan.reconstruction.fuse import FusedPoints, fuse_points, misfit_mm
 from armscan.reconstruction.identify_stereo import name_stripes, residual_and_sigma
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.right_sheet import triangulate_right
+from armscan.reconstruction.stereo_fate import StereoFate
 from armscan.reconstruction.stereo_options import StereoNamingOptions
 from armscan.reconstruction.stereo_residuals import (
     Crossings,
@@ -74,6 +75,8 @@ class StereoMeasurement:
         Rows of the right profile: points that the left camera does not see.
     is_fused
         (M,) for ``left_points``: True where both cameras saw the point.
+    left_fate, right_fate
+        (N,) `StereoFate` of every stripe point.
     epipolar_offset_px, epipolar_sigma_px
         Mean distance of the right picture from the epipolar lines, and its standard deviation.
     offset
@@ -89,6 +92,8 @@ class StereoMeasurement:
     left_points: StripePoints
     right_points: StripePoints
     is_fused: BoolArray
+    left_fate: IntArray
+    right_fate: IntArray
     epipolar_offset_px: float
     epipolar_sigma_px: float
     offset: EpipolarOffset
@@ -121,6 +126,7 @@ def measure_stereo(
     options = options or StereoNamingOptions()
     names = name_stripes(left, right, sensor, options)
     row = np.flatnonzero(names.left.sheet >= 0)
+    left_fate = _before(names.left)
     projected = project_on_sheets(left.points_px[row], names.left.sheet[row], sensor)
     row, projected = row[projected.is_met], projected.select(projected.is_met)
     stripes = RightStripes.of(right)
@@ -139,10 +145,21 @@ def measure_stereo(
     )
     single = _left_alone(projected, alone[inside], row, left, sensor)
     left_points, is_fused = _in_order(both, single)
+    left_fate[row[is_pair]] = np.where(
+        agrees[is_pair], int(StereoFate.FUSED), int(StereoFate.INCONSISTENT)
+    )
+    left_fate[row[alone]] = np.where(inside, int(StereoFate.ALONE), int(StereoFate.OUT_OF_DEPTH))
     taken = _taken(crossings.row[is_pair], right)
     right_row = np.flatnonzero((names.right.sheet >= 0) & ~taken)
     right_points = triangulate_right(right, right_row, names.right.sheet, sensor)
     kept = _in_depth(right_points, sensor, options)
+    right_fate = _before(names.right)
+    named = names.right.sheet >= 0
+    right_fate[named & taken] = int(StereoFate.INCONSISTENT)
+    right_fate[named & _taken(crossings.row[fused], right)] = int(StereoFate.TAKEN)
+    right_fate[right_points.row] = np.where(
+        kept, int(StereoFate.ALONE), int(StereoFate.OUT_OF_DEPTH)
+    )
     counts = StereoCounts(
         len(fused),
         int(inside.sum()),
@@ -160,12 +177,19 @@ def measure_stereo(
         left_points,
         _chosen(right_points, kept),
         is_fused,
+        left_fate,
+        right_fate,
         names.offset.offset_px,
         names.offset.sigma_px,
         names.offset,
         counts,
         _warnings(names.offset),
     )
+
+
+def _before(named: NamedProfile) -> IntArray:
+    """(N,) `StereoFate` of points before their rays are met with the sheets."""
+    return np.where(named.sheet >= 0, int(StereoFate.NO_RAY), int(StereoFate.UNNAMED))
 
 
 def _inside(

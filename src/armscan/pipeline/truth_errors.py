@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armscan.errors import EstimationError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.frames import Sensor, Tool
 from armscan.geometry.poses import Pose
@@ -126,6 +127,11 @@ def true_names(
 
     A calibration numbers the lines of a source as it finds them; a line that no target ever saw
     shifts the numbers of those after it.
+
+    Raises
+    ------
+    EstimationError
+        If no true sheet has a point at the depths in which a sheet was calibrated.
     """
     found = {}
     for calibrated in sensor.sheets:
@@ -136,6 +142,12 @@ def true_names(
             if len(inside):
                 height = calibrated.sheet.height_with_jacobian(inside)[0]
                 distance[name] = float(np.mean(height**2))
+        if not distance:
+            raise EstimationError(
+                f"sheet {calibrated.name} was calibrated from {low:.1f} to {high:.1f} mm, where no "
+                "true sheet has a point: which one it is cannot be told",
+                remedy="calibrate it over a larger range of depths, from boards of this head",
+            )
         found[calibrated.name] = min(distance, key=lambda name: distance[name])
     return found
 

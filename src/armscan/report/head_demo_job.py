@@ -12,6 +12,7 @@ from typing import Any
 
 from armscan.devices.scan_source import ScanSource
 from armscan.devices.twin import Preset, Twin, TwinScene
+from armscan.errors import OptionError
 from armscan.pipeline.head_demo import ONE_SHEET_SCENES, HeadDemo, HeadOptions, run_head
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.recorded_scans import RecordedScans
@@ -109,8 +110,14 @@ def make_head_demo(
     Raises
     ------
     ArmscanError
-        If the folder holds something else than an earlier demo or cannot be written.
+        If the head has no demo, the folder holds something else than an earlier demo or cannot be
+        written.
     """
+    if request.head not in KINDS:
+        raise OptionError(
+            f"there is no demo of the head {request.head!r}",
+            remedy=f"give one of {', '.join(KINDS)}",
+        )
     name = TwinName(request.head, request.preset, request.seed)
     twin = name.build()
     with replaced_demo(request.folder, OWN_FILES) as place:

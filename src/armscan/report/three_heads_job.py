@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from armscan.errors import OutputError
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.demo_folder import check_demo_folder
 from armscan.report.head_demo_job import TRUTH, HeadDemoRequest, make_head_demo
@@ -31,6 +32,9 @@ PAGE, DATA = "report.html", "summary.json"
 def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Summary:
     """Run the demo of each head, and compare them.
 
+    An earlier comparison is removed first: if a head fails, none stands beside heads that it does
+    not compare.
+
     Parameters
     ----------
     request
@@ -46,6 +50,7 @@ def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Su
     folder = request.folder
     mark = folder / FOLDERS[HEADS[0]] / TRUTH
     check_demo_folder(folder, {*FOLDERS.values(), PAGE, DATA}, mark)
+    _remove_comparison(folder)
     heads: dict[str, Any] = {}
     pictures: dict[str, HeadPicture] = {}
     warnings: list[str] = []
@@ -73,6 +78,18 @@ def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Su
     files = {folder / PAGE: render_page(page), folder / DATA: summary_json(result).encode()}
     write_files(files, is_overwriting=True)
     return result
+
+
+def _remove_comparison(folder: Path) -> None:
+    for name in (PAGE, DATA):
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"the earlier comparison cannot be removed ({error.strerror or error})",
+                where=str(folder / name),
+                remedy="choose another folder",
+            ) from error
 
 
 def _written(folder: Path) -> tuple[Path, ...]:

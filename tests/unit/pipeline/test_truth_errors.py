@@ -8,16 +8,17 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from armscan.errors import OptionError
+from armscan.errors import EstimationError, OptionError
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.fewer_views import FewerViews
-from armscan.pipeline.truth_errors import hand_eye_errors
+from armscan.pipeline.truth_errors import hand_eye_errors, true_names
 from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
 from armscan.records.session import ExposureRow, Session
 from hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
+from scan_fake import scanner as one_sheet_scanner
 from sheet_rig import PROVENANCE
 
 
@@ -66,3 +67,13 @@ def test_exposures_without_view_are_views_of_their_own() -> None:
 def test_no_view_at_all_is_refused() -> None:
     with pytest.raises(OptionError, match="keep at least one"):
         FewerViews(scan_of([None]), 0)
+
+
+def test_a_sheet_without_true_points_at_its_depths_is_told() -> None:
+    sensor = one_sheet_scanner().sensor
+    assert sensor is not None
+    far = {"A": np.array([[0.0, 0.0, 500.0]])}
+    with pytest.raises(EstimationError, match=r"sheet A was calibrated from 115\.0 to 160\.0 mm"):
+        true_names(sensor, far)
+    near = {"A": np.array([[0.0, 0.0, 140.0]])}
+    assert true_names(sensor, {**far, **near}) == {"A": "A"}

@@ -14,8 +14,7 @@ import pytest
 from armscan.cli import main
 from armscan.records.cloud import PointCloud
 from armscan.storage.clouds import ply_bytes, read_ply
-from armscan.storage.marker_files import read_marker_list
-from armscan.storage.markers import markers_csv
+from armscan.storage.marker_files import markers_csv, read_marker_list
 from armscan.storage.registration_files import read_registration
 from inspection_clouds import cloud_of
 from marker_scenes import Walk, marker_set, two_views, walk
@@ -115,6 +114,34 @@ def test_an_arm_that_moved_goes_on_in_its_old_frame(
     assert len(joint) == len(scene.a) + len(scene.b) - 12
     assert main(["info", str(folder / "registration.json")]) == 0
     assert "registration by markers (moved arm)" in capsys.readouterr().out
+
+
+def test_a_marker_that_moved_is_listed_where_it_is_now(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its old place is no marker any more: a third registration with it would be wrong."""
+    scene = two_views(
+        np.random.default_rng(4), 9, np.array([400.0, 300.0, 80.0]), missing=0.0, extra=0.0
+    )
+    old, new = replace(scene.a, ids=scene.true_a), replace(scene.b, ids=scene.true_b)
+    number, step = int(old.ids[0]), np.array([1.0, -2.0, 3.0])
+    points = new.points_mm.copy()
+    points[new.ids == number] += scene.a_from_b.rotation.T @ step
+    paths = tmp_path / "before.csv", tmp_path / "after.csv"
+    paths[0].write_bytes(markers_csv(old))
+    paths[1].write_bytes(markers_csv(replace(new, points_mm=points)))
+    folder = tmp_path / "joined"
+    words = ["register", str(paths[0]), "--moved", str(paths[1]), "--by-id", "-o", str(folder)]
+    assert main(words) == 0
+    assert "markers.csv has its new place" in capsys.readouterr().out
+    assert "markers.csv has its new place" in (folder / "registration.html").read_text("utf-8")
+    joint = read_marker_list(folder / "markers.csv", frame="").markers
+    np.testing.assert_array_equal(joint.ids, old.ids)
+    apart = joint.points_mm - old.points_mm
+    sigma = np.sqrt(np.trace(joint.covariance_mm2[0]))
+    np.testing.assert_allclose(apart[0], step, atol=6.0 * sigma)
+    assert not apart[1:].any()
+    assert sigma > np.sqrt(np.trace(joint.covariance_mm2[1]))
 
 
 def test_what_cannot_be_joined_gets_one_sentence(

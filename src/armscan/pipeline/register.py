@@ -211,9 +211,17 @@ def _without_moved(
             )
         misfit = misfits(data, fit)
         worst = misfit.moved(MOVED_LEVEL)
-        if worst is None or len(used) <= LEAST_LEFT:
+        if worst is None:
             return fit, is_used, moved
         i, k = (int(index) for index in used[worst])
+        if len(used) <= LEAST_LEFT:
+            raise EstimationError(
+                f"marker {old.ids[i]} (new {new.ids[k]}) does not fit the others, and of "
+                f"{len(pairs)} common markers only {len(used)} are left to tell which moved",
+                where=f"{old.source} and {new.source}",
+                remedy="measure more markers, take those out that moved, or state larger "
+                "uncertainties",
+            )
         moved.append(MovedMarker(int(old.ids[i]), int(new.ids[k]), -misfit.offset_mm[worst]))
         is_used[np.flatnonzero(is_used)[worst]] = False
 

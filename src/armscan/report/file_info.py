@@ -36,7 +36,11 @@ from armscan.storage.calibration_files import (
     read_calibration,
     read_camera_calibration,
 )
-from armscan.storage.calibration_schema import SCANNER_SCHEMA, STEREO_SCHEMA
+from armscan.storage.calibration_schema import (
+    REGISTRATION_SCHEMA,
+    SCANNER_SCHEMA,
+    STEREO_SCHEMA,
+)
 from armscan.storage.clouds import read_ply
 from armscan.storage.image_format import image_format
 from armscan.storage.image_paths import expand_paths
@@ -49,7 +53,7 @@ from armscan.storage.recording_arm import ARM_FILE
 from armscan.storage.recording_exposures import EXPOSURES_FILE
 from armscan.storage.recording_reader import is_recording
 from armscan.storage.recording_session import SESSION_FILE
-from armscan.storage.registration_files import REGISTRATION_SCHEMA, read_registration
+from armscan.storage.registration_files import read_registration
 from armscan.storage.scanner_files import read_scanner_calibration
 from armscan.storage.stereo_files import read_stereo_calibration
 

@@ -31,7 +31,7 @@ from armscan.storage.atomic import check_outputs, write_files
 from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import read_exposures
-from armscan.storage.markers import markers_csv
+from armscan.storage.marker_files import markers_csv
 from armscan.storage.provenance import new_provenance
 from armscan.storage.simulated import are_simulated
 from armscan.storage.stereo_files import read_stereo_calibration

@@ -33,12 +33,11 @@ from armscan.report.summary import Summary
 from armscan.storage.atomic import write_files
 from armscan.storage.atomic_folder import check_new_folder, new_folder
 from armscan.storage.calibration_bodies import provenance_body
+from armscan.storage.calibration_schema import REGISTRATION_SCHEMA
 from armscan.storage.clouds import ply_bytes
-from armscan.storage.marker_files import MarkerList
-from armscan.storage.markers import markers_csv
+from armscan.storage.marker_files import MarkerList, markers_csv
 from armscan.storage.provenance import new_provenance
 from armscan.storage.registration_files import (
-    REGISTRATION_SCHEMA,
     RegistrationDocument,
     registration_document,
 )
@@ -108,18 +107,26 @@ def _join_place(request: RegisterRequest, moved: Path) -> Summary:
 
 
 def _joint_markers(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> MarkerSet:
-    """The old markers, and behind them those that only the new place saw, in the old frame."""
-    chosen = np.isin(new.markers.ids, place.only_new)
-    points = new.markers.points_mm[chosen]
+    """The old markers, and behind them those that only the new place saw, in the old frame.
+
+    A marker that moved keeps its number and has its new place.
+    """
     pose = place.fit.value
-    added = carried_covariance_mm2(
-        points, new.markers.covariance_mm2[chosen], pose, place.fit.covariance
+    carried = new.markers.points_mm @ pose.rotation.T + pose.translation_mm
+    covariance = carried_covariance_mm2(
+        new.markers.points_mm, new.markers.covariance_mm2, pose, place.fit.covariance
     )
+    points, covariances = old.markers.points_mm.copy(), old.markers.covariance_mm2.copy()
+    for item in place.moved:
+        i = np.flatnonzero(old.markers.ids == item.old_id)
+        k = np.flatnonzero(new.markers.ids == item.new_id)
+        points[i], covariances[i] = carried[k], covariance[k]
+    added = np.isin(new.markers.ids, place.only_new)
     last = int(old.markers.ids.max())
     return MarkerSet(
-        np.concatenate([old.markers.ids, last + 1 + np.arange(len(points))]),
-        np.concatenate([old.markers.points_mm, points @ pose.rotation.T + pose.translation_mm]),
-        np.concatenate([old.markers.covariance_mm2, added]),
+        np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
+        np.concatenate([points, carried[added]]),
+        np.concatenate([covariances, covariance[added]]),
         old.markers.frame,
     )
 

@@ -213,7 +213,8 @@ def _warnings(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> tup
     ]
     found += [
         f"marker {item.old_id} (new {item.new_id}) moved by "
-        f"{significant(float(np.linalg.norm(item.offset_mm)), 'mm')} and was left out"
+        f"{significant(float(np.linalg.norm(item.offset_mm)), 'mm')} and was left out; "
+        "markers.csv has its new place"
         for item in place.moved
     ]
     if place.chi2_probability < UNLIKELY:

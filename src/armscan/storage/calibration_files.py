@@ -21,6 +21,7 @@ from armscan.storage.calibration_bodies import (
 )
 from armscan.storage.calibration_schema import (
     CAMERA_SCHEMA,
+    REGISTRATION_SCHEMA,
     SCANNER_SCHEMA,
     SCHEMA_VERSION,
     SENSOR_SCHEMA,
@@ -42,12 +43,14 @@ KINDS = {
     SENSOR_SCHEMA: "sensor calibration",
     SCANNER_SCHEMA: "scanner calibration",
     STEREO_SCHEMA: "stereo calibration",
+    REGISTRATION_SCHEMA: "registration",
 }
-STAGES = {
-    CAMERA_SCHEMA: "camera",
-    SENSOR_SCHEMA: "laser",
-    SCANNER_SCHEMA: "hand-eye",
-    STEREO_SCHEMA: "stereo",
+WRITERS = {
+    CAMERA_SCHEMA: "calibrate camera",
+    SENSOR_SCHEMA: "calibrate laser",
+    SCANNER_SCHEMA: "calibrate hand-eye",
+    STEREO_SCHEMA: "calibrate stereo",
+    REGISTRATION_SCHEMA: "register",
 }
 
 
@@ -176,13 +179,13 @@ def validated_document(kind: type[D], schema: str, data: bytes, path: Path) -> D
         raise FileFormatError(
             f"this is a {KINDS[found]}, and a {wanted} is needed",
             where=where,
-            remedy=f"name the file that `armscan calibrate {STAGES[schema]}` wrote",
+            remedy=f"name the file that `armscan {WRITERS[schema]}` wrote",
         )
     if found != schema:
         raise FileFormatError(
             f"this is not a {wanted} of armscan",
             where=where,
-            remedy=f"name the file that `armscan calibrate {STAGES[schema]}` wrote",
+            remedy=f"name the file that `armscan {WRITERS[schema]}` wrote",
         )
     version = content.get("schema_version")
     if isinstance(version, int) and version > SCHEMA_VERSION:
@@ -199,7 +202,7 @@ def validated_document(kind: type[D], schema: str, data: bytes, path: Path) -> D
         raise FileFormatError(
             f"the {wanted} is not valid at '{key}': {first['msg'].lower()}",
             where=where,
-            remedy="use the file as it was written, or calibrate anew",
+            remedy="use the file as it was written, or make it anew",
         ) from error
 
 

@@ -21,6 +21,7 @@ CAMERA_SCHEMA: Final = "armscan/camera-calibration"
 SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
 SCANNER_SCHEMA: Final = "armscan/scanner-calibration"
 STEREO_SCHEMA: Final = "armscan/stereo-calibration"
+REGISTRATION_SCHEMA: Final = "armscan/registration"
 
 
 def _nan_from_null(value: object) -> object:
@@ -199,7 +200,7 @@ class SheetBody(Body):
 
 
 class RightPoseBody(Body):
-    """``p_right = R p_sensor + t``, the rotation by its rows."""
+    """``p_right = R p_sensor + t`` (eqs. 4.3 to 4.5), the rotation by its rows."""
 
     rotation_rows: tuple[Triple, Triple, Triple]
     translation_right_mm: Triple

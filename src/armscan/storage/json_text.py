@@ -43,7 +43,9 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
             "this is not a JSON document", where=where, remedy="copy the file again; it may be cut"
         ) from error
     except ValueError as error:
-        raise FileFormatError(str(error), where=where, remedy="calibrate anew") from error
+        raise FileFormatError(
+            str(error), where=where, remedy="use the file as it was written, or make it anew"
+        ) from error
     if not isinstance(value, dict):
         raise FileFormatError(
             "this is not a JSON object",

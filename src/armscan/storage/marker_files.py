@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lists of markers of any origin: armscan's own tables, probed points, a few columns typed in."""
+"""Lists of markers: armscan's own tables, written and read; probed points, columns typed in."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import numpy as np
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.markers import MarkerSet
-from armscan.storage.csv_table import CsvTable, read_csv
-from armscan.storage.markers import COORDINATES, COVARIANCES
+from armscan.storage.csv_table import CsvTable, csv_bytes, number_text, read_csv
 
+COORDINATES = ("x_mm", "y_mm", "z_mm")
+COVARIANCES = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_mm2", "cov_zz_mm2")
 ASSUMED_SIGMA_MM = 0.02
 """Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
 ring's centre measured by two cameras."""
@@ -21,6 +22,7 @@ SMALLEST_EXTENT_MM = 2.0
 """Markers that all lie this near to each other are taken for metres."""
 FRAME = "frame ="
 METRES = ("x_m", "y_m", "z_m")
+_UPPER = np.triu_indices(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +45,24 @@ class MarkerList:
     path: Path
     has_ids: bool
     is_sigma_assumed: bool
+
+
+def markers_csv(markers: MarkerSet) -> bytes:
+    """Text of a table of markers; `read_marker_list` reads it back as the same numbers.
+
+    Columns ``id,x_mm,y_mm,z_mm`` and the six different elements of the covariance; a comment
+    ``# frame = Sensor`` names the coordinate frame.
+    """
+    upper = markers.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+    columns = {"id": tuple(str(number) for number in markers.ids)}
+    columns |= _texts(COORDINATES, markers.points_mm) | _texts(COVARIANCES, upper)
+    return csv_bytes(columns, (f"{FRAME} {markers.frame}",))
+
+
+def _texts(names: tuple[str, ...], values: FloatArray) -> dict[str, tuple[str, ...]]:
+    return {
+        name: tuple(number_text(value) for value in values[:, k]) for k, name in enumerate(names)
+    }
 
 
 def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:
@@ -115,7 +135,7 @@ def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> Fl
     if not has_covariance:
         return np.tile(sigma_mm**2 * np.eye(3), (len(table), 1, 1))
     table.require(COVARIANCES)
-    rows, columns = np.triu_indices(3)
+    rows, columns = _UPPER
     covariance = np.zeros((len(table), 3, 3))
     covariance[:, rows, columns] = table.floats(COVARIANCES)
     covariance[:, columns, rows] = covariance[:, rows, columns]

@@ -4,16 +4,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.geometry.registration import REGISTRATION_PARAMETERS
 from armscan.storage.calibration_bodies import covariance_body, triple
+from armscan.storage.calibration_files import validated_document
 from armscan.storage.calibration_schema import (
+    REGISTRATION_SCHEMA,
     SCHEMA_VERSION,
     Body,
     CovarianceBody,
@@ -22,9 +23,7 @@ from armscan.storage.calibration_schema import (
     Triple,
 )
 from armscan.storage.images import read_bytes
-from armscan.storage.json_text import json_bytes, parse_json
-
-REGISTRATION_SCHEMA: Final = "armscan/registration"
+from armscan.storage.json_text import json_bytes
 
 
 class TransformBody(Body):
@@ -123,28 +122,4 @@ def read_registration(path: Path) -> RegistrationDocument:
     FileFormatError
         If the file is cut, of another kind, of a newer version, or holds values that cannot be.
     """
-    data = read_bytes(path)
-    content = parse_json(data, str(path))
-    if content.get("schema") != REGISTRATION_SCHEMA:
-        raise FileFormatError(
-            "this is not a registration of armscan",
-            where=str(path),
-            remedy="name the registration.json that `armscan register` wrote",
-        )
-    version = content.get("schema_version")
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        raise FileFormatError(
-            f"the file has schema version {version}, and this program reads up to {SCHEMA_VERSION}",
-            where=str(path),
-            remedy="update armscan",
-        )
-    try:
-        return RegistrationDocument.model_validate_json(data, strict=True)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise FileFormatError(
-            f"the registration is not valid at '{key}': {first['msg'].lower()}",
-            where=str(path),
-            remedy="use the file as it was written, or register again",
-        ) from error
+    return validated_document(RegistrationDocument, REGISTRATION_SCHEMA, read_bytes(path), path)

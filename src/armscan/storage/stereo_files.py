@@ -5,10 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from armscan.errors import FileFormatError, InputError
-from armscan.geometry.poses import Pose
 from armscan.models.stereo import STEREO_PARAMETER_NAMES, StereoCalibration, StereoDiagnostics
 from armscan.storage.calibration_bodies import (
     camera_body,
@@ -17,7 +14,8 @@ from armscan.storage.calibration_bodies import (
     covariance_from_body,
     provenance_body,
     provenance_from_body,
-    triple,
+    right_pose_body,
+    right_pose_from_body,
 )
 from armscan.storage.calibration_files import observations_body, validated_document
 from armscan.storage.calibration_schema import STEREO_SCHEMA
@@ -25,7 +23,6 @@ from armscan.storage.images import read_bytes
 from armscan.storage.json_text import json_bytes
 from armscan.storage.stereo_schema import (
     LeftOutBody,
-    RightFromLeftBody,
     StereoDiagnosticsBody,
     StereoDocument,
 )
@@ -43,15 +40,11 @@ def stereo_document(
     observations
         Name and content of the file of observations beside it.
     """
-    pose = calibration.right_from_left
-    x, y, z = (triple(row) for row in pose.rotation)
     document = StereoDocument(
         schema=STEREO_SCHEMA,
         left=camera_body(calibration.left),
         right=camera_body(calibration.right),
-        right_from_left=RightFromLeftBody(
-            rotation=(x, y, z), translation_mm=triple(pose.translation_mm)
-        ),
+        right_from_sensor=right_pose_body(calibration.right_from_left),
         covariance=covariance_body(STEREO_PARAMETER_NAMES, calibration.covariance),
         rms_px=calibration.rms_px,
         n_pairs=calibration.n_pairs,
@@ -74,11 +67,10 @@ def read_stereo_calibration(path: Path) -> StereoCalibration:
     document = validated_document(StereoDocument, STEREO_SCHEMA, read_bytes(path), path)
     try:
         provenance = provenance_from_body(document.provenance)
-        pose = document.right_from_left
         return StereoCalibration(
             left=camera_from_body(document.left, provenance),
             right=camera_from_body(document.right, provenance),
-            right_from_left=Pose(np.array(pose.rotation), np.array(pose.translation_mm)),
+            right_from_left=right_pose_from_body(document.right_from_sensor),
             covariance=covariance_from_body(document.covariance, STEREO_PARAMETER_NAMES),
             rms_px=document.rms_px,
             n_pairs=document.n_pairs,

@@ -14,15 +14,8 @@ from armscan.storage.calibration_schema import (
     CovarianceBody,
     ObservationsBody,
     ProvenanceBody,
-    Triple,
+    RightPoseBody,
 )
-
-
-class RightFromLeftBody(Body):
-    """Pose of the left camera, which is the Sensor frame, in the right one's (eqs. 4.3 to 4.5)."""
-
-    rotation: tuple[Triple, Triple, Triple]
-    translation_mm: Triple
 
 
 class LeftOutBody(Body):
@@ -51,7 +44,7 @@ class StereoDocument(Body):
     schema_version: Literal[1] = SCHEMA_VERSION
     left: CameraBody
     right: CameraBody
-    right_from_left: RightFromLeftBody
+    right_from_sensor: RightPoseBody
     covariance: CovarianceBody
     rms_px: float
     n_pairs: int = Field(ge=0)

@@ -10,8 +10,7 @@ import pytest
 
 from armscan.errors import FileFormatError, InputError
 from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import read_marker_list
-from armscan.storage.markers import markers_csv
+from armscan.storage.marker_files import markers_csv, read_marker_list
 
 
 def some_markers(n: int = 4) -> MarkerSet:

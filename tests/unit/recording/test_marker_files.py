@@ -10,8 +10,7 @@ import pytest
 
 from armscan.errors import FileFormatError
 from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import read_marker_list
-from armscan.storage.markers import markers_csv
+from armscan.storage.marker_files import markers_csv, read_marker_list
 
 HEAD = "x_mm,y_mm,z_mm"
 ROWS = "1.5,2,3\n100,2,3\n1,200,3\n"

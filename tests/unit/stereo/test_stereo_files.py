@@ -68,11 +68,11 @@ def test_documents_of_other_kinds_are_refused_by_name(tmp_path: Path) -> None:
 def test_values_that_cannot_be_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "stereo.json"
     content = json.loads(stereo_document(calibration()))
-    content["right_from_left"]["rotation"][0][0] += 0.1
+    content["right_from_sensor"]["rotation_rows"][0][0] += 0.1
     path.write_text(json.dumps(content))
     with pytest.raises(FileFormatError, match="not a rotation"):
         read_stereo_calibration(path)
-    content["right_from_left"]["angle"] = 3
+    content["right_from_sensor"]["angle"] = 3
     path.write_text(json.dumps(content))
-    with pytest.raises(FileFormatError, match="right_from_left"):
+    with pytest.raises(FileFormatError, match="right_from_sensor"):
         read_stereo_calibration(path)

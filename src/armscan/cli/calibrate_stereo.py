@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -63,11 +64,22 @@ def stereo(
     """Calibrate two cameras and where they are to each other."""
     from armscan.calibration.camera.options import CameraOptions, DistortionModel
     from armscan.calibration.stereo.options import StereoOptions
+    from armscan.errors import OptionError
     from armscan.models.stereo import IntrinsicsUse
     from armscan.report.stereo_job import StereoRequest, run_stereo_calibration
     from armscan.storage.image_options import Alignment, ImageOptions
 
+    given = StereoOptions(
+        camera=CameraOptions(distortion=cast(DistortionModel, distortion)),
+        intrinsics=cast(IntrinsicsUse, intrinsics),
+        leave_out=tuple(leave_out or ()),
+        leave_out_misfits=auto_leave_out,
+    )
     is_given = left_camera is not None or right_camera is not None
+    if intrinsics == "fixed" and not is_given:
+        raise OptionError(
+            "there is nothing to hold", where="--intrinsics fixed", remedy="give --left and --right"
+        )
     request = StereoRequest(
         left=left,
         right=right,
@@ -76,12 +88,7 @@ def stereo(
         scan=scan,
         left_camera=left_camera,
         right_camera=right_camera,
-        options=StereoOptions(
-            camera=CameraOptions(distortion=cast(DistortionModel, distortion)),
-            intrinsics=cast(IntrinsicsUse, intrinsics) if is_given else "free",
-            leave_out=tuple(leave_out or ()),
-            leave_out_misfits=auto_leave_out,
-        ),
+        options=given if is_given else replace(given, intrinsics="free"),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
         command=("armscan", *sys.argv[1:]),

@@ -68,11 +68,12 @@ def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[Expo
             f"({_listed(right)})",
             remedy="give one right image for each left image, in the same order",
         )
-    for a, b in zip(left, right, strict=True):
-        if a.source == b.source:
+    on_the_right = {exposure.source for exposure in right}
+    for exposure in left:
+        if exposure.source in on_the_right:
             raise InputError(
                 "the same image is given for both cameras",
-                where=a.source,
+                where=exposure.source,
                 remedy="give the images of the right camera as the second argument",
             )
     return list(zip(left, right, strict=True))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
-from armscan.errors import EstimationError, OptionError
+from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
@@ -185,6 +185,7 @@ def _read_images(request: LaserRequest, *, is_stereo: bool) -> _Images:
             "a recording and images are given", remedy="give --scan, or --on with --off"
         )
     if request.scan is not None:
+        request.image_options.check_unused()
         return _read_scan(request.scan, is_stereo=is_stereo)
     if is_stereo:
         raise OptionError(
@@ -202,6 +203,13 @@ def _read_images(request: LaserRequest, *, is_stereo: bool) -> _Images:
 def _read_scan(folder: Path, *, is_stereo: bool) -> _Images:
     recording = read_recording(folder)
     rows = [k for k, row in enumerate(recording.rows) if row.camera == 0 or is_stereo]
+    if not rows:
+        numbers = sorted({row.camera for row in recording.rows})
+        raise InputError(
+            f"camera 0 has no rows, camera {' and '.join(map(str, numbers))} has all",
+            where=str(folder),
+            remedy="number a single camera 0 in the column 'camera' of exposures.csv",
+        )
     exposures = tuple(recording.exposure(k) for k in rows)
     return _Images(
         exposures,

@@ -45,6 +45,8 @@ def run_measurement(request: CloudRequest, progress: Progress = silent) -> Summa
     """
     folders = [Path(name) for name in request.images if Path(name).is_dir()]
     recordings = [folder for folder in folders if is_recording(folder)]
+    if recordings and not (request.background or request.right):
+        request.image_options.check_unused()
     if recordings and is_scanner_document(request.sensor):
         if len(request.images) > 1:
             raise OptionError(
@@ -76,12 +78,7 @@ def run_scan(request: CloudRequest, folder: Path, progress: Progress = silent) -
     volume = parse_volume(request.volume) if request.volume else None
     scanner = read_scanner_calibration(request.sensor)
     recording = read_recording(folder, None if request.arm is None else read_arm_model(request.arm))
-    if request.background:
-        raise OptionError(
-            "the backgrounds of a recording are its own exposures without laser",
-            where="--background",
-            remedy="leave it out, and give both exposures one view in exposures.csv",
-        )
+    _check_own_images(request)
     options = ScanOptions(measure=request.options, volume=volume)
     scan = measure_scan(recording, scanner, options, progress=progress)
     notes = (*recording.warnings, *recording.session.assumed)
@@ -113,6 +110,26 @@ def run_scan(request: CloudRequest, folder: Path, progress: Progress = silent) -
         (*notes, *scan.warnings, *losses),
         is_simulated=recording.is_simulated,
     )
+
+
+def _check_own_images(request: CloudRequest) -> None:
+    """Raise if images are given beside a recording, which has its own."""
+    if request.background:
+        raise OptionError(
+            "the backgrounds of a recording are its own exposures without laser",
+            where="--background",
+            remedy="leave it out, and give both exposures one view in exposures.csv",
+        )
+    for option, value in (
+        ("--right", request.right),
+        ("--right-background", request.right_background),
+    ):
+        if value:
+            raise OptionError(
+                "the right camera's images of a recording are its own rows of camera 1",
+                where=option,
+                remedy="leave it out",
+            )
 
 
 def shown_exposures(recording: FolderRecording, scan: ScanReconstruction) -> dict[str, Exposure]:

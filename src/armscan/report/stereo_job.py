@@ -31,6 +31,7 @@ from armscan.report.page import render_page
 from armscan.report.stereo_page import pair_row, relative_rows, stereo_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
+from armscan.storage.calibration_bodies import right_pose_body
 from armscan.storage.calibration_files import read_camera_calibration
 from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths
@@ -103,7 +104,7 @@ def run_stereo_calibration(request: StereoRequest, progress: Progress = silent) 
     target = parse_target(request.target)
     files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
     given = _given(request)
-    images = _from_scan(request.scan) if request.scan is not None else _from_lists(request)
+    images = _read_images(request)
     every = [exposure for pair in images.pairs for exposure in pair if exposure is not None]
     for side in (0, 1):
         check_same_size([one for pair in images.pairs if (one := pair[side]) is not None])
@@ -153,6 +154,17 @@ def _given(request: StereoRequest) -> Given | None:
             remedy="give both --left and --right, or neither",
         )
     return read_camera_calibration(left), read_camera_calibration(right)
+
+
+def _read_images(request: StereoRequest) -> _Images:
+    if request.scan is None:
+        return _from_lists(request)
+    if request.left or request.right:
+        raise OptionError(
+            "a recording and images are given", remedy="give --scan, or images left and right"
+        )
+    request.image_options.check_unused()
+    return _from_scan(request.scan)
 
 
 def _from_lists(request: StereoRequest) -> _Images:
@@ -235,15 +247,11 @@ def stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: boo
 
 def _data(run: StereoRun, is_simulated: bool) -> dict[str, Any]:
     fit = run.fit
-    pose = fit.views.right_from_left
     return {
         "kind": "stereo calibration",
         "simulated": is_simulated,
         "intrinsics": fit.options.intrinsics,
-        "right_from_left": {
-            "rotation": pose.rotation.tolist(),
-            "translation_mm": pose.translation_mm.tolist(),
-        },
+        "right_from_sensor": right_pose_body(fit.views.right_from_left).model_dump(mode="json"),
         "parameters": _named(fit.parameters.tolist()),
         "sigmas": _named(fit.sigma.tolist()),
         "rms_px": fit.rms_px,

@@ -35,3 +35,13 @@ class ImageOptions:
             raise OptionError(
                 "high-aligned pixels need the count of bits used", remedy="give 10, 12 or 14"
             )
+
+    def check_unused(self) -> None:
+        """Raise `OptionError` if anything is said of pixels: a recording describes its own."""
+        if self != ImageOptions():
+            raise OptionError(
+                "a recording says itself how its pixels are stored",
+                where="--bits-used and --bits-align",
+                remedy="leave them out, or correct bits_used and align under [[camera]] in "
+                "session.toml",
+            )

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two cameras and recordings: what would be ignored or cannot be used is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError
+from armscan.pipeline.stereo import pair_lists
+from armscan.records.exposure import Exposure
+from armscan.storage.calibration_files import camera_document
+from recording_folders import EXPOSURES, SESSION, lab_folder
+from stereo_rig import LEFT, held
+
+Fails = Callable[..., str]
+TARGET = ("--target", "chessboard:9x6:25")
+SECOND_CAMERA = SESSION + SESSION[SESSION.index("[[camera]]") :]
+
+
+def named(source: str) -> Exposure:
+    return Exposure(np.zeros((4, 6), np.uint8), source)
+
+
+def test_an_image_in_both_lists_is_refused_wherever_it_stands() -> None:
+    left, right = [named("a.png"), named("b.png")], [named("b.png"), named("c.png")]
+    with pytest.raises(InputError, match=r"b\.png: the same image is given for both cameras"):
+        pair_lists(left, right)
+    assert len(pair_lists(left, [named("c.png"), named("d.png")])) == 2
+
+
+def test_images_beside_a_recording_are_refused(tmp_path: Path, fails: Fails) -> None:
+    scan, output = lab_folder(tmp_path), tmp_path / "stereo.json"
+    words = ("calibrate", "stereo", *TARGET, "--scan", scan, "-o", output)
+    assert "a recording and images are given" in fails(*words, "left", "right", writes=tmp_path)
+    assert "a recording and images are given" in fails(*words, "left", writes=tmp_path)
+    assert "bits_used and align under [[camera]]" in fails(*words, "--bits-used", 10)
+
+
+def test_pixels_of_a_recording_are_described_by_it_alone(tmp_path: Path, fails: Fails) -> None:
+    scan, camera = lab_folder(tmp_path), tmp_path / "camera.json"
+    camera.write_bytes(camera_document(held(LEFT)))
+    bits = ("--bits-used", 12, "--bits-align", "high")
+    words = ("calibrate", "laser", "--camera", camera, "--scan", scan, *TARGET)
+    said = fails(*words, *bits, "-o", tmp_path / "sensor.json", writes=tmp_path)
+    assert "a recording says itself how its pixels are stored" in said
+    words = ("reconstruct", scan, "--sensor", camera, *bits, "-o", tmp_path / "cloud.ply")
+    assert "a recording says itself how its pixels are stored" in fails(*words, writes=tmp_path)
+
+
+def test_a_single_camera_that_is_not_camera_0_is_said(tmp_path: Path, fails: Fails) -> None:
+    rows = EXPOSURES.replace("000,0,", "000,1,")
+    scan = lab_folder(tmp_path, exposures=rows, session=SECOND_CAMERA)
+    camera = tmp_path / "camera.json"
+    camera.write_bytes(camera_document(held(LEFT)))
+    words = ("calibrate", "laser", "--camera", camera, "--scan", scan, *TARGET)
+    said = fails(*words, "-o", tmp_path / "sensor.json", writes=tmp_path)
+    assert "camera 0 has no rows, camera 1 has all" in said
+
+
+def test_what_cameras_are_given_for_is_checked_without_them(tmp_path: Path, fails: Fails) -> None:
+    words = ("calibrate", "stereo", "left", "right", *TARGET, "-o", tmp_path / "stereo.json")
+    assert "intrinsics 'foo' is not known" in fails(*words, "--intrinsics", "foo", writes=tmp_path)
+    fixed = fails(*words, "--intrinsics", "fixed", writes=tmp_path)
+    assert "give --left and --right" in fixed

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def by_enumeration(log_likelihood: FloatArray) -> FloatArray:
     total = np.zeros((n, h))
     for names in product(range(h), repeat=n):
         weight = np.exp(sum(log_likelihood[p, name] for p, name in enumerate(names)))
-        for before, after in zip(names, names[1:], strict=False):
+        for before, after in pairwise(names):
             weight *= 1.0 - SWITCH if before == after else SWITCH / (h - 1)
         for p, name in enumerate(names):
             total[p, name] += weight

@@ -147,8 +147,8 @@ def _sure(
             (numbering_of(lines, roots, slot, spacing_mm, best.fan.axis).fan.cost, slot)
             for slot in shifted_slots(lines, best)
         ]
-        margin, slot = min(((cost - best.fan.cost, slot) for cost, slot in rivals),
-                           key=lambda item: item[0])  # fmt: skip
+        cost, slot = min(rivals, key=lambda rival: rival[0])
+        margin = cost - best.fan.cost
         if margin >= clear:
             return _Sure(lines, spacing_mm, best, margin, tuple(left_out))
         loose = _moved_images(lines, best.slot, slot)
@@ -172,8 +172,8 @@ def _ambiguous(margin: float) -> FitFailure:
 def _moved_images(lines: FanLines, slot: IntArray, moved: IntArray) -> list[int]:
     """The images that a rival numbering moves against most of the others."""
     named = slot >= 0
-    difference = {int(i): int((moved - slot)[named & (lines.image == i)][0])
-                  for i in np.unique(lines.image[named])}  # fmt: skip
+    images = [int(i) for i in np.unique(lines.image[named])]
+    difference = {i: int((moved - slot)[named & (lines.image == i)][0]) for i in images}
     values = list(difference.values())
     usual = max(set(values), key=values.count)
     return [image for image, value in difference.items() if value != usual]

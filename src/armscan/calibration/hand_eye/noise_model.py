@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why points on a plate do not lie in it: arm, flatness and stripe, as covariances.
+"""Why points on a plate do not lie in it: arm, flatness, sheets and stripe, as covariances.
 
 The arm's pose errs by a shift of the scan point and a turn about it, alike for all points of a
 posture, and by a smaller part that is new in every exposure. The plate is uneven by a smooth
 random function of the place on it, so that postures which look at the same place see the same
-error. Only the stripe's own noise is independent.
+error. The light sheets are not quite what their parameters describe, by another smooth function, of
+the place on the sheet, the same in all postures. Only the stripe's own noise is independent.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from armscan.calibration.hand_eye.plate_nodes import PlateNodes
 from armscan.calibration.hand_eye.plate_residuals import N_PLANE, PlacedNodes
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.fitting import Plane
+from armscan.models.calibration import SHEET_PARAMETER_NAMES
+from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 from armscan.models.scanner import ArmNoise
 
 ROTATION_LEVER_MM = 265.0
@@ -27,6 +30,10 @@ of some tens of mm it hardly shows."""
 TYPICAL_ARM_MM = 0.006
 TYPICAL_EXPOSURE_MM = 0.001
 TYPICAL_FLATNESS_MM = 0.003
+TYPICAL_SHEET_SHAPE_MM = 0.001
+"""What plane and bow leave of the sheets of simulated heads, root mean square."""
+SHEET_SHAPE_LENGTH_MM = 15.0
+"""Half a calibrated region and less: what is longer, plane and bow take up."""
 WIDE = 1.0
 """Standard deviation of the logarithm of a scatter about its typical value: a factor of 2.7."""
 LEAST_STRIPE_MM = 1e-5
@@ -39,7 +46,8 @@ class NoiseComponent:
     Parameters
     ----------
     name
-        ``arm``, ``arm rotation``, ``exposure``, ``exposure rotation``, ``flatness`` or ``stripe``.
+        ``arm``, ``arm rotation``, ``exposure``, ``exposure rotation``, ``flatness``,
+        ``sheet shape`` or ``stripe``.
     covariance
         (N, N) of the residuals when ``sigma`` is 1.
     sigma
@@ -92,6 +100,7 @@ def noise_components(
     return (
         *components,
         _component("flatness", alike, options.plate_flatness_mm, TYPICAL_FLATNESS_MM),
+        *_sheet_shape(nodes, placed, options),
         _component("stripe", own, options.stripe_noise_factor, 1.0),
     )
 
@@ -111,15 +120,36 @@ def stripe_variance_mm2(nodes: PlateNodes, placed: PlacedNodes) -> FloatArray:
     return np.asarray(np.maximum(variance, LEAST_STRIPE_MM**2))
 
 
+def _sheet_shape(
+    nodes: PlateNodes, placed: PlacedNodes, options: HandEyeOptions
+) -> tuple[NoiseComponent, ...]:
+    """The sheets' own shape beyond their parameters; nothing where points came without a sheet.
+
+    It moves a point as an offset of its sheet would that is a smooth function of the place on the
+    sheet. Two stripes of one exposure share arm and plate: without this part, whatever their
+    sheets' shapes set between them would count as a scatter of arm or plate.
+    """
+    offset = len(CAMERA_PARAMETER_NAMES) + SHEET_PARAMETER_NAMES.index("offset_mm")
+    column = offset + len(SHEET_PARAMETER_NAMES) * nodes.sheet
+    if nodes.by_sensor is None or not len(nodes) or column.max() >= nodes.by_sensor.shape[2]:
+        return ()
+    by_offset = nodes.by_sensor[np.arange(len(nodes)), :, column]
+    moved = np.einsum("ni,ni->n", placed.normals_sensor, by_offset)
+    alike = _same(nodes.sheet) * _alike(nodes.points_mm, SHEET_SHAPE_LENGTH_MM)
+    covariance = alike * moved[:, None] * moved[None, :]
+    return (_component("sheet shape", covariance, options.sheet_shape_mm, TYPICAL_SHEET_SHAPE_MM),)
+
+
 def _same(labels: IntArray) -> FloatArray:
     return np.asarray(labels[:, None] == labels[None, :], dtype=np.float64)
 
 
 def _alike(places_mm: FloatArray, length_mm: float) -> FloatArray:
-    """Correlation (N, N) of the flatness at (N, 2) places: Matern's of order 5/2.
+    """Correlation (N, N) of a smooth error at (N, 2) or (N, 3) places: Matern's of order 5/2.
 
     Near zero it bends like ``exp(-d^2 / (2 length^2))``. A Gaussian supposes more smoothness than
-    any plate has and, given too long a length, takes whatever else is smooth for exactly known.
+    any plate or sheet has and, given too long a length, takes whatever else is smooth for exactly
+    known.
     """
     apart = np.linalg.norm(places_mm[:, None] - places_mm[None, :], axis=2)
     scaled = apart * (np.sqrt(3.0) / length_mm)

@@ -29,6 +29,8 @@ class HandEyeOptions:
         Standard deviation of the plate's smooth flatness error.
     flatness_length_mm
         Length over which it stays alike; need not be exact.
+    sheet_shape_mm
+        Standard deviation of the light sheets' own shape, beyond what their parameters describe.
     stripe_noise_factor
         What the stripes' own noise is multiplied with.
     solve_plate
@@ -53,6 +55,7 @@ class HandEyeOptions:
     exposure_rotation_rad: float | None = None
     plate_flatness_mm: float | None = None
     flatness_length_mm: float = 30.0
+    sheet_shape_mm: float | None = None
     stripe_noise_factor: float | None = None
     solve_plate: bool = False
     nodes_per_stripe: int = 12
@@ -68,6 +71,7 @@ class HandEyeOptions:
             "exposure_position_mm",
             "exposure_rotation_rad",
             "plate_flatness_mm",
+            "sheet_shape_mm",
             "stripe_noise_factor",
         ):
             value = getattr(self, name)

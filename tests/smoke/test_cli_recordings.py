@@ -42,6 +42,19 @@ def test_what_cannot_be_simulated_is_said(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("head", ["thesis-cross", "thesis-multi-5"])
+def test_an_earlier_truth_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], head: str
+) -> None:
+    """`simulate` has no --force, so none may be advised."""
+    truth = tmp_path / "scan.truth.json"
+    truth.write_text("mine")
+    assert main(["simulate", head, "still-step", "-o", str(tmp_path / "scan")]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and "--force" not in err and "remove it, or name another folder" in err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
 BAD = {
     "swapped columns": ({"arm": ARM.replace("z_mm,qw", "qw,z_mm")}, "norm is 400"),
     "duplicate times": ({"arm": ARM.replace("3500,", "1500,")}, "appears again"),

@@ -125,6 +125,12 @@ def simulate_scene(
     settings = SimulateOptions() if options is None else options
     truth = truth_path(folder)
     check_new_folder(folder)
+    if truth.is_file():
+        raise OutputError(
+            "the truth of an earlier recording is there",
+            where=str(truth),
+            remedy="remove it, or name another folder",
+        )
     check_outputs((truth,))
     name = TwinName(head, settings.preset, settings.seed)
     twin = name.build()

@@ -22,7 +22,7 @@ CROSSING_PX = 2.0
 SEEN_MM = 0.25
 """A true point is seen by the other camera if that one has a true point so near."""
 LEAST_POINTS = 20
-"""A sheet counts as in view if so many accepted points lie on its true stripe."""
+"""A sheet counts as in view if so many accepted points of it are seen by all cameras."""
 MOST_CHECKED = 8
 """Instants of a scan whose truth is computed, evenly chosen."""
 
@@ -49,8 +49,8 @@ class NamingErrors:
     n_ambiguous, n_unexplained
         Accepted points that were dropped because several sheets, or none, explain them.
     n_stripes_in_view, n_stripes_named
-        Sheets with a true stripe in the left image that the camera saw as a stripe, and those of
-        them that gave a measured point; summed over the instants.
+        Sheets of which the left camera saw a stripe that every camera of the head sees, and those
+        of them that gave a measured point; summed over the instants.
     """
 
     n_instants: int = 0
@@ -124,11 +124,14 @@ def _of_instant(
     names: tuple[str, ...],
 ) -> NamingErrors:
     total = NamingErrors(n_instants=1)
+    in_view: set[str] = set()
     for k, (image, stripes) in enumerate(zip(images, true, strict=True)):
         others = [stripes for j, stripes in enumerate(true) if j != k]
-        total += _of_image(image, stripes, others, names)
+        found, shared = _of_image(image, stripes, others, names)
+        total += found
+        if k == 0:
+            in_view = {name for name, count in shared.items() if count >= LEAST_POINTS}
     seen = {names[k] for image in images for k in set(image.sheet[_measured(image)].tolist())}
-    in_view = {s.sheet for s in true[0] if _is_seen(images[0], s)}
     return total + NamingErrors(n_stripes_in_view=len(in_view), n_stripes_named=len(in_view & seen))
 
 
@@ -137,7 +140,8 @@ def _of_image(
     stripes: Sequence[TrueStripe],
     others: Sequence[Sequence[TrueStripe]],
     names: tuple[str, ...],
-) -> NamingErrors:
+) -> tuple[NamingErrors, dict[str, int]]:
+    """Names of one image, and how many points that all cameras see each sheet has in it."""
     points, measured = image.profile.points_px, _measured(image)
     distance, nearest = _distances(points, stripes)
     best = np.argmin(distance, axis=1) if len(stripes) else np.zeros(len(points), dtype=np.int64)
@@ -145,7 +149,8 @@ def _of_image(
     own = _own_distance(image.sheet, distance, stripes, names)
     right_name = own < CROSSING_PX
     shared = on & image.profile.is_accepted & _seen_by_all(nearest, best, stripes, others)
-    return NamingErrors(
+    counts = {s.sheet: int((shared & (best == k)).sum()) for k, s in enumerate(stripes)}
+    errors = NamingErrors(
         n_named=int((measured & on).sum()),
         n_wrong=int((measured & on & ~right_name).sum()),
         n_stray=int((measured & ~on).sum()),
@@ -154,6 +159,7 @@ def _of_image(
         n_ambiguous=image.count(PointFate.AMBIGUOUS),
         n_unexplained=image.count(PointFate.STRAY),
     )
+    return errors, counts
 
 
 def _measured(image: ReconstructedImage) -> BoolArray:
@@ -203,12 +209,3 @@ def _seen_by_all(
             at = stripe.points_base_mm[nearest[given, k]]
             seen[given] &= cKDTree(there.points_base_mm).query(at)[0] < SEEN_MM
     return seen
-
-
-def _is_seen(image: ReconstructedImage, stripe: TrueStripe) -> bool:
-    """True if the camera saw some of the stripe as one."""
-    used = image.profile.points_px[image.profile.is_accepted]
-    if not len(used) or not len(stripe.points_px):
-        return False
-    near = cKDTree(stripe.points_px).query(used)[0] < ON_STRIPE_PX
-    return int(np.count_nonzero(near)) >= LEAST_POINTS

@@ -85,7 +85,7 @@ def test_a_marker_that_moved_is_named_among_those_with_ids() -> None:
 def test_a_marker_that_does_not_fit_three_others_is_named() -> None:
     """Four markers are the least; with one of them moved there is no registration to believe."""
     scene = two_views(np.random.default_rng(4), 4, SIZE, missing=0.0, extra=0.0)
-    scene, old_id, _ = pushed(scene, 2, np.array([3.0, -2.0, 1.0]))
+    scene, _, _ = pushed(scene, 2, np.array([3.0, -2.0, 1.0]))
     numbers = [replace(scene.a, ids=scene.true_a), replace(scene.b, ids=scene.true_b)]
     old, new = (listed(item, name, has_ids=True) for item, name in zip(numbers, "ab", strict=True))
     with pytest.raises(EstimationError, match=r"marker \d+ \(new \d+\) does not fit the others"):

@@ -18,6 +18,10 @@ from scipy.spatial import cKDTree
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 
 NEIGHBOURS = 24
+ASKED = 3
+"""Times as many neighbours are looked at: those on another thing are passed over."""
+SAME_THING_MM = 10.0
+"""Neighbours further in front or behind are taken for another thing."""
 THINNING = 5
 """Of the samples along a line, so that the nearest are of several lines."""
 SCALE_PX = 500.0
@@ -74,8 +78,14 @@ def fit_planes(points_px: FloatArray, depth_mm: FloatArray, stretch: IntArray) -
         return none
     numbers = np.unique(stretch)
     middle = np.stack([np.median(points_px[stretch == b], axis=0) for b in numbers])
-    _, nearest = cKDTree(points_px[thin]).query(middle, NEIGHBOURS)
+    own_mm = np.array([np.median(depth_mm[stretch == b]) for b in numbers])
+    n_asked = min(ASKED * NEIGHBOURS, len(thin))
+    _, nearest = cKDTree(points_px[thin]).query(middle, n_asked)
     near = thin[nearest]
+    # What stands in front or behind comes last, so that it is taken only where nothing else is.
+    is_other = np.abs(depth_mm[near] - own_mm[:, None]) > SAME_THING_MM
+    order = np.argsort(is_other, axis=1, kind="stable")[:, :NEIGHBOURS]
+    near = np.take_along_axis(near, order, axis=1)
     place = (points_px[near] - middle[:, None, :]) / SCALE_PX
     design = np.concatenate([np.ones((*near.shape, 1)), place], axis=2)
     inverse = 1.0 / depth_mm[near]

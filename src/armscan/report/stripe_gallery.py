@@ -19,6 +19,8 @@ FATE_COLOURS = {
     PointFate.OUT_OF_DEPTH: "#ff7a3c",
     PointFate.AMBIGUOUS: "#ffd23f",
     PointFate.STRAY: "#ff4d6d",
+    PointFate.SHARED: "#7f8c99",
+    PointFate.INCONSISTENT: "#d65db1",
 }
 
 

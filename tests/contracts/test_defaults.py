@@ -25,6 +25,7 @@ from armscan.pipeline.register import RegisterOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
 from armscan.reconstruction.choose_sheet import DepthRange
+from armscan.reconstruction.stereo_options import StereoNamingOptions
 from armscan.report.hand_eye_request import HandEyeRequest
 from armscan.report.head_demo_job import HeadDemoRequest
 from armscan.storage.image_options import ImageOptions
@@ -121,7 +122,8 @@ def test_the_depth_margin_that_texts_name_is_the_default() -> None:
     text = f"{DepthRange().margin:g}"
     option = parameters(("reconstruct",))["depth_margin"]
     assert option.default is None
-    assert f"Without it {text};" in option.help
+    stereo = f"{StereoNamingOptions().depths.margin:g}"
+    assert f"Without it {text}; with two cameras {stereo};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())
     assert f"up to X times its width at either end ({text} unless said)" in words

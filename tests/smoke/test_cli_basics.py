@@ -50,8 +50,8 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     assert main(["-h"]) == 0
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
-    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "inspect", "verify"]
-    assert names == [*chain, "convert", "info", "doctor"]
+    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"]
+    assert names == [*chain, "inspect", "verify", "convert", "info", "doctor"]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

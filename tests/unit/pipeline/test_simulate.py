@@ -129,7 +129,7 @@ def test_probing_gives_touches_and_the_tip(tmp_path: Path) -> None:
 
 def test_results_that_exist_stop_it_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "scan.truth.json").write_text("mine")
-    with pytest.raises(OutputError, match="the file exists"):
+    with pytest.raises(OutputError, match="the truth of an earlier recording is there"):
         simulate_scene(tmp_path / "scan", HEAD, "ball")
     assert not (tmp_path / "scan").exists()
     (tmp_path / "full").mkdir()

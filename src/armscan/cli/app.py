@@ -29,6 +29,7 @@ from armscan.cli import (
     verify,
 )
 
+EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
@@ -36,6 +37,14 @@ HELP_ORDER = (
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
+
+
+def _help_unless_a_command_follows(context: typer.Context) -> None:
+    """Print the help of a group that is given no command; nothing was done, so exit code 2."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help(), err=True)
+        raise typer.Exit(EXIT_INPUT)
+
 
 app = typer.Typer(
     name="armscan",
@@ -48,7 +57,7 @@ app = typer.Typer(
         "  armscan COMMAND -h            options, and an example that works"
     ),
     context_settings=HELP_OPTIONS,
-    no_args_is_help=True,
+    invoke_without_command=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -59,7 +68,8 @@ calibrate = typer.Typer(
         "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json"
     ),
     context_settings=HELP_OPTIONS,
-    no_args_is_help=True,
+    invoke_without_command=True,
+    callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
 calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
@@ -69,7 +79,8 @@ inspect = typer.Typer(
     help="Compare measured points with a plane, a ball or a step.",
     epilog=inspect_sphere.EXAMPLE,
     context_settings=HELP_OPTIONS,
-    no_args_is_help=True,
+    invoke_without_command=True,
+    callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
 inspect.command("plane", epilog=inspect_plane.EXAMPLE)(inspect_plane.plane)
@@ -98,6 +109,7 @@ def _print_version(is_asked: bool) -> None:
 
 @app.callback()
 def root(
+    context: typer.Context,
     show_version: Annotated[
         bool,
         typer.Option(
@@ -106,6 +118,7 @@ def root(
     ] = False,
 ) -> None:
     """Cameras and line lasers as a calibrated 3-D scanner: calibrate, then measure."""
+    _help_unless_a_command_follows(context)
 
 
 def command() -> Any:

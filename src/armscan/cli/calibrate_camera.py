@@ -10,7 +10,7 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli.image_arguments import BitsAlign, BitsUsed, Target
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -23,15 +23,19 @@ EXAMPLE = (
 def camera(
     *,
     images: Annotated[
-        list[str],
+        list[str] | None,
         typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
-    ],
+    ] = None,
     target: Target,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
     ] = Path("camera.json"),
+    scan: Annotated[
+        Path | None, typer.Option(help="Recording of the target instead of images.")
+    ] = None,
     leave_out: Annotated[
-        list[str] | None, typer.Option(help="Image not to use, by name; repeat for more.")
+        list[str] | None,
+        typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
     ] = None,
     auto_leave_out: Annotated[
         bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
@@ -48,6 +52,8 @@ def camera(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = "low",
     force: Force = False,
+    force_bad: ForceBad = False,
+    cache: Cache = True,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a flat target."""
@@ -60,7 +66,8 @@ def camera(
     if unknown := sorted(held - {"aspect", "centre"}):
         raise OptionError(f"--fix {unknown[0]} is not known", remedy="choose aspect or centre")
     request = CameraRequest(
-        images=tuple(images),
+        images=tuple(images or ()),
+        scan=scan,
         target=target,
         output=output,
         options=CameraOptions(
@@ -73,6 +80,8 @@ def camera(
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
+        is_forced=force_bad,
+        is_caching=cache,
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:

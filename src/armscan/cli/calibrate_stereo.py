@@ -11,7 +11,7 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli.image_arguments import BitsAlign, BitsUsed, Target
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -48,7 +48,10 @@ def stereo(
         str, typer.Option(help="What these are for: prior (beside the images) or fixed (held).")
     ] = "prior",
     leave_out: Annotated[
-        list[str] | None, typer.Option(help="Image whose pair is not used; repeat for more.")
+        list[str] | None,
+        typer.Option(
+            help="Image whose pair is not used, by name or quoted pattern; repeat for more."
+        ),
     ] = None,
     auto_leave_out: Annotated[
         bool, typer.Option("--auto-leave-out", help="Take pairs apart that disagree.")
@@ -59,6 +62,8 @@ def stereo(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = "low",
     force: Force = False,
+    force_bad: ForceBad = False,
+    cache: Cache = True,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate two cameras and where they are to each other."""
@@ -91,6 +96,8 @@ def stereo(
         options=given if is_given else replace(given, intrinsics="free"),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
         is_overwriting=force,
+        is_forced=force_bad,
+        is_caching=cache,
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:

@@ -14,6 +14,17 @@ if TYPE_CHECKING:
     from armscan.report.summary import Summary
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON, for programs.")]
+ForceBad = Annotated[
+    bool,
+    typer.Option(
+        "--force-bad",
+        help="Write a result that makes no sense, marked as such in all that uses it.",
+    ),
+]
+Cache = Annotated[
+    bool,
+    typer.Option("--cache/--no-cache", help="Keep the points found in images beside the document."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
 
 

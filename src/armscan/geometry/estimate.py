@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NoReturn, TypeVar
 
 import numpy as np
 
@@ -55,11 +55,15 @@ class Estimate(Generic[T]):
 
 @dataclass(frozen=True, slots=True)
 class FitFailure:
-    """Why there is no estimate: the fact and what to do. Falsy, so that ``if not fit`` reads."""
+    """Why there is no estimate: the fact and what to do.
+
+    It is neither true nor false: ``first or FitFailure(...)`` would lose the reason of a first
+    failure, and ``if fit`` ask an estimate that may be empty itself. Ask with `isinstance`.
+    """
 
     reason: str
     remedy: str = ""
 
-    def __bool__(self) -> bool:
-        """Return False: a failure is no estimate."""
-        return False
+    def __bool__(self) -> NoReturn:
+        """Raise: whether there is an estimate is asked with `isinstance`."""
+        raise TypeError("a FitFailure has no truth value; ask isinstance(x, FitFailure)")

@@ -66,6 +66,9 @@ class Provenance:
         (name, value as text) of the options in force.
     warnings
         What the program warned of.
+    forced
+        Why it was refused, where it was written all the same on request (``--force-bad``), with
+        the reasons of the documents on which it rests; empty for a document that was not refused.
     """
 
     document_id: str
@@ -76,6 +79,7 @@ class Provenance:
     parent_ids: tuple[str, ...] = ()
     options: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    forced: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -91,14 +91,15 @@ def _see(
     cameras: HeadCameras,
     options: TargetOptions,
 ) -> SeenBoard | FitFailure:
-    first: FitFailure | None = None
+    """The board in the first image that shows it, or why the first does not."""
+    failures: list[FitFailure] = []
     for image in images:
         view = detect_target(image, target, options)
         found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
         if not isinstance(found, FitFailure):
             return found
-        first = first or found
-    return first or FitFailure("there is no image of it", "give one")
+        failures.append(found)
+    return failures[0] if failures else FitFailure("there is no image of it", "give one")
 
 
 def _posed(camera: int, view: TargetView, cameras: HeadCameras) -> SeenBoard | FitFailure:

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence, Sized
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,15 +12,14 @@ from armscan.calibration.camera.calibrate import calibrate_camera
 from armscan.calibration.camera.options import MIN_VIEWS, CameraOptions
 from armscan.calibration.camera.result import CameraFit
 from armscan.geometry.estimate import FitFailure
+from armscan.pipeline.found_targets import FoundTargets, find_targets
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.circle_centres import correct_centres
 from armscan.vision.targets.definition import Target
-from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.options import TargetOptions
 from armscan.vision.targets.view import TargetView
 
-DETECTION_THREADS = 2
 CENTRE_ROUNDS = 5
 CENTRES_STABLE = 0.02
 """Circle centres are stable when no camera parameter moves by more than this many sigmas."""
@@ -83,38 +80,23 @@ def calibrate_camera_from_exposures(
     InputError, OptionError
         As `calibrate_camera`.
     """
+    found = find_targets(exposures, target, target_options, progress=progress)
+    return calibrate_camera_from_found(found, options, progress=progress)
+
+
+def calibrate_camera_from_found(
+    found: FoundTargets, options: CameraOptions | None = None, *, progress: Progress = silent
+) -> CameraRun | FitFailure:
+    """As `calibrate_camera_from_exposures`, with the targets looked for already."""
     options = options or CameraOptions()
-    total = len(exposures) if isinstance(exposures, Sized) else 0
-    views: list[TargetView] = []
-    not_found: list[tuple[str, str]] = []
-    for done, (source, found) in enumerate(detect_in_order(exposures, target, target_options), 1):
-        if isinstance(found, FitFailure):
-            not_found.append((source, found.reason))
-        else:
-            views.append(found)
-        progress(ProgressEvent("find target", done, max(total, done), source))
-    missing = _too_few(views, not_found)
+    missing = _too_few(found)
     if missing is not None:
         return missing
-    run = calibrate_camera_from_views(views, options, progress=progress)
+    options = replace(options, leave_out=found.shown_of(options.leave_out))
+    run = calibrate_camera_from_views(found.views, options, progress=progress)
     if isinstance(run, FitFailure):
-        return FitFailure(run.reason + _listed(not_found), run.remedy)
-    return CameraRun(run.fit, tuple(not_found), run.centre_rounds)
-
-
-def detect_in_order(
-    exposures: Iterable[Exposure], target: Target, options: TargetOptions | None
-) -> Iterator[tuple[str, TargetView | FitFailure]]:
-    """Detect in a few threads, in order, without holding more exposures than threads."""
-    waiting: deque[tuple[str, Future[TargetView | FitFailure]]] = deque()
-    with ThreadPoolExecutor(DETECTION_THREADS) as pool:
-        for exposure in exposures:
-            waiting.append((exposure.source, pool.submit(detect_target, exposure, target, options)))
-            if len(waiting) == DETECTION_THREADS:
-                source, future = waiting.popleft()
-                yield source, future.result()
-        for source, future in waiting:
-            yield source, future.result()
+        return FitFailure(run.reason + found.not_found_text(), run.remedy)
+    return CameraRun(run.fit, found.not_found, run.centre_rounds)
 
 
 def calibrate_camera_from_views(
@@ -159,9 +141,9 @@ def _moved_sigmas(before: CameraFit, after: CameraFit) -> float:
     return float(np.max(moved[is_free] / after.sigma[is_free]))
 
 
-def _too_few(views: list[TargetView], not_found: list[tuple[str, str]]) -> FitFailure | None:
-    n_images = len(views) + len(not_found)
-    if len(views) >= MIN_VIEWS:
+def _too_few(found: FoundTargets) -> FitFailure | None:
+    n_images = len(found.views) + len(found.not_found)
+    if len(found.views) >= MIN_VIEWS:
         return None
     if n_images < MIN_VIEWS:
         given = "1 image was" if n_images == 1 else f"{n_images} images were"
@@ -170,19 +152,7 @@ def _too_few(views: list[TargetView], not_found: list[tuple[str, str]]) -> FitFa
             "take 10 to 20 images with the board tilted by 20 to 45 degrees in all directions",
         )
     return FitFailure(
-        f"the target was found in {len(views)} of {n_images} images, a camera needs {MIN_VIEWS}"
-        + _listed(not_found),
+        f"the target was found in {len(found.views)} of {n_images} images, a camera needs "
+        f"{MIN_VIEWS}{found.not_found_text()}",
         "check columns, rows and kind of the target, and that all of it is in the image",
     )
-
-
-def _listed(not_found: list[tuple[str, str]]) -> str:
-    """First few of the exposures without target; each reason names its exposure or is prefixed."""
-    if not not_found:
-        return ""
-    parts = [
-        reason if reason.startswith(source) else f"{source}: {reason}"
-        for source, reason in not_found[:3]
-    ]
-    more = f"; and {len(not_found) - 3} more" if len(not_found) > 3 else ""
-    return f" (no target: {'; '.join(parts)}{more})"

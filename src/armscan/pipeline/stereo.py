@@ -19,7 +19,8 @@ from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.diagnostics import CameraDiagnostics
 from armscan.models.stereo import StereoCalibration, StereoDiagnostics
-from armscan.pipeline.camera import CENTRE_ROUNDS, CENTRES_STABLE, detect_in_order
+from armscan.pipeline.camera import CENTRE_ROUNDS, CENTRES_STABLE
+from armscan.pipeline.found_targets import FoundTargets, find_targets
 from armscan.pipeline.instants import group_instants
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
@@ -146,20 +147,30 @@ def calibrate_stereo_from_exposures(
         As `calibrate_stereo`.
     """
     every = [exposure for pair in exposures for exposure in pair if exposure is not None]
-    views: dict[str, TargetView] = {}
-    not_found: list[tuple[str, str]] = []
-    for done, (source, found) in enumerate(detect_in_order(every, target, target_options), 1):
-        if isinstance(found, FitFailure):
-            not_found.append((source, found.reason))
-        else:
-            views[source] = found
-        progress(ProgressEvent("find target", done, len(every), source))
-    pairs = _found_pairs(exposures, views)
-    missing = _too_few(exposures, pairs, not_found)
+    found = find_targets(every, target, target_options, progress=progress)
+    return calibrate_stereo_from_found(exposures, found, target, options, given, progress=progress)
+
+
+def calibrate_stereo_from_found(
+    exposures: Sequence[ExposedPair],
+    found: FoundTargets,
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """As `calibrate_stereo_from_exposures`, with the targets looked for already."""
+    pairs = _found_pairs(exposures, {view.source: view for view in found.views})
+    missing = _too_few(exposures, pairs, found)
     if missing is not None:
         return missing
+    options = options or StereoOptions()
+    options = replace(options, leave_out=found.shown_of(options.leave_out))
     run = calibrate_stereo_from_pairs(pairs, target, options, given, progress=progress)
-    return replace(run, not_found=tuple(not_found)) if isinstance(run, StereoRun) else run
+    if isinstance(run, FitFailure):
+        return FitFailure(run.reason + found.not_found_text(), run.remedy)
+    return replace(run, not_found=found.not_found)
 
 
 def calibrate_stereo_from_pairs(
@@ -263,16 +274,11 @@ def _found_pairs(
 def _too_few(
     exposures: Sequence[ExposedPair],
     pairs: Sequence[StereoPair],
-    not_found: Sequence[tuple[str, str]],
+    found: FoundTargets,
 ) -> FitFailure | None:
     n_both = sum(pair.is_seen_by_both for pair in pairs)
     if n_both >= MIN_PAIRS:
         return None
-    reasons = "; ".join(
-        reason if reason.startswith(source) else f"{source}: {reason}"
-        for source, reason in not_found[:LISTED]
-    )
-    more = f"; and {len(not_found) - LISTED} more" if len(not_found) > LISTED else ""
     counts = []
     for side, word in enumerate(SIDES):
         n_images = sum(pair[side] is not None for pair in exposures)
@@ -280,7 +286,7 @@ def _too_few(
         counts.append(f"{n_seen} of {n_images} {word} images")
     return FitFailure(
         f"the target was found in {' and '.join(counts)}, in both of {n_both} pairs; "
-        f"{MIN_PAIRS} pairs are needed" + (f" (no target: {reasons}{more})" if reasons else ""),
+        f"{MIN_PAIRS} pairs are needed{found.not_found_text()}",
         "take 10 to 20 pairs in which both cameras see the whole target, and check its columns, "
         "rows and kind",
     )

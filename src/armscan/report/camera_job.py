@@ -4,27 +4,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from armscan.calibration.camera.options import CameraOptions
-from armscan.errors import EstimationError
+from armscan.calibration.camera.refusals import reasons_to_refuse
+from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.models.calibration import Provenance
+from armscan.pipeline.camera import CameraRun, calibrate_camera_from_found
 from armscan.pipeline.documents import camera_calibration
+from armscan.pipeline.found_targets import find_targets
 from armscan.pipeline.progress import Progress, silent
-from armscan.report.camera_page import camera_page, parameter_rows
+from armscan.records.exposure import Exposure
+from armscan.report.camera_page import TITLE, camera_page, parameter_rows
 from armscan.report.numbers import sentence, significant, without_source
-from armscan.report.outputs import calibration_outputs
-from armscan.report.page import render_page
+from armscan.report.outputs import OutputFiles, calibration_outputs
+from armscan.report.page import Page, render_page
+from armscan.report.refusal import refuse, refused_for, refused_page, tried_targets
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import camera_document
+from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.image_options import ImageOptions
-from armscan.storage.image_paths import expand_paths
+from armscan.storage.image_paths import expand_paths, named_by
 from armscan.storage.images import check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.provenance import new_provenance
+from armscan.storage.recording_exposures import EXPOSURES_FILE
+from armscan.storage.recording_reader import read_recording
+from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.simulated import are_simulated
 from armscan.vision.targets.specification import parse_target
 
@@ -47,6 +56,12 @@ class CameraRequest:
         How pixels are read.
     is_overwriting
         Replace results that exist.
+    scan
+        Folder recording of the target, instead of images.
+    is_forced
+        Write a camera that makes no sense, marked as such.
+    is_caching
+        Keep the targets found beside the document, and take those kept there.
     command
         The command line, for the record.
     """
@@ -57,7 +72,26 @@ class CameraRequest:
     options: CameraOptions = field(default_factory=CameraOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
     is_overwriting: bool = False
+    scan: Path | None = None
+    is_forced: bool = False
+    is_caching: bool = False
     command: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Images:
+    """What was read: exposures with their files, other files that went in, and what is odd."""
+
+    exposures: tuple[Exposure, ...]
+    paths: tuple[Path, ...]
+    is_simulated: bool
+    tables: tuple[Path, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def by_source(self) -> dict[str, Exposure]:
+        """Exposures by their names."""
+        return {exposure.source: exposure for exposure in self.exposures}
 
 
 def run_camera_calibration(request: CameraRequest, progress: Progress = silent) -> Summary:
@@ -67,32 +101,97 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
     ------
     ArmscanError
         If a file is unreadable, an option is wrong, or the images do not determine the camera;
-        nothing is written then.
+        no document is written then. Where it is the images, a page shows them.
     """
     target = parse_target(request.target)
     files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
-    paths = expand_paths(request.images)
-    exposures = read_exposures(paths, request.image_options)
-    check_same_size(exposures)
-    run = calibrate_camera_from_exposures(exposures, target, request.options, progress=progress)
-    if isinstance(run, FitFailure):
-        raise EstimationError(run.reason, remedy=run.remedy)
+    images = _read_images(request)
+    check_same_size(images.exposures)
+    sources = [exposure.source for exposure in images.exposures]
+    left_out = named_by(request.options.leave_out, sources, "--leave-out")
+    options = replace(request.options, leave_out=left_out)
+    cache = DetectionCache.beside(request.output) if request.is_caching else None
+    found = find_targets(images.exposures, target, cache=cache, progress=progress)
+    run = calibrate_camera_from_found(found, options, progress=progress)
+    fit = None if isinstance(run, FitFailure) else run.fit
+    nonsense = () if fit is None else reasons_to_refuse(fit)
     provenance = new_provenance(
-        paths,
+        (*images.paths, *images.tables),
         command=request.command,
-        options=(target, run.fit.options, request.image_options),
-        warnings=run.fit.warnings,
+        options=(target, options if fit is None else fit.options, request.image_options),
+        warnings=(*images.warnings, *(() if fit is None else fit.warnings)),
+        forced=nonsense,
     )
+    if isinstance(run, FitFailure):
+        tried = tried_targets(found.views, found.not_found, sources)
+        page = refused_page(
+            TITLE, tried, images.by_source, provenance, is_simulated=images.is_simulated
+        )
+        refuse(files, page, run)
     page = camera_page(
-        run.fit,
-        run.not_found,
-        {exposure.source: exposure for exposure in exposures},
-        provenance,
-        is_simulated=are_simulated(paths),
+        run.fit, run.not_found, images.by_source, provenance, is_simulated=images.is_simulated
     )
+    if nonsense and not request.is_forced:
+        refuse(files, replace(page, forced=()), refused_for(nonsense))
+    _write(files, run, images, (page, provenance), is_overwriting=request.is_overwriting)
+    return camera_summary(
+        run,
+        (files.document, files.observations, files.page),
+        images.warnings,
+        nonsense,
+        is_simulated=images.is_simulated,
+    )
+
+
+def _read_images(request: CameraRequest) -> _Images:
+    if request.scan is None:
+        if not request.images:
+            raise OptionError("no images are given", remedy="name images, or give --scan FOLDER")
+        paths = expand_paths(request.images)
+        exposures = read_exposures(paths, request.image_options)
+        return _Images(exposures, paths, are_simulated(paths))
+    if request.images:
+        raise OptionError(
+            "a recording and images are given", remedy="give --scan FOLDER, or images"
+        )
+    request.image_options.check_unused()
+    return _read_scan(request.scan)
+
+
+def _read_scan(folder: Path) -> _Images:
+    """The images without laser of a recording of one camera; all images where none is without."""
+    recording = read_recording(folder)
+    cameras = sorted({row.camera for row in recording.rows})
+    if len(cameras) > 1:
+        raise OptionError(
+            f"the recording is of {len(cameras)} cameras",
+            where=f"--scan {folder}",
+            remedy="calibrate them together with `armscan calibrate stereo --scan`",
+        )
+    dark = [k for k, row in enumerate(recording.rows) if not row.lasers]
+    chosen = dark or list(range(len(recording.rows)))
+    tables = (folder / EXPOSURES_FILE, folder / SESSION_FILE)
+    return _Images(
+        tuple(recording.exposure(k) for k in chosen),
+        tuple(folder / recording.rows[k].source for k in chosen),
+        recording.is_simulated,
+        tuple(path for path in tables if path.is_file()),
+        (*recording.warnings, *recording.session.assumed),
+    )
+
+
+def _write(
+    files: OutputFiles,
+    run: CameraRun,
+    images: _Images,
+    report: tuple[Page, Provenance],
+    *,
+    is_overwriting: bool,
+) -> None:
+    page, provenance = report
     hashes = {
         exposure.source: item.sha256
-        for exposure, item in zip(exposures, provenance.inputs, strict=True)
+        for exposure, item in zip(images.exposures, provenance.inputs, strict=False)
     }
     observations = pack_observations([view.view for view in run.fit.views], (), hashes)
     document = camera_document(
@@ -100,14 +199,19 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
     )
     write_files(
         {files.document: document, files.observations: observations, files.page: render_page(page)},
-        is_overwriting=request.is_overwriting,
+        is_overwriting=is_overwriting,
     )
-    return camera_summary(
-        run, (files.document, files.observations, files.page), is_simulated=page.is_simulated
-    )
+    files.refused_page.unlink(missing_ok=True)
 
 
-def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: bool) -> Summary:
+def camera_summary(
+    run: CameraRun,
+    written: Sequence[Path],
+    notes: Sequence[str] = (),
+    forced: Sequence[str] = (),
+    *,
+    is_simulated: bool,
+) -> Summary:
     """What a person, and a program, wants to know of a calibration."""
     fit = run.fit
     held_out = fit.cross_validation
@@ -138,7 +242,8 @@ def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: boo
         title="Camera calibrated" + (" from simulated images." if is_simulated else "."),
         facts=tuple(facts),
         tables=(views,) if views.rows else (),
-        warnings=tuple(sentence(warning) for warning in fit.warnings),
+        warnings=tuple(sentence(warning) for warning in (*notes, *fit.warnings)),
+        forced=tuple(forced),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
         data=_data(run, is_simulated),

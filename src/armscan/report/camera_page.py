@@ -18,6 +18,7 @@ from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.summary import Table
 
+TITLE = "Camera calibration"
 UNITS = {"fx_px": "px", "fy_px": "px", "cx_px": "px", "cy_px": "px"}
 MEANINGS = {
     "fx_px": "focal length along x",
@@ -72,7 +73,7 @@ def camera_page(
         sections.append(_warp_section(fit))
     sections += [_parameters_section(fit), origin_section(provenance)]
     return Page(
-        title="Camera calibration",
+        title=TITLE,
         subtitle=f"{fit.camera.width_px} × {fit.camera.height_px} px camera, "
         f"{fit.n_views} of {n_images} images used, {fit.n_points} target points",
         cards=_cards(fit),
@@ -80,6 +81,7 @@ def camera_page(
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

@@ -103,7 +103,7 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
         (*images, *background, request.sensor),
         command=request.command,
         options=(request.options, request.image_options),
-        parent_ids=(sensor.provenance.document_id,),
+        parents=(sensor.provenance,),
         warnings=result.warnings,
     )
     is_simulated = are_simulated((*images, *background))

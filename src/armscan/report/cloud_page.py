@@ -68,6 +68,7 @@ def cloud_page(
         ),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

@@ -116,12 +116,12 @@ def _input_warnings(inputs: HandEyeInputs) -> tuple[str, ...]:
 
 def _provenance(request: HandEyeRequest, inputs: HandEyeInputs, fit: HandEyeFit) -> Provenance:
     options = request.sphere_options if request.is_sphere else request.options
-    parent = () if inputs.sensor is None else (inputs.sensor.provenance.document_id,)
+    parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
     return new_provenance(
         inputs.files,
         command=request.command,
         options=(options, request.stripes),
-        parent_ids=parent,
+        parents=parents,
         warnings=fit.warnings,
     )
 

@@ -89,6 +89,7 @@ def hand_eye_page(
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(scanner.provenance),
+        forced=scanner.provenance.forced,
     )
 
 

@@ -38,16 +38,16 @@ class DemoOrigin:
     folder: Path
     place: Path
 
-    def provenance(self, files: Iterable[Path], *parents: str) -> Provenance:
+    def provenance(self, files: Iterable[Path], *parents: Provenance) -> Provenance:
         """Provenance that names files in ``place`` as they will be in ``folder``."""
-        found = new_provenance(files, command=self.command, parent_ids=parents)
+        found = new_provenance(files, command=self.command, parents=parents)
         inputs = tuple(
             replace(item, path=(self.folder / Path(item.path).relative_to(self.place)).as_posix())
             for item in found.inputs
         )
         return replace(found, inputs=inputs)
 
-    def of_recording(self, recording: FolderRecording, *parents: str) -> Provenance:
+    def of_recording(self, recording: FolderRecording, *parents: Provenance) -> Provenance:
         """Provenance of what rests on a recording."""
         folder = recording.folder
         return self.provenance((folder / EXPOSURES_FILE, folder / SESSION_FILE), *parents)
@@ -62,7 +62,7 @@ def demo_documents(
     sensor = replace(
         found.sensor,
         camera=replace(found.sensor.camera, provenance=base),
-        provenance=origin.of_recording(scans["laser"], base.document_id),
+        provenance=origin.of_recording(scans["laser"], base),
     )
     if sensor.second is not None:
         right = replace(sensor.second.camera, provenance=base)
@@ -70,7 +70,7 @@ def demo_documents(
     scanner = ScannerCalibration(
         sensor,
         found.hand_eye.fit.calibration,
-        origin.of_recording(scans["hand-eye"], sensor.provenance.document_id),
+        origin.of_recording(scans["hand-eye"], sensor.provenance),
     )
     return {
         **_cameras(found.camera, place, base),

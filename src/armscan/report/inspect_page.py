@@ -110,6 +110,7 @@ def inspection_page(
         ),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

@@ -117,7 +117,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         (*images.paths, *images.tables, request.camera),
         command=request.command,
         options=(target, options.target, options.stripes, fit.options, request.image_options),
-        parent_ids=(camera.provenance.document_id,),
+        parents=(camera.provenance,),
         warnings=(*images.warnings, *all_warnings(fit)),
     )
     is_simulated = are_simulated(images.paths)

@@ -69,6 +69,7 @@ def laser_page(
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

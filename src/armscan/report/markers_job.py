@@ -148,7 +148,7 @@ def _measure(request: MarkersRequest, progress: Progress) -> Summary:
     provenance = new_provenance(
         (*paths, request.stereo),
         command=request.command,
-        parent_ids=(stereo.provenance.document_id,),
+        parents=(stereo.provenance,),
         options=(request.rings, request.matching, request.image_options),
         warnings=warnings,
     )

@@ -57,6 +57,7 @@ def detection_page(
         ),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 
@@ -119,6 +120,7 @@ def stereo_page(
         ),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

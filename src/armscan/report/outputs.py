@@ -32,6 +32,11 @@ class OutputFiles:
         """The report beside it."""
         return self.document.with_suffix(".html")
 
+    @property
+    def refused_page(self) -> Path:
+        """The page of a run that wrote no document; an earlier document keeps its own page."""
+        return self.document.with_suffix(".refused.html")
+
 
 def calibration_outputs(document: Path, *, is_overwriting: bool) -> OutputFiles:
     """Check the place of ``NAME.json``, and of ``NAME.npz`` and ``NAME.html`` beside it.

@@ -101,6 +101,10 @@ class Page:
         True marks every number as coming from rendered data.
     footer
         One line about origin.
+    forced
+        Why what is shown, or what it rests on, was refused and made all the same.
+    refused
+        Why the run ended without a document, and what to do; empty if it did not.
     """
 
     title: str
@@ -110,6 +114,8 @@ class Page:
     sections: tuple[Section, ...]
     is_simulated: bool
     footer: str
+    forced: tuple[str, ...] = ()
+    refused: tuple[str, ...] = ()
 
 
 def render_page(page: Page) -> bytes:

@@ -91,4 +91,5 @@ def registration_page(
         ),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )

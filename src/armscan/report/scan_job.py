@@ -86,7 +86,7 @@ def run_scan(request: CloudRequest, folder: Path, progress: Progress = silent) -
         _files(request, folder),
         command=request.command,
         options=(options,),
-        parent_ids=(scanner.provenance.document_id,),
+        parents=(scanner.provenance,),
         warnings=(*notes, *scan.warnings),
     )
     page = scan_page(

@@ -68,6 +68,7 @@ def scan_page(
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

@@ -4,37 +4,42 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from armscan.calibration.stereo.options import StereoOptions
+from armscan.calibration.stereo.refusals import reasons_to_refuse
 from armscan.calibration.stereo.result import PairFit
-from armscan.errors import EstimationError, OptionError
+from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.stereo import STEREO_PARAMETER_NAMES
+from armscan.pipeline.found_targets import find_targets
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.stereo import (
     ExposedPair,
     Given,
     StereoRun,
-    calibrate_stereo_from_exposures,
+    calibrate_stereo_from_found,
     pair_lists,
     stereo_calibration,
     stereo_rows,
 )
+from armscan.records.exposure import Exposure
 from armscan.report.numbers import sentence, significant, without_source
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import render_page
-from armscan.report.stereo_page import pair_row, relative_rows, stereo_page
+from armscan.report.refusal import refuse, refused_for, refused_page, tried_targets
+from armscan.report.stereo_page import TITLE, pair_row, relative_rows, stereo_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_bodies import right_pose_body
 from armscan.storage.calibration_files import read_camera_calibration
+from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.image_options import ImageOptions
-from armscan.storage.image_paths import expand_paths
+from armscan.storage.image_paths import expand_paths, named_by
 from armscan.storage.images import check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.provenance import fingerprint, new_provenance
@@ -66,6 +71,10 @@ class StereoRequest:
         How pixels are read.
     is_overwriting
         Replace results that exist.
+    is_forced
+        Write cameras that make no sense, marked as such.
+    is_caching
+        Keep the targets found beside the document, and take those kept there.
     command
         The command line, for the record.
     """
@@ -80,6 +89,8 @@ class StereoRequest:
     options: StereoOptions = field(default_factory=StereoOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
     is_overwriting: bool = False
+    is_forced: bool = False
+    is_caching: bool = False
     command: tuple[str, ...] = ()
 
 
@@ -91,6 +102,11 @@ class _Images:
     paths: dict[str, Path]
     is_simulated: bool
 
+    @property
+    def by_source(self) -> dict[str, Exposure]:
+        """Exposures by their names."""
+        return {one.source: one for pair in self.pairs for one in pair if one is not None}
+
 
 def run_stereo_calibration(request: StereoRequest, progress: Progress = silent) -> Summary:
     """Read, calibrate, write ``stereo.json``, ``.npz`` and ``.html``, and say what came out.
@@ -99,38 +115,46 @@ def run_stereo_calibration(request: StereoRequest, progress: Progress = silent) 
     ------
     ArmscanError
         If a file is unreadable, an option is wrong, or the images do not determine the cameras;
-        nothing is written then.
+        no document is written then. Where it is the images, a page shows them.
     """
     target = parse_target(request.target)
     files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
     given = _given(request)
     images = _read_images(request)
-    every = [exposure for pair in images.pairs for exposure in pair if exposure is not None]
     for side in (0, 1):
         check_same_size([one for pair in images.pairs if (one := pair[side]) is not None])
     hashes = {source: fingerprint(path).sha256 for source, path in images.paths.items()}
     if given is not None and request.options.intrinsics == "prior":
         _check_not_the_same(given, hashes)
-    run = calibrate_stereo_from_exposures(
-        images.pairs, target, request.options, given, progress=progress
+    left_out = named_by(request.options.leave_out, list(images.by_source), "--leave-out")
+    options = replace(request.options, leave_out=left_out)
+    cache = DetectionCache.beside(request.output) if request.is_caching else None
+    found = find_targets(list(images.by_source.values()), target, cache=cache, progress=progress)
+    run = calibrate_stereo_from_found(
+        images.pairs, found, target, options, given, progress=progress
     )
-    if isinstance(run, FitFailure):
-        raise EstimationError(run.reason, remedy=run.remedy)
+    fit = None if isinstance(run, FitFailure) else run.fit
+    nonsense = () if fit is None else reasons_to_refuse(fit)
     cameras = [path for path in (request.left_camera, request.right_camera) if path is not None]
     provenance = new_provenance(
         (*images.paths.values(), *cameras),
         command=request.command,
-        options=(target, request.options, request.image_options),
-        parent_ids=tuple(one.provenance.document_id for one in given or ()),
-        warnings=run.fit.warnings,
+        options=(target, options, request.image_options),
+        parents=tuple(one.provenance for one in given or ()),
+        warnings=() if fit is None else fit.warnings,
+        forced=nonsense,
     )
+    if isinstance(run, FitFailure):
+        tried = tried_targets(found.views, found.not_found, list(images.by_source))
+        page = refused_page(
+            TITLE, tried, images.by_source, provenance, is_simulated=images.is_simulated
+        )
+        refuse(files, page, run)
     page = stereo_page(
-        run.fit,
-        run.not_found,
-        {exposure.source: exposure for exposure in every},
-        provenance,
-        is_simulated=images.is_simulated,
+        run.fit, run.not_found, images.by_source, provenance, is_simulated=images.is_simulated
     )
+    if nonsense and not request.is_forced:
+        refuse(files, replace(page, forced=()), refused_for(nonsense))
     views = [view for pair in run.fit.pairs for view in pair.pair.views if view is not None]
     observations = pack_observations(views, (), hashes)
     document = stereo_document(
@@ -140,8 +164,10 @@ def run_stereo_calibration(request: StereoRequest, progress: Progress = silent) 
         {files.document: document, files.observations: observations, files.page: render_page(page)},
         is_overwriting=request.is_overwriting,
     )
+    files.refused_page.unlink(missing_ok=True)
     written = (files.document, files.observations, files.page)
-    return stereo_summary(run, written, is_simulated=images.is_simulated)
+    summary = stereo_summary(run, written, is_simulated=images.is_simulated)
+    return replace(summary, forced=provenance.forced)
 
 
 def _given(request: StereoRequest) -> Given | None:

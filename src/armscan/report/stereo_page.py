@@ -20,6 +20,7 @@ from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Section, Text
 from armscan.report.summary import Table
 
+TITLE = "Stereo calibration"
 AXES = "xyz"
 N_INTRINSICS = 2 * len(PARAMETER_NAMES)
 USES = {
@@ -64,7 +65,7 @@ def stereo_page(
         sections.append(Section("Images without a usable target", (table,)))
     sections += [_covariance_section(fit), origin_section(provenance)]
     return Page(
-        title="Stereo calibration",
+        title=TITLE,
         subtitle=f"{len(fit.related)} of {len(fit.pairs)} pairs relate the cameras, "
         f"{fit.n_points} target points",
         cards=_cards(fit),
@@ -72,6 +73,7 @@ def stereo_page(
         sections=tuple(sections),
         is_simulated=is_simulated,
         footer=footer(provenance),
+        forced=provenance.forced,
     )
 
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from armscan.report.numbers import sentence
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -51,6 +53,8 @@ class Summary:
         A command that comes next; empty for none.
     data
         The same for programs: plain values only, units in the keys; NaN stands for "not known".
+    forced
+        Why the result, or what it rests on, was refused and made all the same (``--force-bad``).
     """
 
     title: str
@@ -60,12 +64,14 @@ class Summary:
     written: tuple[Path, ...] = ()
     next_step: str = ""
     data: Mapping[str, Any] = field(default_factory=dict)
+    forced: tuple[str, ...] = ()
 
 
 def summary_json(summary: Summary) -> str:
     """JSON text of a summary in ASCII; what is not known is ``null``."""
     content = {
         **summary.data,
+        "forced": list(summary.forced),
         "warnings": list(summary.warnings),
         "written": [path.as_posix() for path in summary.written],
     }
@@ -74,7 +80,7 @@ def summary_json(summary: Summary) -> str:
 
 def summary_text(summary: Summary) -> str:
     """Readable text of a summary."""
-    lines = [summary.title]
+    lines = [summary.title, *(f"FORCED: {sentence(reason)}" for reason in summary.forced)]
     width = max((len(label) for label, _ in summary.facts), default=0)
     for label, value in summary.facts:
         first, *rest = value.splitlines() or [""]

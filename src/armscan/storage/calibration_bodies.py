@@ -167,6 +167,7 @@ def provenance_body(provenance: Provenance) -> ProvenanceBody:
         parent_ids=provenance.parent_ids,
         options=dict(provenance.options),
         warnings=provenance.warnings,
+        forced=provenance.forced,
     )
 
 
@@ -181,6 +182,7 @@ def provenance_from_body(body: ProvenanceBody) -> Provenance:
         parent_ids=body.parent_ids,
         options=tuple(body.options.items()),
         warnings=body.warnings,
+        forced=body.forced,
     )
 
 

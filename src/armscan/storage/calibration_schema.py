@@ -68,6 +68,15 @@ class ProvenanceBody(Body):
     parent_ids: tuple[str, ...]
     options: dict[str, str]
     warnings: tuple[str, ...]
+    forced: tuple[str, ...] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_empty_mark(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Only a document that was refused bears the mark; older programs refuse to read it."""
+        content: dict[str, Any] = write(self)
+        if not self.forced:
+            del content["forced"]
+        return content
 
 
 class ObservationsBody(Body):

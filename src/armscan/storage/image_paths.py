@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
-from armscan.errors import FileFormatError
+from armscan.errors import FileFormatError, OptionError
 
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
+
+LISTED = 8
 
 MAGIC = re.compile(r"[*?\[]")
 
@@ -17,7 +20,7 @@ MAGIC = re.compile(r"[*?\[]")
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key in which ``frame2`` comes before ``frame10``; ties are broken by the text."""
     words = re.split(r"(\d+)", text)
-    key = [(1, int(word), "") if word.isdigit() else (0, 0, word) for word in words]
+    key = [(1, int(word), "") if word.isdecimal() else (0, 0, word) for word in words]
     return (*key, (0, 0, text))
 
 
@@ -44,6 +47,44 @@ def expand_paths(patterns: Iterable[str | Path]) -> tuple[Path, ...]:
     if not found:
         raise FileFormatError("no image was given", remedy="name files, a folder or a pattern")
     return tuple(found)
+
+
+def named_by(patterns: Iterable[str], names: Sequence[str], where: str) -> tuple[str, ...]:
+    """Names that a list of names and patterns stands for, in the order of ``names``.
+
+    Parameters
+    ----------
+    patterns
+        Each is a name, its last parts (the file's name without its folders), or a pattern with
+        ``*``, ``?`` and ``[...]`` of either.
+    names
+        What there is.
+    where
+        The option that the patterns came from, for messages.
+
+    Raises
+    ------
+    OptionError
+        If one of them names nothing.
+    """
+    chosen: set[str] = set()
+    for pattern in patterns:
+        found = {name for name in names if _is_named(name, pattern)}
+        if not found:
+            listed = ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
+            raise OptionError(
+                f"'{pattern}' is the name of none of {len(names)} images ({listed})",
+                where=where,
+                remedy="give names as reports show them, or a quoted pattern",
+            )
+        chosen |= found
+    return tuple(name for name in names if name in chosen)
+
+
+def _is_named(name: str, pattern: str) -> bool:
+    parts = name.split("/")
+    tails = ["/".join(parts[k:]) for k in range(len(parts))]
+    return pattern in tails or any(fnmatchcase(tail, pattern) for tail in tails)
 
 
 def _expand(pattern: str) -> list[Path]:

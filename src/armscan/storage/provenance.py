@@ -26,8 +26,9 @@ def new_provenance(
     *,
     command: Sequence[str],
     options: Iterable[Any] = (),
-    parent_ids: Sequence[str] = (),
+    parents: Sequence[Provenance] = (),
     warnings: Sequence[str] = (),
+    forced: Sequence[str] = (),
 ) -> Provenance:
     """Describe a document that is about to be written.
 
@@ -40,10 +41,12 @@ def new_provenance(
     options
         Options dataclasses in force; every field is recorded as ``Class.field``, one
         that is a dataclass itself by its own class and fields.
-    parent_ids
-        Documents on which this one rests.
+    parents
+        Of the documents on which this one rests; their reasons for a refusal go on.
     warnings
         What the program warned of.
+    forced
+        Why this document was refused, if it is written all the same.
     """
     return Provenance(
         document_id=str(uuid4()),
@@ -51,9 +54,12 @@ def new_provenance(
         armscan_version=version("armscan"),
         command=tuple(command),
         inputs=tuple(fingerprint(path) for path in inputs),
-        parent_ids=tuple(parent_ids),
+        parent_ids=tuple(parent.document_id for parent in parents),
         options=tuple(entry for group in options for entry in _entries(group)),
         warnings=tuple(warnings),
+        forced=tuple(
+            dict.fromkeys((*(text for parent in parents for text in parent.forced), *forced))
+        ),
     )
 
 

@@ -38,5 +38,8 @@ def test_estimate_checks_its_covariance_and_gives_sigmas() -> None:
         Estimate("value", ("a_mm",), np.eye(2), np.zeros(3), 1, 0.0)
 
 
-def test_a_failure_is_false() -> None:
-    assert not FitFailure("too few points")
+def test_a_failure_is_neither_true_nor_false() -> None:
+    """``first or FitFailure(...)`` would lose the first reason."""
+    first = FitFailure("too few points")
+    with pytest.raises(TypeError, match="isinstance"):
+        _ = first or FitFailure("another reason")

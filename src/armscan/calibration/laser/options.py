@@ -41,6 +41,8 @@ class SheetOptions:
         A bow is fitted when the plane's lack-of-fit probability is below this.
     min_boards_for_bow
         Fewest boards from which a bow is told from the boards' own errors.
+    is_bow_allowed
+        False holds every sheet to a plane.
     """
 
     margin_mm: float = 0.0
@@ -53,6 +55,7 @@ class SheetOptions:
     min_points: int = 20
     lack_of_fit_p: float = 0.001
     min_boards_for_bow: int = 4
+    is_bow_allowed: bool = True
 
     def __post_init__(self) -> None:
         _require(

@@ -141,8 +141,10 @@ def choose_model(
         model = SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision, factor)
         return _with_explained_stripes(model, alone, errors, options)
 
-    if plane_test.p_value >= options.lack_of_fit_p:
-        return plane(f"a plane is enough ({test})")
+    is_enough = plane_test.p_value >= options.lack_of_fit_p
+    if is_enough or not options.is_bow_allowed:
+        asked = "a plane was asked for, and does not explain the stripes"
+        return plane(f"{'a plane is enough' if is_enough else asked} ({test})")
     n_boards = len(np.unique(observations.board))
     if n_boards < options.min_boards_for_bow:
         return plane(

@@ -16,7 +16,7 @@ from armscan.cli.image_arguments import (
     StripeMethodOption,
     Target,
 )
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.output import AsJson, Cache, Force, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -65,6 +65,15 @@ def laser(
         list[str] | None,
         typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
     ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Image, or view of a recording, not to use, by name or quoted pattern; repeatable."
+        ),
+    ] = None,
+    plane_only: Annotated[
+        bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
+    ] = False,
     margin_mm: Annotated[
         float, typer.Option(help="Use stripe points this far outside the target's points.")
     ] = 0.0,
@@ -73,6 +82,7 @@ def laser(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = "low",
     force: Force = False,
+    cache: Cache = True,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate light sheets from images of laser lines on a flat target."""
@@ -95,11 +105,16 @@ def laser(
                 laser_colour=cast(LaserColour, laser_colour),
             ),
             sheets=SheetOptions(
-                margin_mm=margin_mm, n_sheets=sheets, sheet_names=tuple(name or ())
+                margin_mm=margin_mm,
+                n_sheets=sheets,
+                sheet_names=tuple(name or ()),
+                is_bow_allowed=not plane_only,
             ),
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),
+        leave_out=tuple(leave_out or ()),
         is_overwriting=force,
+        is_caching=cache,
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:

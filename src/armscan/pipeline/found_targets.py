@@ -42,16 +42,23 @@ class FoundTargets:
         return tuple(source for source in sources if source not in empty)
 
     def not_found_text(self) -> str:
-        """First few exposures without target and why, in brackets; empty if all show it."""
+        """Why there is no target, with the exposures of each reason, in brackets; or empty."""
         if not self.not_found:
             return ""
-        parts = [
-            reason if reason.startswith(source) else f"{source}: {reason}"
-            for source, reason in self.not_found[:LISTED]
-        ]
-        n_more = len(self.not_found) - LISTED
+        by_reason: dict[str, list[str]] = {}
+        for source, reason in self.not_found:
+            by_reason.setdefault(reason.removeprefix(f"{source}: "), []).append(source)
+        often = sorted(by_reason.items(), key=lambda item: -len(item[1]))
+        parts = [f"{_listed(sources)}: {reason}" for reason, sources in often[:LISTED]]
+        n_more = sum(len(sources) for _, sources in often[LISTED:])
         more = f"; and {n_more} more" if n_more > 0 else ""
         return f" (no target: {'; '.join(parts)}{more})"
+
+
+def _listed(sources: Sequence[str]) -> str:
+    if len(sources) <= LISTED:
+        return ", ".join(sources)
+    return f"{', '.join(sources[:2])} and {len(sources) - 2} more"
 
 
 def find_targets(

@@ -5,27 +5,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
-from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
-from armscan.errors import EstimationError, InputError, OptionError
+from armscan.calibration.laser.result import (
+    LaserFit,
+    PointUse,
+    SheetFit,
+    SheetImage,
+    SkippedImage,
+)
+from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
 from armscan.models.stereo import StereoCalibration
+from armscan.pipeline.board_and_stripe import SeenPair, look_at_pairs
 from armscan.pipeline.documents import sensor_calibration
 from armscan.pipeline.exposure_pairs import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import LaserOptions, calibrate_sheets_from_pairs
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.report.laser_page import laser_page, sheet_facts
-from armscan.report.numbers import sentence
+from armscan.report.laser_page import TITLE, laser_page, sheet_facts
+from armscan.report.numbers import sentence, without_source
 from armscan.report.outputs import calibration_outputs
-from armscan.report.page import render_page
+from armscan.report.page import Page, render_page
+from armscan.report.refusal import TriedImage, refuse, refused_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import (
@@ -34,8 +42,9 @@ from armscan.storage.calibration_files import (
     sensor_document,
 )
 from armscan.storage.calibration_schema import STEREO_SCHEMA
+from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.image_options import ImageOptions
-from armscan.storage.image_paths import expand_paths
+from armscan.storage.image_paths import expand_paths, named_by
 from armscan.storage.images import read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.provenance import new_provenance
@@ -47,6 +56,7 @@ from armscan.storage.simulated import are_simulated
 from armscan.storage.stereo_files import read_stereo_calibration
 from armscan.vision.targets.specification import parse_target
 
+REQUESTED = "left out by request"
 SCAN_TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
 
 
@@ -75,8 +85,12 @@ class LaserRequest:
         Of target, stripes and sheets.
     image_options
         How pixels are read.
+    leave_out
+        Images, or views of a recording, that are not used: names or patterns.
     is_overwriting
         Replace results that exist.
+    is_caching
+        Keep the points found beside the document, and take those kept there.
     command
         The command line, for the record.
     """
@@ -89,7 +103,9 @@ class LaserRequest:
     options: LaserOptions = field(default_factory=LaserOptions)
     image_options: ImageOptions = field(default_factory=ImageOptions)
     scan: Path | None = None
+    leave_out: tuple[str, ...] = ()
     is_overwriting: bool = False
+    is_caching: bool = False
     command: tuple[str, ...] = ()
 
 
@@ -100,7 +116,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     ------
     ArmscanError
         If a file is unreadable, an option is wrong, or the images do not determine the sheets;
-        nothing is written then.
+        no document is written then. Where it is the images, a page shows them.
     """
     target = parse_target(request.target)
     files = calibration_outputs(request.output, is_overwriting=request.is_overwriting)
@@ -111,7 +127,8 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         images.pairs, target, camera, options=request.options, progress=progress
     )
     if isinstance(fit, FitFailure):
-        raise EstimationError(fit.reason, remedy=fit.remedy)
+        refuse(files, _refused(request, images, camera.provenance, progress), fit)
+    fit = replace(fit, skipped=(*images.left_out, *fit.skipped))
     options = request.options
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
@@ -139,8 +156,48 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         {files.document: document, files.observations: observations, files.page: render_page(page)},
         is_overwriting=request.is_overwriting,
     )
+    files.refused_page.unlink(missing_ok=True)
     written = (files.document, files.observations, files.page)
-    return laser_summary(fit, written, is_simulated=is_simulated)
+    summary = laser_summary(fit, written, is_simulated=is_simulated)
+    return replace(summary, forced=provenance.forced)
+
+
+def _refused(
+    request: LaserRequest, images: _Images, parent: Provenance, progress: Progress
+) -> Page:
+    """The page of images that determine no sheet: what each of them shows by itself."""
+    target, options = parse_target(request.target), request.options
+    cache = DetectionCache.beside(request.output) if request.is_caching else None
+    seen = look_at_pairs(images.pairs, target, options, cache=cache, progress=progress)
+    provenance = new_provenance(
+        (*images.paths, *images.tables, request.camera),
+        command=request.command,
+        options=(target, options.target, options.stripes, options.sheets, request.image_options),
+        parents=(parent,),
+        warnings=images.warnings,
+    )
+    left_out = tuple(TriedImage(item.source, item.reason, False) for item in images.left_out)
+    return refused_page(
+        TITLE,
+        (*left_out, *(_tried(pair) for pair in seen)),
+        {exposure.source: exposure for exposure in images.exposures},
+        provenance,
+        is_simulated=are_simulated(images.paths),
+    )
+
+
+def _tried(pair: SeenPair) -> TriedImage:
+    n_points = int(pair.profile.is_accepted.sum())
+    stripe = f"{n_points} clean stripe points" if n_points else "no stripe was found"
+    if isinstance(pair.board, FitFailure):
+        board, points = without_source(pair.board_source, pair.board.reason), None
+    else:
+        board, points = "board found", pair.board.points_px
+        if pair.board_source != pair.source:
+            board += f" in {pair.board_source}"
+    is_used = points is not None and n_points > 0
+    accepted = pair.profile.points_px[pair.profile.is_accepted]
+    return TriedImage(pair.source, f"{board}; {stripe}", is_used, points, accepted)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +214,8 @@ class _Images:
         Other files that went in.
     warnings
         What is odd about a recording.
+    left_out
+        Images with a laser on that take no part by request.
     """
 
     exposures: tuple[Exposure, ...]
@@ -164,6 +223,7 @@ class _Images:
     pairs: list[ExposurePair]
     tables: tuple[Path, ...] = ()
     warnings: tuple[str, ...] = ()
+    left_out: tuple[SkippedImage, ...] = ()
 
 
 def read_cameras(path: Path) -> CameraCalibration | StereoCalibration:
@@ -186,7 +246,7 @@ def _read_images(request: LaserRequest, *, is_stereo: bool) -> _Images:
         )
     if request.scan is not None:
         request.image_options.check_unused()
-        return _read_scan(request.scan, is_stereo=is_stereo)
+        return _read_scan(request.scan, request.leave_out, is_stereo=is_stereo)
     if is_stereo:
         raise OptionError(
             "images of a head with two cameras come as a recording, which says which camera took "
@@ -196,11 +256,31 @@ def _read_images(request: LaserRequest, *, is_stereo: bool) -> _Images:
     on = expand_paths(request.on)
     off = expand_paths(request.off) if request.off else ()
     exposures = read_exposures((*on, *off), request.image_options)
-    pairs = pair_exposures(exposures[: len(on)], exposures[len(on) :])
-    return _Images(exposures, (*on, *off), pairs)
+    lit, dark = exposures[: len(on)], exposures[len(on) :]
+    named = named_by(request.leave_out, [one.source for one in exposures], "--leave-out")
+    gone = _with_partners(lit, dark, set(named))
+    pairs = pair_exposures(
+        [one for one in lit if one.source not in gone],
+        [one for one in dark if one.source not in gone],
+    )
+    return _Images(exposures, (*on, *off), pairs, left_out=_skipped(lit, gone))
 
 
-def _read_scan(folder: Path, *, is_stereo: bool) -> _Images:
+def _with_partners(lit: Sequence[Exposure], dark: Sequence[Exposure], named: set[str]) -> set[str]:
+    """Images to leave out, each with the other of its pair: of its name, else of its place."""
+    names = {PurePath(one.source).name: one.source for one in dark}
+    if len(names) == len(dark) and set(names) == {PurePath(one.source).name for one in lit}:
+        partners = [(one.source, names[PurePath(one.source).name]) for one in lit]
+    else:
+        partners = [(on.source, off.source) for on, off in zip(lit, dark, strict=False)]
+    return named.union(*({on, off} for on, off in partners if {on, off} & named))
+
+
+def _skipped(lit: Sequence[Exposure], gone: set[str]) -> tuple[SkippedImage, ...]:
+    return tuple(SkippedImage(one.source, REQUESTED) for one in lit if one.source in gone)
+
+
+def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _Images:
     recording = read_recording(folder)
     rows = [k for k, row in enumerate(recording.rows) if row.camera == 0 or is_stereo]
     if not rows:
@@ -211,12 +291,19 @@ def _read_scan(folder: Path, *, is_stereo: bool) -> _Images:
             remedy="number a single camera 0 in the column 'camera' of exposures.csv",
         )
     exposures = tuple(recording.exposure(k) for k in rows)
+    views = {one.view: None for one in exposures if one.view is not None}
+    names = [*(one.source for one in exposures), *views]
+    named = set(named_by(leave_out, names, "--leave-out"))
+    # without its image without laser a view is no pair any more
+    named |= {one.view for one in exposures if one.view and not one.lasers and one.source in named}
+    gone = {one.source for one in exposures if one.view in named or one.source in named}
     return _Images(
         exposures,
         tuple(folder / recording.rows[k].source for k in rows),
-        pair_by_view(exposures),
+        pair_by_view([one for one in exposures if one.source not in gone]),
         tuple(folder / name for name in SCAN_TABLES if (folder / name).is_file()),
         (*recording.warnings, *recording.session.assumed),
+        _skipped([one for one in exposures if one.lasers], gone),
     )
 
 

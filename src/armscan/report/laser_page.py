@@ -19,6 +19,7 @@ from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Sec
 from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
 from armscan.report.summary import Table
 
+TITLE = "Light sheet calibration"
 USE_COLOURS = {
     PointUse.NO_RAY: "#8a6d5a",
     PointUse.OFF_BOARD: "#b8c0ca",
@@ -62,7 +63,7 @@ def laser_page(
         warnings += [f"sheet {sheet.name}: {warning}" for warning in sheet.warnings]
     n = len(fit.sheets)
     return Page(
-        title="Light sheet calibration" if n == 1 else "Light sheets calibration",
+        title=TITLE if n == 1 else "Light sheets calibration",
         subtitle=f"{n} light sheet{'s' if n > 1 else ''} from {len(fit.images)} stripe images",
         cards=tuple(_card(sheet) for sheet in fit.sheets),
         warnings=tuple(sentence(warning) for warning in warnings),

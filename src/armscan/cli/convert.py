@@ -33,6 +33,7 @@ def convert(
             title=f"Converted: {done.what}.",
             warnings=(losses,),
             written=(output,),
+            forced=done.forced,
             data={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
         ),
         as_json=as_json,

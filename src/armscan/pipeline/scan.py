@@ -168,7 +168,11 @@ def measure_scan(
     found = _joined(placed, exposures, poses, placing, options)
     return replace(
         found,
-        cloud=replace(found.cloud, is_simulated=source.is_simulated),
+        cloud=replace(
+            found.cloud,
+            is_simulated=source.is_simulated,
+            forced=scanner.provenance.forced,
+        ),
         warnings=(*found.warnings, *collected(weak)),
     )
 

@@ -45,6 +45,9 @@ class PointCloud:
         (N, 3) unit surface normals towards the sensor, or None where not estimated.
     is_simulated
         True if the points were measured on rendered images.
+    forced
+        Why the calibration that they were measured with was refused, if it was and was used all
+        the same.
     """
 
     frame: CloudFrame
@@ -59,6 +62,7 @@ class PointCloud:
     intensity: FloatArray
     normals: FloatArray | None = None
     is_simulated: bool = False
+    forced: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.points_mm))

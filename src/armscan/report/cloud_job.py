@@ -110,7 +110,8 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     by_source = {exposure.source: exposure for exposure in exposures}
     page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
     is_ply = request.output.suffix.lower() == ".ply"
-    measured = replace(result.cloud, is_simulated=is_simulated)
+    forced = provenance.forced
+    measured = replace(result.cloud, is_simulated=is_simulated, forced=forced)
     cloud = ply_bytes(measured) if is_ply else xyz_bytes(measured)
     write_files(
         {files.document: cloud, files.page: render_page(page)},
@@ -118,7 +119,8 @@ def run_reconstruction(request: CloudRequest, progress: Progress = silent) -> Su
     )
     written = (files.document, files.page)
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
-    return cloud_summary(result, written, losses, is_simulated=is_simulated)
+    summary = cloud_summary(result, written, losses, is_simulated=is_simulated)
+    return replace(summary, forced=forced)
 
 
 def _sensor(path: Path) -> SensorCalibration:

@@ -155,6 +155,7 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
         cloud = read_ply(path)
         content["frame"] = cloud.frame
         content["simulated"] = cloud.is_simulated
+        content |= {"forced": list(cloud.forced)} if cloud.forced else {}
         content["sheets"] = list(cloud.sheet_names)
         content["exposures"] = list(cloud.exposure_sources)
         content["median_sigma_mm"] = float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0
@@ -262,6 +263,7 @@ def _origin(provenance: Provenance) -> dict[str, Any]:
         "id": provenance.document_id,
         "written": f"{provenance.created_utc} by armscan {provenance.armscan_version}",
         "from": f"{len(provenance.inputs)} files",
+        **({"forced": list(provenance.forced)} if provenance.forced else {}),
     }
 
 

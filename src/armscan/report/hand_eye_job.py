@@ -69,13 +69,14 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
         {files.document: scanner_document(scanner), files.page: render_page(page)},
         is_overwriting=request.is_overwriting,
     )
-    return hand_eye_summary(
+    summary = hand_eye_summary(
         fit,
         scanner,
         (files.document, files.page),
         [block for block in repeats if isinstance(block, Table)],
         is_simulated=inputs.is_simulated,
     )
+    return replace(summary, forced=scanner.provenance.forced)
 
 
 def calibrated(

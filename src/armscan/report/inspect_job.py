@@ -217,7 +217,7 @@ def _finished(
     is_simulated = cloud.is_simulated or are_simulated(inputs)
     written: tuple[Path, ...] = ()
     if request.output is not None:
-        provenance = _provenance(request, report, inputs, more_options)
+        provenance = _provenance(request, report, inputs, more_options, cloud.forced)
         page = inspection_page(report, provenance, is_simulated=is_simulated)
         write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
         written = (request.output,)
@@ -228,6 +228,7 @@ def _finished(
         warnings=tuple(sentence(warning) for warning in report.warnings),
         written=written,
         next_step=f"open {request.output}" if request.output else "",
+        forced=cloud.forced,
         data={
             "kind": "inspection",
             "simulated": is_simulated,
@@ -242,10 +243,12 @@ def _provenance(
     report: InspectionReport,
     inputs: tuple[Path, ...],
     more_options: tuple[StepOptions, ...],
+    forced: tuple[str, ...],
 ) -> Provenance:
     return new_provenance(
         inputs,
         command=request.command,
         options=(request.options, *more_options),
         warnings=report.warnings,
+        forced=forced,
     )

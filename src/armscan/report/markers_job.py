@@ -159,9 +159,10 @@ def _measure(request: MarkersRequest, progress: Progress) -> Summary:
         {table_path: markers_csv(matches.markers), page_path: render_page(page)},
         is_overwriting=request.is_overwriting,
     )
-    return _measured_summary(
+    summary = _measured_summary(
         matches, detections, warnings, (table_path, page_path), is_simulated=page.is_simulated
     )
+    return replace(summary, forced=provenance.forced)
 
 
 def _detect(

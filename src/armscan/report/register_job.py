@@ -141,7 +141,11 @@ def _written(
     inputs = (*(item.path for item in lists), *(item.path for item in carried))
     is_simulated = are_simulated(inputs) or any(item.cloud.is_simulated for item in carried)
     provenance = new_provenance(
-        inputs, command=request.command, options=(request.options,), warnings=report.warnings
+        inputs,
+        command=request.command,
+        options=(request.options,),
+        warnings=report.warnings,
+        forced=[reason for item in carried for reason in item.cloud.forced],
     )
     page = registration_page(report, provenance, is_simulated=is_simulated)
     contents = {
@@ -161,6 +165,7 @@ def _written(
         warnings=tuple(sentence(warning) for warning in report.warnings),
         written=tuple(request.output / name for name in contents),
         next_step=f"open {request.output / PAGE}",
+        forced=provenance.forced,
         data={
             "kind": "registration",
             "of": "views" if request.moved is None else "moved arm",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -103,13 +104,14 @@ def run_scan(request: CloudRequest, folder: Path, progress: Progress = silent) -
         is_overwriting=request.is_overwriting,
     )
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
-    return scan_summary(
+    summary = scan_summary(
         scan,
         scanner,
         (files.document, files.page),
         (*notes, *scan.warnings, *losses),
         is_simulated=recording.is_simulated,
     )
+    return replace(summary, forced=provenance.forced)
 
 
 def _check_own_images(request: CloudRequest) -> None:

@@ -112,6 +112,7 @@ def run_verification(
             command=request.command,
             options=(request.options, request.inspection),
             warnings=report.warnings,
+            forced=measured.cloud.forced,
         )
         blocks = (
             Text(verdict_sentence(result)),
@@ -122,7 +123,8 @@ def run_verification(
         page = inspection_page(report, provenance, is_simulated=is_simulated, first=first)
         write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
         written = (request.output,)
-    return _summary(result, report, written, is_simulated=is_simulated), result.verdict
+    summary = _summary(result, report, written, is_simulated=is_simulated)
+    return replace(summary, forced=measured.cloud.forced), result.verdict
 
 
 def verdict_sentence(result: Verification) -> str:

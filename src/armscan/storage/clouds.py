@@ -29,6 +29,8 @@ COVARIANCE = {
 INDICES = ("sheet", "exposure", "segment")
 SIMULATED = "simulated"
 """Comment in the header of a cloud that was measured on rendered images."""
+FORCED = "forced"
+"""Comment with a reason for which the cloud's calibration was refused, and used all the same."""
 
 XYZ_LOSES = (
     "normals",
@@ -45,7 +47,8 @@ def ply_bytes(cloud: PointCloud) -> bytes:
 
     ``sigma_mm`` is written for other programs; it follows from the covariance. Names stand in the
     header: ``comment frame Sensor``, ``comment sheet 0 "A"``, ``comment exposure 0 "laser.png"``;
-    of points measured on rendered images also ``comment simulated``.
+    of points measured on rendered images also ``comment simulated``, of those of a calibration
+    that was refused and forced ``comment forced 0 "why"``.
     """
     columns: dict[str, NDArray[Any]] = {}
     columns |= {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
@@ -63,7 +66,11 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     comments = ["written by armscan", "unit mm", f"frame {cloud.frame}"]
     if cloud.is_simulated:
         comments.append(SIMULATED)
-    for word, names in (("sheet", cloud.sheet_names), ("exposure", cloud.exposure_sources)):
+    for word, names in (
+        ("sheet", cloud.sheet_names),
+        ("exposure", cloud.exposure_sources),
+        (FORCED, cloud.forced),
+    ):
         comments += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
     return ply_header(table.dtype, len(cloud), comments) + table.tobytes()
 
@@ -73,6 +80,7 @@ def xyz_bytes(cloud: PointCloud) -> bytes:
     buffer = io.StringIO()
     frame = f"{cloud.frame}; {SIMULATED}" if cloud.is_simulated else cloud.frame
     header = f"x_mm y_mm z_mm in frame {frame}; not in this file: {'; '.join(XYZ_LOSES)}"
+    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in cloud.forced)))
     np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header)
     return buffer.getvalue().encode()
 
@@ -113,6 +121,7 @@ def read_ply(path: Path) -> PointCloud:
             intensity=table["intensity"],
             normals=np.stack([table[n] for n in NORMAL], axis=1) if has_normals else None,
             is_simulated=SIMULATED in vertices.comments,
+            forced=_names(vertices, FORCED),
         )
     except InputError as error:
         raise FileFormatError(error.what, where=str(path)) from error

@@ -21,10 +21,11 @@ YAML_LOSES = ("covariance", "evidence and provenance")
 
 @dataclass(frozen=True, slots=True)
 class Conversion:
-    """What was converted, in words, and what the new file does not hold."""
+    """What was converted, in words, what the new file does not hold, and marks of the old one."""
 
     what: str
     losses: tuple[str, ...]
+    forced: tuple[str, ...] = ()
 
 
 def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) -> Conversion:
@@ -57,19 +58,21 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         )
     check_outputs((output,), is_overwriting=is_overwriting)
     if kinds[0]:
-        content = xyz_bytes(read_ply(source))
-        conversion = Conversion("cloud to XYZ", XYZ_LOSES)
+        cloud = read_ply(source)
+        content = xyz_bytes(cloud)
+        conversion = Conversion("cloud to XYZ", XYZ_LOSES, cloud.forced)
     else:
-        content = camera_info_yaml(_camera(source)).encode()
-        conversion = Conversion("camera to ROS camera_info", YAML_LOSES)
+        camera, forced = _camera(source)
+        content = camera_info_yaml(camera, comments=forced).encode()
+        conversion = Conversion("camera to ROS camera_info", YAML_LOSES, forced)
     write_files({output: content}, is_overwriting=is_overwriting)
     return conversion
 
 
-def _camera(path: Path) -> CameraModel:
+def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:
     data = read_bytes(path)
     is_own = data.lstrip().startswith(b"{") and "schema" in parse_json(data, str(path))
     calibration = read_calibration(path) if is_own else read_camera_calibration(path)
     if isinstance(calibration, SensorCalibration):
-        return calibration.camera.camera
-    return calibration.camera
+        return calibration.camera.camera, calibration.camera.provenance.forced
+    return calibration.camera, calibration.provenance.forced

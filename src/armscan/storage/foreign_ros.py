@@ -13,7 +13,9 @@ from armscan.errors import InputError
 from armscan.models.camera import CameraModel
 
 
-def camera_info_yaml(camera: CameraModel, name: str = "camera") -> str:
+def camera_info_yaml(
+    camera: CameraModel, name: str = "camera", *, comments: Iterable[str] = ()
+) -> str:
     """Text of a ``camera_info`` file with the model ``plumb_bob``.
 
     Rectification is the identity and the projection matrix repeats the intrinsics: a single
@@ -25,6 +27,8 @@ def camera_info_yaml(camera: CameraModel, name: str = "camera") -> str:
         The camera.
     name
         ``camera_name``: letters, digits, ``_``, ``/`` and ``-``.
+    comments
+        Why the calibration was refused, if it was and was written all the same.
 
     Raises
     ------
@@ -37,6 +41,7 @@ def camera_info_yaml(camera: CameraModel, name: str = "camera") -> str:
         )
     matrix = camera.matrix
     lines = [
+        *(f"# forced: {' '.join(comment.split())}" for comment in comments),
         f"image_width: {camera.width_px}",
         f"image_height: {camera.height_px}",
         f"camera_name: {name}",

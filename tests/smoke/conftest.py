@@ -44,7 +44,10 @@ def calibrated(bench: Bench) -> Bench:
 
 @pytest.fixture
 def fails(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run a command that must fail with exit code 2 and one sentence; return the sentence."""
+    """Run a command that must fail with exit code 2 and one sentence; return the sentence.
+
+    It may leave the page of a refusal, and nothing else.
+    """
 
     def run(*words: object, writes: Path | None = None) -> str:
         before = _listing(writes)
@@ -64,4 +67,8 @@ def fails(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
 def _listing(folder: Path | None) -> dict[str, bytes]:
     if folder is None or not folder.is_dir():
         return {}
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    return {
+        path.name: path.read_bytes()
+        for path in folder.iterdir()
+        if path.is_file() and not path.name.endswith(".refused.html")
+    }

@@ -54,6 +54,19 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     assert names == [*chain, "inspect", "verify", "convert", "info", "doctor"]
 
 
+@pytest.mark.parametrize("path", [(), ("calibrate",), ("inspect",)], ids=" ".join)
+def test_a_group_without_a_command_prints_its_help(
+    path: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As lines, not as one sentence; nothing was done, so the exit code is not 0."""
+    assert main([*path, "-h"]) == 0
+    asked = capsys.readouterr().out
+    assert main(list(path)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err == asked
+
+
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.startswith("armscan 0.")

@@ -6,12 +6,16 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
+import shlex
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from armscan.cli import main
 from armscan.pipeline.head_demo import HeadOptions
 from armscan.report.head_demo_job import (
     DOCUMENTS,
@@ -30,6 +34,7 @@ FEW = HeadOptions(
     {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}
 )
 HEAD = "thesis-single"
+TUTORIAL = Path(__file__).parents[2] / "docs/tutorials/02-hand-eye-on-real-robot-data.md"
 CHI_6_IN_999 = math.sqrt(22.46)
 """Length of six standard normal numbers that one in a thousand exceeds."""
 
@@ -124,6 +129,43 @@ def test_things_measure_what_they_are(demo: Done) -> None:
         assert abs(step["fitted_mm"] - step["nominal_mm"]) < 4.0 * sigma
         assert abs(step["mean_mm"] - step["fitted_mm"]) < step["std_mm"] < 0.015
     assert head["part"]["normalised_rms"] < 1.5
+
+
+def tutorial_commands() -> list[list[str]]:
+    """What the second tutorial types after its demo, in its order."""
+    text = TUTORIAL.read_text("utf-8").partition("## The same on a simulated arm")[2]
+    blocks = re.findall(r"^```\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    assert lines[0] == "armscan demo single -o demo"
+    return [shlex.split(line)[1:] for line in lines[1:]]
+
+
+def test_the_second_tutorial_measures_the_ball(
+    demo: Done,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Typed as the page shows it: nothing is named that no command before it wrote."""
+    shutil.copytree(demo.folder, tmp_path / "demo")
+    monkeypatch.chdir(tmp_path)
+    commands = tutorial_commands()
+    assert [words[0] for words in commands] == [
+        *("calibrate", "calibrate", "probe", "calibrate", "reconstruct", "inspect"),
+    ]
+    for words in commands[:-1]:
+        assert main(words) == 0, capsys.readouterr().err
+    capsys.readouterr()
+    assert main([*commands[-1], "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert abs(found["diameter_error_mm"]) < 0.1
+    scanner = read_scanner_calibration(Path("twin-scanner.json"))
+    by_demo = read_scanner_calibration(demo.folder / "scanner.json")
+    shift = (
+        scanner.hand_eye.tool_from_sensor.translation_mm
+        - by_demo.hand_eye.tool_from_sensor.translation_mm
+    )
+    assert float(abs(shift).max()) < 0.05
 
 
 def test_the_page_shows_the_chain_and_says_that_it_is_simulated(demo: Done) -> None:

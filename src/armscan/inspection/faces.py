@@ -57,7 +57,7 @@ def find_levels(
     fits = np.abs(apart - height_mm) <= tolerance_mm
     if not fits.any():
         return FitFailure(
-            f"there are no two parallel faces {height_mm:g} ± {tolerance_mm:.2g} mm apart; "
+            f"there are no two parallel faces {height_mm:g} mm apart, to {tolerance_mm:.2g} mm; "
             + _found(levels, counts),
             "check the height, or show where the step is with --region",
         )

@@ -119,7 +119,7 @@ def _share(d: FloatArray, limit_mm: float) -> tuple[str, str, float, str, str]:
     share = 100.0 * float((np.abs(d) <= limit_mm).mean()) if len(d) else math.nan
     return (
         within_key(limit_mm),
-        f"within ±{limit_mm:g} mm",
+        f"within {limit_mm:g} mm",
         share,
         "%",
         f"part of the points whose deviation is at most {limit_mm:g} mm either way",

@@ -62,9 +62,7 @@ def deviation_histogram(
         axes.set_xlim(-half_width, half_width)
         axes.set_xlabel(f"{axis_label}, from the {deviations.reference} reference")
         axes.set_ylabel("points")
-        axes.set_title(
-            f"{share:.2f} % of {len(values):,} points within ±{band_mm:g} mm", loc="left"
-        )
+        axes.set_title(f"{share:.2f} % of {len(values):,} points within {band_mm:g} mm", loc="left")
     return Picture(
         chart_markup(figure, f"Histogram: {title}"),
         title=title,
@@ -150,7 +148,7 @@ def _caption(deviations: Deviations, before: str, beyond: int, half_width_mm: fl
     parts.append(f"Deviations from {deviations.reference_text}; {deviations.points_text}.")
     if beyond:
         parts.append(
-            f"{beyond:,} of them lie beyond ±{significant(half_width_mm)} mm, outside the picture; "
+            f"{beyond:,} of them lie beyond {significant(half_width_mm)} mm, outside the picture; "
             "the share counts them."
         )
     return " ".join(parts)

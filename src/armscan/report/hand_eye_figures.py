@@ -137,7 +137,7 @@ def correlation_picture(covariance: FloatArray) -> Picture:
         chart_markup(figure, "Correlations of the hand-eye's parameters"),
         title="Correlations",
         caption="Increments of rotation about, and of translation along, the axes of Tool. Near "
-        "±1, two of them can hardly be told apart with these postures.",
+        "1 or -1, two of them can hardly be told apart with these postures.",
     )
 
 

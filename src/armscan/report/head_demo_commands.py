@@ -37,26 +37,13 @@ def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
 
 
 def _calibrated(recordings: Path, twin: Twin, demo: HeadDemo) -> list[str]:
-    """Cameras and sheets: of one camera and one laser from images, else from the recordings."""
+    """Cameras and sheets."""
     target, laser = twin.target, recordings / "laser"
-    if demo.instrument.sensor.second is not None:
-        return [
-            f"armscan calibrate stereo --scan {recordings / 'camera'} --target {target} "
-            "-o stereo.json",
-            f"armscan calibrate laser --camera stereo.json --scan {laser} --target {target} "
-            "-o sensor.json",
-        ]
-    camera = (
-        f"armscan calibrate camera {recordings / 'camera' / 'images'} --target {target} "
-        "-o camera.json"
-    )
-    if len(demo.instrument.sensor.sheets) > 1:
-        images = f"--scan {laser}"
-    else:
-        images = f"--on {laser / 'images' / 'on'} --off {laser / 'images' / 'off'}"
+    kind = "camera" if demo.instrument.sensor.second is None else "stereo"
     return [
-        camera,
-        f"armscan calibrate laser --camera camera.json {images} --target {target} -o sensor.json",
+        f"armscan calibrate {kind} --scan {recordings / 'camera'} --target {target} -o {kind}.json",
+        f"armscan calibrate laser --camera {kind}.json --scan {laser} --target {target} "
+        "-o sensor.json",
     ]
 
 

@@ -118,14 +118,14 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
     return (
         Card(
             "Plate",
-            f"{within_text(plate)} in ±0.05 mm",
+            f"{within_text(plate)} within 0.05 mm",
             f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
         Card(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
             f"error of the diameter, sigma {1000.0 * ball['diameter_sigma_mm']:.1f} µm; "
-            f"{within_text(ball)} in ±0.05 mm",
+            f"{within_text(ball)} within 0.05 mm",
         ),
         Card(
             "Step, one exposure",
@@ -142,6 +142,6 @@ def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
         Card(
             "Free-form part",
             f"{1000.0 * head['part']['rms_mm']:.1f} µm rms",
-            f"{within_text(head['part'])} in ±0.05 mm of the truth",
+            f"{within_text(head['part'])} within 0.05 mm of the truth",
         ),
     )

@@ -66,7 +66,7 @@ def comparison_table(head: Mapping[str, Any], name: str) -> Table:
     limit = thesis.plate_limit_mm
     rows = [
         (
-            f"Plate: within ±{limit:g} mm",
+            f"Plate: within {limit:g} mm",
             thesis.plate,
             f"{_within(plate, limit)} of {points_text(plate)} ({plate['reference']} plane)",
         ),
@@ -76,7 +76,7 @@ def comparison_table(head: Mapping[str, Any], name: str) -> Table:
             f"{ball['diameter_mm']:.4f} mm, {ball['diameter_error_mm']:+.4f} mm off",
         ),
         (
-            "Ball: within ±0.05 mm",
+            "Ball: within 0.05 mm",
             thesis.ball_within,
             f"{_within(ball, 0.05)} of {points_text(ball)} ({ball['reference']} radius)",
         ),

@@ -231,7 +231,7 @@ def _sigma_facts(length: MeasuredLength, name: str) -> tuple[tuple[str, str], ..
 def _share_card(deviations: Deviations) -> Card:
     share = deviations.value(within_key(BAND_MM))
     return Card(
-        f"Within ±{BAND_MM:g} mm", share_text(share), f"of the {deviations.reference} surface"
+        f"Within {BAND_MM:g} mm", share_text(share), f"of the {deviations.reference} surface"
     )
 
 

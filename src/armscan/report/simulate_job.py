@@ -83,18 +83,10 @@ def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
 
 
 def _next_calibration(scene: TwinScene, found: SimulatedScene) -> str:
-    images = found.folder / "images"
     if scene == "camera":
-        is_pair = found.n_cameras > 1
-        return (
-            f"armscan calibrate stereo --scan {found.folder}"
-            if is_pair
-            else f"armscan calibrate camera {images}"
-        )
-    given = f"armscan calibrate laser --camera {_cameras_document(found)}"
-    if found.n_cameras > 1 or len(found.sources) > 1:
-        return f"{given} --scan {found.folder}"
-    return f"{given} --on {images / 'on'} --off {images / 'off'}"
+        kind = "stereo" if found.n_cameras > 1 else "camera"
+        return f"armscan calibrate {kind} --scan {found.folder}"
+    return f"armscan calibrate laser --camera {_cameras_document(found)} --scan {found.folder}"
 
 
 def _cameras_document(found: SimulatedScene) -> str:

@@ -114,9 +114,9 @@ def three_heads_table(heads: Mapping[str, Figures]) -> Table:
             lambda _, h: f"{FRAMES_A_SECOND * h['points_per_exposure']:,.0f}",
         ),
         ("wrong names among the points", _wrong),
-        ("plate within ±0.05 mm", _plate),
+        ("plate within 0.05 mm", _plate),
         (
-            "plate within ±0.03 mm",
+            "plate within 0.03 mm",
             lambda _, h: share_text(100 * h["plate"]["fraction_within_0p03mm"]),
         ),
         ("plate, standard deviation", lambda _, h: f"{1000 * h['plate']['std_mm']:.1f} µm"),
@@ -156,7 +156,7 @@ _THESIS_POINTS = {
 _THESIS_PLATE = {
     "thesis-single": "97.9 %",
     "thesis-cross": "96 %",
-    "thesis-multi": "95.1 % within ±0.08, five lines",
+    "thesis-multi": "95.1 % within 0.08, five lines",
 }
 """Figures 5.12, 5.28 and 5.41."""
 

@@ -134,7 +134,7 @@ def test_input_without_the_step_is_refused_in_words() -> None:
     points, exposure = block_stripes(HEIGHT_MM)
     wrong = inspect_step(cloud_of(points, exposure), 10.0)
     assert isinstance(wrong, FitFailure)
-    assert "no two parallel faces 10 ± 0.5 mm apart" in wrong.reason
+    assert "no two parallel faces 10 mm apart, to 0.5 mm" in wrong.reason
     assert "stand 20.000 mm apart" in wrong.reason
     flat = inspect_step(cloud_of(points[points[:, 2] == 0.0]), HEIGHT_MM)
     assert isinstance(flat, FitFailure)

@@ -219,8 +219,8 @@ def correlation_matrix(fit: CameraFit) -> Picture:
     return Picture(
         raster_markup(figure, "Correlations of the parameters"),
         title="Correlations",
-        caption="Two parameters near 1 or -1 trade against each other: neither is known well alone, "
-        "their combination is.",
+        caption="Two parameters near 1 or -1 trade against each other: neither is known well "
+        "alone, their combination is.",
     )
 
 

@@ -134,10 +134,20 @@ def _camera_section(fit: CameraFit) -> Section:
             Table(("parameter", "value ± 1 sigma", "meaning"), parameter_rows(fit), "", (2,)),
             Text(
                 f"{sentence(fit.model_reason)} Pixel (0, 0) is the centre of the top-left pixel. "
-                "Standard deviations rest on the scatter of the residuals, which is "
-                f"{fit.noise_scale:.2f} times what the detector expected." + _target_text(fit)
+                + noise_text(f"{fit.noise_scale:.2g} times")
+                + _target_text(fit)
             ),
         ),
+    )
+
+
+def noise_text(times: str) -> str:
+    """Why standard deviations rest on the residuals, and how much larger these are."""
+    return (
+        "Standard deviations rest on the scatter of the residuals, which is "
+        f"{times} what the noise of the image's pixels alone would make: the rest is compression, "
+        "sharpening, a board that is not quite flat or a lens that the model does not quite "
+        "follow, and it is counted."
     )
 
 

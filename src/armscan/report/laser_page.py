@@ -88,7 +88,7 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
         (
             "Known to",
             f"± {significant(fit.tilt_sigma_deg)}° in direction, "
-            f"± {significant(fit.offset_sigma_mm)} mm in the middle (1 sigma)",
+            f"± {significant(fit.offset_sigma_mm)} mm in the middle",
         ),
         ("Residual", f"{significant(calibration.rms_mm)} mm rms, {significant(fit.rms_px)} px rms"),
         ("Depth covered", f"Z {low:.1f} to {high:.1f} mm"),

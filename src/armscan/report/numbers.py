@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import math
 
+SIGMA_NOTE = "± is one standard deviation."
+"""Said once on every report: no other range is written with this sign."""
+
 
 def with_sigma(value: float, sigma: float, unit: str = "") -> str:
     """A value rounded to two digits of its standard deviation: ``1431.27 ± 0.85 px``.

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from armscan.models.calibration import Provenance
+from armscan.report.numbers import SIGMA_NOTE
 from armscan.report.page import Facts, Section
 from armscan.report.summary import Table
 
@@ -32,5 +33,5 @@ def footer(provenance: Provenance) -> str:
     """One line for the foot of a page."""
     return (
         f"Written {provenance.created_utc} by armscan {provenance.armscan_version}. "
-        "This page holds all its pictures and asks no other host for anything."
+        f"{SIGMA_NOTE} This page holds all its pictures and asks no other host for anything."
     )

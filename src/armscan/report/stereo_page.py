@@ -14,7 +14,7 @@ from armscan.models.calibration import Provenance
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report import stereo_figures as figures
-from armscan.report.camera_page import MEANINGS, RMS_MEANING, UNITS
+from armscan.report.camera_page import MEANINGS, RMS_MEANING, UNITS, noise_text
 from armscan.report.numbers import sentence, significant, with_sigma, without_source
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Page, Section, Text
@@ -152,9 +152,9 @@ def _relative_section(fit: StereoFit) -> Section:
     text = (
         f"{USES[fit.options.intrinsics]} The right camera's centre lies at x {x:.2f}, y {y:.2f}, "
         f"z {z:.2f} mm in the left camera's frame, which is the Sensor frame (x to the right, y "
-        "down, z forward). Standard deviations rest on the scatter of each camera's residuals: "
-        f"{fit.left.noise_scale:.2f} (left) and {fit.right.noise_scale:.2f} (right) times what the "
-        "detector expected."
+        "down, z forward). "
+    ) + noise_text(
+        f"{fit.left.noise_scale:.2g} (left) and {fit.right.noise_scale:.2g} (right) times"
     )
     if fit.target_error_mm > 0.0:
         text += (

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from armscan.report.numbers import sentence
+from armscan.report.numbers import SIGMA_NOTE, sentence
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +86,8 @@ def summary_text(summary: Summary) -> str:
         first, *rest = value.splitlines() or [""]
         lines.append(f"  {label:<{width}}  {first}".rstrip())
         lines += [f"  {'':<{width}}  {line}" for line in rest]
+    if any("±" in value for _, value in summary.facts):
+        lines.append(f"  {SIGMA_NOTE}")
     for table in summary.tables:
         lines += ["", *_table_lines(table)]
     if summary.warnings:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -11,6 +12,10 @@ from armscan.calibration.camera.result import CameraFit
 FEW_VIEWS = 8
 SMALL_TILT_DEG = 15.0
 THIN_COVERAGE = 0.6
+LISTED = 3
+SQUARE_PIXELS = 0.02
+SQUARE_SIGMAS = 5.0
+"""Pixels are square to a part in a thousand in nearly all cameras."""
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""
@@ -34,6 +39,7 @@ def advise(
         *_about_convergence(fit, is_converged=is_converged),
         *_about_views(fit, repeats),
         *_about_coverage(fit),
+        *_about_pixels(fit),
         *_about_model(fit),
         *_about_warp(fit),
     ]
@@ -62,13 +68,24 @@ def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str
         if view.note and view.source not in requested
     ]
     warnings += [f"{view.source} cannot be used: {view.reason}" for view in fit.refused_views]
-    warnings += [f"{later} repeats {earlier} and adds little" for later, earlier in repeats]
+    warnings += _about_repeats(repeats)
     n_outliers = sum(int(view.is_outlier.sum()) for view in fit.used_views)
     if n_outliers:
         warnings.append(f"{n_outliers} points lie too far out and were not used")
     if fit.n_views < FEW_VIEWS:
         warnings.append(f"only {fit.n_views} views: take 10 to 20")
     return warnings
+
+
+def _about_repeats(repeats: Sequence[tuple[str, str]]) -> list[str]:
+    """One line, however many they are."""
+    if not repeats:
+        return []
+    named = [f"{later} (as {earlier})" for later, earlier in repeats[:LISTED]]
+    more = f" and {len(repeats) - LISTED} more" if len(repeats) > LISTED else ""
+    verbs = ("view repeats", "adds") if len(repeats) == 1 else ("views repeat", "add")
+    fact = f"{len(repeats)} {verbs[0]} an earlier one and {verbs[1]} little"
+    return [f"{fact}: {', '.join(named)}{more}"]
 
 
 def _about_coverage(fit: CameraFit) -> list[str]:
@@ -84,6 +101,19 @@ def _about_coverage(fit: CameraFit) -> list[str]:
             "tilt it by 20 to 45"
         )
     return warnings
+
+
+def _about_pixels(fit: CameraFit) -> list[str]:
+    camera, (sigma_fx, sigma_fy) = fit.camera, fit.sigma[:2]
+    ratio = camera.fx_px / camera.fy_px
+    sigma = ratio * math.hypot(sigma_fx / camera.fx_px, sigma_fy / camera.fy_px)
+    if abs(ratio - 1.0) < max(SQUARE_PIXELS, SQUARE_SIGMAS * sigma):
+        return []
+    return [
+        f"fx is {ratio:.3f} of fy, as if pixels were not square: check that the target's pitch is "
+        "the same along both its sides and is given as the target page says, and that the images "
+        "were not scaled along one side only"
+    ]
 
 
 def _about_model(fit: CameraFit) -> list[str]:

@@ -98,7 +98,17 @@ def refused_page(
     rows = tuple((image.source, image.remark) for image in images)
     failed_first = sorted(images, key=lambda image: image.is_used)
     shown = [image for image in failed_first if image.source in exposures][:MAX_PICTURES]
-    legend = Legend(((TARGET_COLOUR, "target point found"), (STRIPE_COLOUR, "stripe point")))
+    kinds = (
+        (TARGET_COLOUR, "target point, the filled one is the first", [i.target_px for i in images]),
+        (STRIPE_COLOUR, "stripe point", [i.stripe_px for i in images]),
+    )
+    legend = Legend(
+        tuple(
+            (colour, word)
+            for colour, word, points in kinds
+            if any(one is not None and len(one) for one in points)
+        )
+    )
     text = "Images that gave nothing come first. Click a picture to enlarge it."
     if len(shown) < len(images):
         text += f" {len(shown)} of {len(images)} images are shown."
@@ -130,7 +140,9 @@ def _picture(image: TriedImage, exposure: Exposure) -> Picture:
         marks.append(Marks(image.target_px[:1], TARGET_COLOUR, "dot", 13.0))
     if image.stripe_px is not None:
         marks.append(Marks(image.stripe_px, STRIPE_COLOUR, "dot", 4.0))
-    markup = photo_markup(exposure, marks, f"What was found in {image.source}", longest_px=700)
+    is_grey = image.stripe_px is not None
+    alt = f"What was found in {image.source}"
+    markup = photo_markup(exposure, marks, alt, longest_px=700, is_grey=is_grey)
     return Picture(markup, image.remark, image.source)
 
 

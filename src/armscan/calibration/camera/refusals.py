@@ -16,8 +16,8 @@ from armscan.models.camera import CameraModel
 
 LARGEST_FOCAL_SIGMA = 0.02
 """Relative. Lengths across the image scale with the focal length: 2 mm in 100, one sigma."""
-LARGEST_RMS = 0.005
-"""Of the image's diagonal: 4 px of 640 x 480."""
+LARGEST_RMS = 0.003
+"""Of the image's diagonal: 2.4 px of 640 x 480."""
 
 
 def reasons_to_refuse(fit: CameraFit) -> tuple[str, ...]:

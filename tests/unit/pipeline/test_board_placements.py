@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Why no board was found in a placement is told as it was in its first image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.calibration.laser.cameras import HeadCameras
+from armscan.geometry.estimate import FitFailure
+from armscan.pipeline import board_placements
+from armscan.pipeline.board_placements import find_placements
+from armscan.records.exposure import Exposure
+from armscan.vision.targets.definition import Chessboard
+from armscan.vision.targets.options import TargetOptions
+from sheet_rig import thesis_rig
+
+
+def test_the_first_images_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without laser it is looked for first; that reason was lost, being no true value."""
+    monkeypatch.setattr(
+        board_placements,
+        "detect_target",
+        lambda image, *_: FitFailure(f"nothing in {image.source}"),
+    )
+    rig = thesis_rig()
+    image = np.zeros((64, 64), np.uint8)
+    pair = Exposure(image, "on.png"), Exposure(image, "off.png")
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    (placement,) = find_placements([pair], Chessboard(8, 6, 5.0), cameras, TargetOptions())
+    assert placement.seen == {0: FitFailure("nothing in off.png")}
+    assert placement.placed is None

@@ -66,8 +66,11 @@ def laser(
         typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
     ] = None,
     margin_mm: Annotated[
-        float, typer.Option(help="Use stripe points this far outside the target's points.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Use stripe points this far outside the target's points; else as the boards agree."
+        ),
+    ] = None,
     stripe_method: StripeMethodOption = "fit",
     laser_colour: LaserColourOption = "auto",
     bits_used: BitsUsed = None,

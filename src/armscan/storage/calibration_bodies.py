@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -47,6 +48,7 @@ from armscan.storage.diagnostics_bodies import (
     sensor_diagnostics,
     sheet_diagnostics,
 )
+from armscan.vision.stripe.options import LaserColour
 
 BOW_KEYS = tuple(f"u{i}_v{j}" for i, j in BOW_TERMS)
 SYMMETRY_TOLERANCE = 1e-9
@@ -102,6 +104,7 @@ def sensor_document_of(
         covariance=covariance_body(calibration.parameter_names, calibration.covariance),
         diagnostics=diagnostics_body(calibration.diagnostics, SensorDiagnosticsBody),
         second=None if calibration.second is None else second_camera_body(calibration.second),
+        laser_colour=cast(LaserColour, calibration.laser_colour),
         observations=observations,
         provenance=provenance_body(calibration.provenance),
     )
@@ -120,6 +123,7 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
         provenance_from_body(document.provenance),
         sensor_diagnostics(document.diagnostics),
         second,
+        document.laser_colour,
     )
     covariance = covariance_from_body(document.covariance, empty.parameter_names)
     return replace(empty, covariance=covariance)

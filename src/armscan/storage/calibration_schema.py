@@ -16,6 +16,8 @@ from pydantic import (
     model_serializer,
 )
 
+from armscan.vision.stripe.options import LaserColour
+
 SCHEMA_VERSION: Final = 1
 CAMERA_SCHEMA: Final = "armscan/camera-calibration"
 SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
@@ -225,7 +227,9 @@ class CameraDocument(Body):
 
 
 class SensorDocument(Body):
-    """``sensor.json``; ``second`` is there only for a head of two cameras."""
+    """``sensor.json``; ``second`` is there only for a head of two cameras, ``laser_colour`` only where
+    a channel of colour images was chosen.
+    """
 
     schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")
     schema_version: Literal[1] = SCHEMA_VERSION
@@ -235,13 +239,16 @@ class SensorDocument(Body):
     covariance: CovarianceBody
     diagnostics: SensorDiagnosticsBody | None
     second: SecondCameraBody | None = None
+    laser_colour: LaserColour = "auto"
     observations: ObservationsBody | None = None
     provenance: ProvenanceBody
 
     @model_serializer(mode="wrap")
-    def _without_absent_camera(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Heads of one camera keep the document that they always had."""
+    def _without_what_is_absent(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Heads of one grey camera keep the document that they always had."""
         content: dict[str, Any] = write(self)
         if self.second is None:
             del content["second"]
+        if self.laser_colour == "auto":
+            del content["laser_colour"]
         return content

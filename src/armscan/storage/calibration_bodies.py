@@ -201,6 +201,8 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
         ),
         scale_mm=sheet.scale_mm,
         bow_mm=dict(zip(BOW_KEYS, sheet.bow_mm.tolist(), strict=True)),
+        fan_lean=float(sheet.fan[0]),
+        fan_spread=float(sheet.fan[1]),
         rms_mm=calibration.rms_mm,
         n_boards=calibration.n_boards,
         n_points=calibration.n_points,
@@ -216,9 +218,10 @@ def _sheet_from_body(body: SheetBody) -> SheetCalibration:
         raise InputError(f"sheet {body.name} needs the bow terms {', '.join(BOW_KEYS)}")
     axes = np.array([body.axes.u_sensor, body.axes.v_sensor, body.axes.normal_sensor])
     bow = np.array([body.bow_mm[key] for key in BOW_KEYS])
+    fan = np.array([body.fan_lean, body.fan_spread])
     return SheetCalibration(
         name=body.name,
-        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow),
+        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow, fan),
         rms_mm=body.rms_mm,
         n_boards=body.n_boards,
         n_points=body.n_points,

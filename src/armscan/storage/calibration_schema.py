@@ -185,13 +185,19 @@ class AxesBody(Body):
 
 
 class SheetBody(Body):
-    """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame."""
+    """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame.
+
+    The fan says how the terms of u alone follow the light's rays, see `LightSheet`; documents
+    without it have zeros.
+    """
 
     name: str = Field(min_length=1)
     origin_sensor_mm: Triple
     axes: AxesBody
     scale_mm: float = Field(gt=0)
     bow_mm: dict[str, float]
+    fan_lean: float = 0.0
+    fan_spread: float = 0.0
     rms_mm: KnownOrNot
     n_boards: int = Field(ge=0)
     n_points: int = Field(ge=0)

@@ -75,8 +75,11 @@ def laser(
         bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
     ] = False,
     margin_mm: Annotated[
-        float, typer.Option(help="Use stripe points this far outside the target's points.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Use stripe points this far outside the target's points; else as the boards agree."
+        ),
+    ] = None,
     stripe_method: StripeMethodOption = "fit",
     laser_colour: LaserColourOption = "auto",
     bits_used: BitsUsed = None,

@@ -30,5 +30,10 @@ StripeMethodOption = Annotated[
     ),
 ]
 LaserColourOption = Annotated[
-    str, typer.Option("--laser-colour", help="auto, red, green, blue or grey.")
+    str,
+    typer.Option(
+        "--laser-colour",
+        help="What of colour images to use: auto, red, green, blue, grey, green-red (a difference), "
+        "green-excess (less the mean of the others) and so on.",
+    ),
 ]

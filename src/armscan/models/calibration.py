@@ -195,6 +195,9 @@ class SensorCalibration:
         Evidence for a reader; None where there is none.
     second
         The right camera of a stereo head; None for a head of one camera.
+    laser_colour
+        The channel of colour images in which the stripes of the calibration were found, and in
+        which stripes are sought from then on; ``auto`` where none was chosen.
     """
 
     camera: CameraCalibration
@@ -203,6 +206,7 @@ class SensorCalibration:
     provenance: Provenance
     diagnostics: SensorDiagnostics | None = None
     second: SecondCamera | None = None
+    laser_colour: str = "auto"
 
     def __post_init__(self) -> None:
         if not self.sheets:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,12 +11,15 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
 
 BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
-"""Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth."""
+"""Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; those of u
+alone follow the light's rays, see `LightSheet`."""
 
 PLANE_PARAMETER_NAMES = ("tilt_u_mm", "tilt_v_mm", "offset_mm")
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-6
 """A last step larger than this means that the ray does not meet the bowed sheet."""
+NEAREST_SOURCE = 0.2
+"""Nearer to the light's source than this part of its distance the sheet is not followed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +30,13 @@ class LightSheet:
     ``sum(bow_mm[k] * u**i * v**j)`` over `BOW_TERMS`; a plane has ``bow_mm = 0``. The scale makes
     the coefficients lengths: each is the deviation from the plane at the edge of the calibrated
     region.
+
+    Light spreads from its source in straight rays, so what bends the sheet along the stripe grows
+    and widens with the distance from it. With ``fan = (lean, spread)`` the ray through ``(u0, 0)``
+    runs along ``(lean + spread u0, 1)``; a point ``(u, v)`` lies on that of
+    ``u0 = (u - lean v) / w``, ``w = 1 + spread v``, and the terms of u alone are ``w u0**3`` and
+    ``w 2 u0**2 / (1 + sqrt(1 + (spread u0)**2))``: a cone, as a line lens that is tilted, or a
+    grating, makes. A fan of zeros gives the powers of u.
 
     Parameters
     ----------
@@ -39,12 +49,15 @@ class LightSheet:
         Half size of the calibrated region.
     bow_mm
         (5,) coefficients.
+    fan
+        (2,) lean and spread of the light's rays, without unit; known, not fitted with the rest.
     """
 
     origin_mm: FloatArray
     axes: FloatArray
     scale_mm: float
     bow_mm: FloatArray
+    fan: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
         axes = frozen_floats(self.axes, (3, 3), "axes")
@@ -55,6 +68,7 @@ class LightSheet:
         object.__setattr__(self, "axes", axes)
         object.__setattr__(self, "origin_mm", frozen_floats(self.origin_mm, (3,), "origin_mm"))
         object.__setattr__(self, "bow_mm", frozen_floats(self.bow_mm, (len(BOW_TERMS),), "bow_mm"))
+        object.__setattr__(self, "fan", frozen_floats(self.fan, (2,), "fan"))
 
     @property
     def plane(self) -> FloatArray:
@@ -90,9 +104,8 @@ class LightSheet:
         """
         local = (points_mm - self.origin_mm) @ self.axes.T
         u, v = local[:, 0] / self.scale_mm, local[:, 1] / self.scale_mm
-        terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
-        dbow_du = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], 1) @ self.bow_mm
-        dbow_dv = np.stack([j * u**i * v ** max(j - 1, 0) for i, j in BOW_TERMS], 1) @ self.bow_mm
+        terms, dterms_du, dterms_dv = self._bow_terms(u, v)
+        dbow_du, dbow_dv = dterms_du @ self.bow_mm, dterms_dv @ self.bow_mm
         height = local[:, 2] - terms @ self.bow_mm
         dheight_dpoint = (
             self.axes[2]
@@ -101,6 +114,27 @@ class LightSheet:
         )
         dheight_dparameters = -np.column_stack([u, v, np.ones_like(u), terms])
         return height, dheight_dpoint, dheight_dparameters
+
+    def _bow_terms(
+        self, u: FloatArray, v: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(N, 5) values of the bow's terms, and their derivatives by u and by v."""
+        terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
+        by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], axis=1)
+        by_v = np.stack([j * u**i * v ** max(j - 1, 0) for i, j in BOW_TERMS], axis=1)
+        lean, spread = self.fan
+        w = np.maximum(1.0 + spread * v, NEAREST_SOURCE)
+        dw_dv = np.where(w > NEAREST_SOURCE, spread, 0.0)
+        u0 = (u - lean * v) / w
+        root = np.sqrt(1.0 + (spread * u0) ** 2)
+        for k, (shape, slope) in {
+            BOW_TERMS.index((2, 0)): (2.0 * u0**2 / (1.0 + root), 2.0 * u0 / root),
+            BOW_TERMS.index((3, 0)): (u0**3, 3.0 * u0**2),
+        }.items():
+            terms[:, k] = w * shape
+            by_u[:, k] = slope
+            by_v[:, k] = dw_dv * (shape - u0 * slope) - lean * slope
+        return terms, by_u, by_v
 
     def intersect(self, xy: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Points where the rays ``(x, y, 1)`` through the camera's centre meet the sheet.
@@ -178,4 +212,4 @@ class LightSheet:
         e_u = e_u / np.linalg.norm(e_u)
         axes = np.stack([e_u, np.cross(normal, e_u), normal])
         origin = self.origin_mm + step[2] * self.axes[2]
-        return LightSheet(origin, axes, self.scale_mm, self.bow_mm + step[3:])
+        return LightSheet(origin, axes, self.scale_mm, self.bow_mm + step[3:], self.fan)

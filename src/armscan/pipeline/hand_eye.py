@@ -20,7 +20,7 @@ from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasuredImage, cameras_of, collected, see
+from armscan.pipeline.measure import MeasuredImage, cameras_of, collected, see, stripes_for
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.sheet_rules import measurer_for
@@ -195,7 +195,7 @@ def observe_stripes(
             n_unreadable += 1
             continue
         seen = [
-            see(pair, camera, options.measure.stripes)
+            see(pair, camera, stripes_for(sensor, options.measure.stripes))
             for pair, camera in zip(pairs, cameras, strict=True)
         ]
         # Each still is named by itself: where the sensor is on the arm is not known yet.

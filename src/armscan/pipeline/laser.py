@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.cameras import HeadCameras
@@ -15,7 +17,12 @@ from armscan.devices.scan_source import ScanSource
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.stereo import StereoCalibration
-from armscan.pipeline.board_placements import Placement, find_placements, placement_of
+from armscan.pipeline.board_placements import (
+    Placement,
+    SeenBoard,
+    find_placements,
+    placement_of,
+)
 from armscan.pipeline.exposure_pairs import (
     ExposurePair,
     check_sizes,
@@ -23,13 +30,16 @@ from armscan.pipeline.exposure_pairs import (
     pair_exposures,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.stripe_channel import choose_channel
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.stripe.options import LaserColour, StripeOptions
 from armscan.vision.targets.definition import Target
 from armscan.vision.targets.options import TargetOptions
+from armscan.vision.targets.view import TargetView
 
-STAGE = "boards and stripes"
+BOARDS_STAGE = "boards"
+STRIPES_STAGE = "stripes"
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,19 +131,31 @@ def calibrate_sheets_from_pairs(
     for pair in pairs:
         images = [image for image in pair if image is not None]
         check_sizes(images, cameras.model(pair[0].camera))
+    places = {p.name: p for p in _found_placements(pairs, target, cameras, options, progress)}
+    shown = [pair for pair in pairs if _seen(pair, places) is not None]
+
+    def stripes_of(pair: ExposurePair, colour: LaserColour) -> BoardStripes | FitFailure:
+        chosen = replace(options.stripes, laser_colour=colour)
+        return _board_stripes(pair, places[placement_of(pair)], target, cameras, chosen)
+
+    def tried(k: int, colour: LaserColour) -> BoardStripes | None:
+        found = stripes_of(shown[k], colour)
+        return None if isinstance(found, FitFailure) else found
+
+    colour, choice = options.stripes.laser_colour, None
+    if colour == "auto" and any(pair[0].colour != "mono" for pair in shown):
+        choice = choose_channel(len(shown), tried, cameras, options.sheets)
+        colour = "auto" if choice is None else choice.channel
     boards: list[BoardStripes] = []
     skipped: list[SkippedImage] = []
-    done = 0
-    for placement in find_placements(pairs, target, cameras, options.target):
-        for pair in (pair for pair in pairs if placement_of(pair) == placement.name):
-            progress(ProgressEvent(STAGE, done, len(pairs), pair[0].source))
-            done += 1
-            found = _board_stripes(pair, placement, target, cameras, options.stripes)
-            if isinstance(found, FitFailure):
-                skipped.append(SkippedImage(pair[0].source, found.reason))
-            else:
-                boards.append(found)
-    progress(ProgressEvent(STAGE, len(pairs), len(pairs)))
+    for done, pair in enumerate(pairs):
+        progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
+        found = stripes_of(pair, colour)
+        if isinstance(found, FitFailure):
+            skipped.append(SkippedImage(pair[0].source, found.reason))
+        else:
+            boards.append(found)
+    progress(ProgressEvent(STRIPES_STAGE, len(pairs), len(pairs)))
     if not boards:
         return FitFailure(
             f"no board with stripes in any of {len(pairs)} images; {skipped[0].source}: "
@@ -144,7 +166,33 @@ def calibrate_sheets_from_pairs(
     if isinstance(fit, FitFailure):
         lost = "; ".join(f"{image.source}: {image.reason}" for image in skipped)
         return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
-    return replace(fit, skipped=tuple(skipped))
+    return replace(
+        fit,
+        skipped=(*skipped, *fit.skipped),
+        laser_colour=colour,
+        channel_reason="" if choice is None else choice.reason,
+    )
+
+
+def _found_placements(
+    pairs: Sequence[ExposurePair],
+    target: Target,
+    cameras: HeadCameras,
+    options: LaserOptions,
+    progress: Progress,
+) -> Iterator[Placement]:
+    """Look for the board in each placement, telling of each."""
+    n_places = len({placement_of(pair) for pair in pairs})
+    found = find_placements(pairs, target, cameras, options.target)
+    for done, placement in enumerate(found):
+        progress(ProgressEvent(BOARDS_STAGE, done + 1, n_places, placement.name))
+        yield placement
+
+
+def _seen(pair: ExposurePair, places: Mapping[str, Placement]) -> SeenBoard | None:
+    """The board as the pair's camera saw it; None where it found none."""
+    seen = places[placement_of(pair)].seen[pair[0].camera]
+    return None if isinstance(seen, FitFailure) else seen
 
 
 def _board_stripes(
@@ -154,15 +202,31 @@ def _board_stripes(
     cameras: HeadCameras,
     options: StripeOptions,
 ) -> BoardStripes | FitFailure:
-    """Stripes of one exposure on its placement's board."""
+    """Stripes of one exposure on its placement's board and around it."""
     exposure, background = pair
     seen = placement.seen[exposure.camera]
     if isinstance(seen, FitFailure):
         return seen
     camera, view, pose = seen
-    profile = extract_stripes(exposure, options, background)
+    profile = extract_stripes(
+        _around(view, exposure), options, None if background is None else _around(view, background)
+    )
     if not bool(profile.is_accepted.any()):
-        return FitFailure("no stripe was found", "check the laser and the exposure")
+        return FitFailure("no stripe was found on or around the board", "check laser and exposure")
     edges = find_target_edges(view, target, pose.value, cameras.model(camera))
     placed, name = placement.placed, placement.name
     return BoardStripes(profile, view, pose, exposure.lasers, edges, camera, placed, name)
+
+
+def _around(view: TargetView, exposure: Exposure) -> Exposure:
+    """The part of an exposure that shows the board, with as much again on every side.
+
+    What is bright elsewhere, a lamp or a window, then does not set the threshold.
+    """
+    points = exposure.window.to_image(view.points_px)
+    reach = float(np.ptp(points, axis=0).max())
+    left, top = np.floor(points.min(axis=0) - reach).astype(int)
+    right, bottom = np.ceil(points.max(axis=0) + reach).astype(int) + 1
+    return exposure.cropped(
+        max(left, 0), max(top, 0), min(right, exposure.width_px), min(bottom, exposure.height_px)
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.triangulate import StripePoints, meet_sheets, triangulate_stripe
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.stripe.options import LaserColour, StripeOptions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,6 +69,13 @@ class Measurer(Protocol):
         t_ns: int = 0,
     ) -> tuple[MeasuredImage, ...]:
         """Measure what the cameras saw at one instant; one result a camera."""
+
+
+def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOptions:
+    """The options with the channel in which the sensor was calibrated, unless one was chosen."""
+    if options.laser_colour != "auto":
+        return options
+    return replace(options, laser_colour=cast(LaserColour, sensor.laser_colour))
 
 
 def see(pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> LitProfile:

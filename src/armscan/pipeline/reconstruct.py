@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair, pair_exposures
-from armscan.pipeline.measure import cameras_of, collected, see
+from armscan.pipeline.measure import cameras_of, collected, see, stripes_for
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
@@ -61,15 +61,14 @@ def reconstruct(
     options = options or MeasureOptions()
     instants = _instants(exposures, backgrounds, rights, right_backgrounds, sensor)
     cameras = cameras_of(sensor)
+    stripes = stripes_for(sensor, options.stripes)
     images: list[ReconstructedImage] = []
     clouds: list[PointCloud] = []
     weak: list[str] = []
     for done, pairs in enumerate(instants):
         progress(ProgressEvent(STAGE, done, len(instants), pairs[0][0].source))
         measurer = measurer_for(sensor, options)
-        seen = [
-            see(pair, camera, options.stripes) for pair, camera in zip(pairs, cameras, strict=True)
-        ]
+        seen = [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
         for one in measurer.measure(seen):
             images.append(one.image)
             weak += one.warnings

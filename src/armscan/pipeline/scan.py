@@ -24,6 +24,7 @@ from armscan.pipeline.measure import (
     cameras_of,
     collected,
     see,
+    stripes_for,
 )
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
@@ -151,7 +152,7 @@ def measure_scan(
             yield instant, pairs
 
     def extract(pairs: tuple[ExposurePair, ...]) -> list[LitProfile]:
-        stripes = options.measure.stripes
+        stripes = stripes_for(scanner.sensor, options.measure.stripes)
         return [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
 
     measurer = measurer_for(scanner.sensor, options.measure, is_scan=True)

@@ -65,6 +65,7 @@ def triangulate_right(
             there.axes @ turn,
             there.scale_mm,
             there.bow_mm,
+            there.fan,
         )
         found, met, by_xy, by_sheet = seen.intersect_with_jacobian(xy[own])
         own, found, by_xy, by_sheet = own[met], found[met], by_xy[met], by_sheet[met]

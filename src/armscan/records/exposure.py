@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -84,6 +84,12 @@ class Exposure:
     def width_px(self) -> int:
         """Columns of the image."""
         return int(self.image.shape[1])
+
+    def cropped(self, left: int, top: int, right: int, bottom: int) -> Exposure:
+        """The part of columns ``left`` to ``right`` and rows ``top`` to ``bottom``, ends excluded."""
+        step = self.window.binning
+        window = SensorWindow(self.window.x_px + left * step, self.window.y_px + top * step, step)
+        return replace(self, image=self.image[top:bottom, left:right], window=window)
 
     @property
     def full_scale(self) -> int:

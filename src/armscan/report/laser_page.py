@@ -27,6 +27,7 @@ USE_COLOURS = {
     PointUse.UNNAMED: "#ff9df0",
     PointUse.OFF_SHEET: "#ff7a3c",
     PointUse.ON_EDGE: "#8d7bff",
+    PointUse.OUTVOTED: "#c9a227",
 }
 BOARD_COLOUR = "#35e0c0"
 WEAK_P = 0.01

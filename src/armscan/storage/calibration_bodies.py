@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -47,6 +48,7 @@ from armscan.storage.diagnostics_bodies import (
     sensor_diagnostics,
     sheet_diagnostics,
 )
+from armscan.vision.stripe.options import LaserColour
 
 BOW_KEYS = tuple(f"u{i}_v{j}" for i, j in BOW_TERMS)
 SYMMETRY_TOLERANCE = 1e-9
@@ -102,6 +104,7 @@ def sensor_document_of(
         covariance=covariance_body(calibration.parameter_names, calibration.covariance),
         diagnostics=diagnostics_body(calibration.diagnostics, SensorDiagnosticsBody),
         second=None if calibration.second is None else second_camera_body(calibration.second),
+        laser_colour=cast(LaserColour, calibration.laser_colour),
         observations=observations,
         provenance=provenance_body(calibration.provenance),
     )
@@ -120,6 +123,7 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
         provenance_from_body(document.provenance),
         sensor_diagnostics(document.diagnostics),
         second,
+        document.laser_colour,
     )
     covariance = covariance_from_body(document.covariance, empty.parameter_names)
     return replace(empty, covariance=covariance)
@@ -199,6 +203,8 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
         ),
         scale_mm=sheet.scale_mm,
         bow_mm=dict(zip(BOW_KEYS, sheet.bow_mm.tolist(), strict=True)),
+        fan_lean=float(sheet.fan[0]),
+        fan_spread=float(sheet.fan[1]),
         rms_mm=calibration.rms_mm,
         n_boards=calibration.n_boards,
         n_points=calibration.n_points,
@@ -214,9 +220,10 @@ def _sheet_from_body(body: SheetBody) -> SheetCalibration:
         raise InputError(f"sheet {body.name} needs the bow terms {', '.join(BOW_KEYS)}")
     axes = np.array([body.axes.u_sensor, body.axes.v_sensor, body.axes.normal_sensor])
     bow = np.array([body.bow_mm[key] for key in BOW_KEYS])
+    fan = np.array([body.fan_lean, body.fan_spread])
     return SheetCalibration(
         name=body.name,
-        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow),
+        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow, fan),
         rms_mm=body.rms_mm,
         n_boards=body.n_boards,
         n_points=body.n_points,

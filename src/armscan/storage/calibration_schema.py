@@ -16,6 +16,8 @@ from pydantic import (
     model_serializer,
 )
 
+from armscan.vision.stripe.options import LaserColour
+
 SCHEMA_VERSION: Final = 1
 CAMERA_SCHEMA: Final = "armscan/camera-calibration"
 SENSOR_SCHEMA: Final = "armscan/sensor-calibration"
@@ -192,13 +194,19 @@ class AxesBody(Body):
 
 
 class SheetBody(Body):
-    """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame."""
+    """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame.
+
+    The fan says how the terms of u alone follow the light's rays, see `LightSheet`; documents
+    without it have zeros.
+    """
 
     name: str = Field(min_length=1)
     origin_sensor_mm: Triple
     axes: AxesBody
     scale_mm: float = Field(gt=0)
     bow_mm: dict[str, float]
+    fan_lean: float = 0.0
+    fan_spread: float = 0.0
     rms_mm: KnownOrNot
     n_boards: int = Field(ge=0)
     n_points: int = Field(ge=0)
@@ -234,7 +242,9 @@ class CameraDocument(Body):
 
 
 class SensorDocument(Body):
-    """``sensor.json``; ``second`` is there only for a head of two cameras."""
+    """``sensor.json``; ``second`` is there only for a head of two cameras, ``laser_colour`` only where
+    a channel of colour images was chosen.
+    """
 
     schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")
     schema_version: Literal[1] = SCHEMA_VERSION
@@ -244,13 +254,16 @@ class SensorDocument(Body):
     covariance: CovarianceBody
     diagnostics: SensorDiagnosticsBody | None
     second: SecondCameraBody | None = None
+    laser_colour: LaserColour = "auto"
     observations: ObservationsBody | None = None
     provenance: ProvenanceBody
 
     @model_serializer(mode="wrap")
-    def _without_absent_camera(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Heads of one camera keep the document that they always had."""
+    def _without_what_is_absent(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Heads of one grey camera keep the document that they always had."""
         content: dict[str, Any] = write(self)
         if self.second is None:
             del content["second"]
+        if self.laser_colour == "auto":
+            del content["laser_colour"]
         return content

@@ -85,6 +85,7 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
         case.errors,
         is_bowed,
         sigma_factor=factors[used.sheet],
+        are_cameras_held=True,
     )
     if isinstance(solution, FitFailure):
         return solution

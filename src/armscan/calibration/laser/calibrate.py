@@ -12,7 +12,12 @@ from armscan.calibration.laser.assembly import LooseSheet, SheetCase, assemble_f
 from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.conditioning import refuse_few_boards
 from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
-from armscan.calibration.laser.naming import NamedStripes, board_numbers, name_stripes
+from armscan.calibration.laser.naming import (
+    LEAST_FAN,
+    NamedStripes,
+    board_numbers,
+    name_stripes,
+)
 from armscan.calibration.laser.observations import (
     SheetObservations,
     collect_observations,
@@ -23,6 +28,7 @@ from armscan.calibration.laser.result import BoardStripes, LaserFit
 from armscan.calibration.laser.sheet_model import SheetModel, choose_model, start_sheet
 from armscan.calibration.laser.sightings import BoardImage, sight_stripes
 from armscan.calibration.laser.solve import CommonErrors, solve_sheets
+from armscan.calibration.laser.voting import LEAST_BOARDS, Vote, vote_on_sheets
 from armscan.geometry.arrays import BoolArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
@@ -77,7 +83,8 @@ def calibrate_sheets(
     """
     options = options or SheetOptions()
     cameras = HeadCameras.of(camera)
-    images = [sight_stripes(board, cameras, options) for board in boards]
+    vote = sight_on_boards(boards, cameras, options)
+    images = vote.images
     if not any(image.sightings for image in images):
         return FitFailure(
             f"no straight stripe with {options.min_points} accepted points lies on the board in "
@@ -88,12 +95,48 @@ def calibrate_sheets(
     named = name_stripes(images, cameras.covariance, options)
     while not isinstance(named, FitFailure):
         fit = _fit_named(images, named, cameras, options)
-        if not isinstance(fit, _Refused):
+        if isinstance(fit, LaserFit):
+            return replace(
+                fit,
+                skipped=(*vote.outlying, *fit.skipped),
+                warnings=(*vote.warnings, *fit.warnings),
+            )
+        if isinstance(fit, FitFailure):
             return fit
         if not named.is_fan or len(named.names) == 1:
             return fit.failure
         named = named.without(fit.sheet, fit.failure.reason)
     return named
+
+
+def sight_on_boards(
+    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
+) -> Vote:
+    """Straight stripes on the boards, less the lines on which the boards do not agree.
+
+    Stripes are looked for on the print and, where three boards can vote, on the carrier around it as
+    far as the print is long: a line beside the print is taken only if it lies on the common sheet.
+    The lines of a fan are not voted on, and of them those on the print are preferred.
+    """
+    can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
+    n_lines = 0 if can_vote else options.n_sheets
+    on_print = [
+        sight_stripes(board, cameras, options, options.margin_mm, n_lines) for board in boards
+    ]
+    if not can_vote or options.margin_mm is not None or _most_lines(on_print) >= LEAST_FAN:
+        return vote_on_sheets(on_print, options)
+    around = [sight_stripes(board, cameras, options, _carrier_mm(board)) for board in boards]
+    return vote_on_sheets(around, options)
+
+
+def _most_lines(images: Sequence[BoardImage]) -> float:
+    return float(np.median([len(image.sightings) for image in images]))
+
+
+def _carrier_mm(board: BoardStripes) -> float:
+    """A board may go on beyond its print by the print's own length."""
+    points = board.view.points_board_mm
+    return float(np.ptp(points, axis=0).max())
 
 
 def _fit_named(

@@ -17,7 +17,8 @@ class SheetOptions:
     ----------
     margin_mm
         Stripe points up to this far outside the rectangle of the target's points are used;
-        negative keeps that far inside.
+        negative keeps that far inside. None uses what the print covers, and of boards whose stripe
+        lies beside it the carrier, as far as the boards agree.
     n_sheets
         Sheets that were on together; 0 finds out (the count of stripes that most images show).
     sheet_names
@@ -45,7 +46,7 @@ class SheetOptions:
         False holds every sheet to a plane.
     """
 
-    margin_mm: float = 0.0
+    margin_mm: float | None = None
     n_sheets: int = 0
     sheet_names: tuple[str, ...] = ()
     edge_widths: float = 3.0
@@ -59,7 +60,9 @@ class SheetOptions:
 
     def __post_init__(self) -> None:
         _require(
-            math.isfinite(self.margin_mm), f"margin of {self.margin_mm} mm", "give a finite length"
+            self.margin_mm is None or math.isfinite(self.margin_mm),
+            f"margin of {self.margin_mm} mm",
+            "give a finite length",
         )
         _require(0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32")
         _require(

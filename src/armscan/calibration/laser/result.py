@@ -22,6 +22,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile
+from armscan.vision.stripe.options import LaserColour
 from armscan.vision.targets.view import TargetView
 
 
@@ -43,6 +44,8 @@ class PointUse(IntEnum):
     """Given to a sheet and too far from it."""
     ON_EDGE = 7
     """Next to a reflectance edge of the target that runs along the stripe and pulls its centre."""
+    OUTVOTED = 8
+    """On a straight line that does not lie on the sheet on which the boards agree."""
 
     @property
     def label(self) -> str:
@@ -59,6 +62,7 @@ _USE_LABELS = {
     PointUse.UNNAMED: "stripe not given to a sheet",
     PointUse.OFF_SHEET: "off the sheet",
     PointUse.ON_EDGE: "along an edge of the target",
+    PointUse.OUTVOTED: "on a line off the common sheet",
 }
 
 
@@ -331,6 +335,11 @@ class LaserFit:
         Images that gave nothing.
     second
         The right camera of a stereo head.
+    laser_colour
+        The channel of colour images in which the stripes were found, as
+        `armscan.vision.stripe.options.StripeOptions.laser_colour`.
+    channel_reason
+        Why that channel, in words; empty where nothing was to be chosen.
     """
 
     sheets: tuple[SheetFit, ...]
@@ -344,6 +353,8 @@ class LaserFit:
     warnings: tuple[str, ...]
     skipped: tuple[SkippedImage, ...] = ()
     second: SecondCamera | None = None
+    laser_colour: LaserColour = "auto"
+    channel_reason: str = ""
 
     def __post_init__(self) -> None:
         n = 9 + 8 * len(self.sheets) + (15 if self.second is not None else 0)
@@ -358,5 +369,11 @@ class LaserFit:
         """Return the document that reconstruction needs."""
         sheets = tuple(sheet.calibration for sheet in self.sheets)
         return SensorCalibration(
-            self.camera, sheets, self.covariance, provenance, None, self.second
+            self.camera,
+            sheets,
+            self.covariance,
+            provenance,
+            None,
+            self.second,
+            self.laser_colour,
         )

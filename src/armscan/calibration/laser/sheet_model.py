@@ -26,14 +26,26 @@ from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.planes import sheet_from_plane
 from armscan.calibration.laser.result import LackOfFit
 from armscan.calibration.laser.sightings import BoardImage
-from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.calibration.laser.solve import (
+    N_PLANE,
+    CommonErrors,
+    SheetSolution,
+    solve_sheets,
+)
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.fitting import fit_plane
-from armscan.models.light_sheet import LightSheet
+from armscan.models.light_sheet import BOW_TERMS, LightSheet
 
 MAX_BOW_CONDITION = 1e7
 MAX_RAISES = 10
+FAN_ROUNDS = 5
+FAN_SETTLED = 1e-3
+USUAL_FAN = 0.5
+"""Size of a fan's lean and spread where the bow is too small to show them: a source twice as far as
+the calibrated region is wide. It only keeps them finite."""
+MAX_FAN = 0.8
+U2, UV, U2V = (BOW_TERMS.index(term) for term in ((2, 0), (1, 1), (2, 1)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,7 +164,7 @@ def choose_model(
             f"bow from their own errors: {options.min_boards_for_bow} are needed"
         )
     condition = _bow_condition(alone, flat)
-    bowed = solve_sheets(alone, [start], errors, [True], sigma_factor=noise.sigma_factor)
+    bowed = _solve_bowed(alone, start, errors, noise.sigma_factor)
     if condition > MAX_BOW_CONDITION or isinstance(bowed, FitFailure):
         return plane(
             f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
@@ -172,6 +184,38 @@ def choose_model(
     factor = noise.sigma_factor
     model = SheetModel(bowed.sheets[0], True, noise, plane_test, final, decision, factor)
     return _with_explained_stripes(model, alone, errors, options)
+
+
+def _solve_bowed(
+    observations: SheetObservations, start: LightSheet, errors: CommonErrors, sigma_factor: float
+) -> SheetSolution | FitFailure:
+    """Fit a bowed sheet, and find from the bow itself how its light spreads.
+
+    Where the rays come from shows in how the bow along the stripe changes with depth: to first
+    order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2``.
+    """
+    solution = solve_sheets(observations, [start], errors, [True], sigma_factor=sigma_factor)
+    for _ in range(FAN_ROUNDS):
+        if isinstance(solution, FitFailure):
+            return solution
+        sheet = solution.sheets[0]
+        bow = sheet.bow_mm[U2]
+        variance = np.diag(solution.covariance)[errors.n_camera + N_PLANE :]
+        lean, spread = sheet.fan
+        sideways = 2.0 * lean * bow - sheet.bow_mm[UV]
+        weaker = spread * bow - sheet.bow_mm[U2V]
+        fan = np.array(
+            [
+                0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2),
+                bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2),
+            ]
+        )
+        fan = np.clip(fan, -MAX_FAN, MAX_FAN)
+        if float(np.abs(fan - sheet.fan).max()) < FAN_SETTLED:
+            break
+        start = replace(start, fan=fan)
+        solution = solve_sheets(observations, [start], errors, [True], sigma_factor=sigma_factor)
+    return solution
 
 
 def _with_explained_stripes(

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.options import SheetOptions
@@ -15,6 +16,7 @@ from armscan.calibration.laser.second_view import meet_board_of, place_board
 from armscan.calibration.laser.straight_stripes import find_straight_stripes
 from armscan.calibration.laser.target_edges import runs_along_edge
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.vision.targets.view import TargetView
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +85,43 @@ class BoardImage:
     sightings: tuple[Sighting, ...]
 
 
-def sight_stripes(data: BoardStripes, cameras: HeadCameras, options: SheetOptions) -> BoardImage:
-    """Carry the stripe points of one image to its board and sort them into straight stripes."""
+TOLERANCE_PX = 2.0
+"""The least half width of a straight stripe's band, where a pixel is coarser than the tolerance."""
+
+
+def printed_margin_mm(view: TargetView) -> float:
+    """How far the print goes on beyond the target's points: a square, half a pitch of circles."""
+    points = view.points_board_mm[:, :2]
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])
+    pitch = float(np.median(nearest[:, 1]))
+    return pitch if view.edges is None else 0.5 * pitch
+
+
+def sight_stripes(
+    data: BoardStripes,
+    cameras: HeadCameras,
+    options: SheetOptions,
+    margin_mm: float | None = None,
+    n_lines: int = 0,
+) -> BoardImage:
+    """Carry the stripe points of one image to its board and sort them into straight stripes.
+
+    Parameters
+    ----------
+    data
+        The image's stripe points and its board.
+    cameras
+        The cameras.
+    options
+        In force.
+    margin_mm
+        Points so far outside the rectangle of the target's points count as on the board; what the
+        print covers if None.
+    n_lines
+        Stripes to look for, those with the most points; 0 for all.
+    """
+    if margin_mm is None:
+        margin_mm = printed_margin_mm(data.view)
     seen = ((data.camera, data.view, data.sensor_from_board),)
     placed = data.placed or place_board(seen, cameras)
     profile, pose = data.profile, placed.sensor_from_board
@@ -96,9 +133,7 @@ def sight_stripes(data: BoardStripes, cameras: HeadCameras, options: SheetOption
     corners = data.view.points_board_mm[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     with np.errstate(invalid="ignore"):
-        known = (on_board[:, :2] >= low - options.margin_mm) & (
-            on_board[:, :2] <= high + options.margin_mm
-        )
+        known = (on_board[:, :2] >= low - margin_mm) & (on_board[:, :2] <= high + margin_mm)
     use = np.full(len(profile), int(PointUse.OFF_LINE))
     if data.edges is not None:
         pulled = runs_along_edge(profile, data.edges, options.edge_widths, options.edge_angle_deg)
@@ -107,12 +142,16 @@ def sight_stripes(data: BoardStripes, cameras: HeadCameras, options: SheetOption
     use[~points.is_valid] = PointUse.NO_RAY
     use[~profile.is_accepted] = PointUse.FLAGGED
     candidates = np.flatnonzero(use == PointUse.OFF_LINE)
+    mm_px = sigma_mm[candidates] / profile.sigma_px[candidates]
+    coarse = TOLERANCE_PX * float(np.median(mm_px)) if len(mm_px) else 0.0
+    tolerance = max(options.line_tolerance_mm, coarse)
     stripes = find_straight_stripes(
         on_board[candidates, :2],
         sigma_mm[candidates],
         profile.segment[candidates],
         (float(high[0] - low[0]), float(high[1] - low[1])),
-        options,
+        replace(options, line_tolerance_mm=tolerance),
+        n_lines,
     )
     for stripe in stripes:
         use[candidates[stripe.rows]] = PointUse.UNNAMED

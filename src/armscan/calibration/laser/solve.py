@@ -4,14 +4,18 @@
 The residual of a point is the movement of the stripe across itself in the image. Besides the
 sheets' parameters the unknowns are the errors of the boards' poses and of the camera, with their
 covariance as prior knowledge: errors that all points of an image, or all images, have in common
-are so weighed as what they are. The camera itself stays as calibrated; its uncertainty goes into
-the weights and into the joint covariance.
+are so weighed as what they are.
+
+The cameras may be free or held. Free, they take up what their own errors do to the stripes, so that
+it is not taken for a bow or for outliers: models are chosen so. Held, the sheets are those that
+belong to the cameras as they were calibrated: only these may stand beside them in a document, for a
+sheet of moved cameras makes wrong points with the unmoved ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -69,13 +73,15 @@ class SheetSolution:
     sheets
         S sheets.
     covariance
-        (P + 8 S, P + 8 S) joint with the cameras' own covariance, cameras first.
+        (P + 8 S, P + 8 S) of the errors of the cameras, as calibrated, and of these sheets.
     height_mm, residual_px
         (N,) residuals with boards and camera as measured.
     remaining_px
-        (N,) residuals after boards and camera are moved within their uncertainty.
+        (N,) residuals after the boards, and the cameras if free, are moved within their
+        uncertainty.
     common
-        (6 M + P,) estimated common errors of M boards and the cameras, in their own sigmas.
+        (6 M + P,) estimated common errors of M boards and the cameras, in their own sigmas; zero
+        for cameras that are held.
     chi2
         Weighted squares of ``remaining_px`` plus squares of ``common``.
     n_parameters
@@ -116,6 +122,7 @@ def solve_sheets(
     *,
     sigma_factor: float | FloatArray = 1.0,
     is_robust: bool = False,
+    are_cameras_held: bool = False,
 ) -> SheetSolution | FitFailure:
     """Fit the sheets by Gauss-Newton steps.
 
@@ -133,6 +140,8 @@ def solve_sheets(
         Multiplies the stripes' sigmas in the weights; one number, or one a point.
     is_robust
         Weigh points down by Huber's function on what remains; for finding outliers.
+    are_cameras_held
+        Solve for the sheets that belong to the cameras as calibrated.
 
     Returns
     -------
@@ -146,12 +155,13 @@ def solve_sheets(
     )
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
+    n_held = errors.n_camera if are_cameras_held else 0
     for _ in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active)
-        solved = system.step(robust / sigma**2, int(active.sum()))
+        solved = system.step(robust / sigma**2, int(active.sum()), n_held)
         if solved is None:
             return _UNDETERMINED
-        step, inverse = solved
+        step, inverse, follow = solved
         full = np.zeros(N_SHEET * len(sheets))
         full[active] = step[: int(active.sum())]
         if _turns_too_far(full, sheets):
@@ -170,14 +180,14 @@ def solve_sheets(
     remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
     return SheetSolution(
         tuple(sheets),
-        _joint_covariance(inverse, active, errors),
+        _joint_covariance(inverse, follow, active, errors),
         system.height_mm,
         system.residual_px,
         remaining,
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
         n_active,
-        float((np.abs(step) / np.sqrt(np.diag(inverse)))[:n_active].max()),
+        float((np.abs(step[:n_active]) / np.sqrt(np.diag(inverse)[:n_active])).max()),
     )
 
 
@@ -194,7 +204,7 @@ def _turns_too_far(full: FloatArray, sheets: Sequence[LightSheet]) -> bool:
 
 
 def _without_bow(sheet: LightSheet) -> LightSheet:
-    return LightSheet(sheet.origin_mm, sheet.axes, sheet.scale_mm, np.zeros(5))
+    return replace(sheet, bow_mm=np.zeros(5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -222,17 +232,24 @@ class _System:
             change[stripe.rows] = stripe.design @ unknowns[stripe.columns]
         return change
 
-    def step(self, weight: FloatArray, n_active: int) -> tuple[FloatArray, FloatArray] | None:
-        """Step and inverse of the normal matrix; the common errors are known to be 0 +- 1.
+    def step(
+        self, weight: FloatArray, n_active: int, n_held: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Step, inverse of the normal matrix, and how the step follows the unknowns held.
 
-        None where the matrix is not positive definite to rounding, so that neither means anything.
+        The common errors are known to be 0 +- 1; the last ``n_held`` of them stay 0. The third is
+        (U, n_held) for the U unknowns that are free. None where the matrix is not positive
+        definite to rounding, so that nothing of it means anything.
         """
+        n_free = self.n_columns - n_held
         information = np.diag((np.arange(self.n_columns) >= n_active).astype(np.float64))
         pull = np.zeros(self.n_columns)
         for stripe in self.stripes:
             weighted = stripe.design * weight[stripe.rows, None]
             information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
             pull[stripe.columns] += weighted.T @ self.residual_px[stripe.rows]
+        held = information[:n_free, n_free:]
+        information = information[:n_free, :n_free]
         diagonal = np.diag(information)
         if not np.isfinite(information).all() or not (diagonal > 0.0).all():
             return None
@@ -241,7 +258,8 @@ class _System:
         if not values[0] > MIN_EIGENVALUE:
             return None
         inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-        return np.asarray(-inverse @ pull), np.asarray(inverse)
+        step = np.concatenate([-inverse @ pull[:n_free], np.zeros(n_held)])
+        return step, np.asarray(inverse), np.asarray(-inverse @ held)
 
 
 def _linearised(
@@ -281,19 +299,28 @@ def _huber(normalised: FloatArray) -> FloatArray:
     return np.asarray(HUBER_SIGMA * scale / np.maximum(np.abs(normalised), HUBER_SIGMA * scale))
 
 
-def _joint_covariance(inverse: FloatArray, active: BoolArray, errors: CommonErrors) -> FloatArray:
-    """Covariance of cameras and sheets together, the cameras as they were calibrated.
+def _joint_covariance(
+    inverse: FloatArray, follow: FloatArray, active: BoolArray, errors: CommonErrors
+) -> FloatArray:
+    """Covariance of the errors of cameras and sheets, the cameras as they were calibrated.
 
-    With the cameras' error ``c = L w`` in its own sigmas, the estimate of the sheets errs by
-    ``e_s`` with ``cov(e_s, w) = -inverse[s, w]``; the calibrated cameras err by ``-L w``.
+    With the cameras' error ``e_c = L w`` in its own sigmas: sheets of cameras that are held follow
+    it, ``e_s = F w + n`` with F from the normal equations (n by stripes and boards, of covariance
+    ``inverse``). Sheets of free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
     """
     n_active, n_sheets, p = int(active.sum()), len(active), errors.n_camera
-    camera = slice(len(inverse) - p, len(inverse))
+    root = square_root(errors.camera_covariance)
+    own = inverse[:n_active, :n_active]
+    if follow.shape[1]:
+        by_camera = follow[:n_active]
+        own = own + by_camera @ by_camera.T
+    else:
+        by_camera = inverse[:n_active, len(inverse) - p :]
     joint = np.zeros((p + n_sheets, p + n_sheets))
     joint[:p, :p] = errors.camera_covariance
     places = p + np.flatnonzero(active)
-    joint[np.ix_(places, places)] = inverse[:n_active, :n_active]
-    cross = inverse[:n_active, camera] @ square_root(errors.camera_covariance).T
+    joint[np.ix_(places, places)] = own
+    cross = by_camera @ root.T
     joint[np.ix_(places, np.arange(p))] = cross
     joint[np.ix_(np.arange(p), places)] = cross.T
     return 0.5 * (joint + joint.T)

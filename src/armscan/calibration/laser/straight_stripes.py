@@ -39,6 +39,7 @@ def find_straight_stripes(
     segment: IntArray,
     board_size_mm: tuple[float, float],
     options: SheetOptions,
+    n_lines: int = 0,
 ) -> list[StraightStripe]:
     """Group points on the board into straight stripes, the one with the most points first.
 
@@ -56,12 +57,14 @@ def find_straight_stripes(
     board_size_mm
         Width and height of the board's known region.
     options
-        Tolerances, and the count of stripes where it is known.
+        Tolerances.
+    n_lines
+        Most stripes to look for; 0 for all.
     """
     stripes: list[StraightStripe] = []
     rest = np.arange(len(points_board_mm))
     shortest_mm = MIN_SPAN * min(board_size_mm)
-    limit = options.n_sheets or len(points_board_mm)
+    limit = n_lines or len(points_board_mm)
     generator = np.random.default_rng(SEED)
     while len(rest) >= options.min_points and len(stripes) < limit:
         line = _best_line(points_board_mm[rest], segment[rest], options, generator)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the channel in colour exposures, and the gate by the laser's colour."""
+"""Channels of colour exposures, their differences, and the gate by the laser's colour."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from armscan.vision.stripe.laser_off import subtract
 from armscan.vision.stripe.options import LaserColour
 from armscan.vision.stripe.plane import NORMAL_SCALE, StripePlane, saturated_mask, to_units
 
-CHANNELS: tuple[LaserColour, ...] = ("red", "green", "blue")
+CHANNELS = ("red", "green", "blue")
+COLOURS: tuple[LaserColour, ...] = ("red", "green", "blue")
 RIDGE_STEP_PX = 14
 RIDGE_QUANTILE = 0.9995
 LEAST_COLOUR_SHARE = 0.25
@@ -65,7 +66,7 @@ def _channel(exposure: Exposure, k: int) -> ImageArray:
     return np.ascontiguousarray(image[:, :, k], dtype=np.uint16)
 
 
-def colour_excess(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
+def colour_excess(images: ColourImages, colour: str) -> NDArray[np.float32]:
     """How much stronger the laser's colour is than the mean of the two others, (H, W)."""
     k = CHANNELS.index(colour)
     others = [images.channels[m] for m in range(3) if m != k]
@@ -90,21 +91,22 @@ def _strength(image: NDArray[np.float32]) -> float:
 
 def find_laser_colour(images: ColourImages) -> LaserColour:
     """Colour whose excess forms the strongest thin lines; grey if none stands out."""
-    strengths = [_strength(colour_excess(images, colour)) for colour in CHANNELS]
+    strengths = [_strength(colour_excess(images, colour)) for colour in COLOURS]
     grey = _strength(np.asarray(sum(images.channels) / np.float32(3.0)))
     best = int(np.argmax(strengths))
-    return CHANNELS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"
+    return COLOURS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"
 
 
 def colour_plane(
     exposure: Exposure, background: Exposure | None, colour: LaserColour
 ) -> StripePlane:
-    """Choose the channel for the stripe in a colour exposure.
+    """The plane of a colour exposure in which the stripe is sought.
 
-    The laser's own channel is used. Where its core is saturated, the least saturated channel that
-    still shows the core is added: it rises where the first has reached its limit, while the halo
-    and dim parts of the line stay with the laser's colour. Only ridges with the laser's colour
-    around them count.
+    Of ``auto``, the colour is found in this one image. For a colour, the laser's own channel is
+    used; where its core is saturated, the least saturated channel that still shows the core is
+    added: it rises where the first has reached its limit, while the halo and dim parts of the line
+    stay with the laser's colour; only ridges with the laser's colour around them count. For a
+    difference, what the channels have in common, the room's light on a printed pattern, cancels.
     """
     images = split_channels(exposure, background)
     factor = exposure.full_scale / NORMAL_SCALE
@@ -112,26 +114,34 @@ def colour_plane(
         colour = find_laser_colour(images)
     if colour == "grey":
         mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
-        masks = [mask for mask in images.clipped if mask.size > 1]
-        clipped = np.maximum.reduce(masks) if masks else NOWHERE
+        clipped = _any_clipped(images.clipped)
         return StripePlane(mean, clipped, clipped, factor)
-    own = CHANNELS.index(colour)
-    excess = colour_excess(images, colour)
+    own = CHANNELS.index(colour.partition("-")[0])
     unknown = None
     if background is not None:
         unknown = saturated_mask(_channel(background, own), background.full_scale)
+    if colour not in CHANNELS:
+        clipped = images.clipped[own]
+        return StripePlane(_difference(images, colour), clipped, clipped, factor, unknown=unknown)
+    excess = colour_excess(images, colour)
     core = _core_channel(images, excess, own)
-    if core is None:
-        return StripePlane(
-            images.channels[own],
-            images.clipped[own],
-            images.clipped[own],
-            factor,
-            excess,
-            unknown,
-        )
-    both = images.channels[own] + images.channels[core]
-    return StripePlane(both, images.clipped[core], images.clipped[own], factor, excess, unknown)
+    image, clipped = images.channels[own], images.clipped[own]
+    if core is not None:
+        image, clipped = image + images.channels[core], images.clipped[core]
+    return StripePlane(image, clipped, images.clipped[own], factor, excess, unknown)
+
+
+def _difference(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
+    """One channel less another one, or less the mean of both others."""
+    first, _, second = colour.partition("-")
+    if second == "excess":
+        return colour_excess(images, first)
+    return images.channels[CHANNELS.index(first)] - images.channels[CHANNELS.index(second)]
+
+
+def _any_clipped(masks: tuple[NDArray[np.uint8], ...]) -> NDArray[np.uint8]:
+    found = [mask for mask in masks if mask.size > 1]
+    return np.maximum.reduce(found) if found else NOWHERE
 
 
 def _core_channel(images: ColourImages, excess: NDArray[np.float32], own: int) -> int | None:

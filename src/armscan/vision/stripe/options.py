@@ -10,7 +10,22 @@ from typing import Literal, get_args
 from armscan.errors import OptionError
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
-LaserColour = Literal["auto", "red", "green", "blue", "grey"]
+LaserColour = Literal[
+    "auto",
+    "red",
+    "green",
+    "blue",
+    "grey",
+    "red-excess",
+    "green-excess",
+    "blue-excess",
+    "red-green",
+    "red-blue",
+    "green-red",
+    "green-blue",
+    "blue-red",
+    "blue-green",
+]
 SIGMA_RANGE_PX = (0.6, 10.0)
 
 
@@ -23,7 +38,9 @@ class StripeOptions:
     method
         ``fit`` (noise-weighted profile fit, smoothed along the line) or one of the thesis's four.
     laser_colour
-        Colour of the laser in colour images; ``auto`` finds it.
+        What of a colour image shows the line: a channel of the laser's colour; ``grey``, the mean
+        of all; an excess, a channel less the mean of the two others (``green-excess``); or a
+        difference of two (``green-red`` is green less red). ``auto`` finds it.
     line_sigma_px
         Sigma of the line's cross-section, or None to find it.
     threshold

@@ -1,0 +1,311 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which straight stripes the boards agree on: one light sheet draws coplanar lines on all of them.
+
+A photograph shows more straight lines than the laser's: a border of the board, the line where it
+went past the board to the wall behind, a reflection, a second laser. Carried to their boards'
+planes, the lines of one sheet are coplanar in the Sensor frame and the others are not, so that three
+boards and more tell them apart without any limit on brightness or length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armscan.calibration.laser.naming import LEAST_FAN, board_numbers
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import PointUse, SkippedImage
+from armscan.calibration.laser.sightings import BoardImage, Sighting
+from armscan.calibration.laser.solve import square_root
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+
+LEAST_BOARDS = 3
+"""Any two lines that meet are coplanar: only a third one can agree."""
+TOLERANCES_PX = (3.0, 8.0, 20.0)
+"""How far across itself a stripe may lie from the common sheet, besides what its board's pose
+leaves open: the first with which most boards agree. A bowed board or sheet needs more than a flat
+one."""
+AGREEING_SHARE = 0.6
+SECOND_SHARE = 0.5
+"""A further sheet is seen on at least this part of the boards that show the first."""
+MAX_TRIALS = 3000
+CHUNK = 250
+POSE_SIGMAS = 3.0
+OUTLYING = 4.0
+"""In robust sigmas of all boards' residuals."""
+GRAZING = 0.1
+"""Sine of the angle between sheet and board below which a pixel's worth of height is not trusted."""
+MIN_SPREAD_RATIO = 0.01
+REFITS = 3
+SEED = 12
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Vote:
+    """What the boards agreed on.
+
+    Parameters
+    ----------
+    images
+        The images with the stripes that lie on a common sheet; without vote, as they were given.
+    outlying
+        Images whose stripes lie on none, with how far off.
+    warnings
+        What is doubtful about the vote.
+    """
+
+    images: tuple[BoardImage, ...]
+    outlying: tuple[SkippedImage, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """S stripes as the pieces in space between their ends.
+
+    ``ends_mm`` (S, 2, 3); ``pose_root`` (S, 2, 3, 6) movement of the ends for a sigma of the
+    board's pose; ``across_mm_px`` (S, 3) movement for a pixel across; ``length`` (S,) points;
+    ``image`` and ``board`` (S,), ``place`` (S,) number of the sighting in its image.
+    """
+
+    ends_mm: FloatArray
+    pose_root: FloatArray
+    across_mm_px: FloatArray
+    length: FloatArray
+    image: IntArray
+    board: IntArray
+    place: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreement:
+    """A plane ``normal @ x = offset`` with the (S,) residuals of all lines, px, and who agrees."""
+
+    residual_px: FloatArray
+    agrees: BoolArray
+
+    def boards(self, lines: _Lines) -> int:
+        return len(np.unique(lines.board[self.agrees]))
+
+
+def vote_on_sheets(images: Sequence[BoardImage], options: SheetOptions) -> Vote:
+    """Keep of each image the stripes that lie on a sheet on which at least three boards agree.
+
+    Images whose one laser is named vote among themselves. Nothing is decided where fewer than three
+    boards show a stripe, where no three agree, or where the lines of a fan are coplanar in too many
+    ways: their numbering (`armscan.calibration.laser.fan_naming`) then judges.
+    """
+    lines = _lines_of(images)
+    kept: dict[int, set[int]] = {i: set(range(len(m.sightings))) for i, m in enumerate(images)}
+    outlying: list[SkippedImage] = []
+    warnings: list[str] = []
+    for group in _groups(images):
+        own = np.isin(lines.image, group)
+        sheets = _agreements(lines, own, options)
+        if not sheets or (not options.n_sheets and len(sheets) >= LEAST_FAN):
+            continue
+        agrees = np.any([sheet.agrees for sheet in sheets], axis=0)
+        for i in group:
+            mine = lines.image == i
+            kept[i] = set(lines.place[mine & agrees].tolist())
+            if mine.any() and not kept[i]:
+                off = min(float(sheet.residual_px[mine].min()) for sheet in sheets)
+                outlying.append(_outlying(images[i], off, sheets[0].boards(lines)))
+        n_boards = len(np.unique(lines.board[own]))
+        if sheets[0].boards(lines) < 0.5 * n_boards:
+            warnings.append(
+                f"only {sheets[0].boards(lines)} of {n_boards} boards with a straight line agree on "
+                "a sheet: look at the images that were left out"
+            )
+    return Vote(
+        tuple(_with(image, kept[i]) for i, image in enumerate(images)),
+        tuple(outlying),
+        tuple(warnings),
+    )
+
+
+def _groups(images: Sequence[BoardImage]) -> list[list[int]]:
+    """Numbers of the images that share one named laser; all others are one group."""
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, image in enumerate(images):
+        lasers = image.data.lasers
+        groups.setdefault(lasers if len(lasers) == 1 else (), []).append(i)
+    return list(groups.values())
+
+
+def _outlying(image: BoardImage, off_px: float, n_boards: int) -> SkippedImage:
+    return SkippedImage(
+        image.data.profile.source,
+        f"outlying board: its straight stripe lies {off_px:.1f} px from the sheet that {n_boards} "
+        "boards agree on",
+    )
+
+
+def _with(image: BoardImage, kept: set[int]) -> BoardImage:
+    if len(kept) == len(image.sightings):
+        return image
+    use = image.use.copy()
+    for place, sighting in enumerate(image.sightings):
+        if place not in kept:
+            use[sighting.rows] = int(PointUse.OUTVOTED)
+    sightings = tuple(s for place, s in enumerate(image.sightings) if place in kept)
+    return replace(image, use=use, sightings=sightings)
+
+
+def _lines_of(images: Sequence[BoardImage]) -> _Lines:
+    boards = board_numbers(images)
+    found = [(i, k, s) for i, image in enumerate(images) for k, s in enumerate(image.sightings)]
+    roots = [square_root(image.placed.covariance) for image in images]
+    n = len(found)
+    return _Lines(
+        np.array([s.ends_mm for _, _, s in found]).reshape(n, 2, 3),
+        np.array([s.ends_by_pose @ roots[i] for i, _, s in found]).reshape(n, 2, 3, 6),
+        np.array([s.across * _mm_per_px(images[i], s) for i, _, s in found]).reshape(n, 3),
+        np.array([float(len(s.rows)) for _, _, s in found]),
+        np.array([i for i, _, _ in found], dtype=np.int64),
+        np.array([boards[i] for i, _, _ in found], dtype=np.int64),
+        np.array([k for _, k, _ in found], dtype=np.int64),
+    )
+
+
+def _mm_per_px(image: BoardImage, sighting: Sighting) -> float:
+    rows = sighting.rows
+    return float(np.median(image.sigma_mm[rows] / image.data.profile.sigma_px[rows]))
+
+
+def _agreements(lines: _Lines, own: BoolArray, options: SheetOptions) -> list[_Agreement]:
+    """Planes from the one with the most support on; lines of one do not count for the next."""
+    n_boards = len(np.unique(lines.board[own]))
+    found: list[_Agreement] = []
+    open_lines = own.copy()
+    while len(found) < (options.n_sheets or LEAST_FAN):
+        best = _best_agreement(lines, open_lines, n_boards)
+        if best is None:
+            break
+        least = SECOND_SHARE * found[0].boards(lines) if found else 0.0
+        if best.boards(lines) < max(LEAST_BOARDS, least):
+            break
+        found.append(best)
+        open_lines &= ~(best.residual_px < 2.0 * TOLERANCES_PX[0]) & ~best.agrees
+    return found
+
+
+def _best_agreement(lines: _Lines, own: BoolArray, n_boards: int) -> _Agreement | None:
+    trials = list(_trial_planes(lines, own))
+    if not trials:
+        return None
+    normals, offsets = (np.concatenate(parts) for parts in zip(*trials, strict=True))
+    best: _Agreement | None = None
+    for tolerance in TOLERANCES_PX:
+        found = _refined(lines, own, *_most_supported(lines, own, normals, offsets, tolerance))
+        if best is None or found.boards(lines) > best.boards(lines):
+            best = found
+        if best.boards(lines) >= max(LEAST_BOARDS, AGREEING_SHARE * n_boards):
+            break
+    return best
+
+
+def _trial_planes(lines: _Lines, own: BoolArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Planes (T, 3), (T,) through two lines of different boards, a random choice of all pairs."""
+    chosen = np.flatnonzero(own)
+    a, b = np.triu_indices(len(chosen), 1)
+    apart = lines.board[chosen[a]] != lines.board[chosen[b]]
+    a, b = chosen[a[apart]], chosen[b[apart]]
+    if len(a) > MAX_TRIALS:
+        # Long lines carry long support: they are tried more often.
+        weight = lines.length[a] * lines.length[b]
+        generator = np.random.default_rng(SEED)
+        pick = generator.choice(len(a), MAX_TRIALS, replace=False, p=weight / weight.sum())
+        a, b = a[pick], b[pick]
+    for start in range(0, len(a), CHUNK):
+        pair = np.concatenate(
+            [lines.ends_mm[a[start : start + CHUNK]], lines.ends_mm[b[start : start + CHUNK]]],
+            axis=1,
+        )
+        middle = pair.mean(axis=1)
+        values, vectors = np.linalg.eigh(
+            np.einsum("tki,tkj->tij", pair - middle[:, None], pair - middle[:, None])
+        )
+        wide = values[:, 1] > MIN_SPREAD_RATIO**2 * values[:, 2]
+        normals = vectors[wide, :, 0]
+        yield normals, np.einsum("ti,ti->t", normals, middle[wide])
+
+
+def _most_supported(
+    lines: _Lines, own: BoolArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
+) -> tuple[FloatArray, float, float]:
+    """The plane with the longest support, one line an image, and the tolerance."""
+    best, best_score = 0, -1.0
+    images = lines.image[own]
+    order = np.argsort(images, kind="stable")
+    starts = np.flatnonzero(np.diff(images[order], prepend=-1))
+    for start in range(0, len(normals), CHUNK):
+        block = slice(start, start + CHUNK)
+        ratio = _misses(lines, own, normals[block], offsets[block], tolerance_px)
+        gain = lines.length[own] * np.maximum(1.0 - ratio**2, 0.0)
+        score = np.maximum.reduceat(gain[:, order], starts, axis=1).sum(axis=1)
+        if float(score.max()) > best_score:
+            best, best_score = start + int(np.argmax(score)), float(score.max())
+    return normals[best], float(offsets[best]), tolerance_px
+
+
+def _misses(
+    lines: _Lines, own: BoolArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
+) -> FloatArray:
+    """(T, S) largest distance of a line's ends from each plane, over what is tolerated."""
+    height = np.einsum("ti,sei->tse", normals, lines.ends_mm[own]) - offsets[:, None, None]
+    by_pose = np.einsum("ti,seip->tsep", normals, lines.pose_root[own])
+    pose = POSE_SIGMAS * np.sqrt((by_pose**2).sum(axis=3))
+    allowed = tolerance_px * _mm_of_px(lines, own, normals)[:, :, None] + pose
+    return np.asarray((np.abs(height) / allowed).max(axis=2))
+
+
+def _mm_of_px(lines: _Lines, own: BoolArray, normals: FloatArray) -> FloatArray:
+    """(T, S) height over each plane for a pixel across the stripe."""
+    across = lines.across_mm_px[own]
+    height = np.abs(normals @ across.T)
+    return np.asarray(np.maximum(height, GRAZING * np.linalg.norm(across, axis=1)))
+
+
+def _refined(
+    lines: _Lines, own: BoolArray, normal: FloatArray, offset: float, tolerance_px: float
+) -> _Agreement:
+    """Refit the plane to who agrees, and leave out who is far off by the others' own scatter."""
+    limit = tolerance_px
+    everyone = np.ones(len(lines.length), dtype=np.bool_)
+    for _ in range(REFITS):
+        ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit)[0]
+        agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
+        if len(np.unique(lines.board[agrees])) < LEAST_BOARDS:
+            break
+        ends = lines.ends_mm[agrees].reshape(-1, 3)
+        mm_px = _mm_of_px(lines, agrees, normal[None])[0]
+        weight = np.repeat(lines.length[agrees] / mm_px**2, 2)
+        middle = weight @ ends / weight.sum()
+        spread = (ends - middle).T @ ((ends - middle) * weight[:, None])
+        normal = np.linalg.eigh(spread)[1][:, 0]
+        offset = float(normal @ middle)
+        residual = _residual_px(lines, normal, offset)
+        scatter = 1.4826 * float(np.median(residual[agrees]))
+        limit = float(np.clip(OUTLYING * scatter, TOLERANCES_PX[0], tolerance_px))
+    ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit)[0]
+    agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
+    return _Agreement(_residual_px(lines, normal, offset), agrees)
+
+
+def _residual_px(lines: _Lines, normal: FloatArray, offset: float) -> FloatArray:
+    everyone = np.ones(len(lines.length), dtype=np.bool_)
+    height = np.abs(lines.ends_mm @ normal - offset).max(axis=1)
+    return np.asarray(height / _mm_of_px(lines, everyone, normal[None])[0])
+
+
+def _one_an_image(lines: _Lines, agrees: BoolArray, ratio: FloatArray) -> BoolArray:
+    """Of the lines of one image that agree, the one with the most support."""
+    gain = np.where(agrees, lines.length * (1.0 - ratio**2), -1.0)
+    keep = np.zeros(len(gain), dtype=np.bool_)
+    for i in np.unique(lines.image[agrees]):
+        own = np.flatnonzero(lines.image == i)
+        keep[own[np.argmax(gain[own])]] = True
+    return keep

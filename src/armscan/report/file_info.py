@@ -99,7 +99,7 @@ def _line(key: str, value: Any) -> str:
         return str(value)
     if isinstance(value, list):
         return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value)
-    return f"{key.replace('_', ' ')}: {value}"
+    return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
 
 
 def _file(path: Path) -> dict[str, Any]:

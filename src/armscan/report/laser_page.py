@@ -99,7 +99,7 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"{calibration.n_points} points",
         ),
         (
-            "Redundant",
+            "Checked by other boards",
             "yes"
             if calibration.is_redundant
             else "no: two stripes fix a plane, only their coplanarity checks it",
@@ -110,7 +110,7 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"{significant(fit.coplanarity_sigma_mm)} mm",
         ),
         ("Bow (u along the stripe, v in depth)", bow if fit.sheet.is_bowed else "none: a plane"),
-        ("Why", sentence(fit.bow_decision)),
+        ("Plane or bow, and why", sentence(fit.bow_decision)),
         ("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
         ("Lack of fit of the sheet", lack_of_fit_text(fit.final_test)),
     )

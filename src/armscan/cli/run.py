@@ -7,6 +7,7 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import cast
 
 import typer
@@ -31,8 +32,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Words after ``armscan``; those of the process if None.
     """
     from armscan.cli.app import command
+    from armscan.cli.compiled_kernels import give_kernels_a_folder
 
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+    give_kernels_a_folder(Path(__file__).parents[1])
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a terminal that has no sign for ± or ° shows a question mark instead of failing
         sys.stdout.reconfigure(errors="replace")

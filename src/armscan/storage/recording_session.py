@@ -188,8 +188,10 @@ def _stated(keys: Keys, prefix: str = "") -> Iterator[str]:
         if isinstance(value, Keys):
             yield from _stated(value, f"{prefix}{name}.")
         elif isinstance(value, list):
+            # a list that nobody knows may hold anything
             for k, item in enumerate(value):
-                yield from _stated(item, f"{prefix}{name}.{k}.")
+                if isinstance(item, Keys):
+                    yield from _stated(item, f"{prefix}{name}.{k}.")
 
 
 def _unknown(keys: Keys, file: str, prefix: str = "") -> Iterator[str]:

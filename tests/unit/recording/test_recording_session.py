@@ -135,6 +135,15 @@ def test_unknown_keys_are_warned_of_with_the_nearest_name(tmp_path: Path) -> Non
     assert any("'camera.bit_used' is not known" in t and "'bits_used' is" in t for t in warnings)
 
 
+def test_unknown_lists_and_tables_of_tables_are_warned_of_too(tmp_path: Path) -> None:
+    session = 'operators = ["Anna", "Bob"]\n' + SESSION + '\n[[lens]]\nname = "x"\n'
+    warnings = read_recording(lab_folder(tmp_path, session=session)).warnings
+    assert [name for name in ("operators", "lens") for text in warnings if f"'{name}'" in text] == [
+        "operators",
+        "lens",
+    ]
+
+
 def test_a_head_that_is_not_there_is_warned_of(tmp_path: Path) -> None:
     session = 'head = "head.toml"\n' + SESSION
     folder = lab_folder(tmp_path, session=session)

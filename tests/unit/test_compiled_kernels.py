@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from armscan.cli import compiled_kernels
 from armscan.cli.compiled_kernels import VARIABLE, give_kernels_a_folder
 
 
@@ -17,8 +16,9 @@ from armscan.cli.compiled_kernels import VARIABLE, give_kernels_a_folder
 def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Nothing but the folder for temporary files may be written."""
     monkeypatch.delenv(VARIABLE, raising=False)
+    (tmp_path / "home").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(compiled_kernels.os, "access", lambda *_: False)
+    (tmp_path / "kernels").write_text("no folder")
     place = tmp_path / "tmp"
     place.mkdir()
     return place
@@ -27,21 +27,21 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_folder_of_this_user_is_made_and_used_again(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    give_kernels_a_folder(bare, bare)
+    give_kernels_a_folder(bare.parent, bare)
     first = Path(os.environ[VARIABLE])
     assert first.parent == bare
     assert stat.S_IMODE(first.stat().st_mode) == 0o700
     monkeypatch.delenv(VARIABLE)
-    give_kernels_a_folder(bare, bare)
+    give_kernels_a_folder(bare.parent, bare)
     assert Path(os.environ[VARIABLE]) == first
 
 
 def test_a_folder_that_others_may_write_is_not_taken(bare: Path) -> None:
     """What it holds would be run."""
-    give_kernels_a_folder(bare, bare)
+    give_kernels_a_folder(bare.parent, bare)
     first = Path(os.environ.pop(VARIABLE))
     first.chmod(0o777)
-    give_kernels_a_folder(bare, bare)
+    give_kernels_a_folder(bare.parent, bare)
     assert Path(os.environ[VARIABLE]) != first
 
 
@@ -49,9 +49,10 @@ def test_numba_is_left_alone_where_it_finds_a_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
     give_kernels_a_folder(tmp_path, tmp_path)
     assert VARIABLE not in os.environ
+    assert not list(tmp_path.glob("armscan-kernels-*"))
     monkeypatch.setenv(VARIABLE, "mine")
-    monkeypatch.setattr(compiled_kernels.os, "access", lambda *_: False)
     give_kernels_a_folder(tmp_path, tmp_path)
     assert os.environ[VARIABLE] == "mine"

@@ -27,7 +27,9 @@ def give_kernels_a_folder(package: Path, temporary: Path | None = None) -> None:
     if VARIABLE in os.environ:
         return
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
-    if _may_be_written(package / "kernels" / "__pycache__") or _may_be_written(Path(home)):
+    if _may_be_written(package / "kernels" / "__pycache__") or _may_be_written(
+        Path(home) / "numba"
+    ):
         return
     place = Path(tempfile.gettempdir()) if temporary is None else temporary
     user = os.getuid() if hasattr(os, "getuid") else 0
@@ -43,8 +45,11 @@ def give_kernels_a_folder(package: Path, temporary: Path | None = None) -> None:
     os.environ[VARIABLE] = str(folder)
 
 
-def _may_be_written(path: Path) -> bool:
-    """Whether a folder, or the nearest one above it that exists, lets it be written."""
-    while not path.exists() and path != path.parent:
-        path = path.parent
-    return path.is_dir() and os.access(path, os.W_OK)
+def _may_be_written(folder: Path) -> bool:
+    """Whether a file can be made in a folder, tried as numba tries it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

@@ -26,7 +26,9 @@ from armscan.report.summary import Table
 from armscan.storage.atomic import write_files
 from armscan.vision.targets.view import TargetView
 
-FORCE_REMEDY = "give --force-bad to have it written and marked all the same"
+FORCE_REMEDY = (
+    "take better photographs, or give --force-bad to have it written and marked in all that uses it"
+)
 MAX_PICTURES = 60
 TARGET_COLOUR, STRIPE_COLOUR = "#35e0c0", "#ff5a4f"
 

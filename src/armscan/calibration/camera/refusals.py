@@ -4,7 +4,7 @@
 The limits are far outside what photographs give that are worth anything, so that a refusal means a
 mistake (another target than stated, views of two cameras or zooms, a board that bends), not a
 poor set. Real sets of strangers, down to four views taken at random from each: focal length known
-to 0.02 to 1.2 %, residuals of 0.0001 to 0.0005 of the image's diagonal.
+to 0.02 to 1.7 %, residuals of 0.00001 to 0.0005 of the image's diagonal.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 
 The limits are far outside what photographs give that are worth anything, so that a refusal means a
 mistake (another target than stated, views of two cameras or zooms, a board that bends), not a
-poor set. Real sets of strangers, down to four views taken at random from each: focal length known
-to 0.02 to 1.7 %, residuals of 0.00001 to 0.0005 of the image's diagonal.
+poor set. 91 calibrations of 12 real sets, down to four views drawn at random: focal length known
+to 0.02 to 1.7 %, residuals on views not used of 0.00001 to 0.0013 of the diagonal.
 """
 
 from __future__ import annotations

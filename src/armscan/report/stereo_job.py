@@ -256,7 +256,9 @@ def stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: boo
     tables = []
     if noted:
         rows = tuple((row[0], row[5], row[6]) for row in noted)
-        tables.append(Table(("pair", "level", "remark"), rows, "Pairs to look at", (2,)))
+        tables.append(
+            Table(("pair", "level (1: like the others)", "remark"), rows, "Pairs to look at", (2,))
+        )
     if run.not_found:
         reasons = tuple((source, without_source(source, why)) for source, why in run.not_found)
         tables.append(Table(("image", "why"), reasons, "Images without the target", (1,)))

@@ -28,6 +28,32 @@ EXAMPLE = (
     "laser and which camera took part."
 )
 
+Scan = Annotated[
+    Path | None,
+    typer.Option(help="Recording of the board instead of images; paired by its views."),
+]
+Sheets = Annotated[
+    int,
+    typer.Option(
+        "--sheets",
+        "--lines",
+        help="Light sheets that were on together, or lines of each source; 0 finds out.",
+    ),
+]
+SheetNames = Annotated[
+    list[str] | None,
+    typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
+]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Image, or view of a recording, not to use, by name or quoted pattern; repeatable."
+    ),
+]
+PlaneOnly = Annotated[
+    bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
+]
+
 
 def laser(
     *,
@@ -46,34 +72,14 @@ def laser(
     off: Annotated[
         list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
     ] = None,
-    scan: Annotated[
-        Path | None,
-        typer.Option(help="Recording of the board instead of images; paired by its views."),
-    ] = None,
+    scan: Scan = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
     ] = Path("sensor.json"),
-    sheets: Annotated[
-        int,
-        typer.Option(
-            "--sheets",
-            "--lines",
-            help="Light sheets that were on together, or lines of each source; 0 finds out.",
-        ),
-    ] = 0,
-    name: Annotated[
-        list[str] | None,
-        typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
-    ] = None,
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Image, or view of a recording, not to use, by name or quoted pattern; repeatable."
-        ),
-    ] = None,
-    plane_only: Annotated[
-        bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
-    ] = False,
+    sheets: Sheets = 0,
+    name: SheetNames = None,
+    leave_out: LeaveOut = None,
+    plane_only: PlaneOnly = False,
     margin_mm: Annotated[
         float | None,
         typer.Option(

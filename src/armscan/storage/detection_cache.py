@@ -94,6 +94,8 @@ class DetectionCache:
             temporary.write_bytes(content)
             temporary.replace(self.folder / f"{key}{SUFFIX}")
         except OSError:
+            return
+        finally:
             with suppress(OSError):
                 temporary.unlink()
 

@@ -19,6 +19,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import Provenance
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.reconstruction.result import PointFate
 from armscan.report.hand_eye_inputs import HandEyeInputs, read_hand_eye_inputs, shown_exposures
 from armscan.report.hand_eye_numbers import (
     hand_eye_facts,
@@ -26,12 +27,13 @@ from armscan.report.hand_eye_numbers import (
     size_facts,
     total_covariance,
 )
-from armscan.report.hand_eye_page import hand_eye_page, posture_table
+from armscan.report.hand_eye_page import TITLE, hand_eye_page, posture_table
 from armscan.report.hand_eye_repeat import repeat_blocks
 from armscan.report.hand_eye_request import HandEyeRequest
 from armscan.report.numbers import sentence
 from armscan.report.outputs import document_and_page
-from armscan.report.page import Text, render_page
+from armscan.report.page import Page, Text, render_page
+from armscan.report.refusal import TriedImage, refuse, refused_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.provenance import new_provenance
@@ -45,16 +47,21 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
     ------
     ArmscanError
         If a file is unreadable, an option is wrong, or the postures do not determine the
-        hand-eye; nothing is written then.
+        hand-eye; no document is written then. Where it is the postures, a page shows them.
     """
     files = document_and_page(request.output, is_overwriting=request.is_overwriting)
     inputs = read_hand_eye_inputs(request, progress)
     progress(ProgressEvent("solve", 0, len(inputs.groups) + 1))
-    fit = calibrated(inputs.all_stripes, inputs, request)
+    try:
+        fit = calibrated(inputs.all_stripes, inputs, request)
+    except EstimationError as error:
+        refuse(files, _refused(request, inputs), FitFailure(error.what, error.remedy))
     repeats = _repeats(inputs, request)
     progress(ProgressEvent("solve", len(inputs.groups) + 1, len(inputs.groups) + 1))
     fit = replace(fit, warnings=(*_input_warnings(inputs), *fit.warnings))
-    scanner = ScannerCalibration(inputs.sensor, fit.calibration, _provenance(request, inputs, fit))
+    scanner = ScannerCalibration(
+        inputs.sensor, fit.calibration, _provenance(request, inputs, fit.warnings)
+    )
     images = tuple(image for _, seen in inputs.groups for image in seen.images)
     page = hand_eye_page(
         fit,
@@ -69,6 +76,7 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
         {files.document: scanner_document(scanner), files.page: render_page(page)},
         is_overwriting=request.is_overwriting,
     )
+    files.refused_page.unlink(missing_ok=True)
     summary = hand_eye_summary(
         fit,
         scanner,
@@ -115,7 +123,30 @@ def _input_warnings(inputs: HandEyeInputs) -> tuple[str, ...]:
     return (*inputs.warnings, *own)
 
 
-def _provenance(request: HandEyeRequest, inputs: HandEyeInputs, fit: HandEyeFit) -> Provenance:
+def _refused(request: HandEyeRequest, inputs: HandEyeInputs) -> Page:
+    """The page of stripes that determine no hand-eye."""
+    tried = []
+    for image in (image for _, seen in inputs.groups for image in seen.images):
+        is_measured = image.fate == int(PointFate.MEASURED)
+        n_points, n = int(is_measured.sum()), len(image.profile)
+        remark = f"{n_points} of {n} stripe points measured" if n else "no stripe was found"
+        points = image.profile.points_px[is_measured]
+        source = image.profile.source
+        tried.append(TriedImage(source, remark, n_points > 0, stripe_px=points))
+    warnings = _input_warnings(inputs)
+    page = refused_page(
+        TITLE,
+        tried,
+        shown_exposures(inputs),
+        _provenance(request, inputs, warnings),
+        is_simulated=inputs.is_simulated,
+    )
+    return replace(page, warnings=tuple(sentence(text) for text in warnings))
+
+
+def _provenance(
+    request: HandEyeRequest, inputs: HandEyeInputs, warnings: Sequence[str]
+) -> Provenance:
     options = request.sphere_options if request.is_sphere else request.options
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
     return new_provenance(
@@ -123,7 +154,7 @@ def _provenance(request: HandEyeRequest, inputs: HandEyeInputs, fit: HandEyeFit)
         command=request.command,
         options=(options, request.stripes),
         parents=parents,
-        warnings=fit.warnings,
+        warnings=warnings,
     )
 
 

@@ -35,6 +35,8 @@ NOISE_TEXT = (
     "the sigmas of the hand-eye count postures, not points."
 )
 
+TITLE = "Hand-eye calibration"
+
 
 def hand_eye_page(
     fit: HandEyeFit,
@@ -81,7 +83,7 @@ def hand_eye_page(
     sections.append(origin_section(scanner.provenance))
     hand_eye = fit.calibration
     return Page(
-        title="Hand-eye calibration",
+        title=TITLE,
         subtitle=f"Where the sensor sits on the arm, from {hand_eye.n_postures} postures, "
         f"{hand_eye.n_exposures} exposures and {hand_eye.n_points:,} points",
         cards=_cards(fit, scanner),

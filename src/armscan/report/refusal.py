@@ -97,42 +97,41 @@ def refused_page(
         True if the photographs were rendered.
     """
     n_used = sum(image.is_used for image in images)
+    unwritten = replace(provenance, document_id="none was written")
+    of_images = (_images_section(images, exposures),) if images else ()
+    return Page(
+        title=title,
+        subtitle=f"{n_used} of {len(images)} images gave something to work with" if images else "",
+        cards=(),
+        warnings=(),
+        sections=(*of_images, origin_section(unwritten)),
+        is_simulated=is_simulated,
+        footer=footer(provenance),
+        forced=provenance.forced,
+    )
+
+
+def _images_section(images: Sequence[TriedImage], exposures: Mapping[str, Exposure]) -> Section:
     rows = tuple((image.source, image.remark) for image in images)
+    table = Table(("image", "what it gave"), rows, "", (1,))
     failed_first = sorted(images, key=lambda image: image.is_used)
     shown = [image for image in failed_first if image.source in exposures][:MAX_PICTURES]
+    if not shown:
+        return Section("The images", (table,))
     kinds = (
         (TARGET_COLOUR, "target point, the filled one is the first", [i.target_px for i in images]),
         (STRIPE_COLOUR, "stripe point", [i.stripe_px for i in images]),
     )
-    legend = Legend(
-        tuple(
-            (colour, word)
-            for colour, word, points in kinds
-            if any(one is not None and len(one) for one in points)
-        )
+    colours = tuple(
+        (colour, word)
+        for colour, word, points in kinds
+        if any(one is not None and len(one) for one in points)
     )
     text = "Images that gave nothing come first. Click a picture to enlarge it."
     if len(shown) < len(images):
         text += f" {len(shown)} of {len(images)} images are shown."
     pictures = tuple(_picture(image, exposures[image.source]) for image in shown)
-    unwritten = replace(provenance, document_id="none was written")
-    return Page(
-        title=title,
-        subtitle=f"{n_used} of {len(images)} images gave something to work with",
-        cards=(),
-        warnings=(),
-        sections=(
-            Section(
-                "The images",
-                (Table(("image", "what it gave"), rows, "", (1,)), Text(text), legend,
-                 Gallery(pictures, 300)),
-            ),
-            origin_section(unwritten),
-        ),
-        is_simulated=is_simulated,
-        footer=footer(provenance),
-        forced=provenance.forced,
-    )  # fmt: skip
+    return Section("The images", (table, Text(text), Legend(colours), Gallery(pictures, 300)))
 
 
 def _picture(image: TriedImage, exposure: Exposure) -> Picture:
@@ -162,7 +161,7 @@ def refuse(files: OutputFiles, page: Page, failure: FitFailure) -> NoReturn:
     # the reason counts more than the page: a full disk must not hide it
     with suppress(OutputError):
         write_files({files.refused_page: render_page(marked)}, is_overwriting=True)
-        shown = f"{files.refused_page} shows what was found in every image"
+        shown = f"{files.refused_page} shows what was found"
         remedy = f"{remedy}; {shown}" if remedy else shown
     raise EstimationError(failure.reason, remedy=remedy)
 

@@ -133,11 +133,11 @@ def test_refusals() -> None:
     few = fit_sphere(np.eye(3))
     assert isinstance(few, FitFailure)
     assert few.reason == "a sphere needs 4 points, got 3"
-    assert not fit_sphere(np.ones((5, 3)))
+    assert isinstance(fit_sphere(np.ones((5, 3))), FitFailure)
     line = np.outer(np.arange(10.0), [1.0, 2.0, 3.0])
-    assert not fit_sphere(line)
-    assert not fit_sphere(line, outlier_sigmas=3.0)
-    assert not fit_circle(line[:, :2])
+    assert isinstance(fit_sphere(line), FitFailure)
+    assert isinstance(fit_sphere(line, outlier_sigmas=3.0), FitFailure)
+    assert isinstance(fit_circle(line[:, :2]), FitFailure)
 
 
 def test_circle_by_hand_and_against_scipy_on_a_short_arc() -> None:
@@ -168,4 +168,4 @@ def test_circle_in_space_lies_in_its_plane() -> None:
     np.testing.assert_allclose(fit.value.centre_mm, [1.0, 2.0, 300.0], atol=1e-8)
     assert fit.value.radius_mm == pytest.approx(12.5, abs=1e-8)
     assert abs(fit.value.plane.normal @ [0.6, 0.0, -0.8]) == pytest.approx(1.0, abs=1e-9)
-    assert not fit_space_circle(points[:2])
+    assert isinstance(fit_space_circle(points[:2]), FitFailure)

@@ -95,6 +95,7 @@ def test_json_is_strict_and_says_null_for_what_is_not_known() -> None:
         "rms": None,
         "list": [1, 2.5, None],
         "nested": {"path": "ü"},
+        "forced": [],
         "warnings": ["Careful."],
         "written": ["out/c.json"],
     }

@@ -115,9 +115,7 @@ class LightSheet:
         dheight_dparameters = -np.column_stack([u, v, np.ones_like(u), terms])
         return height, dheight_dpoint, dheight_dparameters
 
-    def _bow_terms(
-        self, u: FloatArray, v: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _bow_terms(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(N, 5) values of the bow's terms, and their derivatives by u and by v."""
         terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
         by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], axis=1)

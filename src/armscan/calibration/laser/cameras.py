@@ -67,6 +67,13 @@ class HeadCameras:
             return self.left.camera
         return self._right(camera).camera.camera
 
+    def centre_mm(self, camera: int) -> FloatArray:
+        """(3,) projection centre of camera 0 or 1 in the Sensor frame."""
+        if camera == 0:
+            return np.zeros(3)
+        place = self._right(camera).right_from_sensor
+        return np.asarray(-place.rotation.T @ place.translation_mm)
+
     def right(self) -> SecondCamera:
         """Camera 1.
 

@@ -58,11 +58,6 @@ class CommonErrors:
         """Count P of the cameras' parameters."""
         return len(self.camera_covariance)
 
-    @property
-    def count(self) -> int:
-        """Count of the common errors: 6 a board, then P."""
-        return 6 * len(self.pose_covariances) + self.n_camera
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetSolution:
@@ -158,7 +153,7 @@ def solve_sheets(
     n_held = errors.n_camera if are_cameras_held else 0
     for _ in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active)
-        solved = system.step(robust / sigma**2, int(active.sum()), n_held)
+        solved = system.step(robust / sigma**2, n_held)
         if solved is None:
             return _UNDETERMINED
         step, inverse, follow = solved
@@ -209,57 +204,90 @@ def _without_bow(sheet: LightSheet) -> LightSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Stripe:
-    """Derivatives (K, C) of one stripe's residuals by the C unknowns that move it."""
+    """Derivatives of one stripe's K residuals: (K, C) by the C of the sheets' and cameras' unknowns
+    in ``columns`` that move it, (K, 6) by its board's pose.
+    """
 
     rows: IntArray
     columns: IntArray
     design: FloatArray
+    board: int
+    by_board: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
-    """All residuals with their derivatives by the active sheet parameters and common errors."""
+    """All residuals with their derivatives by the active sheet parameters and common errors.
+
+    The unknowns are the sheets' active parameters, then the boards' errors, then the cameras'. A
+    board moves its own stripes only, so that the boards are eliminated one by one.
+    """
 
     stripes: tuple[_Stripe, ...]
-    n_columns: int
+    n_active: int
+    n_boards: int
+    n_camera: int
     residual_px: FloatArray
     height_mm: FloatArray
 
     def times(self, unknowns: FloatArray) -> FloatArray:
         """(N,) change of the residuals."""
+        shared, boards = self._parted(unknowns)
         change = np.zeros(len(self.residual_px))
         for stripe in self.stripes:
-            change[stripe.rows] = stripe.design @ unknowns[stripe.columns]
+            change[stripe.rows] = (
+                stripe.design @ shared[stripe.columns] + stripe.by_board @ boards[stripe.board]
+            )
         return change
 
+    def _parted(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sheets' and cameras' unknowns, and (M, 6) those of the boards."""
+        a, b = self.n_active, self.n_active + 6 * self.n_boards
+        return np.concatenate([unknowns[:a], unknowns[b:]]), unknowns[a:b].reshape(-1, 6)
+
     def step(
-        self, weight: FloatArray, n_active: int, n_held: int
+        self, weight: FloatArray, n_held: int
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
         """Step, inverse of the normal matrix, and how the step follows the unknowns held.
 
-        The common errors are known to be 0 +- 1; the last ``n_held`` of them stay 0. The third is
-        (U, n_held) for the U unknowns that are free. None where the matrix is not positive
-        definite to rounding, so that nothing of it means anything.
+        The common errors are known to be 0 +- 1; the last ``n_held`` of them stay 0. The second is
+        (U, U) and the third (U, n_held) for the U unknowns of sheets and cameras that are free.
+        None where the matrix is not positive definite to rounding, so that nothing of it means
+        anything.
         """
-        n_free = self.n_columns - n_held
-        information = np.diag((np.arange(self.n_columns) >= n_active).astype(np.float64))
-        pull = np.zeros(self.n_columns)
+        n = self.n_active + self.n_camera
+        information = np.diag((np.arange(n) >= self.n_active).astype(np.float64))
+        pull = np.zeros(n)
+        blocks = np.tile(np.eye(6), (self.n_boards, 1, 1))
+        mixed = np.zeros((self.n_boards, 6, n))
+        pulls = np.zeros((self.n_boards, 6))
         for stripe in self.stripes:
-            weighted = stripe.design * weight[stripe.rows, None]
+            w, residual = weight[stripe.rows, None], self.residual_px[stripe.rows]
+            weighted, board = stripe.design * w, (stripe.by_board * w).T
             information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
-            pull[stripe.columns] += weighted.T @ self.residual_px[stripe.rows]
-        held = information[:n_free, n_free:]
-        information = information[:n_free, :n_free]
+            pull[stripe.columns] += weighted.T @ residual
+            blocks[stripe.board] += board @ stripe.by_board
+            mixed[stripe.board][:, stripe.columns] += board @ stripe.design
+            pulls[stripe.board] += board @ residual
         diagonal = np.diag(information)
-        if not np.isfinite(information).all() or not (diagonal > 0.0).all():
+        if not all(np.isfinite(part).all() for part in (information, blocks, mixed)):
             return None
-        scale = 1.0 / np.sqrt(diagonal)
-        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        if not (diagonal > 0.0).all():
+            return None
+        of_boards = np.linalg.solve(blocks, np.concatenate([mixed, pulls[:, :, None]], axis=2))
+        reduced = information - np.einsum("bki,bkj->ij", mixed, of_boards[:, :, :n])
+        pull = pull - np.einsum("bki,bk->i", mixed, of_boards[:, :, n])
+        free = n - n_held
+        scale = 1.0 / np.sqrt(diagonal[:free])
+        values, vectors = np.linalg.eigh(reduced[:free, :free] * np.outer(scale, scale))
         if not values[0] > MIN_EIGENVALUE:
             return None
         inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-        step = np.concatenate([-inverse @ pull[:n_free], np.zeros(n_held)])
-        return step, np.asarray(inverse), np.asarray(-inverse @ held)
+        shared = np.concatenate([-inverse @ pull[:free], np.zeros(n_held)])
+        boards = -of_boards[:, :, n] - of_boards[:, :, :n] @ shared
+        a = self.n_active
+        step = np.concatenate([shared[:a], boards.ravel(), shared[a:]])
+        return step, np.asarray(inverse), np.asarray(-inverse @ reduced[:free, free:])
 
 
 def _linearised(
@@ -274,24 +302,19 @@ def _linearised(
     by_pose = np.einsum("ni,nij->nj", by_point, observations.by_pose)
     pose_roots = [square_root(covariance) for covariance in errors.pose_covariances]
     n_active = int(active.sum())
-    n_columns = n_active + errors.count
     column = np.cumsum(active) - 1
     order = np.argsort(observations.stripe, kind="stable")
     starts = np.flatnonzero(np.diff(observations.stripe[order], prepend=-1))
+    cameras = np.arange(errors.n_camera)
     stripes = []
     for rows in np.split(order, starts[1:]):
         sheet, board = int(observations.sheet[rows[0]]), int(observations.board[rows[0]])
         own = np.flatnonzero(active[N_SHEET * sheet : N_SHEET * (sheet + 1)])
-        columns = np.concatenate(
-            [
-                column[N_SHEET * sheet + own],
-                n_active + 6 * board + np.arange(6),
-                np.arange(n_columns - errors.n_camera, n_columns),
-            ]
-        )
-        design = [by_sheet[rows][:, own], by_pose[rows] @ pose_roots[board], by_camera[rows]]
-        stripes.append(_Stripe(rows, columns, np.concatenate(design, axis=1)))
-    return _System(tuple(stripes), n_columns, residual, height)
+        columns = np.concatenate([column[N_SHEET * sheet + own], n_active + cameras])
+        design = np.concatenate([by_sheet[rows][:, own], by_camera[rows]], axis=1)
+        stripes.append(_Stripe(rows, columns, design, board, by_pose[rows] @ pose_roots[board]))
+    n_boards = len(errors.pose_covariances)
+    return _System(tuple(stripes), n_active, n_boards, errors.n_camera, residual, height)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:

@@ -96,12 +96,9 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
     )
     if isinstance(solution, FitFailure):
         return solution
-    if solution.linear is None:
-        raise AssertionError("a solution without normal equations")
     points = check_points(
         used,
         solution,
-        solution.linear,
         noise_px=_noise_px(case),
         images=case.images,
         cameras=case.cameras,

@@ -110,7 +110,7 @@ class SheetSolution:
     last_step_sigma
         Largest last step of a parameter, in its own sigma.
     linear
-        The normal equations; None for a solution made by hand.
+        The normal equations.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -121,8 +121,8 @@ class SheetSolution:
     common: FloatArray
     chi2: float
     n_parameters: int
-    last_step_sigma: float = 0.0
-    linear: LinearSolution | None = None
+    last_step_sigma: float
+    linear: LinearSolution
 
     @property
     def has_converged(self) -> bool:
@@ -180,6 +180,7 @@ def solve_sheets(
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     n_held = errors.n_camera if are_cameras_held else 0
+    normal: NormalSolution | None = None
     for _ in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active)
         normal = system.solve(robust / sigma**2, n_held)
@@ -198,6 +199,8 @@ def solve_sheets(
             robust = _huber(remaining / sigma)
         elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
+    if normal is None:
+        return _UNDETERMINED
     n_active = int(active.sum())
     common = step[n_active:]
     system = _linearised(observations, sheets, errors, active)

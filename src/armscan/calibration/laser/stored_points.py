@@ -33,7 +33,6 @@ from armscan.models.light_sheet import LightSheet
 def check_points(
     observations: SheetObservations,
     solution: SheetSolution,
-    linear: LinearSolution,
     *,
     noise_px: FloatArray,
     images: Sequence[BoardImage],
@@ -45,20 +44,21 @@ def check_points(
     ----------
     observations
         The points used.
-    solution, linear
-        Sheets that belong to the cameras as calibrated, and the normal equations they come from.
+    solution
+        Sheets that belong to the cameras as calibrated.
     noise_px
         (N,) scatter of single points; the weights hold the larger one with which they count as
         independent.
     images, cameras
         As the fit had them.
     """
+    linear = solution.linear
     made = _Made(observations, images, cameras)
     claim = _Claim(linear, linear.normal, noise_px, is_in_fit=True)
     distance = made.distance_mm(solution.sheets)
     slope = made.slope_mm_px(solution.sheets)
     left_out = {
-        int(board): _without(int(board), solution, linear, noise_px)
+        int(board): _without(int(board), solution, noise_px)
         for board in np.unique(observations.board)
     }
     checks = []
@@ -96,9 +96,10 @@ def _sheet_check(fitted: BoardDistances, boards: Sequence[BoardPointCheck]) -> S
 
 
 def _without(
-    board: int, solution: SheetSolution, linear: LinearSolution, noise_px: FloatArray
+    board: int, solution: SheetSolution, noise_px: FloatArray
 ) -> tuple[tuple[LightSheet, ...], _Claim] | None:
     """Sheets of all boards but one, by one step from those of all; None if not determined."""
+    linear = solution.linear
     n_held = linear.normal.follow.shape[1]
     normal = linear.system.solve(linear.weight, n_held, without_board=board)
     if normal is None:
@@ -230,4 +231,4 @@ class _Claim:
         stripes = by_sheet @ normal.by_stripes[np.ix_(own, own)]
         lever = stripe.design[:, is_free] @ normal.gain[np.ix_(own, stripe.columns[is_free])].T
         total = total + (moved**2).sum(axis=1) + ((stripes - 2.0 * lever) * by_sheet).sum(axis=1)
-        return np.maximum(total, 0.0)
+        return np.asarray(np.maximum(total, 0.0))

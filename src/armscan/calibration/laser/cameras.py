@@ -68,11 +68,11 @@ class HeadCameras:
         return self._right(camera).camera.camera
 
     def centre_mm(self, camera: int) -> FloatArray:
-        """(3,) projection centre of camera 0 or 1 in the Sensor frame."""
+        """(3,) where the rays of camera 0 or 1 start, in Sensor."""
         if camera == 0:
             return np.zeros(3)
         place = self._right(camera).right_from_sensor
-        return np.asarray(-place.rotation.T @ place.translation_mm)
+        return np.asarray(-place.translation_mm @ place.rotation)
 
     def right(self) -> SecondCamera:
         """Camera 1.

@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.laser.normal_equations import NormalSolution, StripeRows, StripeSystem
 from armscan.calibration.laser.observations import SheetObservations
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
@@ -31,8 +32,6 @@ CONVERGED_SIGMA = 0.01
 MAX_TILT_STEP = 1.0
 """A step that turns a sheet by more than 45 degrees has left what the linearised fit can do."""
 HUBER_SIGMA = 2.5
-MIN_EIGENVALUE = 1e-13
-"""Of the normal matrix scaled to a unit diagonal, whose rounding is about 1e-15."""
 N_SHEET = 8
 N_PLANE = 3
 
@@ -57,6 +56,33 @@ class CommonErrors:
     def n_camera(self) -> int:
         """Count P of the cameras' parameters."""
         return len(self.camera_covariance)
+
+    @property
+    def count(self) -> int:
+        """Count of the common errors: 6 a board, then P."""
+        return 6 * len(self.pose_covariances) + self.n_camera
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearSolution:
+    """The last normal equations of a fit.
+
+    Parameters
+    ----------
+    system
+        At the solution.
+    normal
+        Its inverse, and the last step.
+    weight
+        (N,) of the points, 1/px^2.
+    active
+        (8 S,) True for the sheets' parameters that are free.
+    """
+
+    system: StripeSystem
+    normal: NormalSolution
+    weight: FloatArray
+    active: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +109,8 @@ class SheetSolution:
         Free parameters of all sheets.
     last_step_sigma
         Largest last step of a parameter, in its own sigma.
+    linear
+        The normal equations.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -93,7 +121,8 @@ class SheetSolution:
     common: FloatArray
     chi2: float
     n_parameters: int
-    last_step_sigma: float = 0.0
+    last_step_sigma: float
+    linear: LinearSolution
 
     @property
     def has_converged(self) -> bool:
@@ -151,12 +180,13 @@ def solve_sheets(
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     n_held = errors.n_camera if are_cameras_held else 0
+    normal: NormalSolution | None = None
     for _ in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active)
-        solved = system.step(robust / sigma**2, n_held)
-        if solved is None:
+        normal = system.solve(robust / sigma**2, n_held)
+        if normal is None:
             return _UNDETERMINED
-        step, inverse, follow = solved
+        step = normal.step
         full = np.zeros(N_SHEET * len(sheets))
         full[active] = step[: int(active.sum())]
         if _turns_too_far(full, sheets):
@@ -169,20 +199,23 @@ def solve_sheets(
             robust = _huber(remaining / sigma)
         elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
+    if normal is None:
+        return _UNDETERMINED
     n_active = int(active.sum())
     common = step[n_active:]
     system = _linearised(observations, sheets, errors, active)
     remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
     return SheetSolution(
         tuple(sheets),
-        _joint_covariance(inverse, follow, active, errors),
+        _joint_covariance(normal, active, errors),
         system.height_mm,
         system.residual_px,
         remaining,
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
         n_active,
-        float((np.abs(step[:n_active]) / np.sqrt(np.diag(inverse)[:n_active])).max()),
+        float((np.abs(step[:n_active]) / np.sqrt(np.diag(normal.inverse)[:n_active])).max()),
+        LinearSolution(system, normal, robust / sigma**2, active),
     )
 
 
@@ -202,119 +235,36 @@ def _without_bow(sheet: LightSheet) -> LightSheet:
     return replace(sheet, bow_mm=np.zeros(5))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Stripe:
-    """Derivatives of one stripe's K residuals: (K, C) by the C of the sheets' and cameras' unknowns
-    in ``columns`` that move it, (K, 6) by its board's pose.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    design: FloatArray
-    board: int
-    by_board: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """All residuals with their derivatives by the active sheet parameters and common errors.
-
-    The unknowns are the sheets' active parameters, then the boards' errors, then the cameras'. A
-    board moves its own stripes only, so that the boards are eliminated one by one.
-    """
-
-    stripes: tuple[_Stripe, ...]
-    n_active: int
-    n_boards: int
-    n_camera: int
-    residual_px: FloatArray
-    height_mm: FloatArray
-
-    def times(self, unknowns: FloatArray) -> FloatArray:
-        """(N,) change of the residuals."""
-        shared, boards = self._parted(unknowns)
-        change = np.zeros(len(self.residual_px))
-        for stripe in self.stripes:
-            change[stripe.rows] = (
-                stripe.design @ shared[stripe.columns] + stripe.by_board @ boards[stripe.board]
-            )
-        return change
-
-    def _parted(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sheets' and cameras' unknowns, and (M, 6) those of the boards."""
-        a, b = self.n_active, self.n_active + 6 * self.n_boards
-        return np.concatenate([unknowns[:a], unknowns[b:]]), unknowns[a:b].reshape(-1, 6)
-
-    def step(
-        self, weight: FloatArray, n_held: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Step, inverse of the normal matrix, and how the step follows the unknowns held.
-
-        The common errors are known to be 0 +- 1; the last ``n_held`` of them stay 0. The second is
-        (U, U) and the third (U, n_held) for the U unknowns of sheets and cameras that are free.
-        None where the matrix is not positive definite to rounding, so that nothing of it means
-        anything.
-        """
-        n = self.n_active + self.n_camera
-        information = np.diag((np.arange(n) >= self.n_active).astype(np.float64))
-        pull = np.zeros(n)
-        blocks = np.tile(np.eye(6), (self.n_boards, 1, 1))
-        mixed = np.zeros((self.n_boards, 6, n))
-        pulls = np.zeros((self.n_boards, 6))
-        for stripe in self.stripes:
-            w, residual = weight[stripe.rows, None], self.residual_px[stripe.rows]
-            weighted, board = stripe.design * w, (stripe.by_board * w).T
-            information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
-            pull[stripe.columns] += weighted.T @ residual
-            blocks[stripe.board] += board @ stripe.by_board
-            mixed[stripe.board][:, stripe.columns] += board @ stripe.design
-            pulls[stripe.board] += board @ residual
-        diagonal = np.diag(information)
-        if not all(np.isfinite(part).all() for part in (information, blocks, mixed)):
-            return None
-        if not (diagonal > 0.0).all():
-            return None
-        of_boards = np.linalg.solve(blocks, np.concatenate([mixed, pulls[:, :, None]], axis=2))
-        reduced = information - np.einsum("bki,bkj->ij", mixed, of_boards[:, :, :n])
-        pull = pull - np.einsum("bki,bk->i", mixed, of_boards[:, :, n])
-        free = n - n_held
-        scale = 1.0 / np.sqrt(diagonal[:free])
-        values, vectors = np.linalg.eigh(reduced[:free, :free] * np.outer(scale, scale))
-        if not values[0] > MIN_EIGENVALUE:
-            return None
-        inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-        shared = np.concatenate([-inverse @ pull[:free], np.zeros(n_held)])
-        boards = -of_boards[:, :, n] - of_boards[:, :, :n] @ shared
-        a = self.n_active
-        step = np.concatenate([shared[:a], boards.ravel(), shared[a:]])
-        return step, np.asarray(inverse), np.asarray(-inverse @ reduced[:free, free:])
-
-
 def _linearised(
     observations: SheetObservations,
     sheets: Sequence[LightSheet],
     errors: CommonErrors,
     active: BoolArray,
-) -> _System:
+) -> StripeSystem:
     height, residual, by_sheet, by_point = observations.residuals_px(sheets)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.by_camera)
     by_camera = by_camera @ square_root(errors.camera_covariance)
     by_pose = np.einsum("ni,nij->nj", by_point, observations.by_pose)
     pose_roots = [square_root(covariance) for covariance in errors.pose_covariances]
     n_active = int(active.sum())
+    n_columns = n_active + errors.count
     column = np.cumsum(active) - 1
     order = np.argsort(observations.stripe, kind="stable")
     starts = np.flatnonzero(np.diff(observations.stripe[order], prepend=-1))
-    cameras = np.arange(errors.n_camera)
     stripes = []
     for rows in np.split(order, starts[1:]):
         sheet, board = int(observations.sheet[rows[0]]), int(observations.board[rows[0]])
         own = np.flatnonzero(active[N_SHEET * sheet : N_SHEET * (sheet + 1)])
-        columns = np.concatenate([column[N_SHEET * sheet + own], n_active + cameras])
-        design = np.concatenate([by_sheet[rows][:, own], by_camera[rows]], axis=1)
-        stripes.append(_Stripe(rows, columns, design, board, by_pose[rows] @ pose_roots[board]))
-    n_boards = len(errors.pose_covariances)
-    return _System(tuple(stripes), n_active, n_boards, errors.n_camera, residual, height)
+        columns = np.concatenate(
+            [
+                column[N_SHEET * sheet + own],
+                n_active + 6 * board + np.arange(6),
+                np.arange(n_columns - errors.n_camera, n_columns),
+            ]
+        )
+        design = [by_sheet[rows][:, own], by_pose[rows] @ pose_roots[board], by_camera[rows]]
+        stripes.append(StripeRows(rows, board, columns, np.concatenate(design, axis=1)))
+    return StripeSystem(tuple(stripes), n_active, n_columns, residual, height)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:
@@ -323,27 +273,25 @@ def _huber(normalised: FloatArray) -> FloatArray:
 
 
 def _joint_covariance(
-    inverse: FloatArray, follow: FloatArray, active: BoolArray, errors: CommonErrors
+    normal: NormalSolution, active: BoolArray, errors: CommonErrors
 ) -> FloatArray:
     """Covariance of the errors of cameras and sheets, the cameras as they were calibrated.
 
     With the cameras' error ``e_c = L w`` in its own sigmas: sheets of cameras that are held follow
-    it, ``e_s = F w + n`` with F from the normal equations (n by stripes and boards, of covariance
-    ``inverse``). Sheets of free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
+    it, ``e_s = F w + n`` with F from the normal equations and n by stripes and boards. Sheets of
+    free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
     """
     n_active, n_sheets, p = int(active.sum()), len(active), errors.n_camera
-    root = square_root(errors.camera_covariance)
-    own = inverse[:n_active, :n_active]
-    if follow.shape[1]:
-        by_camera = follow[:n_active]
+    own = normal.inverse[:n_active, :n_active]
+    by_camera = normal.inverse[:n_active, normal.n_free - p :]
+    if normal.follow.shape[1]:
+        by_camera = normal.follow[:n_active]
         own = own + by_camera @ by_camera.T
-    else:
-        by_camera = inverse[:n_active, len(inverse) - p :]
     joint = np.zeros((p + n_sheets, p + n_sheets))
     joint[:p, :p] = errors.camera_covariance
     places = p + np.flatnonzero(active)
     joint[np.ix_(places, places)] = own
-    cross = by_camera @ root.T
+    cross = by_camera @ square_root(errors.camera_covariance).T
     joint[np.ix_(places, np.arange(p))] = cross
     joint[np.ix_(np.arange(p), places)] = cross.T
     return 0.5 * (joint + joint.T)

@@ -246,8 +246,10 @@ class CameraDocument(Body):
 
 
 class SensorDocument(Body):
-    """``sensor.json``; ``second`` is there only for a head of two cameras, ``laser_colour`` only where
-    a channel of colour images was chosen.
+    """``sensor.json``.
+
+    ``second`` is there only for a head of two cameras, ``laser_colour`` only where a channel of
+    colour images was chosen.
     """
 
     schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")

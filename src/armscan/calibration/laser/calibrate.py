@@ -113,9 +113,8 @@ def sight_on_boards(
 ) -> Vote:
     """Straight stripes on the boards, less the lines on which the boards do not agree.
 
-    Stripes are looked for on the print and, where three boards can vote, on the carrier around it as
-    far as the print is long: a line beside the print is taken only if it lies on the common sheet.
-    The lines of a fan are not voted on, and of them those on the print are preferred.
+    Stripes are looked for on the print and, where three boards can vote, on the carrier around it
+    as far as the print is long (`armscan.calibration.laser.voting`).
     """
     can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
     n_lines = 0 if can_vote else options.n_sheets

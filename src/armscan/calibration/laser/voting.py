@@ -134,7 +134,7 @@ def vote_on_sheets(
         if _most_lines(inner) >= LEAST_FAN:
             continue
         if _most_lines(inner) < 1 and _most_lines(wide) >= LEAST_FAN:
-            found = [_chosen_all(image) for image in wide]
+            found = [_Chosen(image) for image in wide]
         else:
             found = _voted(inner, wide, cameras, options)
         for i, item in zip(group, found, strict=True):
@@ -157,10 +157,6 @@ class _Chosen:
 
     image: BoardImage
     off: SkippedImage | None = None
-
-
-def _chosen_all(image: BoardImage) -> _Chosen:
-    return _Chosen(image)
 
 
 def _most_lines(images: Sequence[BoardImage]) -> float:

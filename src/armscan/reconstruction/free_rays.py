@@ -16,8 +16,8 @@ from armscan.models.light_sheet import LightSheet
 LARGEST_SLANT = 0.6
 """Tangent of the angle at which a ray may run to the sheet's depth axis: line lenses spread light
 by up to 60 degrees. Where the sheet knows its rays, they are followed and half of it is enough."""
-SPENT = 0.98
-"""Of the rays that may have lit a segment, so many must be spent on brighter ones."""
+NEEDED = 0.5
+"""A segment is left without rays if fewer than this part of its own width is free around it."""
 STEP_SPACINGS = 3.0
 """Rays are told apart by so many of the spacings between neighbouring points."""
 
@@ -50,7 +50,7 @@ def is_without_ray(
     low = ray.min()
     bins = np.floor((ray - low) / step).astype(np.int64)
     first_depth = np.full(int(bins.max()) + 1, np.nan)
-    numbers, inverse = np.unique(segment, return_inverse=True)
+    inverse = np.unique(segment, return_inverse=True)[1]
     strength = np.bincount(inverse, np.maximum(intensity, 0.0))
     for k in np.argsort(-strength):
         own = np.flatnonzero(inverse == k)
@@ -62,7 +62,8 @@ def is_without_ray(
         reach = int(np.ceil(slant * apart / step))
         start, stop = int(bins[own].min()) - reach, int(bins[own].max()) + reach + 1
         within = np.arange(max(start, 0), min(stop, len(spent)))
-        if spent[within].sum() >= SPENT * (stop - start):
+        n_free = stop - start - int(spent[within].sum())
+        if n_free < NEEDED * (int(bins[own].max()) - int(bins[own].min()) + 1):
             lost[own] = True
             continue
         covered = np.arange(bins[own].min(), bins[own].max() + 1)

@@ -33,7 +33,7 @@ LaserColourOption = Annotated[
     str,
     typer.Option(
         "--laser-colour",
-        help="What of colour images to use: auto, red, green, blue, grey, green-red (a difference), "
-        "green-excess (less the mean of the others) and so on.",
+        help="What of colour images to use: auto; red, green, blue, grey; a difference (green-red) "
+        "or an excess over the others (green-excess).",
     ),
 ]

@@ -11,8 +11,8 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
 
 BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
-"""Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; those of u
-alone follow the light's rays, see `LightSheet`."""
+"""Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; the terms
+of u alone follow the light's rays, see `LightSheet`."""
 
 PLANE_PARAMETER_NAMES = ("tilt_u_mm", "tilt_v_mm", "offset_mm")
 NEWTON_STEPS = 12
@@ -115,9 +115,7 @@ class LightSheet:
         dheight_dparameters = -np.column_stack([u, v, np.ones_like(u), terms])
         return height, dheight_dpoint, dheight_dparameters
 
-    def _bow_terms(
-        self, u: FloatArray, v: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _bow_terms(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(N, 5) values of the bow's terms, and their derivatives by u and by v."""
         terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
         by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], axis=1)
@@ -195,6 +193,16 @@ class LightSheet:
         dpoint_dxy[:, 1, 1] += depth
         ddepth_dparameters = -dh_dparameters / along[:, None]
         return points, is_valid, dpoint_dxy, rays[:, :, None] * ddepth_dparameters[:, None, :]
+
+    def in_frame(self, rotation: FloatArray, translation_mm: FloatArray) -> LightSheet:
+        """The same sheet in another frame: ``p_there = R p_here + t``."""
+        return LightSheet(
+            rotation @ self.origin_mm + translation_mm,
+            self.axes @ rotation.T,
+            self.scale_mm,
+            self.bow_mm,
+            self.fan,
+        )
 
     def updated(self, step: FloatArray) -> LightSheet:
         """Apply a step (8,) in (tilt_u, tilt_v, offset_mm, bow).

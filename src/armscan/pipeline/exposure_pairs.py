@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import PurePath
 
 import numpy as np
+from scipy.ndimage import grey_opening
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
@@ -20,6 +21,9 @@ OTHER_VIEW = 0.15
 LEAST_CONTRAST = 0.02
 """A pair shows two scenes if the correlation of their structure is below `OTHER_VIEW`, given that
 both have a contrast of more than this part of full scale: a dark room shows no structure."""
+THIN_BLOCKS = 5
+"""A laser's line is narrower than so many blocks of the reduced image, wide or saturated as it may
+be: a twentieth of the image's shorter side."""
 THIN_SHARE = 0.001
 SWAPPED_RATIO = 3.0
 """The pair is swapped if the partner's brightest `THIN_SHARE` of the pixels stands this many times
@@ -159,6 +163,8 @@ def _check_order(exposures: Sequence[Exposure], partners: Sequence[Exposure]) ->
     dark = np.stack([_structure(partner) for partner in partners])
     likeness = lit @ dark.T
     for k, exposure in enumerate(exposures):
+        if _contrast(exposure) < LEAST_CONTRAST:
+            continue
         best = int(np.argmax(likeness[k]))
         own, other = float(likeness[k, k]), float(likeness[k, best])
         if other > SAME_VIEW and own < MISORDERED * other:
@@ -172,7 +178,7 @@ def _check_order(exposures: Sequence[Exposure], partners: Sequence[Exposure]) ->
 
 def _check_scene(exposure: Exposure, partner: Exposure) -> None:
     """Raise `InputError` if the two images of a pair show different scenes."""
-    contrast = min(float(_reduced(image).std()) / image.full_scale for image in (exposure, partner))
+    contrast = min(_contrast(image) for image in (exposure, partner))
     likeness = float(_structure(exposure) @ _structure(partner))
     if contrast > LEAST_CONTRAST and likeness < OTHER_VIEW:
         raise InputError(
@@ -202,6 +208,16 @@ def _check_laser_side(exposure: Exposure, partner: Exposure) -> None:
             where=exposure.source,
             remedy="swap the images with and without laser",
         )
+
+
+def _contrast(exposure: Exposure) -> float:
+    """Standard deviation of the scene as a part of full scale; bright lines on black are no scene.
+
+    What is bright and thin is taken away: the lines of a laser in a photograph that is exposed for
+    them alone.
+    """
+    scene = grey_opening(_reduced(exposure), size=(THIN_BLOCKS, THIN_BLOCKS))
+    return float(scene.std()) / exposure.full_scale
 
 
 def _reduced(exposure: Exposure) -> FloatArray:

@@ -16,6 +16,7 @@ from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
 from armscan.reconstruction.choose_sheet import DepthRange
+from armscan.reconstruction.free_rays import is_without_ray
 from armscan.reconstruction.named_profile import NamedProfile, NameFate
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.triangulate import StripePoints, meet_sheets, triangulate_stripe
@@ -110,6 +111,13 @@ def triangulated(
         outside = (points[:, 2] < low) | (points[:, 2] > high)
         fate[is_open & (image.sheet == k) & outside] = int(PointFate.OUT_OF_DEPTH)
     fate[is_open & ~is_met] = int(PointFate.NO_RAY)
+    for k, calibrated in enumerate(sensor.sheets):
+        own = np.flatnonzero((fate == int(PointFate.MEASURED)) & (image.sheet == k))
+        profile = image.profile
+        lost = is_without_ray(
+            points[own], profile.intensity[own], profile.segment[own], calibrated.sheet
+        )
+        fate[own[lost]] = int(PointFate.NO_LASER_RAY)
     measured = replace(image, fate=fate)
     return MeasuredImage(measured, stripe_points(measured, sensor))
 

@@ -117,8 +117,8 @@ def nothing_measured(images: Sequence[ReconstructedImage]) -> str:
     if n_points == 0:
         return f"no stripe was found in {len(images)} images"
     counts = ", ".join(
-        f"{sum(image.count(fate) for image in images)} {fate.label}"
+        f"{count} {fate.label}"
         for fate in PointFate
-        if fate is not PointFate.MEASURED
+        if (count := sum(image.count(fate) for image in images))
     )
     return f"none of {n_points} stripe points could be measured: {counts}"

@@ -131,6 +131,7 @@ def measure_scan(
         raise InputError(
             "the scanner's document has no camera and light sheet", remedy="give one with a sensor"
         )
+    stripes = stripes_for(scanner.sensor, options.measure.stripes)
     poses = exposure_poses(
         source.rows, source.arm, source.session.clock, scanner.latency_ns, options.sync
     )
@@ -152,7 +153,6 @@ def measure_scan(
             yield instant, pairs
 
     def extract(pairs: tuple[ExposurePair, ...]) -> list[LitProfile]:
-        stripes = stripes_for(scanner.sensor, options.measure.stripes)
         return [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
 
     measurer = measurer_for(scanner.sensor, options.measure, is_scan=True)

@@ -23,7 +23,7 @@ from armscan.pipeline.measure import (
 )
 from armscan.pipeline.measure_options import MeasureOptions
 from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
-from armscan.reconstruction.identify_cross import CrossNamer
+from armscan.reconstruction.identify_cross import CrossNamer, CrossOptions
 from armscan.reconstruction.named_profile import NamedProfile
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.reconstruction.stereo_fate import StereoFate
@@ -65,7 +65,8 @@ def measurer_for(
         return ByTwoCameras(sensor, _stereo_options(options))
     n_sheets = len(sensor.sheets)
     if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
-        return ByPast(sensor, options, CrossNamer(sensor))
+        cross = CrossOptions() if options.depths is None else CrossOptions(depths=options.depths)
+        return ByPast(sensor, options, CrossNamer(sensor, cross))
     return ByDepth(sensor, options)
 
 

@@ -70,8 +70,9 @@ class ChannelChoice:
         """Why it was taken, in words."""
         best, *others = self.evidence
         text = (
-            f"{best.channel}: the stripe on the common sheet in {best.n_images} of {self.n_sampled} "
-            f"sampled photographs, {best.n_points} points that scatter {best.scatter_px:.2f} px"
+            f"{best.channel}: the stripe on the common sheet in {best.n_images} of "
+            f"{self.n_sampled} sampled photographs, {best.n_points} points that scatter "
+            f"{best.scatter_px:.2f} px"
         )
         if others and others[0].weight > 0.0:
             rival = others[0]

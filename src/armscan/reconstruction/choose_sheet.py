@@ -23,7 +23,7 @@ WIDENED = "within reach of its calibrated depths"
 
 @dataclass(frozen=True, slots=True)
 class DepthRange:
-    """Depths that a reconstruction accepts: the calibrated range of the sheet, widened.
+    """Depths that a reconstruction accepts: the calibrated range of the sheet, or more.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class DepthRange:
         warning counts them.
     """
 
-    margin: float = 3.0
+    margin: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.margin >= 0.0:

@@ -29,6 +29,8 @@ class PointFate(IntEnum):
     """The other camera saw the same point: it is measured there, from both images."""
     INCONSISTENT = 7
     """The two cameras contradict each other."""
+    NO_LASER_RAY = 8
+    """Brighter parts of the line took all rays of the laser: a reflection, or other light."""
 
     @property
     def label(self) -> str:
@@ -45,6 +47,7 @@ _FATE_LABELS = {
     PointFate.STRAY: "on no sheet: stray light",
     PointFate.SHARED: "in the other camera's point",
     PointFate.INCONSISTENT: "contradicted by the other camera",
+    PointFate.NO_LASER_RAY: "beside an unbroken line: a reflection",
 }
 
 

@@ -9,7 +9,6 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.rotation import skew
 from armscan.models.calibration import SensorCalibration
-from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.fuse import misfit_mm
 from armscan.reconstruction.triangulate import N_CAMERA, N_SHEET, StripePoints, sensor_columns
 from armscan.records.profile import Profile
@@ -60,13 +59,7 @@ def triangulate_right(
         if not len(own):
             continue
         there = calibrated.sheet
-        seen = LightSheet(
-            pose.rotation @ there.origin_mm + pose.translation_mm,
-            there.axes @ turn,
-            there.scale_mm,
-            there.bow_mm,
-            there.fan,
-        )
+        seen = there.in_frame(pose.rotation, pose.translation_mm)
         found, met, by_xy, by_sheet = seen.intersect_with_jacobian(xy[own])
         own, found, by_xy, by_sheet = own[met], found[met], by_xy[met], by_sheet[met]
         is_met[own] = True

@@ -86,7 +86,7 @@ class Exposure:
         return int(self.image.shape[1])
 
     def cropped(self, left: int, top: int, right: int, bottom: int) -> Exposure:
-        """The part of columns ``left`` to ``right`` and rows ``top`` to ``bottom``, ends excluded."""
+        """Columns ``left`` to ``right`` and rows ``top`` to ``bottom``, ends excluded."""
         step = self.window.binning
         window = SensorWindow(self.window.x_px + left * step, self.window.y_px + top * step, step)
         return replace(self, image=self.image[top:bottom, left:right], window=window)

@@ -30,6 +30,7 @@ from armscan.storage.calibration_schema import (
     CameraDiagnosticsBody,
     CovarianceBody,
     CoveredBody,
+    FanBody,
     InputFileBody,
     IntrinsicsBody,
     ObservationsBody,
@@ -203,8 +204,7 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
         ),
         scale_mm=sheet.scale_mm,
         bow_mm=dict(zip(BOW_KEYS, sheet.bow_mm.tolist(), strict=True)),
-        fan_lean=float(sheet.fan[0]),
-        fan_spread=float(sheet.fan[1]),
+        fan=_fan_body(sheet),
         rms_mm=calibration.rms_mm,
         n_boards=calibration.n_boards,
         n_points=calibration.n_points,
@@ -215,12 +215,17 @@ def _sheet_body(calibration: SheetCalibration) -> SheetBody:
     )
 
 
+def _fan_body(sheet: LightSheet) -> FanBody | None:
+    lean, spread = sheet.fan.tolist()
+    return FanBody(lean=lean, spread=spread) if lean or spread else None
+
+
 def _sheet_from_body(body: SheetBody) -> SheetCalibration:
     if set(body.bow_mm) != set(BOW_KEYS):
         raise InputError(f"sheet {body.name} needs the bow terms {', '.join(BOW_KEYS)}")
     axes = np.array([body.axes.u_sensor, body.axes.v_sensor, body.axes.normal_sensor])
     bow = np.array([body.bow_mm[key] for key in BOW_KEYS])
-    fan = np.array([body.fan_lean, body.fan_spread])
+    fan = np.zeros(2) if body.fan is None else np.array([body.fan.lean, body.fan.spread])
     return SheetCalibration(
         name=body.name,
         sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow, fan),

@@ -193,11 +193,17 @@ class AxesBody(Body):
     normal_sensor: Triple
 
 
+class FanBody(Body):
+    """How the light of a sheet spreads, without unit; see `LightSheet`."""
+
+    lean: float
+    spread: float
+
+
 class SheetBody(Body):
     """A light sheet ``n.(p - o) = sum(bow[i, j] u^i v^j)`` in the Sensor frame.
 
-    The fan says how the terms of u alone follow the light's rays, see `LightSheet`; documents
-    without it have zeros.
+    The fan is there only for a sheet whose bow follows the light's rays, see `LightSheet`.
     """
 
     name: str = Field(min_length=1)
@@ -205,8 +211,7 @@ class SheetBody(Body):
     axes: AxesBody
     scale_mm: float = Field(gt=0)
     bow_mm: dict[str, float]
-    fan_lean: float = 0.0
-    fan_spread: float = 0.0
+    fan: FanBody | None = None
     rms_mm: KnownOrNot
     n_boards: int = Field(ge=0)
     n_points: int = Field(ge=0)
@@ -214,6 +219,14 @@ class SheetBody(Body):
     depth_max_sensor_mm: float
     is_redundant: bool
     diagnostics: SheetDiagnosticsBody | None
+
+    @model_serializer(mode="wrap")
+    def _without_absent_fan(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Sheets without it keep the document that they always had."""
+        content: dict[str, Any] = write(self)
+        if self.fan is None:
+            del content["fan"]
+        return content
 
 
 class RightPoseBody(Body):
@@ -242,8 +255,10 @@ class CameraDocument(Body):
 
 
 class SensorDocument(Body):
-    """``sensor.json``; ``second`` is there only for a head of two cameras, ``laser_colour`` only where
-    a channel of colour images was chosen.
+    """``sensor.json``.
+
+    ``second`` is there only for a head of two cameras, ``laser_colour`` only where a channel of
+    colour images was chosen.
     """
 
     schema_name: Literal["armscan/sensor-calibration"] = Field(alias="schema")

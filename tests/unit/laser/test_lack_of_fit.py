@@ -6,8 +6,9 @@ import pytest
 from scipy import stats
 
 from armscan.calibration.laser.lack_of_fit import StripeNoise, gain_of_bow, lack_of_fit
+from armscan.calibration.laser.normal_equations import NormalSolution, StripeSystem
 from armscan.calibration.laser.observations import SheetObservations
-from armscan.calibration.laser.solve import SheetSolution
+from armscan.calibration.laser.solve import LinearSolution, SheetSolution
 from armscan.geometry.arrays import FloatArray
 
 NOISE = StripeNoise(1.2, 4.0, 500.0)
@@ -16,7 +17,11 @@ NOISE = StripeNoise(1.2, 4.0, 500.0)
 
 def solution(chi2: float, n_parameters: int) -> SheetSolution:
     none: FloatArray = np.zeros(0)
-    return SheetSolution((), np.zeros((0, 0)), none, none, none, none, chi2, n_parameters)
+    empty = np.zeros((0, 0))
+    linear = LinearSolution(
+        StripeSystem((), 0, 0, none, none), NormalSolution(none, empty, empty, 0), none, none > 0.0
+    )
+    return SheetSolution((), empty, none, none, none, none, chi2, n_parameters, 0.0, linear)
 
 
 def observations(n_stripes: int) -> SheetObservations:

@@ -17,13 +17,14 @@ def line(start: tuple[float, float], end: tuple[float, float], n: int, seed: int
     return np.asarray(np.array(start) * (1 - t) + np.array(end) * t + noise)
 
 
-def find(points: FloatArray, segment: FloatArray, **options: float) -> list[set[int]]:
+def find(points: FloatArray, segment: FloatArray, n_lines: int = 0) -> list[set[int]]:
     stripes = find_straight_stripes(
         points,
         np.full(len(points), SIGMA_MM),
         segment.astype(np.int64),
         BOARD_MM,
-        SheetOptions(**options),  # type: ignore[arg-type]
+        SheetOptions(),
+        n_lines=n_lines,
     )
     return [set(stripe.rows.tolist()) for stripe in stripes]
 
@@ -62,7 +63,7 @@ def test_a_gentle_curve_is_kept_whole() -> None:
 
 def test_known_count_keeps_the_best_supported_lines() -> None:
     points = np.concatenate([line((5, 0), (5, 40), 150, 6), line((30, 0), (30, 40), 60, 7)])
-    found = find(points, np.arange(len(points)) // 10, n_sheets=1)
+    found = find(points, np.arange(len(points)) // 10, n_lines=1)
     assert len(found) == 1
     assert len(found[0] & set(range(150))) >= 147
 

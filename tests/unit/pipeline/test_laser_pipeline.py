@@ -11,9 +11,11 @@ from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.laser import calibrate_sheets_from_exposures
+from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_exposures
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.reconstruct import reconstruct
+from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.result import PointFate
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.definition import Chessboard
@@ -65,7 +67,10 @@ def test_images_without_a_board_are_named_with_the_reason() -> None:
     assert not isinstance(fit, LaserFit)
     assert "no board with stripes in any of 2 images" in fit.reason
     assert "one.png" in fit.reason
-    assert [(event.done, event.total) for event in events] == [(0, 2), (1, 2), (2, 2)]
+    boards = [(event.done, event.total) for event in events if event.stage == BOARDS_STAGE]
+    stripes = [(event.done, event.total) for event in events if event.stage == STRIPES_STAGE]
+    assert boards == [(1, 2), (2, 2)]
+    assert stripes == [(0, 2), (1, 2), (2, 2)]
     assert [event.item for event in events[:2]] == ["one.png", "two.png"]
 
 
@@ -102,7 +107,8 @@ def test_a_line_far_outside_the_depths_and_no_line_are_told_apart() -> None:
 
 def test_extrapolated_points_and_empty_images_are_counted() -> None:
     lines = [picture("a.png", CAMERA.cx_px + 40.0), picture("bb.png")]
-    result = reconstruct(lines, sensor())
+    wide = MeasureOptions(depths=DepthRange(3.0))
+    result = reconstruct(lines, sensor(), options=wide)
     assert set(result.cloud.exposure.tolist()) == {0}
     assert any("bb.png" in warning for warning in result.warnings)
     assert any("outside its calibrated depth range" in warning for warning in result.warnings)

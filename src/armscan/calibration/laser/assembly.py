@@ -16,10 +16,17 @@ from armscan.calibration.laser.naming import NamedStripes, board_numbers
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.planes import compare_planes
-from armscan.calibration.laser.result import LaserFit, PointUse, SheetFit, SheetImage
+from armscan.calibration.laser.result import (
+    LaserFit,
+    PointUse,
+    SheetFit,
+    SheetImage,
+    SheetPointCheck,
+)
 from armscan.calibration.laser.sheet_model import SheetModel, sheet_geometry
 from armscan.calibration.laser.sightings import BoardImage
 from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.calibration.laser.stored_points import check_points
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import SheetCalibration
@@ -89,9 +96,16 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
     )
     if isinstance(solution, FitFailure):
         return solution
+    points = check_points(
+        used,
+        solution,
+        noise_px=_noise_px(case),
+        images=case.images,
+        cameras=case.cameras,
+    )
     sheets = []
     for k in range(len(models)):
-        fit = _sheet_fit(k, case, solution)
+        fit = _sheet_fit(k, case, solution, points[k])
         if isinstance(fit, FitFailure):
             return LooseSheet(k, fit)
         sheets.append(fit)
@@ -133,7 +147,16 @@ def _with_second_last(covariance: FloatArray, n_camera: int) -> FloatArray:
     return np.asarray(covariance[np.ix_(order, order)])
 
 
-def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | FitFailure:
+def _noise_px(case: SheetCase) -> FloatArray:
+    """(N,) scatter of the single points used around their stripes."""
+    used = case.observations.select(case.kept)
+    factors = np.array([model.noise.factor for model in case.models])
+    return np.asarray(used.sigma_px * factors[used.sheet])
+
+
+def _sheet_fit(
+    k: int, case: SheetCase, solution: SheetSolution, points_made: SheetPointCheck
+) -> SheetFit | FitFailure:
     images, named, model = case.images, case.named, case.models[k]
     used = case.observations.select(case.kept)
     own = used.sheet == k
@@ -175,6 +198,7 @@ def _sheet_fit(k: int, case: SheetCase, solution: SheetSolution) -> SheetFit | F
         geometry.board_angle_deg,
         compare_planes(sheet, points, images, stripes, case.cameras),
         warnings,
+        points_made,
     )
 
 

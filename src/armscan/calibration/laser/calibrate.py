@@ -13,7 +13,6 @@ from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.conditioning import refuse_few_boards
 from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
 from armscan.calibration.laser.naming import (
-    LEAST_FAN,
     NamedStripes,
     board_numbers,
     name_stripes,
@@ -114,23 +113,20 @@ def sight_on_boards(
 ) -> Vote:
     """Straight stripes on the boards, less the lines on which the boards do not agree.
 
-    Stripes are looked for on the print and, where three boards can vote, on the carrier around it as
-    far as the print is long: a line beside the print is taken only if it lies on the common sheet.
-    The lines of a fan are not voted on, and of them those on the print are preferred.
+    Stripes are looked for on the print and, where three boards can vote, on the carrier around it
+    as far as the print is long (`armscan.calibration.laser.voting`).
     """
     can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
     n_lines = 0 if can_vote else options.n_sheets
     on_print = [
         sight_stripes(board, cameras, options, options.margin_mm, n_lines) for board in boards
     ]
-    if not can_vote or options.margin_mm is not None or _most_lines(on_print) >= LEAST_FAN:
-        return vote_on_sheets(on_print, options)
-    around = [sight_stripes(board, cameras, options, _carrier_mm(board)) for board in boards]
-    return vote_on_sheets(around, options)
-
-
-def _most_lines(images: Sequence[BoardImage]) -> float:
-    return float(np.median([len(image.sightings) for image in images]))
+    if not can_vote:
+        return Vote(tuple(on_print))
+    around = on_print
+    if options.margin_mm is None:
+        around = [sight_stripes(board, cameras, options, _carrier_mm(board)) for board in boards]
+    return vote_on_sheets(on_print, around, cameras, options)
 
 
 def _carrier_mm(board: BoardStripes) -> float:

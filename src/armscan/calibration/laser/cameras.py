@@ -67,6 +67,13 @@ class HeadCameras:
             return self.left.camera
         return self._right(camera).camera.camera
 
+    def centre_mm(self, camera: int) -> FloatArray:
+        """(3,) where the rays of camera 0 or 1 start, in Sensor."""
+        if camera == 0:
+            return np.zeros(3)
+        place = self._right(camera).right_from_sensor
+        return np.asarray(-place.translation_mm @ place.rotation)
+
     def right(self) -> SecondCamera:
         """Camera 1.
 

@@ -12,6 +12,8 @@ from armscan.calibration.laser.solve import CommonErrors, solve_sheets
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
+MAX_TRIED = 6
+"""Boards that are left out in turn, those farthest off first."""
 MIN_BOARDS = 4
 """With fewer, two boards are left of which each explains the other."""
 
@@ -39,6 +41,9 @@ def find_misfit_image(
     boards = np.unique(alone.board)
     if len(boards) < MIN_BOARDS:
         return None
+    normalised = (alone.residuals_px([sheet])[1] / alone.sigma_px) ** 2
+    share = np.bincount(alone.board, normalised)[boards] / np.bincount(alone.board)[boards]
+    boards = boards[np.argsort(-share)[:MAX_TRIED]]
     p_values = []
     for board in boards:
         rest = alone.select(alone.board != board)

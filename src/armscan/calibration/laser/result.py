@@ -243,6 +243,70 @@ class PlaneComparison:
     largest_mm: float
 
 
+@dataclass(frozen=True, slots=True)
+class BoardDistances:
+    """Distances of points from the plane of their board; positive beyond it.
+
+    Parameters
+    ----------
+    n_points
+        Count; 0 if there are none, and then all figures are NaN.
+    mean_mm, sigma_mean_mm
+        Mean, and the standard deviation that the calibration claims for it.
+    rms_mm, claimed_rms_mm
+        Root mean square, and what the calibration claims for it.
+    """
+
+    n_points: int
+    mean_mm: float
+    sigma_mean_mm: float
+    rms_mm: float
+    claimed_rms_mm: float
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPointCheck:
+    """Points of one sheet on one board.
+
+    Parameters
+    ----------
+    source
+        Image of its stripe, the first one.
+    depth_mm
+        Mean Z of the points.
+    fitted
+        The board took part in the fit.
+    left_out
+        It did not; None where the other boards do not determine the sheet.
+    """
+
+    source: str
+    depth_mm: float
+    fitted: BoardDistances
+    left_out: BoardDistances | None
+
+
+@dataclass(frozen=True, slots=True)
+class SheetPointCheck:
+    """Points of one sheet.
+
+    Parameters
+    ----------
+    fitted
+        All points, every board having taken part in the fit.
+    left_out_rms_mm, left_out_claimed_mm
+        Root mean square of the distances when each point's own board is left out, and what the
+        calibration claims for it; NaN where no board can be left out.
+    boards
+        One entry a board.
+    """
+
+    fitted: BoardDistances
+    left_out_rms_mm: float
+    left_out_claimed_mm: float
+    boards: tuple[BoardPointCheck, ...]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetFit:
     """One calibrated sheet with what a reader needs to trust it or not.
@@ -276,6 +340,8 @@ class SheetFit:
         Simpler methods on the same points.
     warnings
         What is weak, in words.
+    points
+        Points that the stored calibration makes of its own stripes, against their boards.
     """
 
     calibration: SheetCalibration
@@ -291,6 +357,7 @@ class SheetFit:
     board_angle_deg: float
     comparisons: tuple[PlaneComparison, ...]
     warnings: tuple[str, ...]
+    points: SheetPointCheck
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_floats(self.covariance, (8, 8), "covariance"))

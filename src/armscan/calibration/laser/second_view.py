@@ -14,11 +14,12 @@ import numpy as np
 from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.ray_board import BoardPoints, meet_board, pose_by_camera
 from armscan.calibration.laser.result import PlacedBoard
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate
 from armscan.geometry.frames import Board, CameraRight, Sensor
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotation import rotation_from_vector, skew, vector_from_rotation
+from armscan.models.light_sheet import LightSheet
 from armscan.vision.targets.view import TargetView
 
 RIGHT_CAMERA = slice(9, 18)
@@ -71,6 +72,22 @@ def meet_board_of(
         back @ seen.dpoint_dpose @ turned,
         by_cameras,
     )
+
+
+def meet_sheet_of(
+    q_px: FloatArray, camera: int, sheet: LightSheet, cameras: HeadCameras
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 3) in Sensor where the rays of pixels (N, 2) of one camera meet a sheet.
+
+    With the second value (N,), False where there is none; what reconstruction does with a stripe.
+    """
+    xy, has_ray = cameras.model(camera).undistort(q_px)
+    if camera == 0:
+        points, is_met = sheet.intersect(xy)
+        return points, is_met & has_ray
+    place = cameras.right().right_from_sensor
+    points, is_met = sheet.in_frame(place.rotation, place.translation_mm).intersect(xy)
+    return (points - place.translation_mm) @ place.rotation, is_met & has_ray
 
 
 def place_board(

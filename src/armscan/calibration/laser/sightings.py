@@ -15,7 +15,8 @@ from armscan.calibration.laser.result import BoardStripes, PlacedBoard, PointUse
 from armscan.calibration.laser.second_view import meet_board_of, place_board
 from armscan.calibration.laser.straight_stripes import find_straight_stripes
 from armscan.calibration.laser.target_edges import runs_along_edge
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.records.profile import REJECTING, StripeFlag
 from armscan.vision.targets.view import TargetView
 
 
@@ -89,6 +90,13 @@ TOLERANCE_PX = 2.0
 """The least half width of a straight stripe's band, where a pixel is coarser than the tolerance."""
 
 
+PULLING = StripeFlag.BACKGROUND_STEP | StripeFlag.ASYMMETRIC
+"""What an edge beside the stripe does to its profile."""
+PULL_WIDTHS = 0.5
+"""An edge under a stripe takes up to half of its light: the centre moves by up to this part of the
+stripe's width."""
+
+
 def printed_margin_mm(view: TargetView) -> float:
     """How far the print goes on beyond the target's points: a square, half a pitch of circles."""
     points = view.points_board_mm[:, :2]
@@ -105,6 +113,9 @@ def sight_stripes(
     n_lines: int = 0,
 ) -> BoardImage:
     """Carry the stripe points of one image to its board and sort them into straight stripes.
+
+    Points that an edge beside the stripe may pull are left out. Where nothing else shows a stripe,
+    because it runs along the target's pattern, they are used as what they are: less certain.
 
     Parameters
     ----------
@@ -127,35 +138,68 @@ def sight_stripes(
     profile, pose = data.profile, placed.sensor_from_board
     points = meet_board_of(profile.points_px, data.camera, pose, cameras)
     by_camera = points.dpoint_dcamera + points.dpoint_dpose @ placed.by_cameras
-    across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
-    sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
-    on_board = (points.points_mm - pose.translation_mm) @ pose.rotation
+    on_board = ((points.points_mm - pose.translation_mm) @ pose.rotation)[:, :2]
     corners = data.view.points_board_mm[:, :2]
     low, high = corners.min(axis=0), corners.max(axis=0)
     with np.errstate(invalid="ignore"):
-        known = (on_board[:, :2] >= low - margin_mm) & (on_board[:, :2] <= high + margin_mm)
+        known = (on_board >= low - margin_mm) & (on_board <= high + margin_mm)
+    is_known = points.is_valid & known.all(axis=1)
     use = np.full(len(profile), int(PointUse.OFF_LINE))
+    pulled = (profile.flags & int(REJECTING) & ~int(PULLING)) == 0
     if data.edges is not None:
-        pulled = runs_along_edge(profile, data.edges, options.edge_widths, options.edge_angle_deg)
-        use[pulled] = PointUse.ON_EDGE
+        on_edge = runs_along_edge(profile, data.edges, options.edge_widths, options.edge_angle_deg)
+        use[on_edge] = PointUse.ON_EDGE
+        pulled &= on_edge | ~profile.is_accepted
     use[~known.all(axis=1)] = PointUse.OFF_BOARD
     use[~points.is_valid] = PointUse.NO_RAY
     use[~profile.is_accepted] = PointUse.FLAGGED
-    candidates = np.flatnonzero(use == PointUse.OFF_LINE)
-    mm_px = sigma_mm[candidates] / profile.sigma_px[candidates]
+    across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
+    sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
+    image = BoardImage(data, placed, points, by_camera, sigma_mm, use, ())
+    size = (float(high[0] - low[0]), float(high[1] - low[1]))
+    found = _with_stripes(image, use == PointUse.OFF_LINE, on_board, size, options, n_lines=n_lines)
+    if found.sightings or not pulled.any():
+        return found
+    less_sure = _with_pull(image, pulled)
+    sure = is_known & (pulled | (use == PointUse.OFF_LINE))
+    return _with_stripes(less_sure, sure, on_board, size, options, n_lines=n_lines)
+
+
+def _with_pull(image: BoardImage, pulled: BoolArray) -> BoardImage:
+    """The image with what an edge may do to a centre in the sigmas of the points that it pulls."""
+    profile = image.data.profile
+    sigma_px = np.where(
+        pulled, np.hypot(profile.sigma_px, PULL_WIDTHS * profile.width_px), profile.sigma_px
+    )
+    data = replace(image.data, profile=replace(profile, sigma_px=sigma_px))
+    return replace(image, data=data, sigma_mm=image.sigma_mm * sigma_px / profile.sigma_px)
+
+
+def _with_stripes(
+    image: BoardImage,
+    is_open: BoolArray,
+    on_board_mm: FloatArray,
+    size_mm: tuple[float, float],
+    options: SheetOptions,
+    *,
+    n_lines: int,
+) -> BoardImage:
+    """Sort the points that are open (N,) into straight stripes on the board."""
+    candidates = np.flatnonzero(is_open)
+    profile, use = image.data.profile, image.use.copy()
+    mm_px = image.sigma_mm[candidates] / profile.sigma_px[candidates]
     coarse = TOLERANCE_PX * float(np.median(mm_px)) if len(mm_px) else 0.0
-    tolerance = max(options.line_tolerance_mm, coarse)
     stripes = find_straight_stripes(
-        on_board[candidates, :2],
-        sigma_mm[candidates],
+        on_board_mm[candidates],
+        image.sigma_mm[candidates],
         profile.segment[candidates],
-        (float(high[0] - low[0]), float(high[1] - low[1])),
-        replace(options, line_tolerance_mm=tolerance),
-        n_lines,
+        size_mm,
+        replace(options, line_tolerance_mm=max(options.line_tolerance_mm, coarse)),
+        n_lines=n_lines,
     )
     for stripe in stripes:
         use[candidates[stripe.rows]] = PointUse.UNNAMED
-    image = BoardImage(data, placed, points, by_camera, sigma_mm, use, ())
+    image = replace(image, use=use)
     sightings = [_sighting(image, candidates[stripe.rows]) for stripe in stripes]
     return replace(image, sightings=tuple(_across_image(sightings)))
 

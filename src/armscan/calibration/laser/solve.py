@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.laser.normal_equations import NormalSolution, StripeRows, StripeSystem
 from armscan.calibration.laser.observations import SheetObservations
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
@@ -31,8 +32,6 @@ CONVERGED_SIGMA = 0.01
 MAX_TILT_STEP = 1.0
 """A step that turns a sheet by more than 45 degrees has left what the linearised fit can do."""
 HUBER_SIGMA = 2.5
-MIN_EIGENVALUE = 1e-13
-"""Of the normal matrix scaled to a unit diagonal, whose rounding is about 1e-15."""
 N_SHEET = 8
 N_PLANE = 3
 
@@ -65,6 +64,28 @@ class CommonErrors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LinearSolution:
+    """The last normal equations of a fit.
+
+    Parameters
+    ----------
+    system
+        At the solution.
+    normal
+        Its inverse, and the last step.
+    weight
+        (N,) of the points, 1/px^2.
+    active
+        (8 S,) True for the sheets' parameters that are free.
+    """
+
+    system: StripeSystem
+    normal: NormalSolution
+    weight: FloatArray
+    active: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SheetSolution:
     """Sheets at the optimum.
 
@@ -88,6 +109,8 @@ class SheetSolution:
         Free parameters of all sheets.
     last_step_sigma
         Largest last step of a parameter, in its own sigma.
+    linear
+        The normal equations.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -98,7 +121,8 @@ class SheetSolution:
     common: FloatArray
     chi2: float
     n_parameters: int
-    last_step_sigma: float = 0.0
+    last_step_sigma: float
+    linear: LinearSolution
 
     @property
     def has_converged(self) -> bool:
@@ -156,12 +180,13 @@ def solve_sheets(
     sigma = observations.sigma_px * sigma_factor
     robust = np.ones(len(observations))
     n_held = errors.n_camera if are_cameras_held else 0
+    normal: NormalSolution | None = None
     for _ in range(ITERATIONS):
         system = _linearised(observations, sheets, errors, active)
-        solved = system.step(robust / sigma**2, int(active.sum()), n_held)
-        if solved is None:
+        normal = system.solve(robust / sigma**2, n_held)
+        if normal is None:
             return _UNDETERMINED
-        step, inverse, follow = solved
+        step = normal.step
         full = np.zeros(N_SHEET * len(sheets))
         full[active] = step[: int(active.sum())]
         if _turns_too_far(full, sheets):
@@ -174,20 +199,23 @@ def solve_sheets(
             robust = _huber(remaining / sigma)
         elif float(np.abs(full).max()) < STEP_TOLERANCE_MM:
             break
+    if normal is None:
+        return _UNDETERMINED
     n_active = int(active.sum())
     common = step[n_active:]
     system = _linearised(observations, sheets, errors, active)
     remaining = system.residual_px + system.times(np.concatenate([np.zeros(n_active), common]))
     return SheetSolution(
         tuple(sheets),
-        _joint_covariance(inverse, follow, active, errors),
+        _joint_covariance(normal, active, errors),
         system.height_mm,
         system.residual_px,
         remaining,
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
         n_active,
-        float((np.abs(step[:n_active]) / np.sqrt(np.diag(inverse)[:n_active])).max()),
+        float((np.abs(step[:n_active]) / np.sqrt(np.diag(normal.inverse)[:n_active])).max()),
+        LinearSolution(system, normal, robust / sigma**2, active),
     )
 
 
@@ -207,67 +235,12 @@ def _without_bow(sheet: LightSheet) -> LightSheet:
     return replace(sheet, bow_mm=np.zeros(5))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Stripe:
-    """Derivatives (K, C) of one stripe's residuals by the C unknowns that move it."""
-
-    rows: IntArray
-    columns: IntArray
-    design: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _System:
-    """All residuals with their derivatives by the active sheet parameters and common errors."""
-
-    stripes: tuple[_Stripe, ...]
-    n_columns: int
-    residual_px: FloatArray
-    height_mm: FloatArray
-
-    def times(self, unknowns: FloatArray) -> FloatArray:
-        """(N,) change of the residuals."""
-        change = np.zeros(len(self.residual_px))
-        for stripe in self.stripes:
-            change[stripe.rows] = stripe.design @ unknowns[stripe.columns]
-        return change
-
-    def step(
-        self, weight: FloatArray, n_active: int, n_held: int
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Step, inverse of the normal matrix, and how the step follows the unknowns held.
-
-        The common errors are known to be 0 +- 1; the last ``n_held`` of them stay 0. The third is
-        (U, n_held) for the U unknowns that are free. None where the matrix is not positive
-        definite to rounding, so that nothing of it means anything.
-        """
-        n_free = self.n_columns - n_held
-        information = np.diag((np.arange(self.n_columns) >= n_active).astype(np.float64))
-        pull = np.zeros(self.n_columns)
-        for stripe in self.stripes:
-            weighted = stripe.design * weight[stripe.rows, None]
-            information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
-            pull[stripe.columns] += weighted.T @ self.residual_px[stripe.rows]
-        held = information[:n_free, n_free:]
-        information = information[:n_free, :n_free]
-        diagonal = np.diag(information)
-        if not np.isfinite(information).all() or not (diagonal > 0.0).all():
-            return None
-        scale = 1.0 / np.sqrt(diagonal)
-        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-        if not values[0] > MIN_EIGENVALUE:
-            return None
-        inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-        step = np.concatenate([-inverse @ pull[:n_free], np.zeros(n_held)])
-        return step, np.asarray(inverse), np.asarray(-inverse @ held)
-
-
 def _linearised(
     observations: SheetObservations,
     sheets: Sequence[LightSheet],
     errors: CommonErrors,
     active: BoolArray,
-) -> _System:
+) -> StripeSystem:
     height, residual, by_sheet, by_point = observations.residuals_px(sheets)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.by_camera)
     by_camera = by_camera @ square_root(errors.camera_covariance)
@@ -290,8 +263,8 @@ def _linearised(
             ]
         )
         design = [by_sheet[rows][:, own], by_pose[rows] @ pose_roots[board], by_camera[rows]]
-        stripes.append(_Stripe(rows, columns, np.concatenate(design, axis=1)))
-    return _System(tuple(stripes), n_columns, residual, height)
+        stripes.append(StripeRows(rows, board, columns, np.concatenate(design, axis=1)))
+    return StripeSystem(tuple(stripes), n_active, n_columns, residual, height)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:
@@ -300,27 +273,25 @@ def _huber(normalised: FloatArray) -> FloatArray:
 
 
 def _joint_covariance(
-    inverse: FloatArray, follow: FloatArray, active: BoolArray, errors: CommonErrors
+    normal: NormalSolution, active: BoolArray, errors: CommonErrors
 ) -> FloatArray:
     """Covariance of the errors of cameras and sheets, the cameras as they were calibrated.
 
     With the cameras' error ``e_c = L w`` in its own sigmas: sheets of cameras that are held follow
-    it, ``e_s = F w + n`` with F from the normal equations (n by stripes and boards, of covariance
-    ``inverse``). Sheets of free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
+    it, ``e_s = F w + n`` with F from the normal equations and n by stripes and boards. Sheets of
+    free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
     """
     n_active, n_sheets, p = int(active.sum()), len(active), errors.n_camera
-    root = square_root(errors.camera_covariance)
-    own = inverse[:n_active, :n_active]
-    if follow.shape[1]:
-        by_camera = follow[:n_active]
+    own = normal.inverse[:n_active, :n_active]
+    by_camera = normal.inverse[:n_active, normal.n_free - p :]
+    if normal.follow.shape[1]:
+        by_camera = normal.follow[:n_active]
         own = own + by_camera @ by_camera.T
-    else:
-        by_camera = inverse[:n_active, len(inverse) - p :]
     joint = np.zeros((p + n_sheets, p + n_sheets))
     joint[:p, :p] = errors.camera_covariance
     places = p + np.flatnonzero(active)
     joint[np.ix_(places, places)] = own
-    cross = by_camera @ root.T
+    cross = by_camera @ square_root(errors.camera_covariance).T
     joint[np.ix_(places, np.arange(p))] = cross
     joint[np.ix_(np.arange(p), places)] = cross.T
     return 0.5 * (joint + joint.T)

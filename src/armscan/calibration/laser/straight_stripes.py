@@ -39,6 +39,7 @@ def find_straight_stripes(
     segment: IntArray,
     board_size_mm: tuple[float, float],
     options: SheetOptions,
+    *,
     n_lines: int = 0,
 ) -> list[StraightStripe]:
     """Group points on the board into straight stripes, the one with the most points first.

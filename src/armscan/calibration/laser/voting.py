@@ -3,8 +3,8 @@
 
 A photograph shows more straight lines than the laser's: a border of the board, the line where it
 went past the board to the wall behind, a reflection, a second laser. Carried to their boards'
-planes, the lines of one sheet are coplanar in the Sensor frame and the others are not, so that three
-boards and more tell them apart without any limit on brightness or length.
+planes, the lines of one sheet are coplanar in the Sensor frame and the others are not, so that
+three boards and more tell them apart without any limit on brightness or length.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.naming import LEAST_FAN, board_numbers
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import PointUse, SkippedImage
@@ -35,8 +36,12 @@ CHUNK = 250
 POSE_SIGMAS = 3.0
 OUTLYING = 4.0
 """In robust sigmas of all boards' residuals."""
+LEAST_TRIANGULATION = 0.02
+"""Sine of the angle between the rays and a sheet below which it is taken for a line of the image: a
+border or a lit edge behind the boards that stays where it is lies, carried to any board, in the
+plane of its own rays. A light sheet at so small an angle measures no depth."""
 GRAZING = 0.1
-"""Sine of the angle between sheet and board below which a pixel's worth of height is not trusted."""
+"""Sine of the angle between sheet and board below which a pixel's height is not trusted."""
 MIN_SPREAD_RATIO = 0.01
 REFITS = 3
 SEED = 12
@@ -67,7 +72,8 @@ class _Lines:
 
     ``ends_mm`` (S, 2, 3); ``pose_root`` (S, 2, 3, 6) movement of the ends for a sigma of the
     board's pose; ``across_mm_px`` (S, 3) movement for a pixel across; ``length`` (S,) points;
-    ``image`` and ``board`` (S,), ``place`` (S,) number of the sighting in its image.
+    ``image`` and ``board`` (S,), ``place`` (S,) number of the sighting in its image; ``centre_mm``
+    (S, 3) of the camera that saw it.
     """
 
     ends_mm: FloatArray
@@ -77,12 +83,18 @@ class _Lines:
     image: IntArray
     board: IntArray
     place: IntArray
+    centre_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Agreement:
-    """A plane ``normal @ x = offset`` with the (S,) residuals of all lines, px, and who agrees."""
+    """A plane ``normal @ x = offset``, how far (px) from it a line may lie to agree, and of all
+    lines the (S,) residuals and whether they agree, at most one an image.
+    """
 
+    normal: FloatArray
+    offset: float
+    limit_px: float
     residual_px: FloatArray
     agrees: BoolArray
 
@@ -90,40 +102,105 @@ class _Agreement:
         return len(np.unique(lines.board[self.agrees]))
 
 
-def vote_on_sheets(images: Sequence[BoardImage], options: SheetOptions) -> Vote:
+def vote_on_sheets(
+    on_print: Sequence[BoardImage],
+    around: Sequence[BoardImage],
+    cameras: HeadCameras,
+    options: SheetOptions,
+) -> Vote:
     """Keep of each image the stripes that lie on a sheet on which at least three boards agree.
 
-    Images whose one laser is named vote among themselves. Nothing is decided where fewer than three
-    boards show a stripe, where no three agree, or where the lines of a fan are coplanar in too many
-    ways: their numbering (`armscan.calibration.laser.fan_naming`) then judges.
+    The stripes on the print vote. Of images that show none there, a stripe beside the print is kept
+    if it lies on one of these sheets. Only where the prints show no sheet, the stripes beside them
+    vote, and then on one sheet unless the options say how many there are: the walls and floors
+    behind show lines, too. Images whose one laser is named vote among themselves. Nothing is
+    decided where no three boards agree, or where the lines of a fan are coplanar in too many ways:
+    their numbering (`armscan.calibration.laser.fan_naming`) then judges.
+
+    Parameters
+    ----------
+    on_print, around
+        The images with the stripes on the print, and with those on print and carrier.
+    cameras
+        The cameras.
+    options
+        In force.
     """
-    lines = _lines_of(images)
-    kept: dict[int, set[int]] = {i: set(range(len(m.sightings))) for i, m in enumerate(images)}
+    images: list[BoardImage] = list(on_print)
     outlying: list[SkippedImage] = []
     warnings: list[str] = []
-    for group in _groups(images):
-        own = np.isin(lines.image, group)
-        sheets = _agreements(lines, own, options)
-        if not sheets or (not options.n_sheets and len(sheets) >= LEAST_FAN):
+    for group in _groups(on_print):
+        inner, wide = [on_print[i] for i in group], [around[i] for i in group]
+        if _most_lines(inner) >= LEAST_FAN:
             continue
-        agrees = np.any([sheet.agrees for sheet in sheets], axis=0)
-        for i in group:
-            mine = lines.image == i
-            kept[i] = set(lines.place[mine & agrees].tolist())
-            if mine.any() and not kept[i]:
-                off = min(float(sheet.residual_px[mine].min()) for sheet in sheets)
-                outlying.append(_outlying(images[i], off, sheets[0].boards(lines)))
-        n_boards = len(np.unique(lines.board[own]))
-        if sheets[0].boards(lines) < 0.5 * n_boards:
+        if _most_lines(inner) < 1 and _most_lines(wide) >= LEAST_FAN:
+            found = [_Chosen(image) for image in wide]
+        else:
+            found = _voted(inner, wide, cameras, options)
+        for i, item in zip(group, found, strict=True):
+            images[i] = item.image
+            if item.off is not None:
+                outlying.append(item.off)
+        n_shown = sum(bool(image.sightings) for image in wide)
+        n_agree = sum(bool(item.image.sightings) for item in found)
+        if n_agree < 0.5 * n_shown:
             warnings.append(
-                f"only {sheets[0].boards(lines)} of {n_boards} boards with a straight line agree on "
-                "a sheet: look at the images that were left out"
+                f"only {n_agree} of {n_shown} images with a straight line agree on a sheet: look "
+                "at those that were left out"
             )
-    return Vote(
-        tuple(_with(image, kept[i]) for i, image in enumerate(images)),
-        tuple(outlying),
-        tuple(warnings),
-    )
+    return Vote(tuple(images), tuple(outlying), tuple(warnings))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Chosen:
+    """An image with the stripes that stay, and why it was left out if none did."""
+
+    image: BoardImage
+    off: SkippedImage | None = None
+
+
+def _most_lines(images: Sequence[BoardImage]) -> float:
+    return float(np.median([len(image.sightings) for image in images]))
+
+
+def _voted(
+    inner: Sequence[BoardImage],
+    wide: Sequence[BoardImage],
+    cameras: HeadCameras,
+    options: SheetOptions,
+) -> list[_Chosen]:
+    """Vote on the stripes of the print, or if they show no sheet, on those around it."""
+    lines = _lines_of(inner, cameras)
+    sheets = _agreements(lines, options.n_sheets or LEAST_FAN)
+    if not options.n_sheets and len(sheets) >= LEAST_FAN:
+        return [_Chosen(image) for image in inner]
+    if sheets:
+        kept = [set(lines.place[_any(sheets) & (lines.image == i)]) for i in range(len(inner))]
+    else:
+        lines = _lines_of(wide, cameras)
+        sheets = _agreements(lines, options.n_sheets or 1)
+        kept = [set[int]() for _ in inner]
+    if not sheets:
+        return [_Chosen(image) for image in inner]
+    beside = _lines_of(wide, cameras)
+    sheets_beside = [_held_against(beside, sheet) for sheet in sheets]
+    found = []
+    for i, image in enumerate(inner):
+        if kept[i]:
+            found.append(_Chosen(_with(image, kept[i])))
+            continue
+        mine = beside.image == i
+        there = set(beside.place[_any(sheets_beside) & mine].tolist())
+        chosen = _Chosen(_with(wide[i], there))
+        if mine.any() and not there:
+            off = min(float(sheet.residual_px[mine].min()) for sheet in sheets_beside)
+            chosen = _Chosen(chosen.image, _outlying(image, off, sheets[0].boards(lines)))
+        found.append(chosen)
+    return found
+
+
+def _any(sheets: Sequence[_Agreement]) -> BoolArray:
+    return np.asarray(np.any([sheet.agrees for sheet in sheets], axis=0))
 
 
 def _groups(images: Sequence[BoardImage]) -> list[list[int]]:
@@ -154,7 +231,7 @@ def _with(image: BoardImage, kept: set[int]) -> BoardImage:
     return replace(image, use=use, sightings=sightings)
 
 
-def _lines_of(images: Sequence[BoardImage]) -> _Lines:
+def _lines_of(images: Sequence[BoardImage], cameras: HeadCameras) -> _Lines:
     boards = board_numbers(images)
     found = [(i, k, s) for i, image in enumerate(images) for k, s in enumerate(image.sightings)]
     roots = [square_root(image.placed.covariance) for image in images]
@@ -167,6 +244,7 @@ def _lines_of(images: Sequence[BoardImage]) -> _Lines:
         np.array([i for i, _, _ in found], dtype=np.int64),
         np.array([boards[i] for i, _, _ in found], dtype=np.int64),
         np.array([k for _, k, _ in found], dtype=np.int64),
+        np.array([cameras.centre_mm(images[i].data.camera) for i, _, _ in found]).reshape(n, 3),
     )
 
 
@@ -175,12 +253,12 @@ def _mm_per_px(image: BoardImage, sighting: Sighting) -> float:
     return float(np.median(image.sigma_mm[rows] / image.data.profile.sigma_px[rows]))
 
 
-def _agreements(lines: _Lines, own: BoolArray, options: SheetOptions) -> list[_Agreement]:
+def _agreements(lines: _Lines, most: int) -> list[_Agreement]:
     """Planes from the one with the most support on; lines of one do not count for the next."""
-    n_boards = len(np.unique(lines.board[own]))
+    n_boards = len(np.unique(lines.board))
     found: list[_Agreement] = []
-    open_lines = own.copy()
-    while len(found) < (options.n_sheets or LEAST_FAN):
+    open_lines = np.ones(len(lines.length), dtype=np.bool_)
+    while len(found) < most:
         best = _best_agreement(lines, open_lines, n_boards)
         if best is None:
             break
@@ -192,11 +270,35 @@ def _agreements(lines: _Lines, own: BoolArray, options: SheetOptions) -> list[_A
     return found
 
 
+def _held_against(lines: _Lines, sheet: _Agreement) -> _Agreement:
+    """The same plane with other lines: which of them agree with it."""
+    return _judged(
+        lines,
+        np.ones(len(lines.length), dtype=np.bool_),
+        sheet.normal,
+        sheet.offset,
+        sheet.limit_px,
+    )
+
+
+def _judged(
+    lines: _Lines, own: BoolArray, normal: FloatArray, offset: float, limit_px: float
+) -> _Agreement:
+    everyone = np.ones(len(lines.length), dtype=np.bool_)
+    ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit_px)[0]
+    height = np.abs(lines.ends_mm @ normal - offset).max(axis=1)
+    residual = height / _mm_of_px(lines, everyone, normal[None])[0]
+    agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
+    return _Agreement(normal, offset, limit_px, residual, agrees)
+
+
 def _best_agreement(lines: _Lines, own: BoolArray, n_boards: int) -> _Agreement | None:
     trials = list(_trial_planes(lines, own))
     if not trials:
         return None
     normals, offsets = (np.concatenate(parts) for parts in zip(*trials, strict=True))
+    if not len(normals):
+        return None
     best: _Agreement | None = None
     for tolerance in TOLERANCES_PX:
         found = _refined(lines, own, *_most_supported(lines, own, normals, offsets, tolerance))
@@ -228,9 +330,11 @@ def _trial_planes(lines: _Lines, own: BoolArray) -> Iterator[tuple[FloatArray, F
         values, vectors = np.linalg.eigh(
             np.einsum("tki,tkj->tij", pair - middle[:, None], pair - middle[:, None])
         )
-        wide = values[:, 1] > MIN_SPREAD_RATIO**2 * values[:, 2]
-        normals = vectors[wide, :, 0]
-        yield normals, np.einsum("ti,ti->t", normals, middle[wide])
+        ray = middle - lines.centre_mm[a[start : start + CHUNK]]
+        sine = np.abs(np.einsum("ti,ti->t", vectors[:, :, 0], ray)) / np.linalg.norm(ray, axis=1)
+        sound = (values[:, 1] > MIN_SPREAD_RATIO**2 * values[:, 2]) & (sine > LEAST_TRIANGULATION)
+        normals = vectors[sound, :, 0]
+        yield normals, np.einsum("ti,ti->t", normals, middle[sound])
 
 
 def _most_supported(
@@ -273,32 +377,22 @@ def _refined(
     lines: _Lines, own: BoolArray, normal: FloatArray, offset: float, tolerance_px: float
 ) -> _Agreement:
     """Refit the plane to who agrees, and leave out who is far off by the others' own scatter."""
-    limit = tolerance_px
-    everyone = np.ones(len(lines.length), dtype=np.bool_)
+    found = _judged(lines, own, normal, offset, tolerance_px)
     for _ in range(REFITS):
-        ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit)[0]
-        agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
-        if len(np.unique(lines.board[agrees])) < LEAST_BOARDS:
+        if found.boards(lines) < LEAST_BOARDS:
             break
+        agrees = found.agrees
         ends = lines.ends_mm[agrees].reshape(-1, 3)
-        mm_px = _mm_of_px(lines, agrees, normal[None])[0]
+        mm_px = _mm_of_px(lines, agrees, found.normal[None])[0]
         weight = np.repeat(lines.length[agrees] / mm_px**2, 2)
         middle = weight @ ends / weight.sum()
         spread = (ends - middle).T @ ((ends - middle) * weight[:, None])
         normal = np.linalg.eigh(spread)[1][:, 0]
-        offset = float(normal @ middle)
-        residual = _residual_px(lines, normal, offset)
-        scatter = 1.4826 * float(np.median(residual[agrees]))
+        refit = _judged(lines, own, normal, float(normal @ middle), found.limit_px)
+        scatter = 1.4826 * float(np.median(refit.residual_px[agrees]))
         limit = float(np.clip(OUTLYING * scatter, TOLERANCES_PX[0], tolerance_px))
-    ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit)[0]
-    agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
-    return _Agreement(_residual_px(lines, normal, offset), agrees)
-
-
-def _residual_px(lines: _Lines, normal: FloatArray, offset: float) -> FloatArray:
-    everyone = np.ones(len(lines.length), dtype=np.bool_)
-    height = np.abs(lines.ends_mm @ normal - offset).max(axis=1)
-    return np.asarray(height / _mm_of_px(lines, everyone, normal[None])[0])
+        found = _judged(lines, own, refit.normal, refit.offset, limit)
+    return found
 
 
 def _one_an_image(lines: _Lines, agrees: BoolArray, ratio: FloatArray) -> BoolArray:

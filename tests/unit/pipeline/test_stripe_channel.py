@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The channel of colour photographs is weighed over a set: rendered boards with a laser line."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.laser.cameras import HeadCameras
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import BoardStripes
+from armscan.geometry.arrays import FloatArray
+from armscan.pipeline.stripe_channel import choose_channel
+from armscan.records.exposure import Exposure
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.options import LaserColour, StripeOptions
+from sheet_rig import SheetRig, thesis_rig
+
+WIDTH_PX = 2.0
+
+
+def rig_of_vga() -> SheetRig:
+    """The thesis's geometry with a small camera: 640 x 480, as a webcam has."""
+    rig = thesis_rig()
+    camera = replace(
+        rig.camera, fx_px=800.0, fy_px=800.0, cx_px=320.0, cy_px=240.0, width_px=640, height_px=480
+    )
+    return replace(rig, camera=camera)
+
+
+def photograph(rig: SheetRig, board: BoardStripes, laser: Sequence[float], seed: int) -> Exposure:
+    """Dark squares on white under white light, and the line in the colour of the laser (3,)."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: rig.camera.height_px, : rig.camera.width_px].astype(np.float64)
+    first = board.view.points_px[0]
+    dark = ((x - first[0]) // 24 + (y - first[1]) // 24) % 2 > 0
+    albedo = np.where(dark, 0.25, 1.0)
+    centre = line_rows(rig, board, x[0])
+    line = np.exp(-0.5 * ((y - centre[None, :]) / WIDTH_PX) ** 2)
+    image = albedo[:, :, None] * (150.0 + line[:, :, None] * np.array(laser))
+    image += rng.normal(0.0, 2.0, image.shape)
+    return Exposure(np.clip(image, 0, 255).round().astype(np.uint8), board.profile.source)
+
+
+def line_rows(rig: SheetRig, board: BoardStripes, x: FloatArray) -> FloatArray:
+    """Row of the true stripe in each column; far outside the image where there is none."""
+    q = board.profile.points_px
+    order = np.argsort(q[:, 0])
+    return np.interp(x, q[order, 0], q[order, 1], left=-100.0, right=-100.0)
+
+
+@pytest.mark.parametrize(
+    ("laser", "expected"),
+    [((0.0, 70.0, 0.0), "green"), ((70.0, 0.0, 0.0), "red"), ((10.0, 20.0, 80.0), "blue")],
+)
+def test_a_faint_line_over_squares_is_taken_in_a_difference_of_channels(
+    laser: tuple[float, float, float], expected: str
+) -> None:
+    """In the laser's own channel the squares are stronger than the line; in a difference they go.
+
+    The choice must be as good as the best single channel, judged by the error against the truth.
+    """
+    rig = rig_of_vga()
+    clean = replace(rig, sigma_stripe_px=1e-3).boards(rig.camera, np.random.default_rng(1))
+    pictures = [photograph(rig, board, laser, k) for k, board in enumerate(clean)]
+
+    def stripes_of(k: int, channel: LaserColour) -> BoardStripes | None:
+        profile = extract_stripes(pictures[k], StripeOptions(laser_colour=channel))
+        return replace(clean[k], profile=profile) if profile.is_accepted.any() else None
+
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    choice = choose_channel(len(clean), stripes_of, cameras, SheetOptions())
+    assert choice is not None
+    assert choice.channel.startswith(expected + "-")
+    assert choice.channel in choice.reason
+    errors = {}
+    for channel in (choice.channel, f"{expected}-excess", expected, "grey"):
+        found = [stripes_of(k, channel) for k in range(len(clean))]  # type: ignore[arg-type]
+        errors[channel] = error_px(rig, clean, [one for one in found if one is not None])
+    best = min(rms for rms, n in errors.values() if n > 0.8 * max(m for _, m in errors.values()))
+    assert errors[choice.channel][0] < 1.1 * best
+
+
+def error_px(
+    rig: SheetRig, clean: Sequence[BoardStripes], found: Sequence[BoardStripes]
+) -> tuple[float, int]:
+    """Root mean square error of the points within 5 px of the true line, and their count."""
+    missed = []
+    truth = {board.profile.source: board for board in clean}
+    for one in found:
+        good = one.profile.points_px[one.profile.is_accepted]
+        off = good[:, 1] - line_rows(rig, truth[one.profile.source], good[:, 0])
+        missed.append(off[np.abs(off) < 5.0])
+    every = np.concatenate([*missed, np.zeros(0)])
+    return (float(np.sqrt((every**2).mean())) if len(every) else np.inf), len(every)
+
+
+def test_nothing_is_chosen_where_nothing_is_straight() -> None:
+    rig = rig_of_vga()
+    clean = rig.boards(rig.camera, np.random.default_rng(2))
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    assert choose_channel(len(clean), lambda k, channel: None, cameras, SheetOptions()) is None

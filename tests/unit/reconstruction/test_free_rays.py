@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One ray of the laser lights one point."""
+
+import numpy as np
+
+from armscan.models.light_sheet import LightSheet
+from armscan.reconstruction.free_rays import is_without_ray
+
+SHEET = LightSheet(np.array([0.0, 0.0, 300.0]), np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
+                   50.0, np.zeros(5))  # fmt: skip
+"""u along X, depth along Z."""
+
+
+def line(low: float, high: float, depth_mm: float, step: float = 0.2) -> np.ndarray:
+    u = np.arange(low, high, step)
+    return np.stack([u, 0.0 * u, 0.0 * u + depth_mm], axis=1)
+
+
+def judged(*pieces: tuple[np.ndarray, float]) -> list[bool]:
+    """For each piece, whether it is left without a ray; points get the piece's brightness."""
+    points = np.concatenate([p for p, _ in pieces])
+    segment = np.concatenate([np.full(len(p), k) for k, (p, _) in enumerate(pieces)])
+    bright = np.concatenate([np.full(len(p), b) for p, b in pieces])
+    lost = is_without_ray(points, bright, segment, SHEET)
+    found = [lost[segment == k] for k in range(len(pieces))]
+    assert all(one.all() or not one.any() for one in found)
+    return [bool(one.all()) for one in found]
+
+
+def test_a_reflection_beside_an_unbroken_line_is_left_out() -> None:
+    assert judged((line(-60, 60, 300.0), 100.0), (line(-5, 10, 340.0), 60.0)) == [False, True]
+    assert judged((line(-5, 10, 340.0), 60.0), (line(-60, 60, 300.0), 100.0)) == [True, False]
+
+
+def test_a_step_keeps_both_levels() -> None:
+    low, block = line(-60, 0, 320.0), line(0, 60, 300.0)
+    assert judged((low, 100.0), (block, 80.0)) == [False, False]
+
+
+def test_a_small_thing_before_a_wall_is_kept_though_the_wall_goes_on_around_it() -> None:
+    """A pin 3 mm wide, 60 mm before the wall: its shadow on the wall lies 30 mm aside.
+
+    The rays are slanted there, and the gap that it leaves is not where the pin seems to be.
+    """
+    wall = [line(-80, 27, 360.0), line(30, 80, 360.0)]
+    assert judged((wall[0], 100.0), (wall[1], 100.0), (line(0, 3, 300.0), 50.0)) == [False] * 3
+
+
+def test_pieces_of_one_broken_line_are_kept() -> None:
+    pieces = [line(k * 10.0, k * 10.0 + 8.0, 300.0 + k) for k in range(6)]
+    assert judged(*((piece, 50.0 + 10 * k) for k, piece in enumerate(pieces))) == [False] * 6
+
+
+def test_near_the_end_of_the_line_nothing_is_claimed() -> None:
+    """Rays past the end of the bright line may have lit what lies in another depth there."""
+    assert judged((line(-60, 60, 300.0), 100.0), (line(45, 58, 340.0), 60.0)) == [False, False]

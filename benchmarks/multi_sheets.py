@@ -15,7 +15,9 @@ Second table, calibration, sheets on four boards or more. *rms*: distance of the
 true light at its own stripe points, root mean square over sheets and sets; *ratio*: that over what
 the stated covariance expects; *worst*: the largest rms of one sheet; *inside*: sets in which all
 parameters of the cameras and of all sheets together lie in the 95 % region that is stated (sheets
-without bow there, so that the model is exact).
+without bow there, so that the model is exact); *points*: the calibration's own stripes made with
+the stored document, against their boards, rms and that over the claimed one, and with each board
+left out.
 """
 
 from __future__ import annotations
@@ -170,6 +172,7 @@ def fit_table(n_fits: int) -> None:
     for title, cameras_of in (("left camera", left_alone), ("both cameras", both)):
         for bow in ("bowed", "flat"):
             squares: list[tuple[float, float]] = []
+            points: list[tuple[float, ...]] = []
             inside = refused = counted = 0
             normalised = freedom = 0.0
             for seed in range(n_fits):
@@ -189,6 +192,16 @@ def fit_table(n_fits: int) -> None:
                     for k, sheet in enumerate(fit.sheets)
                     if sheet.calibration.n_boards >= 4
                 ]
+                points += [
+                    (
+                        sheet.points.fitted.rms_mm,
+                        sheet.points.fitted.claimed_rms_mm,
+                        sheet.points.left_out_rms_mm,
+                        sheet.points.left_out_claimed_mm,
+                    )
+                    for sheet in fit.sheets
+                    if sheet.calibration.n_boards >= 4
+                ]
                 if bow == "flat" and not any(sheet.sheet.is_bowed for sheet in fit.sheets):
                     square, count = joint_square(fit, calibration, truth, rig)
                     inside += square < chi2.ppf(0.95, count)
@@ -196,6 +209,7 @@ def fit_table(n_fits: int) -> None:
                     counted += 1
             found = np.array(squares)
             rms = np.sqrt(found.mean(axis=0))
+            own, claimed, left, left_claimed = np.sqrt((np.array(points) ** 2).mean(axis=0))
             joint = (
                 f"; inside {inside} of {counted}, normalised error {normalised / freedom:.2f}"
                 if counted
@@ -204,7 +218,8 @@ def fit_table(n_fits: int) -> None:
             print(
                 f"  {title}, {bow:6s} {len(found)} sheets: rms {1e3 * rms[0]:.2f} um, "
                 f"ratio {rms[0] / rms[1]:.2f}, worst {1e3 * np.sqrt(found[:, 0].max()):.1f} um, "
-                f"refused {refused}{joint}",
+                f"refused {refused}{joint}; points {1e3 * own:.2f} um, over claimed "
+                f"{own / claimed:.2f}, left out {1e3 * left:.2f} um, {left / left_claimed:.2f}",
                 flush=True,
             )
 

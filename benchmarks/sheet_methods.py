@@ -12,7 +12,9 @@ The sheet is compared with the truth on a grid over the calibrated region. Colum
 - *bias mm*: largest, over the grid, of the mean error over runs;
 - *inside*: runs per cent inside the 95 % region that ours states (all free parameters and the
   camera's together);
-- *bow*: runs per cent in which ours decided for a bow.
+- *bow*: runs per cent in which ours decided for a bow;
+- *points*: the calibration's own stripes made with the stored document, against their boards: rms
+  in mm over all runs, that over the claimed one, and with each board left out.
 """
 
 from __future__ import annotations
@@ -131,6 +133,7 @@ def study(name: str, rig: SheetRig, n_runs: int) -> None:
     """Print the rows of one scene."""
     collected: dict[str, list[FloatArray]] = {method: [] for method in (*METHODS, "sigma")}
     inside = bowed = refused = 0
+    points: list[tuple[float, ...]] = []
     start = time.perf_counter()
     for seed in range(n_runs):
         rng = np.random.default_rng(seed)
@@ -144,12 +147,26 @@ def study(name: str, rig: SheetRig, n_runs: int) -> None:
             collected[method].append(values)
         inside += is_inside(fit, rig, found["ours"])
         bowed += fit.sheets[0].sheet.is_bowed
+        made = fit.sheets[0].points
+        points.append(
+            (
+                made.fitted.rms_mm,
+                made.fitted.claimed_rms_mm,
+                made.left_out_rms_mm,
+                made.left_out_claimed_mm,
+            )
+        )
     n_fitted = n_runs - refused
     bound = float(np.sqrt((np.array(collected["sigma"]) ** 2).mean()))
     seconds = (time.perf_counter() - start) / n_runs
     print(
         f"\n{name}: bound {bound:.4f} mm, inside {inside / n_fitted:.1%}, "
         f"bow {bowed / n_fitted:.0%}, refused {refused}, {seconds:.2f} s a run"
+    )
+    own, claimed, left, left_claimed = np.sqrt((np.array(points) ** 2).mean(axis=0))
+    print(
+        f"  points against their boards: rms {own:.4f} mm, over claimed {own / claimed:.2f}; "
+        f"left out {left:.4f} mm, over claimed {left / left_claimed:.2f}"
     )
     for method in METHODS:
         values = np.array(collected[method])

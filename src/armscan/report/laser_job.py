@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -375,4 +376,14 @@ def _sheet_data(fit: SheetFit) -> dict[str, Any]:
         "depth_max_mm": high,
         "is_redundant": fit.calibration.is_redundant,
         "lack_of_fit_p": fit.final_test.p_value,
+        "points_off_boards": {
+            **asdict(fit.points.fitted),
+            "left_out_rms_mm": _known(fit.points.left_out_rms_mm),
+            "left_out_claimed_mm": _known(fit.points.left_out_claimed_mm),
+            "boards": [asdict(board) for board in fit.points.boards],
+        },
     }
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -7,13 +7,20 @@ import math
 from collections.abc import Mapping
 
 from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse, SheetFit, SheetImage
+from armscan.calibration.laser.result import (
+    LackOfFit,
+    LaserFit,
+    PointUse,
+    SheetFit,
+    SheetImage,
+    SheetPointCheck,
+)
 from armscan.models.calibration import Provenance
 from armscan.models.light_sheet import BOW_TERMS
 from armscan.records.exposure import Exposure
 from armscan.report import laser_figures as figures
 from armscan.report.drawing import Marks, photo_markup
-from armscan.report.numbers import sentence, significant, without_source
+from armscan.report.numbers import sentence, significant, with_sigma, without_source
 from armscan.report.origin import footer, origin_section
 from armscan.report.page import Card, Facts, Gallery, Legend, Page, Picture, Section, Text
 from armscan.report.stripe_figures import evenly_chosen, stripe_legend, stripe_picture
@@ -54,7 +61,8 @@ def laser_page(
     is_simulated
         True if the photographs were rendered.
     """
-    sections = [_sheets_section(fit), _images_section(fit, exposures), _residuals_section(fit)]
+    sections = [_sheets_section(fit), _points_section(fit), _images_section(fit, exposures)]
+    sections.append(_residuals_section(fit))
     sections.append(_boards_section(fit, exposures))
     if fit.skipped:
         sections.append(_skipped_section(fit, exposures))
@@ -92,6 +100,7 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"± {significant(fit.offset_sigma_mm)} mm in the middle",
         ),
         ("Residual", f"{significant(calibration.rms_mm)} mm rms, {significant(fit.rms_px)} px rms"),
+        *point_facts(fit.points),
         ("Depth covered", f"Z {low:.1f} to {high:.1f} mm"),
         (
             "Rests on",
@@ -110,10 +119,79 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"{significant(fit.coplanarity_sigma_mm)} mm",
         ),
         ("Bow (u along the stripe, v in depth)", bow if fit.sheet.is_bowed else "none: a plane"),
+        *(
+            (("The bow's light comes from", f"about {_source_mm(fit):.0f} mm before the middle"),)
+            if fit.sheet.fan.any()
+            else ()
+        ),
         ("Plane or bow, and why", sentence(fit.bow_decision)),
         ("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
         ("Lack of fit of the sheet", lack_of_fit_text(fit.final_test)),
     )
+
+
+def _source_mm(fit: SheetFit) -> float:
+    spread = float(fit.sheet.fan[1])
+    return fit.sheet.scale_mm / spread if spread else math.inf
+
+
+def point_facts(points: SheetPointCheck) -> tuple[tuple[str, str], ...]:
+    """Labels and values of the points that the stored calibration makes of its own stripes."""
+    made = points.fitted
+    facts = [
+        (
+            "Its points off their boards",
+            f"mean {significant(made.mean_mm)} mm (known to ± {significant(made.sigma_mean_mm)}), "
+            f"rms {significant(made.rms_mm)} mm, claimed {significant(made.claimed_rms_mm)}",
+        )
+    ]
+    if math.isfinite(points.left_out_rms_mm):
+        facts.append(
+            (
+                "The same, each board left out",
+                f"rms {significant(points.left_out_rms_mm)} mm, claimed "
+                f"{significant(points.left_out_claimed_mm)}",
+            )
+        )
+    return tuple(facts)
+
+
+def _points_section(fit: LaserFit) -> Section:
+    rows = []
+    for sheet in fit.sheets:
+        for board in sheet.points.boards:
+            made, alone = board.fitted, board.left_out
+            rows.append(
+                (
+                    f"{sheet.name}, {board.source}",
+                    f"{board.depth_mm:.1f}",
+                    str(made.n_points),
+                    with_sigma(made.mean_mm, made.sigma_mean_mm),
+                    f"{significant(made.rms_mm)} / {significant(made.claimed_rms_mm)}",
+                    "" if alone is None else with_sigma(alone.mean_mm, alone.sigma_mean_mm),
+                    ""
+                    if alone is None
+                    else f"{significant(alone.rms_mm)} / {significant(alone.claimed_rms_mm)}",
+                )
+            )
+    heads = (
+        "sheet, image",
+        "Z, mm",
+        "points",
+        "mean, mm",
+        "rms / claimed, mm",
+        "left out: mean, mm",
+        "left out: rms / claimed, mm",
+    )
+    words = Text(
+        "The stripes are measured with the calibration as it is stored, as any later stripe is, "
+        "and compared with the plane of the board on which they lay (positive: beyond it). Camera "
+        "and sheets that do not belong together would show here. 'Left out': the board's points "
+        "made with the sheet of all other boards. 'Claimed' is what the calibration's own uncertainty "
+        "allows for these distances."
+    )
+    table = Table(heads, tuple(rows), "Points against their boards", (1, 2, 3, 4, 5, 6))
+    return Section("Points made with this calibration", (words, table))
 
 
 def _term(i: int, j: int) -> str:

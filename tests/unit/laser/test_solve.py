@@ -96,6 +96,48 @@ def test_fit_and_joint_covariance_are_those_of_the_full_matrix() -> None:
     assert solution.common @ solution.common > 0.01 * expected, "boards and camera must have moved"
 
 
+def test_sheets_of_cameras_that_are_held_are_those_of_the_conditional_estimate() -> None:
+    """Weights by stripes and boards alone; e_s = D e_c + n with D = -G B, cov(s) = N + D C D'."""
+    rng = np.random.default_rng(3)
+    points = observations(rng)
+    pose = [correlated(rng, np.full(6, 0.01)) for _ in range(N_IMAGES)]
+    camera = correlated(rng, np.geomspace(0.001, 0.1, 9))
+    errors = CommonErrors(pose, camera)
+    held = solve_sheets(points, [FLAT], errors, [False], are_cameras_held=True)
+    free = solve_sheets(points, [FLAT], errors, [False])
+    assert isinstance(held, SheetSolution)
+    assert isinstance(free, SheetSolution)
+    np.testing.assert_array_equal(held.common[-9:], 0.0)
+
+    _, residual, by_sheet, by_point = points.residuals_px([FLAT])
+    by_camera = np.einsum("ni,nij->nj", by_point, points.by_camera)
+    by_pose = np.einsum("ni,nij->nj", by_point, points.by_pose)
+    known = np.diag(points.sigma_px**2)
+    for i in range(N_IMAGES):
+        own = points.image == i
+        known[np.ix_(own, own)] += by_pose[own] @ pose[i] @ by_pose[own].T
+    design = by_sheet[:, :3]
+    own_covariance = np.linalg.inv(design.T @ np.linalg.solve(known, design))
+    gain = own_covariance @ np.linalg.solve(known, design).T
+    follow = -gain @ by_camera
+    expected = FLAT.updated(np.append(-gain @ residual, np.zeros(5)))
+    sigma = np.sqrt(np.diag(own_covariance))
+    off = held.sheets[0].height_with_jacobian(points.points_mm)[0]
+    np.testing.assert_allclose(
+        off, expected.height_with_jacobian(points.points_mm)[0], atol=1e-4 * sigma.max()
+    )
+    moved = free.sheets[0].height_with_jacobian(points.points_mm)[0]
+    assert np.abs(moved - off).max() > 0.1 * sigma.max(), "the case must have something to find"
+    joint = np.block([[camera, camera @ follow.T], [follow @ camera, np.zeros((3, 3))]])
+    joint[9:, 9:] = own_covariance + follow @ camera @ follow.T
+    scale = np.sqrt(np.diag(joint))
+    np.testing.assert_allclose(
+        held.covariance[:12, :12] / np.outer(scale, scale),
+        joint / np.outer(scale, scale),
+        atol=1e-5,
+    )
+
+
 def test_square_root_of_a_covariance_without_full_rank() -> None:
     sigma = np.array([600.0, 0.0, 1e-5])
     covariance = np.outer(sigma, sigma)

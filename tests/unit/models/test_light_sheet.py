@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The light sheet: values by hand, derivatives by differences, steps to first order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,6 +67,54 @@ def test_height_derivatives_by_differences() -> None:
         # A tilt also turns the bow's own axes: of the order bow / scale, 0.02, times the height.
         tolerance = DIFFERENCE if k > 1 else 0.05
         np.testing.assert_allclose(by_parameters[:, k], (up - down) / (2 * STEP), atol=tolerance)
+
+
+def test_derivatives_along_a_fan_by_differences() -> None:
+    """The terms of u alone follow the rays; the second point lies beside the region."""
+    sheet = replace(bowed_sheet(), fan=np.array([0.2, 0.6]))
+    points = np.array([[5.0, 6.0, 140.0], [-22.0, 13.0, 128.0], [3.0, -2.0, 135.0]])
+    straight, _, _ = bowed_sheet().height_with_jacobian(points)
+    height, by_point, by_parameters = sheet.height_with_jacobian(points)
+    assert np.abs(height - straight).max() > 0.01, "the fan must matter"
+    for k in range(3):
+        d = STEP * np.eye(3)[k]
+        up, down = (sheet.height_with_jacobian(points + s * d)[0] for s in (1, -1))
+        np.testing.assert_allclose(by_point[:, k], (up - down) / (2 * STEP), atol=DIFFERENCE)
+    for k in range(3, 8):
+        d = STEP * np.eye(8)[k]
+        up, down = (sheet.updated(s * d).height_with_jacobian(points)[0] for s in (1, -1))
+        np.testing.assert_allclose(by_parameters[:, k], (up - down) / (2 * STEP), atol=DIFFERENCE)
+
+
+def test_a_cone_is_met_exactly_by_a_fan_and_not_by_powers() -> None:
+    """Rays from (0, 0, -3) in u, v, n, all 0.02 rad over the plane: h = tan(0.02) |p - source|.
+
+    The simulator's line lasers are such cones; here it is written down anew.
+    """
+    distance, slope, scale = 3.0, np.tan(0.02), 40.0
+    u, v = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-0.7, 0.7, 15)))
+    height = slope * scale * np.hypot(u, v + distance)
+    points = np.column_stack([scale * u, scale * v, height])
+    left = []
+    for spread in (0.0, 1.0 / distance):
+        fan = np.array([0.0, spread])
+        sheet = LightSheet(np.zeros(3), np.eye(3), scale, np.zeros(5), fan)
+        off, _, by_parameters = sheet.height_with_jacobian(points)
+        left.append(off - by_parameters @ np.linalg.lstsq(by_parameters, off, rcond=None)[0])
+    assert np.abs(left[1]).max() < 1e-9
+    assert np.abs(left[0]).max() > 1e-3
+
+
+def test_in_another_frame_the_surface_is_the_same() -> None:
+    sheet = replace(bowed_sheet(), fan=np.array([-0.1, 0.4]))
+    turn, shift = rotation_from_vector(np.array([0.1, -0.7, 0.3])), np.array([30.0, -5.0, 12.0])
+    points = np.array([[5.0, 6.0, 140.0], [-12.0, 3.0, 128.0]])
+    there = sheet.in_frame(turn, shift)
+    np.testing.assert_allclose(
+        there.height_with_jacobian(points @ turn.T + shift)[0],
+        sheet.height_with_jacobian(points)[0],
+        atol=1e-12,
+    )
 
 
 def test_plane_parameters_by_differences_without_bow() -> None:

@@ -29,6 +29,9 @@ from armscan.calibration.laser.solve import N_SHEET, LinearSolution, SheetSoluti
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.light_sheet import LightSheet
 
+FEWEST_OTHERS = 2
+"""Boards that must remain when one is left out: the stripe of one alone is a line."""
+
 
 def check_points(
     observations: SheetObservations,
@@ -65,9 +68,10 @@ def check_points(
     for k in range(len(solution.sheets)):
         of_sheet = observations.sheet == k
         boards = []
-        for board in np.unique(observations.board[of_sheet]):
+        numbers = np.unique(observations.board[of_sheet])
+        for board in numbers:
             rows = of_sheet & (observations.board == board)
-            others = left_out[int(board)]
+            others = left_out[int(board)] if len(numbers) > FEWEST_OTHERS else None
             first = int(observations.image[rows][0])
             boards.append(
                 BoardPointCheck(

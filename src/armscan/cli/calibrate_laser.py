@@ -16,7 +16,7 @@ from armscan.cli.image_arguments import (
     StripeMethodOption,
     Target,
 )
-from armscan.cli.output import AsJson, Cache, Force, progress_bar, show
+from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -91,6 +91,7 @@ def laser(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = "low",
     force: Force = False,
+    force_bad: ForceBad = False,
     cache: Cache = True,
     as_json: AsJson = False,
 ) -> None:
@@ -124,6 +125,7 @@ def laser(
         leave_out=tuple(leave_out or ()),
         is_overwriting=force,
         is_caching=cache,
+        is_forced=force_bad,
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:

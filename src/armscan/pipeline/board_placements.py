@@ -19,11 +19,12 @@ from armscan.calibration.laser.second_view import place_board, poses_chi2
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.frames import Board, Sensor
 from armscan.geometry.poses import Pose
+from armscan.pipeline.cached_detection import cached_target
 from armscan.pipeline.exposure_pairs import ExposurePair
 from armscan.records.exposure import Exposure
+from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.targets.circle_centres import correct_centres
 from armscan.vision.targets.definition import Target
-from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.options import TargetOptions
 from armscan.vision.targets.symmetry import numberings, renumbered
 from armscan.vision.targets.view import TargetView
@@ -62,9 +63,13 @@ def placement_of(pair: ExposurePair) -> str:
 
 
 def find_placements(
-    pairs: Sequence[ExposurePair], target: Target, cameras: HeadCameras, options: TargetOptions
+    pairs: Sequence[ExposurePair],
+    target: Target,
+    cameras: HeadCameras,
+    options: TargetOptions,
+    cache: DetectionCache | None = None,
 ) -> Iterator[Placement]:
-    """Look for the board in each placement, one after the other.
+    """Look for the board in each placement, one after the other; ``cache`` knows earlier finds.
 
     The images without laser are tried first.
     """
@@ -78,7 +83,7 @@ def find_placements(
             images.append(tried)
     for name, by_camera in groups.items():
         seen = {
-            camera: _see(camera, images, target, cameras, options)
+            camera: _see(camera, images, target, cameras, options, cache=cache)
             for camera, images in sorted(by_camera.items())
         }
         yield _placed(name, seen, target, cameras)
@@ -90,11 +95,13 @@ def _see(
     target: Target,
     cameras: HeadCameras,
     options: TargetOptions,
+    *,
+    cache: DetectionCache | None,
 ) -> SeenBoard | FitFailure:
     """The board in the first image that shows it, or why the first does not."""
     failures: list[FitFailure] = []
     for image in images:
-        view = detect_target(image, target, options)
+        view = cached_target(image, target, options, cache)
         found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
         if not isinstance(found, FitFailure):
             return found

@@ -23,6 +23,7 @@ from armscan.pipeline.board_placements import (
     find_placements,
     placement_of,
 )
+from armscan.pipeline.cached_detection import cached_profile
 from armscan.pipeline.exposure_pairs import (
     ExposurePair,
     check_sizes,
@@ -32,7 +33,7 @@ from armscan.pipeline.exposure_pairs import (
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.stripe_channel import choose_channel
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.extract import extract_stripes
+from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.options import LaserColour, StripeOptions
 from armscan.vision.targets.definition import Target
 from armscan.vision.targets.options import TargetOptions
@@ -123,20 +124,27 @@ def calibrate_sheets_from_pairs(
     camera: CameraCalibration | StereoCalibration,
     *,
     options: LaserOptions | None = None,
+    cache: DetectionCache | None = None,
     progress: Progress = silent,
 ) -> LaserFit | FitFailure:
-    """As `calibrate_sheets_from_exposures`, with each exposure's partner chosen already."""
+    """As `calibrate_sheets_from_exposures`, with each exposure's partner chosen already.
+
+    What ``cache`` knows of targets and stripes is not looked for again.
+    """
     options = options or LaserOptions()
     cameras = HeadCameras.of(camera)
     for pair in pairs:
         images = [image for image in pair if image is not None]
         check_sizes(images, cameras.model(pair[0].camera))
-    places = {p.name: p for p in _found_placements(pairs, target, cameras, options, progress)}
+    places = {
+        p.name: p for p in _found_placements(pairs, target, cameras, options, cache, progress)
+    }
     shown = [pair for pair in pairs if _seen(pair, places) is not None]
 
     def stripes_of(pair: ExposurePair, colour: LaserColour) -> BoardStripes | FitFailure:
         chosen = replace(options.stripes, laser_colour=colour)
-        return _board_stripes(pair, places[placement_of(pair)], target, cameras, chosen)
+        place = places[placement_of(pair)]
+        return _board_stripes(pair, place, target, cameras, chosen, cache)
 
     def tried(k: int, colour: LaserColour) -> BoardStripes | None:
         found = stripes_of(shown[k], colour)
@@ -179,11 +187,12 @@ def _found_placements(
     target: Target,
     cameras: HeadCameras,
     options: LaserOptions,
+    cache: DetectionCache | None,
     progress: Progress,
 ) -> Iterator[Placement]:
     """Look for the board in each placement, telling of each."""
     n_places = len({placement_of(pair) for pair in pairs})
-    found = find_placements(pairs, target, cameras, options.target)
+    found = find_placements(pairs, target, cameras, options.target, cache)
     for done, placement in enumerate(found):
         progress(ProgressEvent(BOARDS_STAGE, done + 1, n_places, placement.name))
         yield placement
@@ -201,6 +210,7 @@ def _board_stripes(
     target: Target,
     cameras: HeadCameras,
     options: StripeOptions,
+    cache: DetectionCache | None,
 ) -> BoardStripes | FitFailure:
     """Stripes of one exposure on its placement's board and around it."""
     exposure, background = pair
@@ -208,9 +218,8 @@ def _board_stripes(
     if isinstance(seen, FitFailure):
         return seen
     camera, view, pose = seen
-    profile = extract_stripes(
-        _around(view, exposure), options, None if background is None else _around(view, background)
-    )
+    dark = None if background is None else _around(view, background)
+    profile = cached_profile(_around(view, exposure), options, dark, cache)
     if not bool(profile.is_accepted.any()):
         return FitFailure("no stripe was found on or around the board", "check laser and exposure")
     edges = find_target_edges(view, target, pose.value, cameras.model(camera))

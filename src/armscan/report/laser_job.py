@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from armscan.calibration.laser.refusals import reasons_to_refuse
 from armscan.calibration.laser.result import (
     LaserFit,
     PointUse,
@@ -34,7 +35,7 @@ from armscan.report.laser_page import TITLE, laser_page, sheet_facts
 from armscan.report.numbers import sentence, without_source
 from armscan.report.outputs import calibration_outputs
 from armscan.report.page import Page, render_page
-from armscan.report.refusal import TriedImage, refuse, refused_page
+from armscan.report.refusal import TriedImage, refuse, refused_for, refused_page
 from armscan.report.summary import Summary, Table
 from armscan.storage.atomic import write_files
 from armscan.storage.calibration_files import (
@@ -92,6 +93,8 @@ class LaserRequest:
         Replace results that exist.
     is_caching
         Keep the points found beside the document, and take those kept there.
+    is_forced
+        Write sheets that make no sense, marked.
     command
         The command line, for the record.
     """
@@ -107,6 +110,7 @@ class LaserRequest:
     leave_out: tuple[str, ...] = ()
     is_overwriting: bool = False
     is_caching: bool = False
+    is_forced: bool = False
     command: tuple[str, ...] = ()
 
 
@@ -124,12 +128,16 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     camera = read_cameras(request.camera)
     images = _read_images(request, is_stereo=isinstance(camera, StereoCalibration))
     exposures = images.exposures
+    cache = DetectionCache.beside(request.output) if request.is_caching else None
     fit = calibrate_sheets_from_pairs(
-        images.pairs, target, camera, options=request.options, progress=progress
+        images.pairs, target, camera, options=request.options, cache=cache, progress=progress
     )
+    if cache is not None:
+        cache.trim()
     if isinstance(fit, FitFailure):
         refuse(files, _refused(request, images, camera.provenance, progress), fit)
     fit = replace(fit, skipped=(*images.left_out, *fit.skipped))
+    nonsense = reasons_to_refuse(fit)
     options = request.options
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
@@ -137,10 +145,13 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         options=(target, options.target, options.stripes, fit.options, request.image_options),
         parents=(camera.provenance,),
         warnings=(*images.warnings, *all_warnings(fit)),
+        forced=nonsense,
     )
     is_simulated = are_simulated(images.paths)
     by_source = {exposure.source: exposure for exposure in exposures}
     page = laser_page(fit, by_source, provenance, is_simulated=is_simulated)
+    if nonsense and not request.is_forced:
+        refuse(files, replace(page, forced=()), refused_for(nonsense))
     hashes = {
         exposure.source: item.sha256
         for exposure, item in zip(exposures, provenance.inputs[: len(exposures)], strict=True)
@@ -336,6 +347,8 @@ def laser_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool)
         "Images that gave nothing",
         (1,),
     )
+    if fit.channel_reason:
+        facts.insert(0, ("stripes in", sentence(fit.channel_reason)))
     names = ", ".join(fit.sheet_names)
     return Summary(
         title=f"Light sheets calibrated{' from simulated images' if is_simulated else ''}: {names}",
@@ -352,6 +365,8 @@ def laser_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool)
             "cameras": 1 if fit.second is None else 2,
             "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
             "noise_factor": fit.noise_factor,
+            "laser_colour": fit.laser_colour,
+            "channel_reason": fit.channel_reason,
             "skipped": [{"source": item.source, "reason": item.reason} for item in fit.skipped],
         },
     )

@@ -83,6 +83,12 @@ def laser_page(
     )
 
 
+def named_and_found(fit: LaserFit) -> str:
+    """How the stripes were given to sheets, and in which channel they were found."""
+    text = f"Named: {fit.naming}."
+    return f"{text} Stripes in {fit.channel_reason}." if fit.channel_reason else text
+
+
 def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
     """Labels and values of one sheet."""
     calibration = fit.calibration
@@ -225,7 +231,7 @@ def _sheets_section(fit: LaserFit) -> Section:
     blocks: list[Facts | Text | Gallery] = []
     for sheet in fit.sheets:
         blocks.append(Facts(sheet_facts(sheet), f"Sheet {sheet.name}"))
-    blocks += [Text(f"Named: {fit.naming}."), Gallery((figures.scene(fit),), 560)]
+    blocks += [Text(named_and_found(fit)), Gallery((figures.scene(fit),), 560)]
     return Section("The sheets", tuple(blocks))
 
 

@@ -15,8 +15,10 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 
 _OUTLIER_SIGMAS = 6.0
 _TUKEY = 4.7
-_ROUNDS = 12
-_POINTS_PER_TERM = 2.0
+_HOMOGRAPHIES, _ROUNDS = 3, 6
+_TRUSTED = 0.1
+"""Least weight with which a point helps to fix the homography."""
+_POINTS_PER_TERM = 3.0
 """Fewest points per term of the polynomial; fewer let it follow a single corner."""
 
 
@@ -43,25 +45,34 @@ def off_lattice(
     scatter_px
         Robust standard deviation, per axis, of the rest; infinite if there is no homography.
     """
-    homography, _ = cv2.findHomography(board, points_px, 0)
-    if homography is None:
-        return np.ones(len(board), dtype=np.bool_), float("inf")
-    image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(homography).T
-    mapped: FloatArray = image[:, :2] / image[:, 2:]
-    residual: FloatArray = points_px - mapped
-    field = _terms(mapped)
     weights = np.ones(len(board))
-    scatter = np.full(len(board), np.inf)
-    size = np.hypot(*residual.T)
-    for _ in range(_ROUNDS):
-        root = np.sqrt(weights)[:, None]
-        smooth = np.linalg.lstsq(field * root, residual * root, rcond=None)[0]
-        size = np.hypot(*(residual - field @ smooth).T)
-        # The median length of a two-dimensional normal is 1.18 sigma.
-        scatter = np.maximum(np.median(size) / 1.1774, least_sigma_px)
-        weights = np.clip(1.0 - (size / (_TUKEY * 1.5 * scatter)) ** 2, 1e-6, None) ** 2
+    size = scatter = np.full(len(board), np.inf)
+    for _ in range(_HOMOGRAPHIES):
+        trusted = weights > _TRUSTED
+        if trusted.sum() < 4:
+            break
+        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
+        if homography is None:
+            break
+        image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(homography).T
+        mapped: FloatArray = image[:, :2] / image[:, 2:]
+        field = _terms(mapped)
+        for _ in range(_ROUNDS):
+            size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)
+            # The median length of a two-dimensional normal is 1.18 sigma.
+            scatter = np.maximum(np.median(size) / 1.1774, least_sigma_px)
+            weights = np.clip(1.0 - (size / (_TUKEY * 1.5 * scatter)) ** 2, 1e-3, None) ** 2
     is_off = size > np.maximum(_OUTLIER_SIGMAS * scatter, tolerance_px)
     return is_off, float(np.median(size) / 1.1774)
+
+
+def _without_itself(field: FloatArray, residual: FloatArray, weights: FloatArray) -> FloatArray:
+    """Distance (N, 2) of each point from the smooth field through the others."""
+    root = np.sqrt(weights)[:, None]
+    q, _ = np.linalg.qr(field * root)
+    smooth = q @ (q.T @ (residual * root)) / root
+    leverage = np.einsum("np,np->n", q, q)
+    return np.asarray((residual - smooth) / np.maximum(1.0 - leverage, 0.05)[:, None])
 
 
 def _terms(image: FloatArray) -> FloatArray:

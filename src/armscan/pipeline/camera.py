@@ -15,6 +15,7 @@ from armscan.calibration.camera.options import MIN_VIEWS, CameraOptions
 from armscan.calibration.camera.result import CameraFit
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.target_count import wrong_count
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.circle_centres import correct_centres
 from armscan.vision.targets.definition import Target
@@ -87,12 +88,17 @@ def calibrate_camera_from_exposures(
     total = len(exposures) if isinstance(exposures, Sized) else 0
     views: list[TargetView] = []
     not_found: list[tuple[str, str]] = []
+    answers: list[TargetView | FitFailure] = []
     for done, (source, found) in enumerate(detect_in_order(exposures, target, target_options), 1):
         if isinstance(found, FitFailure):
             not_found.append((source, found.reason))
         else:
             views.append(found)
         progress(ProgressEvent("find target", done, max(total, done), source))
+        answers.append(found)
+        wrong = wrong_count(answers, target)
+        if wrong is not None:
+            return wrong
     missing = _too_few(views, not_found)
     if missing is not None:
         return missing

@@ -22,6 +22,7 @@ from armscan.models.stereo import StereoCalibration, StereoDiagnostics
 from armscan.pipeline.camera import CENTRE_ROUNDS, CENTRES_STABLE, detect_in_order
 from armscan.pipeline.instants import group_instants
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.target_count import wrong_count
 from armscan.records.exposure import Exposure
 from armscan.records.session import ExposureRow
 from armscan.vision.targets.circle_centres import correct_centres
@@ -148,12 +149,17 @@ def calibrate_stereo_from_exposures(
     every = [exposure for pair in exposures for exposure in pair if exposure is not None]
     views: dict[str, TargetView] = {}
     not_found: list[tuple[str, str]] = []
+    answers: list[TargetView | FitFailure] = []
     for done, (source, found) in enumerate(detect_in_order(every, target, target_options), 1):
         if isinstance(found, FitFailure):
             not_found.append((source, found.reason))
         else:
             views[source] = found
         progress(ProgressEvent("find target", done, len(every), source))
+        answers.append(found)
+        wrong = wrong_count(answers, target)
+        if wrong is not None:
+            return wrong
     pairs = _found_pairs(exposures, views)
     missing = _too_few(exposures, pairs, not_found)
     if missing is not None:

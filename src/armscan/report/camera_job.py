@@ -26,7 +26,8 @@ from armscan.storage.images import check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.provenance import new_provenance
 from armscan.storage.simulated import are_simulated
-from armscan.vision.targets.specification import parse_target
+from armscan.vision.targets.definition import Target
+from armscan.vision.targets.specification import describe_target, format_target, parse_target
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,15 +104,21 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
         is_overwriting=request.is_overwriting,
     )
     return camera_summary(
-        run, (files.document, files.observations, files.page), is_simulated=page.is_simulated
+        run,
+        target,
+        (files.document, files.observations, files.page),
+        is_simulated=page.is_simulated,
     )
 
 
-def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: bool) -> Summary:
+def camera_summary(
+    run: CameraRun, target: Target, written: Sequence[Path], *, is_simulated: bool
+) -> Summary:
     """What a person, and a program, wants to know of a calibration."""
     fit = run.fit
     held_out = fit.cross_validation
     facts = [
+        ("target", describe_target(target)),
         ("images", f"{fit.n_views} used of {len(fit.views) + len(run.not_found)}"),
         ("points", str(fit.n_points)),
         ("rms", f"{significant(fit.rms_px)} px (length of the residual, x and y together)"),
@@ -141,17 +148,19 @@ def camera_summary(run: CameraRun, written: Sequence[Path], *, is_simulated: boo
         warnings=tuple(sentence(warning) for warning in fit.warnings),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
-        data=_data(run, is_simulated),
+        data=_data(run, target, is_simulated),
     )
 
 
-def _data(run: CameraRun, is_simulated: bool) -> dict[str, object]:
+def _data(run: CameraRun, target: Target, is_simulated: bool) -> dict[str, object]:
     fit = run.fit
     names = [name for name, _, _ in parameter_rows(fit)]
     held_out = fit.cross_validation
     return {
         "kind": "camera calibration",
         "simulated": is_simulated,
+        "target": format_target(target),
+        "target_description": describe_target(target),
         "width_px": fit.camera.width_px,
         "height_px": fit.camera.height_px,
         "parameters": dict(zip(names, fit.camera.parameters.tolist(), strict=True)),

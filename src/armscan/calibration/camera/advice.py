@@ -6,11 +6,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from armscan.calibration.camera.result import CameraFit
 
 FEW_VIEWS = 8
 SMALL_TILT_DEG = 15.0
 THIN_COVERAGE = 0.6
+USUAL_ASPECT_ERROR = 0.01
+"""Sensors' pixels are square; lenses change the ratio by some parts per thousand at most."""
+ASPECT_SIGMAS = 5.0
+_NAMED = 3
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""
@@ -35,6 +41,7 @@ def advise(
         *_about_views(fit, repeats),
         *_about_coverage(fit),
         *_about_model(fit),
+        *_about_aspect(fit),
         *_about_warp(fit),
     ]
     return replace(fit, warnings=tuple(warnings))
@@ -62,7 +69,13 @@ def _about_views(fit: CameraFit, repeats: Sequence[tuple[str, str]]) -> list[str
         if view.note and view.source not in requested
     ]
     warnings += [f"{view.source} cannot be used: {view.reason}" for view in fit.refused_views]
-    warnings += [f"{later} repeats {earlier} and adds little" for later, earlier in repeats]
+    if repeats:
+        shown = [f"{later} that of {earlier}" for later, earlier in repeats[:_NAMED]]
+        more = f" and {len(repeats) - _NAMED} more" if len(repeats) > _NAMED else ""
+        warnings.append(
+            f"{len(repeats)} views repeat the place of another and add little: "
+            f"{', '.join(shown)}{more}"
+        )
     n_outliers = sum(int(view.is_outlier.sum()) for view in fit.used_views)
     if n_outliers:
         warnings.append(f"{n_outliers} points lie too far out and were not used")
@@ -100,6 +113,17 @@ def _about_model(fit: CameraFit) -> list[str]:
             f"used ({validation.rms_in_sample_px:.3f} px): add views"
         )
     return warnings
+
+
+def _about_aspect(fit: CameraFit) -> list[str]:
+    ratio = fit.camera.fx_px / fit.camera.fy_px
+    sigma = ratio * float(np.hypot(*(fit.sigma[:2] / fit.camera.parameters[:2])))
+    if abs(ratio - 1.0) <= max(USUAL_ASPECT_ERROR, ASPECT_SIGMAS * sigma):
+        return []
+    return [
+        f"fx / fy is {ratio:.3f}, nearly every camera's is 1: were the images stretched or resized "
+        "in one direction, or is the target's spacing along x not the same as along y?"
+    ]
 
 
 def _about_warp(fit: CameraFit) -> list[str]:

@@ -79,5 +79,5 @@ def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | N
 
 def _rightness(numbered: NumberedCorners) -> float:
     design = np.column_stack([numbered.cells, np.ones(len(numbered.cells))])
-    affine: FloatArray = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
+    affine = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
     return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))

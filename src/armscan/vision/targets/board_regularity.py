@@ -55,7 +55,7 @@ def off_lattice(
         if homography is None:
             break
         image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(homography).T
-        mapped: FloatArray = image[:, :2] / image[:, 2:]
+        mapped = np.asarray(image[:, :2] / image[:, 2:], dtype=np.float64)
         field = _terms(mapped)
         for _ in range(_ROUNDS):
             size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)

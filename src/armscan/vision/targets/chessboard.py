@@ -22,7 +22,7 @@ from armscan.vision.targets.chessboard_extent import SMALLEST, Extent, extents
 from armscan.vision.targets.crossing_lattice import find_lattices, predict_cells
 from armscan.vision.targets.crossings import find_crossings
 from armscan.vision.targets.definition import Chessboard
-from armscan.vision.targets.grey import RawGrey, grey_channels, sample
+from armscan.vision.targets.grey import Grey32, RawGrey, grey_channels, sample
 from armscan.vision.targets.options import TargetOptions
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.view import OtherCountSeen, TargetView
@@ -103,7 +103,7 @@ def _numbered(
                 yield NumberedCorners(choices[0].cells, points, choices[0].quarter_turns)
 
 
-def _search_image(grey: RawGrey, size_px: int) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], float]:
+def _search_image(grey: RawGrey, size_px: int) -> tuple[Grey32, float]:
     """The image, reduced to at most ``size_px``, and the factor back to full size."""
     image = np.ascontiguousarray(grey, dtype=np.float32)
     factor = max(image.shape) / size_px
@@ -114,13 +114,13 @@ def _search_image(grey: RawGrey, size_px: int) -> tuple[np.ndarray[tuple[int, ..
     return np.asarray(small, dtype=np.float32), image.shape[1] / size[0]
 
 
-def _dark_first(grey: RawGrey, choices: Sequence[NumberedCorners]) -> list[NumberedCorners]:
+def _dark_first(grey: Grey32, choices: Sequence[NumberedCorners]) -> list[NumberedCorners]:
     """Those numberings whose origin has a dark outer square; all if none has."""
     dark = [numbered for numbered in choices if _darkness(grey, numbered) > 0.0]
     return dark if dark else list(choices)
 
 
-def _darkness(grey: RawGrey, numbered: NumberedCorners) -> float:
+def _darkness(grey: Grey32, numbered: NumberedCorners) -> float:
     """Contrast of the squares in levels, positive if the one before the origin is dark."""
     ahead = predict_cells(numbered.cells, numbered.points_px, numbered.cells + np.array([1, 0]))
     below = predict_cells(numbered.cells, numbered.points_px, numbered.cells + np.array([0, 1]))

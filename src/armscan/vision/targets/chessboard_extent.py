@@ -18,7 +18,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.vision.targets.crossing_lattice import Lattice, cell_arrays, predict_cells
 from armscan.vision.targets.crossings import Crossings
-from armscan.vision.targets.grey import RawGrey, sample
+from armscan.vision.targets.grey import Grey32, sample
 
 Side = Literal["ends", "continues", "unknown"]
 
@@ -26,6 +26,8 @@ SMALLEST = 3
 """Fewest columns and rows of corners that are taken for a chessboard."""
 _MIN_FILLED = 0.6
 """Least fraction of its cells that an outermost row needs in order not to be tried without."""
+_WHOLE = 0.95
+"""Least filled fraction of a rectangle that may be a whole board."""
 _PROBES = (0.2, 0.3, 0.4)
 _ALTERNATES = 0.5
 """Least difference between squares, of the difference beside them, that is one."""
@@ -59,8 +61,9 @@ class Extent:
 
     @property
     def is_whole(self) -> bool:
-        """Tell whether the board is seen to end on all sides, so that its count is certain."""
-        return all(side == "ends" for side in self.sides)
+        """Tell whether the corners fill their rectangle and the board does not go on."""
+        is_filled = len(self.cells) >= _WHOLE * self.size[0] * self.size[1]
+        return is_filled and "continues" not in self.sides
 
     @property
     def counts(self) -> tuple[int, int]:
@@ -69,13 +72,17 @@ class Extent:
         return self.size[0] + more[0] + more[1], self.size[1] + more[2] + more[3]
 
 
-def extents(grey: RawGrey, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
+def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
     """Yield the rectangle of a lattice, then those without its sparse outermost rows.
 
     Parameters
     ----------
     grey
         (H, W) levels of the image in which the crossings were found.
+    crossings
+        All of the image.
+    lattice
+        Those that make a lattice.
     """
     cells, index = cell_arrays(lattice)
     while len(cells) and (np.ptp(cells, axis=0) + 1).min() >= SMALLEST:
@@ -104,7 +111,7 @@ def _without_sparsest(cells: IntArray, size: IntArray) -> IntArray | None:
 
 
 def _sides(
-    grey: RawGrey, cells: IntArray, points: FloatArray, size: IntArray
+    grey: Grey32, cells: IntArray, points: FloatArray, size: IntArray
 ) -> tuple[Side, Side, Side, Side]:
     grid = _with_one_row_around(cells, points, size)
     before_b, after_b = _last_side(grey, grid[::-1]), _last_side(grey, grid)
@@ -121,7 +128,7 @@ def _with_one_row_around(cells: IntArray, points: FloatArray, size: IntArray) ->
     return grid
 
 
-def _last_side(grey: RawGrey, grid: FloatArray) -> Side:
+def _last_side(grey: Grey32, grid: FloatArray) -> Side:
     """What lies beyond the last row; ``grid``'s outermost rows are predictions."""
     border, last, before = grid[-1, 1:-1], grid[-2, 1:-1], grid[-3, 1:-1]
     sign = (-1.0) ** np.arange(len(last))
@@ -147,7 +154,7 @@ def _last_side(grey: RawGrey, grid: FloatArray) -> Side:
 
 
 def _difference(
-    grey: RawGrey, corners_px: FloatArray, along_px: FloatArray, across_px: FloatArray
+    grey: Grey32, corners_px: FloatArray, along_px: FloatArray, across_px: FloatArray
 ) -> FloatArray:
     """Level (N,) ahead of each corner less that behind it, on one side; NaN out of view."""
     total = np.zeros(len(corners_px))

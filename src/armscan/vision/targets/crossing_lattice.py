@@ -83,9 +83,7 @@ def predict_cells(cells: IntArray, points_px: FloatArray, wanted: IntArray) -> F
     -------
     (M, 2) image points; NaN where the cells around do not fix a homography.
     """
-    tree = cKDTree(cells)
-    _, near = tree.query(wanted, min(_NEAR_CELLS, len(cells)))
-    near = np.asarray(near).reshape(len(wanted), -1)
+    _, near = _nearest(cells, wanted, min(_NEAR_CELLS, len(cells)))
     return _mapped_by_homography(
         (cells[near] - wanted[:, None, :]).astype(np.float64), points_px[near]
     )
@@ -119,7 +117,7 @@ def _links(crossings: Crossings) -> IntArray:
     """Neighbour (N, 4) along the rising edge, the falling edge, and against them; -1 for none."""
     points = crossings.points_px
     count = len(points)
-    distance, near = cKDTree(points).query(points, min(_NEIGHBOURS + 1, count))
+    distance, near = _nearest(points, points, min(_NEIGHBOURS + 1, count))
     near, distance = near[:, 1:], distance[:, 1:]
     way = np.arctan2(*np.moveaxis(points[near] - points[:, None, :], -1, 0)[::-1])
     rising, falling = crossings.rising_rad, crossings.falling_rad
@@ -136,6 +134,14 @@ def _links(crossings: Crossings) -> IntArray:
         has = fits.any(axis=1)
         links[has, k] = near[has, first[has]]
     return _mutual(links)
+
+
+def _nearest(
+    known: FloatArray | IntArray, places: FloatArray | IntArray, count: int
+) -> tuple[FloatArray, IntArray]:
+    """Distance and index (M, count) of the known points nearest to each place."""
+    distance, index = cKDTree(known).query(places, np.arange(1, count + 1))
+    return np.asarray(distance, dtype=np.float64), np.asarray(index, dtype=np.int64)
 
 
 def _mutual(links: IntArray) -> IntArray:
@@ -196,9 +202,7 @@ def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
     if len(cells) < _NEAR_CELLS:
         return lattice
     points = crossings.points_px[index]
-    tree = cKDTree(cells)
-    _, near = tree.query(cells, _NEAR_CELLS)
-    others = np.asarray(near)[:, 1:]
+    others = _nearest(cells, cells, _NEAR_CELLS)[1][:, 1:]
     predicted = _mapped_by_homography(
         (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
     )
@@ -220,7 +224,6 @@ def _step_px(points: FloatArray, others: IntArray) -> FloatArray:
 def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
     """The lattice with crossings that lie, with the right sectors, where its cells continue."""
     lattice = dict(lattice)
-    tree = cKDTree(crossings.points_px)
     for _ in range(_MAX_ROUNDS):
         cells, index = cell_arrays(lattice)
         if len(cells) < _MIN_CELLS:
@@ -232,7 +235,8 @@ def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
         below = predict_cells(cells, points, wanted + np.array([0, 1]))
         step = np.minimum(np.hypot(*(beside - places).T), np.hypot(*(below - places).T))
         known = np.isfinite(places).all(axis=1) & np.isfinite(step)
-        distance, found = tree.query(np.where(known[:, None], places, 0.0))
+        nearest, beside_it = _nearest(crossings.points_px, np.where(known[:, None], places, 0.0), 1)
+        distance, found = nearest[:, 0], beside_it[:, 0]
         fits = known & (distance < _POSITION_TOLERANCE * step)
         fits &= ~np.isin(found, index)
         fits &= _is_alike(crossings, lattice, wanted, found)
@@ -259,7 +263,8 @@ def _free_cells(cells: IntArray) -> IntArray:
             at = cells - low + np.array([a, b])
             inside = ((at >= 0) & (at < size)).all(axis=1)
             near[tuple(at[inside].T)] = True
-    return np.argwhere(near & ~taken) + low
+    free: IntArray = np.argwhere(near & ~taken).astype(np.int64) + low
+    return free
 
 
 def _is_alike(
@@ -267,9 +272,9 @@ def _is_alike(
 ) -> BoolArray:
     """Tell whether crossings (M,) have the edges and sectors that a lattice has in cells (M, 2)."""
     cells, index = cell_arrays(lattice)
-    tree = cKDTree(cells)
-    beside = index[np.asarray(tree.query(wanted)[1])]
-    parity = (wanted.sum(axis=1) - cells[np.asarray(tree.query(wanted)[1])].sum(axis=1)) % 2
+    near = _nearest(cells, wanted, 1)[1][:, 0]
+    beside = index[near]
+    parity = (wanted.sum(axis=1) - cells[near].sum(axis=1)) % 2
     rising, falling = crossings.rising_rad, crossings.falling_rad
     like_rising = np.where(parity == 0, rising[beside], falling[beside])
     like_falling = np.where(parity == 0, falling[beside], rising[beside])

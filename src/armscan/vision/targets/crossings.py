@@ -12,12 +12,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-
-Grey = NDArray[np.float32]
+from armscan.vision.targets.grey import Grey32
 
 _BLUR_PX = 1.2
 _RING_PX = 4.0
@@ -57,7 +55,7 @@ class Crossings:
         return len(self.points_px)
 
 
-def find_crossings(grey: Grey, min_contrast: float) -> Crossings:
+def find_crossings(grey: Grey32, min_contrast: float) -> Crossings:
     """Find all crossings with at least ``min_contrast`` levels between light and dark."""
     found = []
     for level in _LEVELS:
@@ -73,7 +71,7 @@ def find_crossings(grey: Grey, min_contrast: float) -> Crossings:
     return Crossings(table[:, :2].copy(), table[:, 2], table[:, 3], table[:, 4])
 
 
-def _crossings_in(grey: Grey, min_contrast: float) -> FloatArray:
+def _crossings_in(grey: Grey32, min_contrast: float) -> FloatArray:
     """Rows u, v, rising, falling, contrast of the crossings at one scale, strongest first."""
     blurred = np.asarray(cv2.GaussianBlur(grey, (0, 0), _BLUR_PX), dtype=np.float32)
     points = _saddles(blurred, min_contrast)
@@ -96,7 +94,7 @@ def _crossings_in(grey: Grey, min_contrast: float) -> FloatArray:
     return np.column_stack([points[is_crossing], rising, falling, 2.0 * amplitude])
 
 
-def _saddles(blurred: Grey, min_contrast: float) -> FloatArray:
+def _saddles(blurred: Grey32, min_contrast: float) -> FloatArray:
     """Saddle points (N, 2) of the blurred image, the strongest first."""
     uu = cv2.filter2D(blurred, cv2.CV_32F, np.array([[1.0, -2.0, 1.0]]))
     vv = cv2.filter2D(blurred, cv2.CV_32F, np.array([[1.0], [-2.0], [1.0]]))
@@ -122,7 +120,7 @@ def _saddles(blurred: Grey, min_contrast: float) -> FloatArray:
     return np.column_stack([u + du, v + dv])[is_near].astype(np.float64)
 
 
-def _ring_levels(blurred: Grey, points: FloatArray) -> FloatArray:
+def _ring_levels(blurred: Grey32, points: FloatArray) -> FloatArray:
     """Levels (N, steps) on a ring around each point."""
     angle = 2.0 * np.pi * np.arange(_N_RING) / _N_RING
     at_u = (points[:, :1] + _RING_PX * np.cos(angle)).astype(np.float32)
@@ -147,9 +145,7 @@ def _first_of_each(table: FloatArray) -> BoolArray:
     kept = np.ones(len(table), dtype=np.bool_)
     if not len(table):
         return kept
-    pairs = cKDTree(table[:, :2]).query_pairs(
-        _SAME_PLACE_PX * max(_LEVELS), output_type="ndarray"
-    )
+    pairs = cKDTree(table[:, :2]).query_pairs(_SAME_PLACE_PX * max(_LEVELS), output_type="ndarray")
     apart = np.hypot(*(table[pairs[:, 0], :2] - table[pairs[:, 1], :2]).T)
     pairs = pairs[apart < _SAME_PLACE_PX * table[pairs[:, 1], 5]]
     for fine, coarse in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].tolist():

@@ -16,6 +16,7 @@ _WEIGHTS = (0.299, 0.587, 0.114)
 _SAMPLES_PER_CUBE = 65_536
 
 Grey8 = NDArray[np.uint8]
+Grey32 = NDArray[np.float32]
 RawGrey = ImageArray | FloatArray
 
 
@@ -70,7 +71,7 @@ def reduced(grey8: Grey8, size_px: int) -> tuple[Grey8, float]:
     return np.asarray(small, dtype=np.uint8), grey8.shape[1] / size[0]
 
 
-def sample(grey: RawGrey, points_px: FloatArray) -> FloatArray:
+def sample(grey: RawGrey | Grey32, points_px: FloatArray) -> FloatArray:
     """Return the levels (N,) at the pixels nearest to (N, 2) points; NaN outside the image."""
     u = np.rint(points_px[:, 0])
     v = np.rint(points_px[:, 1])

@@ -91,7 +91,11 @@ class TargetView:
 
 @dataclass(frozen=True, slots=True)
 class OtherCountSeen(FitFailure):
-    """No such target is in view, but a whole one of another count: ``columns`` x ``rows``."""
+    """No such target is in view, but a full lattice of another count: ``columns`` x ``rows``.
+
+    It may be part of the target, the rest being hidden; where several images show the same one, the
+    count that was asked for is wrong.
+    """
 
     columns: int = 0
     rows: int = 0

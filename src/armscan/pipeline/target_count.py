@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from armscan.geometry.estimate import FitFailure
 from armscan.vision.targets.definition import Charuco, Target
 from armscan.vision.targets.specification import format_target
@@ -13,7 +15,7 @@ from armscan.vision.targets.view import OtherCountSeen, TargetView
 
 ENOUGH_IMAGES = 4
 """Images that show one and the same other count, and never the target, prove the count wrong."""
-_AGREEING = 0.75
+_AGREEING = 0.5
 
 
 def wrong_count(found: Sequence[TargetView | FitFailure], target: Target) -> FitFailure | None:
@@ -28,10 +30,10 @@ def wrong_count(found: Sequence[TargetView | FitFailure], target: Target) -> Fit
 
     Returns
     -------
-    The count that was seen instead and how to write it; None as long as the target was found
-    once, or the images do not agree.
+    The count that was seen instead and how to write it; None as long as the whole target was
+    found once, or the images do not agree.
     """
-    if isinstance(target, Charuco) or any(isinstance(view, TargetView) for view in found):
+    if isinstance(target, Charuco) or any(_is_whole(item, target) for item in found):
         return None
     counts = [(item.columns, item.rows) for item in found if isinstance(item, OtherCountSeen)]
     if len(counts) < ENOUGH_IMAGES:
@@ -50,3 +52,11 @@ def wrong_count(found: Sequence[TargetView | FitFailure], target: Target) -> Fit
         f"none one of {target.columns} x {target.rows}{why}",
         f"count again: {right} fits what was seen; or show the whole board",
     )
+
+
+def _is_whole(item: TargetView | FitFailure, target: Target) -> bool:
+    """Tell whether all border lines of the target were seen: a part fits a larger count, too."""
+    if isinstance(item, FitFailure):
+        return False
+    seen, every = item.points_board_mm, target.points_board_mm
+    return bool(np.array_equal(np.ptp(seen, axis=0), np.ptp(every, axis=0)))

@@ -37,8 +37,8 @@ class NumberedCorners:
 def numberings(extent: Extent, columns: int, rows: int) -> list[NumberedCorners]:
     """All ways to number the corners of an extent, the one whose x points most to the right first.
 
-    A count that is smaller than the board's needs one side on which the board is seen to end:
-    the missing rows lie on the other side. None is returned where both or neither end is seen.
+    A count that is smaller than the board's needs one side on which the board is seen to end and
+    another on which nothing looks like an end: there the missing rows lie.
     """
     found = []
     size = np.array(extent.size)
@@ -70,9 +70,9 @@ def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | N
         return None
     if count == wanted:
         return 0
-    if before == "ends" and after != "ends":
+    if before == "ends" and after == "unknown":
         return 0
-    if after == "ends" and before != "ends":
+    if after == "ends" and before == "unknown":
         return wanted - count
     return None
 

@@ -35,8 +35,10 @@ MAX_SCATTER = 0.03
 """Largest scatter about a smooth lattice, as a fraction of a step: more is no flat board."""
 PRINT_ERROR = 0.02
 """Error of a corner on the board itself that is no fault of the image, as a fraction of a step."""
-_FEW_BAD = 0.95
-"""With more of its corners measured, a channel is not compared with the others."""
+_MANY_BAD, _FEW_BAD = 0.5, 0.95
+"""With fewer of its corners measured this is no board, with more no other channel is needed."""
+_MAX_TRIED = 2
+"""Rectangles of one lattice that are measured."""
 _PROBE = 0.3
 
 
@@ -93,12 +95,16 @@ def _numbered(
     crossings = find_crossings(small, min_contrast)
     fewest = MIN_SEEN_FRACTION * target.columns * target.rows
     for lattice in find_lattices(crossings):
+        n_tried = 0
         for extent in extents(small, crossings, lattice):
+            if n_tried == _MAX_TRIED:
+                break
             choices = _dark_first(small, numberings(extent, target.columns, target.rows))
             is_known = is_sure(choices, is_square=target.columns == target.rows)
             if not is_known:
                 seen.append(extent)
             elif len(extent.cells) >= fewest:
+                n_tried += 1
                 points = (choices[0].points_px + 0.5) * factor - 0.5
                 yield NumberedCorners(choices[0].cells, points, choices[0].quarter_turns)
 
@@ -143,7 +149,7 @@ def _best_measured(
     """
     best = _measured(grey, target, numbered)
     for other in others:
-        if best.is_good.mean() > _FEW_BAD:
+        if not _MANY_BAD < best.is_good.mean() <= _FEW_BAD:
             break
         corners = _measured(other, target, numbered)
         if corners.is_good.sum() > best.is_good.sum():

@@ -20,21 +20,27 @@ from armscan.vision.targets.crossing_lattice import Lattice, cell_arrays, predic
 from armscan.vision.targets.crossings import Crossings
 from armscan.vision.targets.grey import Grey32, sample
 
-Side = Literal["ends", "continues", "unknown"]
+Side = Literal["ends", "may end", "continues", "unknown"]
+"""What is seen beyond the outermost corners; "may end" where too few of them tell."""
 
 SMALLEST = 3
 """Fewest columns and rows of corners that are taken for a chessboard."""
 _MIN_FILLED = 0.6
 """Least fraction of its cells that an outermost row needs in order not to be tried without."""
+_ALONG = (0.2, 0.35)
 _WHOLE = 0.95
 """Least filled fraction of a rectangle that may be a whole board."""
-_PROBES = (0.2, 0.3, 0.4)
+_PROBES = (0.12, 0.2, 0.28)
+"""Steps from the corners along both lines: near, so that what covers a board has to end within
+this much of one of its lines in order to be taken for its end."""
 _ALTERNATES = 0.5
 """Least difference between squares, of the difference beside them, that is one."""
 _ONE_TONE = 0.35
 """Largest difference beyond the border squares that is none."""
 _AGREEING = 0.7
 _KNOWN = 0.6
+_SUSPECT = 0.4
+"""Fraction of the corners in view that must look like an end to make one possible."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,14 +149,16 @@ def _last_side(grey: Grey32, grid: FloatArray) -> Side:
     squares = -sign * _difference(grey, border, along, last - border) / contrast
     beyond = sign * _difference(grey, border, along, border - last) / contrast
     known = np.isfinite(squares) & np.isfinite(beyond)
-    if known.sum() < max(SMALLEST - 1, _KNOWN * len(known)):
+    if not known.any():
         return "unknown"
     alternates = squares[known] > _ALTERNATES
-    if np.mean(alternates & (np.abs(beyond[known]) < _ONE_TONE)) >= _AGREEING:
-        return "ends"
-    if np.mean(alternates & (beyond[known] > _ALTERNATES)) >= _AGREEING:
-        return "continues"
-    return "unknown"
+    is_end = alternates & (np.abs(beyond[known]) < _ONE_TONE)
+    if known.sum() >= max(SMALLEST - 1, _KNOWN * len(known)):
+        if np.mean(is_end) >= _AGREEING:
+            return "ends"
+        if np.mean(alternates & (beyond[known] > _ALTERNATES)) >= _AGREEING:
+            return "continues"
+    return "may end" if np.mean(is_end) >= _SUSPECT else "unknown"
 
 
 def _difference(
@@ -158,8 +166,8 @@ def _difference(
 ) -> FloatArray:
     """Level (N,) ahead of each corner less that behind it, on one side; NaN out of view."""
     total = np.zeros(len(corners_px))
-    for p in _PROBES:
+    for p in _ALONG:
         for q in _PROBES:
             ahead = sample(grey, corners_px + p * along_px + q * across_px)
             total += ahead - sample(grey, corners_px - p * along_px + q * across_px)
-    return total / len(_PROBES) ** 2
+    return total / (len(_ALONG) * len(_PROBES))

@@ -33,7 +33,8 @@ _MIN_SIGNIFICANCE = 5.0
 _MIN_CONTRAST_RATIO = 0.1
 """Least contrast, of that of the board's median corner: less is no print, but what hides it."""
 _MAX_TURN_RAD = 0.2
-"""Between an edge and the way to the next corner: more is the edge of something else."""
+"""Between an edge and the way to the next corner: more is the edge of something else, unless all
+corners show it (motion during the exposure rounds them)."""
 _LEAST_RESIDUAL = 0.3
 _AT_REST_PX = 1e-4
 """A fiftieth of the smallest standard deviation of a corner."""
@@ -83,7 +84,7 @@ def fit_saddles(
     is_good = (moved < 0.6 * radius) & (spread < 0.25 * radius) & np.isfinite(spread)
     is_good &= parameters[:, 4] < radius
     turned = np.abs(np.arcsin(np.sin(parameters[:, 2:4] - start[:, 2:4]))).max(axis=1)
-    is_good &= turned < _MAX_TURN_RAD
+    is_good &= turned < np.maximum(_MAX_TURN_RAD, MAX_RESIDUAL_RATIO * np.median(turned))
     is_good &= parameters[:, 6] * _initial_contrast(levels, offsets, step_x_px, step_y_px) > 0.0
     is_good &= contrast > _MIN_SIGNIFICANCE * np.sqrt(inverse[:, 6, 6])
     is_good &= contrast > _MIN_CONTRAST_RATIO * np.median(contrast)

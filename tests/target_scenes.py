@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.records.sensor_window import SensorWindow
-from armscan.simulation.flat_pattern import FlatPattern
+from armscan.simulation.flat_pattern import ChessboardPattern, FlatPattern
 from armscan.simulation.flat_target import Lighting, RenderedTarget, render_flat_target
 from armscan.simulation.optics import RenderCamera, add_noise
 
@@ -61,3 +63,62 @@ def exposure(
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Normalised error squared, mean 2 for an honest covariance of two coordinates."""
     return np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
+
+
+@dataclass(frozen=True)
+class BareChessboard:
+    """Squares without a rim: where they end, the renderer's surround begins."""
+
+    columns: int
+    rows: int
+    square_mm: float
+
+    @property
+    def squares(self) -> ChessboardPattern:
+        return ChessboardPattern(self.columns, self.rows, self.square_mm)
+
+    @property
+    def marks_board_mm(self) -> FloatArray:
+        return self.squares.marks_board_mm
+
+    @property
+    def extent_board_mm(self) -> tuple[float, float, float, float]:
+        s = self.square_mm
+        return -s, -s, self.columns * s, self.rows * s
+
+    def is_light(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+        return self.squares.is_light(x_mm, y_mm)
+
+    def edge_distance_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        return self.squares.edge_distance_mm(x_mm, y_mm)
+
+
+def line_distance(
+    shape: tuple[int, int], through_px: FloatArray, azimuth_rad: float
+) -> tuple[FloatArray, FloatArray]:
+    """Way (H, W) along and away from a line through a point."""
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    du, dv = u - through_px[0], v - through_px[1]
+    c, s = np.cos(azimuth_rad), np.sin(azimuth_rad)
+    return c * du + s * dv, c * dv - s * du
+
+
+def with_laser_line(
+    image: FloatArray,
+    through_px: FloatArray,
+    azimuth_rad: float,
+    sigma_px: float = 2.0,
+    peak: float = 400.0,
+) -> FloatArray:
+    """The image with a line of light, clipped at 255: brighter where the print is light."""
+    _, away = line_distance(image.shape, through_px, azimuth_rad)
+    light = peak * (0.3 + 0.7 * image / 255.0) * np.exp(-0.5 * (away / sigma_px) ** 2)
+    return np.clip(image + light, 0.0, 255.0)
+
+
+def vignetted(image: FloatArray, remaining: float) -> FloatArray:
+    """The image darkened towards its corners, where ``remaining`` of the light is left."""
+    v, u = np.mgrid[: image.shape[0], : image.shape[1]]
+    height, width = image.shape
+    away = (u / (width - 1) - 0.5) ** 2 + (v / (height - 1) - 0.5) ** 2
+    return image * (1.0 - (1.0 - remaining) * 2.0 * away)

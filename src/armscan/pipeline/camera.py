@@ -89,6 +89,8 @@ def calibrate_camera_from_found(
 ) -> CameraRun | FitFailure:
     """As `calibrate_camera_from_exposures`, with the targets looked for already."""
     options = options or CameraOptions()
+    if found.wrong_count is not None:
+        return found.wrong_count
     missing = _too_few(found)
     if missing is not None:
         return missing

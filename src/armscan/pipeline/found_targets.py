@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.cached_detection import cached_target
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.target_count import wrong_count
 from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.targets.definition import Target
@@ -31,10 +32,13 @@ class FoundTargets:
         The target of each exposure that shows it, in the order of the exposures.
     not_found
         (source, reason) of the others.
+    wrong_count
+        The target's count is wrong, and then no further exposure was looked at; None if not.
     """
 
     views: tuple[TargetView, ...]
     not_found: tuple[tuple[str, str], ...]
+    wrong_count: FitFailure | None = None
 
     def shown_of(self, sources: Sequence[str]) -> tuple[str, ...]:
         """Those of the sources that show the target."""
@@ -85,6 +89,8 @@ def find_targets(
     total = len(exposures) if isinstance(exposures, Sized) else 0
     views: list[TargetView] = []
     not_found: list[tuple[str, str]] = []
+    answers: list[TargetView | FitFailure] = []
+    wrong: FitFailure | None = None
     detections = _detect_in_order(exposures, target, options, cache)
     for done, (source, found) in enumerate(detections, 1):
         if isinstance(found, FitFailure):
@@ -92,9 +98,13 @@ def find_targets(
         else:
             views.append(found)
         progress(ProgressEvent("find target", done, max(total, done), source))
+        answers.append(found)
+        wrong = wrong_count(answers, target)
+        if wrong is not None:
+            break
     if cache is not None:
         cache.trim()
-    return FoundTargets(tuple(views), tuple(not_found))
+    return FoundTargets(tuple(views), tuple(not_found), wrong)
 
 
 def _detect_in_order(

@@ -137,14 +137,15 @@ def calibrate_sheets_from_pairs(
         images = [image for image in pair if image is not None]
         check_sizes(images, cameras.model(pair[0].camera))
     places = {
-        p.name: p for p in _found_placements(pairs, target, cameras, options, cache, progress)
+        p.name: p
+        for p in _found_placements(pairs, target, cameras, options, cache=cache, progress=progress)
     }
     shown = [pair for pair in pairs if _seen(pair, places) is not None]
 
     def stripes_of(pair: ExposurePair, colour: LaserColour) -> BoardStripes | FitFailure:
         chosen = replace(options.stripes, laser_colour=colour)
         place = places[placement_of(pair)]
-        return _board_stripes(pair, place, target, cameras, chosen, cache)
+        return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
 
     def tried(k: int, colour: LaserColour) -> BoardStripes | None:
         found = stripes_of(shown[k], colour)
@@ -187,6 +188,7 @@ def _found_placements(
     target: Target,
     cameras: HeadCameras,
     options: LaserOptions,
+    *,
     cache: DetectionCache | None,
     progress: Progress,
 ) -> Iterator[Placement]:
@@ -210,6 +212,7 @@ def _board_stripes(
     target: Target,
     cameras: HeadCameras,
     options: StripeOptions,
+    *,
     cache: DetectionCache | None,
 ) -> BoardStripes | FitFailure:
     """Stripes of one exposure on its placement's board and around it."""

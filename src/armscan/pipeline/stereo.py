@@ -161,6 +161,8 @@ def calibrate_stereo_from_found(
     progress: Progress = silent,
 ) -> StereoRun | FitFailure:
     """As `calibrate_stereo_from_exposures`, with the targets looked for already."""
+    if found.wrong_count is not None:
+        return found.wrong_count
     pairs = _found_pairs(exposures, {view.source: view for view in found.views})
     missing = _too_few(exposures, pairs, found)
     if missing is not None:

@@ -35,7 +35,8 @@ from armscan.storage.recording_exposures import EXPOSURES_FILE
 from armscan.storage.recording_reader import read_recording
 from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.simulated import are_simulated
-from armscan.vision.targets.specification import parse_target
+from armscan.vision.targets.definition import Target
+from armscan.vision.targets.specification import describe_target, format_target, parse_target
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +137,7 @@ def run_camera_calibration(request: CameraRequest, progress: Progress = silent) 
     _write(files, run, images, (page, provenance), is_overwriting=request.is_overwriting)
     return camera_summary(
         run,
+        target,
         (files.document, files.observations, files.page),
         images.warnings,
         nonsense,
@@ -206,6 +208,7 @@ def _write(
 
 def camera_summary(
     run: CameraRun,
+    target: Target,
     written: Sequence[Path],
     notes: Sequence[str] = (),
     forced: Sequence[str] = (),
@@ -216,6 +219,7 @@ def camera_summary(
     fit = run.fit
     held_out = fit.cross_validation
     facts = [
+        ("target", describe_target(target)),
         ("images", f"{fit.n_views} used of {len(fit.views) + len(run.not_found)}"),
         ("points", str(fit.n_points)),
         ("rms", f"{significant(fit.rms_px)} px (length of the residual, x and y together)"),
@@ -246,17 +250,19 @@ def camera_summary(
         forced=tuple(forced),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
-        data=_data(run, is_simulated),
+        data=_data(run, target, is_simulated),
     )
 
 
-def _data(run: CameraRun, is_simulated: bool) -> dict[str, object]:
+def _data(run: CameraRun, target: Target, is_simulated: bool) -> dict[str, object]:
     fit = run.fit
     names = [name for name, _, _ in parameter_rows(fit)]
     held_out = fit.cross_validation
     return {
         "kind": "camera calibration",
         "simulated": is_simulated,
+        "target": format_target(target),
+        "target_description": describe_target(target),
         "width_px": fit.camera.width_px,
         "height_px": fit.camera.height_px,
         "parameters": dict(zip(names, fit.camera.parameters.tolist(), strict=True)),

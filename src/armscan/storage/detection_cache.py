@@ -33,7 +33,7 @@ from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.vision.targets.view import CircleEdges, TargetView
+from armscan.vision.targets.view import CircleEdges, OtherCountSeen, TargetView
 
 FOLDER_NAME = "armscan-cache"
 SUFFIX = ".found"
@@ -49,7 +49,9 @@ TAG = """Signature: 8a477f597d28d172789f06886806bc55
 """
 
 Found: TypeAlias = TargetView | Profile | FitFailure
-KEPT: Mapping[str, type[Any]] = {kind.__name__: kind for kind in (*get_args(Found), CircleEdges)}
+KEPT: Mapping[str, type[Any]] = {
+    kind.__name__: kind for kind in (*get_args(Found), CircleEdges, OtherCountSeen)
+}
 
 
 @dataclass(frozen=True, slots=True)

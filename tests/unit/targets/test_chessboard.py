@@ -91,9 +91,22 @@ def test_a_dark_board_in_the_red_channel_only(tilted: RenderedTarget) -> None:
     np.testing.assert_allclose(view.points_px, tilted.marks_px[view.point_index], atol=0.6)
 
 
-def test_a_board_partly_out_of_view_fails(tilted: RenderedTarget) -> None:
-    left = int(tilted.marks_px[:, 0].min()) + 60
-    failure = detect_target(exposure(tilted.image[:, left:]), BOARD)
+@pytest.mark.parametrize("cut_px", [60, 140])
+def test_a_board_partly_out_of_view_is_numbered_by_the_end_that_is_seen(
+    tilted: RenderedTarget, cut_px: int
+) -> None:
+    left = int(tilted.marks_px[:, 0].min()) + cut_px
+    view = detect_target(exposure(tilted.image[:, left:]), BOARD)
+    assert isinstance(view, TargetView)
+    assert len(view) < 28
+    true = tilted.marks_px[view.point_index] - np.array([left, 0.0])
+    np.testing.assert_allclose(view.points_px, true, atol=0.1)
+
+
+def test_a_board_of_which_no_end_is_seen_fails(tilted: RenderedTarget) -> None:
+    low, high = np.quantile(tilted.marks_px, [0.2, 0.8], axis=0).astype(int)
+    inner = exposure(tilted.image[low[1] : high[1], low[0] : high[0]])
+    failure = detect_target(inner, BOARD)
     assert isinstance(failure, FitFailure)
     assert failure.remedy
 

@@ -6,7 +6,12 @@ import pytest
 from armscan.errors import OptionError
 from armscan.vision.targets.definition import Charuco, Chessboard, CircleGrid
 from armscan.vision.targets.options import TargetOptions
-from armscan.vision.targets.specification import EXAMPLES, parse_target
+from armscan.vision.targets.specification import (
+    EXAMPLES,
+    describe_target,
+    format_target,
+    parse_target,
+)
 
 
 @pytest.mark.parametrize(
@@ -16,6 +21,9 @@ from armscan.vision.targets.specification import EXAMPLES, parse_target
         ("asymmetric-circle-grid:4x11:5", CircleGrid(4, 11, 5.0, is_asymmetric=True)),
         ("chessboard:11x6:13", Chessboard(11, 6, 13.0)),
         (" chessboard:11X6:13mm ", Chessboard(11, 6, 13.0)),
+        ("chessboard:11x6:1.3cm", Chessboard(11, 6, 13.0)),
+        ("chessboard:11x6:0.013m", Chessboard(11, 6, 13.0)),
+        ("chessboard:11x6:0.05mm", Chessboard(11, 6, 0.05)),
         ("charuco:10x7:4:3:DICT_4X4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
         ("charuco:10x7:4:3:4x4_50", Charuco(10, 7, 4.0, 3.0, "DICT_4X4_50")),
     ],
@@ -41,12 +49,12 @@ def test_every_example_is_right(kind: str) -> None:
         ("chessboard:11*6:13", "COLUMNSxROWS"),
         ("chessboard:11x-6:13", "COLUMNSxROWS"),
         ("chessboard:2x6:13", "too few"),
-        ("chessboard:11x6:0", "no square in mm"),
-        ("chessboard:11x6:-1", "no square in mm"),
-        ("chessboard:11x6:nan", "no square in mm"),
-        ("chessboard:11x6:1e999", "no square in mm"),
-        ("chessboard:11x6:13cm", "no square in mm"),
-        ("circle-grid:11x9:ten", "no pitch in mm"),
+        ("chessboard:11x6:0", "no square"),
+        ("chessboard:11x6:-1", "no square"),
+        ("chessboard:11x6:nan", "no square"),
+        ("chessboard:11x6:1e999", "no square"),
+        ("chessboard:11x6:13in", "no square"),
+        ("circle-grid:11x9:ten", "no pitch"),
         ("charuco:10x7:4:3", "needs 4 fields"),
         ("charuco:10x7:3:4:DICT_4X4_50", "does not fit"),
         ("charuco:10x7:4:3:DICT_9X9_50", "no ArUco dictionary"),
@@ -73,3 +81,28 @@ def test_every_wrong_spelling_shows_a_right_example(text: str, words: str) -> No
 def test_options_are_checked(bad: dict[str, float]) -> None:
     with pytest.raises(OptionError):
         TargetOptions(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("text", ["chessboard:11x6:0.013", "circle-grid:11x9:.00375"])
+def test_a_length_that_was_meant_in_metres_is_asked_about(text: str) -> None:
+    with pytest.raises(OptionError, match="metres") as caught:
+        parse_target(text)
+    assert f"{text.split(':')[2]}m " in str(caught.value)
+
+
+@pytest.mark.parametrize("text", EXAMPLES.values())
+def test_a_formatted_target_is_read_back(text: str) -> None:
+    assert parse_target(format_target(parse_target(text))) == parse_target(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "span"),
+    [
+        ("chessboard:11x6:13", "130 x 65 mm"),
+        ("circle-grid:11x9:3.75", "37.5 x 30 mm"),
+        ("asymmetric-circle-grid:4x11:5", "35 x 50 mm"),
+        ("charuco:10x7:4:3:DICT_4X4_50", "32 x 20 mm"),
+    ],
+)
+def test_a_description_tells_what_a_ruler_measures(text: str, span: str) -> None:
+    assert span in describe_target(parse_target(text))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbering of lattice points in an image: which is the origin, which way x goes.
+"""Numbering of a chessboard's corners: which is the origin, which way x goes.
 
 The camera looks at the front of a print, so that in the image the board's y lies clockwise of
 its x. Where several numberings remain, the one whose x points most to the right is taken.
@@ -7,43 +7,77 @@ its x. Where several numberings remain, the one whose x points most to the right
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.vision.targets.chessboard_extent import Extent, Side
 
 
-def numberings(corners_px: FloatArray, columns: int, rows: int) -> list[FloatArray]:
-    """Return all ways to number a full lattice seen from its front.
+@dataclass(frozen=True, slots=True, eq=False)
+class NumberedCorners:
+    """Corners with their places on the board.
 
     Parameters
     ----------
-    corners_px
-        (rows * columns, 2) image points, row by row from any corner, in either handedness.
-    columns, rows
-        Size of the lattice.
-
-    Returns
-    -------
-    Arrays (rows, columns, 2), the one whose x points most to the right first.
+    cells
+        (N, 2) column and row of each.
+    points_px
+        (N, 2) image points.
+    quarter_turns
+        How far the board's x is turned against the lattice's a.
     """
-    grid = corners_px.reshape(rows, columns, 2)
-    grids = [grid, grid[::-1], grid[:, ::-1], grid[::-1, ::-1]]
-    if columns == rows:
-        grids += [g.transpose(1, 0, 2) for g in grids]
-    front = [g for g in grids if _handedness(g) > 0.0]
-    return sorted(front, key=lambda g: -_rightness(g))
+
+    cells: IntArray
+    points_px: FloatArray
+    quarter_turns: int
 
 
-def lattice_steps(grid_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the way (rows, columns, 2) to the next point along x and along y, at every point."""
-    return np.gradient(grid_px, axis=1), np.gradient(grid_px, axis=0)
+def numberings(extent: Extent, columns: int, rows: int) -> list[NumberedCorners]:
+    """All ways to number the corners of an extent, the one whose x points most to the right first.
+
+    A count that is smaller than the board's needs one side on which the board is seen to end and
+    another on which nothing looks like an end: there the missing rows lie.
+    """
+    found = []
+    size = np.array(extent.size)
+    cells, sides = extent.cells, extent.sides
+    for quarter_turns in range(4):
+        shift = [
+            _first_number(int(n), wanted, sides[2 * axis], sides[2 * axis + 1])
+            for axis, (n, wanted) in enumerate(zip(size, (columns, rows), strict=True))
+        ]
+        if shift[0] is not None and shift[1] is not None:
+            placed = cells + np.array([shift[0], shift[1]])
+            found.append(NumberedCorners(placed, extent.points_px, quarter_turns))
+        # A quarter turn: a becomes b, b runs backwards along the new a.
+        cells = np.stack([size[1] - 1 - cells[:, 1], cells[:, 0]], axis=-1)
+        size = size[::-1]
+        sides = (sides[3], sides[2], sides[0], sides[1])
+    return sorted(found, key=lambda numbered: -_rightness(numbered))
 
 
-def _handedness(grid: FloatArray) -> float:
-    x, y = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    return float(x[0] * y[1] - x[1] * y[0])
+def is_sure(choices: list[NumberedCorners], *, is_square: bool) -> bool:
+    """Tell whether the numberings that remain are one but for a turn that the board permits."""
+    turns = {numbered.quarter_turns for numbered in choices}
+    return bool(turns) and (is_square or turns <= {0, 2} or turns <= {1, 3})
 
 
-def _rightness(grid: FloatArray) -> float:
-    x = grid[:, -1].mean(axis=0) - grid[:, 0].mean(axis=0)
-    return float(x[0] / np.hypot(*x))
+def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | None:
+    """Number on the board of the first of ``count`` rows; None if it is not known."""
+    if "continues" in (before, after) or count > wanted:
+        return None
+    if count == wanted:
+        return 0
+    if before == "ends" and after == "unknown":
+        return 0
+    if after == "ends" and before == "unknown":
+        return wanted - count
+    return None
+
+
+def _rightness(numbered: NumberedCorners) -> float:
+    design = np.column_stack([numbered.cells, np.ones(len(numbered.cells))])
+    affine = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
+    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))

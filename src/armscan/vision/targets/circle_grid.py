@@ -23,7 +23,10 @@ from armscan.vision.targets.grid_numbering import (
 )
 from armscan.vision.targets.lattice_growth import grow_lattices
 from armscan.vision.targets.options import TargetOptions
-from armscan.vision.targets.view import CircleEdges, TargetView
+from armscan.vision.targets.view import CircleEdges, OtherCountSeen, TargetView
+
+WHOLE_FRACTION = 0.95
+"""Least filled fraction of a lattice that may be a whole grid."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,8 +124,12 @@ def _failure(
             f"{exposure.source}: no {wanted} in view, no circles in rows were seen",
             "show the whole grid, sharp and evenly lit",
         )
-    return FitFailure(
+    columns, rows = size_seen
+    reason = (
         f"{exposure.source}: no {wanted} in view; {n_seen} circles in a lattice of "
-        f"{size_seen[0]} x {size_seen[1]} were seen",
-        "check columns and rows, and show the whole grid",
+        f"{columns} x {rows} were seen"
     )
+    remedy = "check columns and rows, and show the whole grid"
+    if n_seen >= WHOLE_FRACTION * columns * rows and min(size_seen) > 1:
+        return OtherCountSeen(reason, remedy, columns=columns, rows=rows)
+    return FitFailure(reason, remedy)

@@ -12,10 +12,11 @@ from armscan.records.exposure import Exposure
 
 SAME_CHANNEL_LEVELS = 1.5
 """Channels whose mean difference is below this (8-bit levels) show the same."""
-_WEIGHTS = np.array([0.299, 0.587, 0.114])
+_WEIGHTS = (0.299, 0.587, 0.114)
 _SAMPLES_PER_CUBE = 65_536
 
 Grey8 = NDArray[np.uint8]
+Grey32 = NDArray[np.float32]
 RawGrey = ImageArray | FloatArray
 
 
@@ -28,9 +29,12 @@ def grey_channels(exposure: Exposure) -> list[RawGrey]:
     if exposure.colour == "mono":
         return [exposure.image]
     image = exposure.image
-    luminance: FloatArray = image @ _WEIGHTS
+    red, green, blue = (image[..., k] for k in range(3))
+    luminance: FloatArray = _WEIGHTS[0] * red + _WEIGHTS[1] * green + _WEIGHTS[2] * blue
     channels: list[RawGrey] = [luminance]
-    others = [image[..., 0], image[..., 1], image[..., 2], image.min(axis=2), image.max(axis=2)]
+    darkest = np.minimum(np.minimum(red, green), blue)
+    brightest = np.maximum(np.maximum(red, green), blue)
+    others = [red, green, blue, darkest, brightest]
     step = max(1, int(np.sqrt(image.shape[0] * image.shape[1] / _SAMPLES_PER_CUBE)))
     limit = SAME_CHANNEL_LEVELS * exposure.full_scale / 255.0
     for other in others:
@@ -67,7 +71,7 @@ def reduced(grey8: Grey8, size_px: int) -> tuple[Grey8, float]:
     return np.asarray(small, dtype=np.uint8), grey8.shape[1] / size[0]
 
 
-def sample(grey: RawGrey, points_px: FloatArray) -> FloatArray:
+def sample(grey: RawGrey | Grey32, points_px: FloatArray) -> FloatArray:
     """Return the levels (N,) at the pixels nearest to (N, 2) points; NaN outside the image."""
     u = np.rint(points_px[:, 0])
     v = np.rint(points_px[:, 1])

@@ -71,14 +71,15 @@ def number_grid(
 
 
 def lattice_size(lattice: Lattice, is_asymmetric: bool) -> tuple[int, int]:
-    """Columns and rows that a lattice spans, the larger first: for messages."""
+    """Columns and rows that a lattice spans, of a symmetric grid the larger first: for messages."""
     cells = np.array(list(lattice), dtype=np.int64)
     if is_asymmetric:
-        cells = np.stack([cells[:, 0] - cells[:, 1], cells[:, 0] + cells[:, 1]], axis=-1)
-        spans = np.ptp(cells, axis=0) + 1
-        if spans[0] > spans[1]:
-            spans = spans[::-1]
-        return int(spans[0] + 1) // 2, int(spans[1])
+        across, along = (
+            int(span) + 1 for span in np.ptp(_border(cells, is_asymmetric=True), axis=0)
+        )
+        # A row of C circles spans 2 C places of the turned lattice, since each second is shifted.
+        sizes = [((u + 1) // 2, v) for u, v in ((across, along), (along, across))]
+        return min(sizes, key=lambda size: abs(size[0] * size[1] - len(cells)))
     spans = np.ptp(cells, axis=0) + 1
     return int(spans.max()), int(spans.min())
 

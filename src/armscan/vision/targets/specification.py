@@ -20,6 +20,9 @@ EXAMPLES = {
 }
 """A right specification of each kind of target."""
 
+SMALLEST_UNASKED_MM = 0.1
+"""A smaller length without a unit is asked about: it was likely meant in metres."""
+_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _MIN_COUNT = {"circle-grid": 3, "asymmetric-circle-grid": 2, "chessboard": 3, "charuco": 3}
 
 
@@ -31,7 +34,8 @@ def parse_target(text: str) -> Target:
     text
         ``circle-grid:COLSxROWS:PITCH_MM``, ``asymmetric-circle-grid:COLSxROWS:PITCH_MM``,
         ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners) or
-        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares).
+        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares). A length is in mm unless it
+        bears a unit: ``13``, ``13mm``, ``1.3cm``, ``0.013m``.
 
     Raises
     ------
@@ -50,6 +54,32 @@ def parse_target(text: str) -> Target:
     if len(fields) != n_fields:
         raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
     return _PARSERS[kind](text, kind, fields)
+
+
+def format_target(target: Target) -> str:
+    """The specification that `parse_target` reads as this target."""
+    counts = f"{target.columns}x{target.rows}"
+    if isinstance(target, Charuco):
+        name = target.dictionary
+        return f"charuco:{counts}:{target.square_mm:.12g}:{target.marker_mm:.12g}:{name}"
+    if isinstance(target, CircleGrid):
+        kind = "asymmetric-circle-grid" if target.is_asymmetric else "circle-grid"
+        return f"{kind}:{counts}:{target.pitch_mm:.12g}"
+    return f"chessboard:{counts}:{target.square_mm:.12g}"
+
+
+def describe_target(target: Target) -> str:
+    """The target in words, with its size in mm, so that a wrong length or unit is noticed."""
+    width, height = target.points_board_mm[-1, :2] - target.points_board_mm[0, :2]
+    if isinstance(target, CircleGrid):
+        reach = target.points_board_mm.max(axis=0)
+        what = "circles, first to last centre"
+        return f"{target.columns} x {target.rows} {what} {reach[0]:.4g} x {reach[1]:.4g} mm"
+    what = "inner corners, first to last"
+    n = (target.columns, target.rows)
+    if isinstance(target, Charuco):
+        n = (target.columns - 1, target.rows - 1)
+    return f"{n[0]} x {n[1]} {what} {width:.4g} x {height:.4g} mm"
 
 
 def _circle_grid(text: str, kind: str, fields: list[str]) -> Target:
@@ -100,10 +130,16 @@ def _counts(text: str, kind: str, field: str) -> tuple[int, int]:
 
 
 def _length_mm(text: str, kind: str, name: str, field: str) -> float:
-    number = re.fullmatch(r"(\d+\.?\d*|\.\d+)(?:mm)?", field)
-    length_mm = float(number[1]) if number else math.nan
+    number = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(mm|cm|m)?", field)
+    length_mm = float(number[1]) * _UNITS_MM[number[2] or "mm"] if number else math.nan
     if not 0.0 < length_mm < math.inf:
-        raise _wrong(text, kind, f"'{field}' is no {name} in mm")
+        raise _wrong(text, kind, f"'{field}' is no {name}: give mm, or a unit as in 13mm, 1.3cm")
+    if number and number[2] is None and length_mm < SMALLEST_UNASKED_MM:
+        raise OptionError(
+            f"a {name} of {field} mm: is it metres",
+            where=f"target '{text}'",
+            remedy=f"write {field}m if it is {1000.0 * length_mm:g} mm, {field}mm if it is not",
+        )
     return length_mm
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.estimate import FitFailure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,3 +87,15 @@ class TargetView:
     def __len__(self) -> int:
         """Count of points found."""
         return len(self.points_px)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherCountSeen(FitFailure):
+    """No such target is in view, but a full lattice of another count: ``columns`` x ``rows``.
+
+    It may be part of the target, the rest being hidden; where several images show the same one, the
+    count that was asked for is wrong.
+    """
+
+    columns: int = 0
+    rows: int = 0

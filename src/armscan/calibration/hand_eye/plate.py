@@ -36,6 +36,7 @@ from armscan.calibration.hand_eye.plate_result import (
     reference_facts,
     stripe_residuals,
 )
+from armscan.calibration.hand_eye.plate_rivals import settle_rivals
 from armscan.calibration.hand_eye.plate_search import Start, find_start
 from armscan.calibration.hand_eye.posture_geometry import REMEDY, common_to_postures
 from armscan.calibration.hand_eye.posture_names import check_postures
@@ -95,6 +96,12 @@ def calibrate_on_plate(
     if refusal is not None:
         also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept, options))
         return FitFailure(refusal.reason + also, refusal.remedy)
+    settled = settle_rivals(
+        nodes, plate, start, options, common_to_postures(nodes, plate.plane)
+    )
+    if isinstance(settled, FitFailure):
+        return settled
+    start = settled
     checked = fit_without_wrong_postures(nodes, plate, start, options)
     if isinstance(checked, FitFailure):
         return checked
@@ -120,12 +127,6 @@ def _refuse_start(
         return refusal
     if not start.typical_mm <= options.max_rms_mm:
         return explain_misfit(nodes, plate, start, options)
-    if start.n_rivals:
-        return FitFailure(
-            f"{len(nodes.used_postures)} postures leave {start.n_rivals + 1} or more different "
-            f"hand-eyes that explain the stripes equally well{cause}",
-            f"add postures: {REMEDY}",
-        )
     return None
 
 

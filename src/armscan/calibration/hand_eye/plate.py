@@ -8,14 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from armscan.calibration.hand_eye.alternatives import find_alternatives
 from armscan.calibration.hand_eye.conditioning import (
     conditioning_warnings,
     describe_conditioning,
     refuse_few_postures,
     refuse_open_hand_eye,
 )
+from armscan.calibration.hand_eye.contradictions import find_contradiction, plane_in_words
 from armscan.calibration.hand_eye.least_squares import design
 from armscan.calibration.hand_eye.left_out import leave_each_out
+from armscan.calibration.hand_eye.mirrors import find_mirror
 from armscan.calibration.hand_eye.noise_model import noise_components, total_covariance
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
@@ -24,9 +27,13 @@ from armscan.calibration.hand_eye.plate_checks import (
     explain_misfit,
     influence_warnings,
     point_warnings,
-    refuse_other_plane,
+    refuse_scatter,
 )
-from armscan.calibration.hand_eye.plate_fit import hand_eye_information, plane_after
+from armscan.calibration.hand_eye.plate_fit import (
+    fit_plate,
+    hand_eye_information,
+    plane_after,
+)
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
 from armscan.calibration.hand_eye.plate_outliers import CheckedFit, fit_without_wrong_postures
 from armscan.calibration.hand_eye.plate_residuals import PlateState, place_nodes, shifted_plane
@@ -34,6 +41,7 @@ from armscan.calibration.hand_eye.plate_result import (
     hand_eye_calibration,
     posture_results,
     reference_facts,
+    sigma_of,
     stripe_residuals,
 )
 from armscan.calibration.hand_eye.plate_rivals import settle_rivals
@@ -43,6 +51,10 @@ from armscan.calibration.hand_eye.posture_names import check_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
+
+OUTLIERS_EXPLAIN = 1.5
+"""Wrong postures explain the stripes if without them the arm scatters by no more than this times
+what it would if something had moved."""
 
 
 def calibrate_on_plate(
@@ -96,20 +108,51 @@ def calibrate_on_plate(
     if refusal is not None:
         also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept, options))
         return FitFailure(refusal.reason + also, refusal.remedy)
-    settled = settle_rivals(
-        nodes, plate, start, options, common_to_postures(nodes, plate.plane)
-    )
+    settled = settle_rivals(nodes, plate, start, options, common_to_postures(nodes, plate.plane))
     if isinstance(settled, FitFailure):
         return settled
-    start = settled
-    checked = fit_without_wrong_postures(nodes, plate, start, options)
+    mirror = find_mirror(nodes, plate, settled, options)
+    if mirror is not None:
+        return mirror
+    checked = _checked(nodes, plate, settled, options)
     if isinstance(checked, FitFailure):
         return checked
-    disagreement = refuse_other_plane(checked.nodes, plate, checked.fit, options)
-    if isinstance(disagreement, FitFailure):
-        return disagreement
-    checked = replace(checked, warnings=(*checked.warnings, *disagreement))
-    return _result(stripes, kept, plate, options, start=start, checked=checked)
+    return _result(stripes, kept, plate, options, start=settled, checked=checked)
+
+
+def _checked(
+    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
+) -> CheckedFit | FitFailure:
+    """Refine, leave wrong postures out, and look for something that moved or is not as given.
+
+    A plate that moved makes postures look wrong, and wrong postures may look like a plate that
+    moved: what leaves the smaller scatter of the arm, is the explanation.
+    """
+    state = PlateState(start.tool_from_sensor, np.zeros(3))
+    right = nodes.select(~start.is_wrong[nodes.posture])
+    first = fit_plate(right, plate, state, options)
+    if isinstance(first, FitFailure):
+        return first
+    found = find_alternatives(right, plate, first, options)
+    moved = find_contradiction(found, right, plate, first)
+    checked = fit_without_wrong_postures(nodes, plate, start, first, options)
+    is_same = isinstance(checked, CheckedFit) and checked.fit is first
+    if moved is not None and moved.is_refused:
+        arm_mm = np.inf if isinstance(checked, FitFailure) else sigma_of(checked.fit, "arm")
+        if is_same or arm_mm > OUTLIERS_EXPLAIN * moved.arm_mm:
+            return moved.failure
+    if isinstance(checked, FitFailure):
+        return checked
+    if not is_same:
+        found = find_alternatives(checked.nodes, plate, checked.fit, options)
+        moved = find_contradiction(found, checked.nodes, plate, checked.fit)
+    checked = replace(checked, plane_check=plane_in_words(found))
+    if moved is None:
+        refusal = refuse_scatter(checked.fit, options)
+        return checked if refusal is None else refusal
+    if moved.is_refused:
+        return moved.failure
+    return replace(checked, widening=moved.widening, warnings=(*checked.warnings, moved.reason))
 
 
 def _refuse_start(
@@ -153,6 +196,7 @@ def _result(
             plate,
             options,
             conditioning=conditioning,
+            widening=checked.widening,
             residuals=residuals,
             postures=postures,
         ),
@@ -160,7 +204,7 @@ def _result(
         residuals,
         postures,
         conditioning.singular_values,
-        reference_facts(plate, options, fit),
+        reference_facts(plate, options, fit, checked.plane_check),
         (
             *checked.warnings,
             *conditioning_warnings(conditioning, len(postures), cause),

@@ -39,8 +39,7 @@ RIVAL_RATIO = 3.0
 RIVAL_MM = 0.02
 """Minima that leave less than this, or than `RIVAL_RATIO` times the least, may be the right one."""
 MIXED = 0.05
-"""Share of stripes seen from another side of the plate than the rest above which a hand-eye is
-impossible: a camera does not pass through the plate."""
+"""Share of the stripes that wrong poses may put on another side of the plate than the rest."""
 GROSS_RATIO = 8.0
 GROSS_MM = 0.05
 """A posture is wrong if its distance from the plate exceeds both this and `GROSS_RATIO` times the
@@ -89,13 +88,10 @@ def find_start(nodes: PlateNodes, plate: Plane) -> Start:
         candidates.append(_descend(nodes, plate, linear))
     used = nodes.used_postures
     is_many = len(used) >= LEAST_FOR_SUBSETS
-    costs = [_cost(nodes, plate, pose, is_many) for pose in candidates]
+    if is_many and _has_wrong(_rms(nodes, plate, candidates[0])):
+        candidates += _from_subsets(nodes, plate, used)
+    candidates, costs = _possible(nodes, plate, candidates, is_robust=is_many)
     best = candidates[int(np.argmin(costs))]
-    if is_many and _has_wrong(_rms(nodes, plate, best)):
-        subsets = _from_subsets(nodes, plate, used)
-        candidates += subsets
-        costs += [_cost(nodes, plate, pose, is_many) for pose in subsets]
-        best = candidates[int(np.argmin(costs))]
     wrong = np.zeros(len(nodes.postures), dtype=np.bool_)
     for _ in range(3 if is_many else 0):
         rms = _rms(nodes, plate, best)
@@ -104,19 +100,37 @@ def find_start(nodes: PlateNodes, plate: Plane) -> Start:
     rms = _rms(nodes, plate, best)
     if is_many:
         wrong = rms > max(GROSS_MM, GROSS_RATIO * float(np.nanmedian(rms)))
-    return Start(best, linear, rms, wrong, _rivals(candidates, np.array(costs), best))
+    return Start(best, linear, rms, wrong, _rivals(candidates, costs, best))
 
 
-def _cost(nodes: PlateNodes, plate: Plane, pose: Pose[Tool, Sensor], is_robust: bool) -> float:
-    """Typical distance of the postures: their median where a wrong one can be told, else their mean."""
-    rms = _rms(nodes, plate, pose)
-    return float(np.nanmedian(rms) if is_robust else np.sqrt(np.nanmean(rms**2)))
+def _possible(
+    nodes: PlateNodes, plate: Plane, candidates: list[Pose[Tool, Sensor]], *, is_robust: bool
+) -> tuple[list[Pose[Tool, Sensor]], FloatArray]:
+    """Hand-eyes that a camera can have, and the typical distance (mm) that each leaves.
+
+    A camera does not pass through the plate. Where all stripes pass one point of the sheet, a
+    hand-eye turned by half a turn explains them as well as the true one, but puts the camera now
+    before the plate and now behind it. One that stays behind counts only where none before the
+    plate will do: the plate's normal may have the wrong sign.
+    """
+    rms = np.array([_rms(nodes, plate, pose) for pose in candidates])
+    costs = np.nanmedian(rms, axis=1) if is_robust else np.sqrt(np.nanmean(rms**2, axis=1))
+    behind = _share_behind(nodes, plate, np.array([pose.translation_mm for pose in candidates]))
+    limit = _limit_mm(costs)
+    for kept in (behind <= MIXED, (behind <= MIXED) | (behind >= 1.0 - MIXED)):
+        if (costs[kept] <= limit).any():
+            return [candidates[k] for k in np.flatnonzero(kept)], costs[kept]
+    return candidates, costs
+
+
+def _limit_mm(costs: FloatArray) -> float:
+    return max(RIVAL_RATIO * float(costs.min()), RIVAL_MM)
 
 
 def _rivals(
     candidates: list[Pose[Tool, Sensor]], costs: FloatArray, best: Pose[Tool, Sensor]
 ) -> tuple[Pose[Tool, Sensor], ...]:
-    limit = max(RIVAL_RATIO * float(costs.min()), RIVAL_MM)
+    limit = _limit_mm(costs)
     rotations = np.array([best.rotation] + [pose.rotation for pose in candidates])
     first = np.concatenate([[-1.0], np.where(costs <= limit, costs, np.inf)])
     kept = distinct(rotations, first, SAME_RAD, N_MINIMA)
@@ -124,7 +138,7 @@ def _rivals(
 
 
 def minima_from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[Pose[Tool, Sensor], ...]:
-    """Distinct minima of the plain sum of squares, least first, that a camera can have."""
+    """Distinct minima of the plain sum of squares, least first."""
     nodes = few_stripes(thinned(nodes))
     rotations = rotations_all_over(N_ROTATIONS)
     normals, constants = plate_in_tool(nodes, plate)
@@ -135,23 +149,18 @@ def minima_from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[Pose[Tool, 
     rotations, shifts, cost = descend_all(place, rotations, shifts, N_FIRST, scale)
     best = np.argsort(cost)[:N_GO_ON]
     rotations, shifts, cost = descend_all(place, rotations[best], shifts[best], N_LAST, scale)
-    cost = np.where(_is_mixed(nodes, plate, shifts), cost + float(cost.max()), cost)
     kept = distinct(rotations, cost, SAME_RAD, N_MINIMA)
     return tuple(Pose(rotations[k], shifts[k]) for k in kept)
 
 
-def _is_mixed(nodes: PlateNodes, plate: Plane, shifts: FloatArray) -> BoolArray:
-    """(K,) True where a hand-eye puts the camera now before the plate and now behind it.
-
-    Where all stripes pass one point of the sheet, a hand-eye turned by half a turn explains them
-    as well as the true one, but does that.
-    """
+def _share_behind(nodes: PlateNodes, plate: Plane, shifts: FloatArray) -> FloatArray:
+    """(K,) share of the stripes for which a hand-eye puts the camera behind the plate."""
     cameras = np.einsum("sij,kj->ksi", nodes.rotations, shifts) + nodes.translations_mm
-    behind = ((cameras - plate.point_mm) @ plate.normal < 0.0).mean(axis=1)
-    return np.asarray(np.minimum(behind, 1.0 - behind) > MIXED)
+    return np.asarray(((cameras - plate.point_mm) @ plate.normal < 0.0).mean(axis=1))
 
 
 def few_stripes(nodes: PlateNodes) -> PlateNodes:
+    """At most `MOST_STRIPES` stripes, evenly spread."""
     used = np.unique(nodes.stripe)
     if len(used) <= MOST_STRIPES:
         return nodes

@@ -167,8 +167,8 @@ def noise_of_sphere(
     """Causes of scatter: the arm's pose, common to a posture, the stripe's form, and its noise.
 
     A stripe whose points all lie a little too far out has the wrong curvature, which the arm's pose
-    does not explain: a profile's scale, light that enters the surface. Where the section is
-    nearly a great circle, a hundredth of a millimetre of it moves the sphere's centre by a whole one.
+    does not explain: a profile's scale, light that enters the surface. Where the section is nearly
+    a great circle, a hundredth of a millimetre of it moves the sphere's centre by a whole one.
     """
     same = (nodes.posture[:, None] == nodes.posture[None, :]) / weights[nodes.posture][:, None]
     shift = same * (placed.by_pose[:, :3] @ placed.by_pose[:, :3].T)

@@ -83,9 +83,10 @@ class _Circles:
         if side:
             return self._solved(rotations, side * self.heights, 1.0)
         flat = self._solved(rotations, np.zeros(len(self.heights)), 0.0)
-        seen = np.einsum(
-            "sji,ksj->ksi", self.rotations, flat[:, None, 3:] - self.origins
-        ) - flat[:, None, :3]
+        seen = (
+            np.einsum("sji,ksj->ksi", self.rotations, flat[:, None, 3:] - self.origins)
+            - flat[:, None, :3]
+        )
         seen = np.einsum("kji,ksj->ksi", rotations, seen)
         above = np.einsum("ksi,si->ks", seen - self.centres, self.normals)
         return self._solved(rotations, np.where(above < 0.0, -1.0, 1.0) * self.heights, 1.0)
@@ -111,7 +112,9 @@ class _Circles:
 def _placing(sections: tuple[Section, ...], radius_mm: float) -> Placing:
     """Distances of a few points of each section from the sphere, for many states at once."""
     picked = [
-        section.points_mm[np.linspace(0, len(section.rows) - 1, POINTS_OF_SECTION).round().astype(int)]
+        section.points_mm[
+            np.linspace(0, len(section.rows) - 1, POINTS_OF_SECTION).round().astype(int)
+        ]
         for section in sections
     ]
     points = np.concatenate(picked)

@@ -165,7 +165,7 @@ def rows() -> Iterator[Row]:
         yield Row(f"plate moved by {shift:g} mm", ("probed",), plate_moved(shift, 0.0))
     for tilt in (0.05, 0.2, 0.5):
         yield Row(f"plate tilted by {tilt:g} deg", ("probed",), plate_moved(0.0, tilt))
-    between = ("not with each other",)
+    between = ("and those from",)
     for shift in (0.1, 0.3, 1.0, 3.0):
         yield Row(f"half re-referenced by {shift:g} mm", between, half_moved(shift, 0.0))
     yield Row("the last third by 1 mm", between, half_moved(1.0, 0.0, 8))

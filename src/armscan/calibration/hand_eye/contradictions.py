@@ -16,8 +16,10 @@ from armscan.calibration.hand_eye.probed_side import offset_in_words
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 
-UNLIKELY = 1e-3
-"""An alternative is believed if unknowns as large as its are less probable than this."""
+SUSPICIOUS = 2e-3
+"""An alternative is named if unknowns as large as its are less probable than this."""
+UNLIKELY = 3e-4
+"""And it may be a reason to refuse below this."""
 ARM_ACCURACY_MM = 0.05
 """What measuring arms err by from place to place without anything being wrong: what moves the
 stripes by less is said, and held by the stated covariance; more is refused."""
@@ -77,14 +79,16 @@ def find_contradiction(
     nodes, plate, fit
         Data and reference, and the refined hand-eye.
     """
-    believed = [one for one in found if one.probability < UNLIKELY]
+    believed = [one for one in found if one.probability < SUSPICIOUS]
     if not believed:
         return None
     best = believed[0]
     change = best.hand_eye_change
     sigma = np.sqrt(np.minimum(np.diag(fit.covariance)[:6], np.diag(best.hand_eye_covariance)))
     is_refused = (
-        best.size_mm > ARM_ACCURACY_MM and float(np.abs(change / sigma).max()) > MOST_SIGMAS
+        best.probability < UNLIKELY
+        and best.size_mm > ARM_ACCURACY_MM
+        and float(np.abs(change / sigma).max()) > MOST_SIGMAS
     )
     reason, remedy = _in_words(best, nodes, plate, fit)
     return Contradiction(
@@ -100,11 +104,11 @@ def plane_in_words(found: Sequence[Alternative]) -> str:
     by_offset = checks["offset"]
     shift_mm, sigma_mm = float(by_offset.values[0]), float(np.sqrt(by_offset.covariance[0, 0]))
     probability = min(checks["plate"].probability, by_offset.probability)
-    agrees = "contradict it" if probability < UNLIKELY else "agree with it"
+    agrees = "contradict it" if probability < SUSPICIOUS else "agree with it"
     return (
         f"the stripes {agrees} (p = {probability:.2g}): by themselves they put it "
         f"{shift_mm:+.3f} ± {sigma_mm:.3f} mm along its normal; a plate that moved by less than "
-        "that after probing is not noticed"
+        f"{3.0 * sigma_mm:.2f} mm after probing may go unnoticed"
     )
 
 

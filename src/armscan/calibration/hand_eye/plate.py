@@ -30,6 +30,7 @@ from armscan.calibration.hand_eye.plate_checks import (
     refuse_scatter,
 )
 from armscan.calibration.hand_eye.plate_fit import (
+    PlateFit,
     fit_plate,
     hand_eye_information,
     plane_after,
@@ -52,9 +53,9 @@ from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 
-OUTLIERS_EXPLAIN = 1.5
-"""Wrong postures explain the stripes if without them the arm scatters by no more than this times
-what it would if something had moved."""
+AS_WELL = 1.5
+"""What moved explains all postures if it leaves no more than this times the scatter of the arm that
+is left without the postures that look wrong."""
 
 
 def calibrate_on_plate(
@@ -126,26 +127,32 @@ def _checked(
     """Refine, leave wrong postures out, and look for something that moved or is not as given.
 
     A plate that moved makes postures look wrong, and wrong postures may look like a plate that
-    moved: what leaves the smaller scatter of the arm, is the explanation.
+    moved. If what moved explains all postures about as well as leaving some out explains the rest,
+    it is believed.
     """
     state = PlateState(start.tool_from_sensor, np.zeros(3))
     right = nodes.select(~start.is_wrong[nodes.posture])
     first = fit_plate(right, plate, state, options)
     if isinstance(first, FitFailure):
         return first
-    found = find_alternatives(right, plate, first, options)
-    moved = find_contradiction(found, right, plate, first)
     checked = fit_without_wrong_postures(nodes, plate, start, first, options)
-    is_same = isinstance(checked, CheckedFit) and checked.fit is first
-    if moved is not None and moved.is_refused:
-        arm_mm = np.inf if isinstance(checked, FitFailure) else sigma_of(checked.fit, "arm")
-        if is_same or arm_mm > OUTLIERS_EXPLAIN * moved.arm_mm:
+    usual_mm = sigma_of(first if isinstance(checked, FitFailure) else checked.fit, "arm")
+    trials = [(right, first)]
+    if start.is_wrong.any():
+        whole = fit_plate(nodes, plate, state, options)
+        trials += [(nodes, whole)] if isinstance(whole, PlateFit) else []
+    for tried, fit in trials:
+        found = find_alternatives(tried, plate, fit, options)
+        moved = find_contradiction(found, tried, plate, fit)
+        is_all = isinstance(checked, CheckedFit) and fit is checked.fit
+        if moved is None or not moved.is_refused:
+            continue
+        if is_all or moved.arm_mm < AS_WELL * usual_mm:
             return moved.failure
     if isinstance(checked, FitFailure):
         return checked
-    if not is_same:
-        found = find_alternatives(checked.nodes, plate, checked.fit, options)
-        moved = find_contradiction(found, checked.nodes, plate, checked.fit)
+    found = find_alternatives(checked.nodes, plate, checked.fit, options)
+    moved = find_contradiction(found, checked.nodes, plate, checked.fit)
     checked = replace(checked, plane_check=plane_in_words(found))
     if moved is None:
         refusal = refuse_scatter(checked.fit, options)

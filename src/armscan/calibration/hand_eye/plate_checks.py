@@ -68,7 +68,7 @@ def explain_misfit(
             f"plane then lies {offset_in_words(free.offset_mm, free.tilt_deg, plate)}",
             PROBE_AGAIN,
         )
-    misread = _misread(nodes, plate, fact, start.typical_mm, np.inf)
+    misread = _misread(nodes, plate, fact, start.typical_mm, options.max_rms_mm)
     if misread is not None:
         return misread
     return FitFailure(

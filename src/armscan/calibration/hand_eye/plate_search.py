@@ -46,6 +46,9 @@ GROSS_MM = 0.05
 median of all."""
 
 
+FAR_MM = 1.0
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Start:
     """Where the refinement begins.
@@ -182,8 +185,9 @@ def _rms(nodes: PlateNodes, plate: Plane, pose: Pose[Tool, Sensor]) -> FloatArra
 
 
 def _has_wrong(rms: FloatArray) -> bool:
+    """True where a posture stands out, or all are far: a grossly wrong one moves all others."""
     largest, typical = float(np.nanmax(rms)), float(np.nanmedian(rms))
-    return largest > max(GROSS_MM, 0.5 * GROSS_RATIO * typical)
+    return largest > max(GROSS_MM, min(0.5 * GROSS_RATIO * typical, FAR_MM))
 
 
 def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[Tool, Sensor]]:

@@ -110,13 +110,18 @@ def draw_waves(rng: np.random.Generator, count: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class PlateRig:
-    """Everything about one simulated calibration but its random errors."""
+    """Everything about one simulated calibration but its random errors.
+
+    ``bow_mm`` bends every stripe alike; ``form_mm`` is the rise of the sheet's own surface at the
+    edge of its working range.
+    """
 
     postures: Postures
     noise: RigNoise = field(default_factory=RigNoise)
     exposures_per_posture: int = 1
     points_per_stripe: int = 150
     bow_mm: float = 0.0
+    form_mm: float = 0.0
     sheet_turn_rad: float = 0.0
     tool_from_sensor: Pose[Tool, Sensor] = TOOL_FROM_SENSOR
 
@@ -165,12 +170,34 @@ class PlateRig:
             np.stack([normal, sheet[:3], along]), [height, -sheet[3], along[2] * height / normal[2]]
         )
         s = np.linspace(-STRIPE_MM, STRIPE_MM, self.points_per_stripe)
+        points = start + s[:, None] * along
+        if self.form_mm:
+            flat, in_plate = points, np.cross(normal, along)
+            for _ in range(4):
+                rise = self.rise_mm(points) / (in_plate @ sheet[:3])
+                points = flat + rise[:, None] * in_plate
         bow = self.bow_mm * (s / STRIPE_MM) ** 2
-        points = start + s[:, None] * along + bow[:, None] * sheet[:3]
+        points = points + bow[:, None] * sheet[:3]
         points -= (bow * (normal @ sheet[:3]) / (normal @ across))[:, None] * across
         places = (points @ rotation.T + origin - PLATE_CENTRE) @ self.plate_axes[:2].T
         points += (surface.height(places) / (normal @ across))[:, None] * across
         return points, across
+
+    def rise_mm(self, points: FloatArray) -> FloatArray:
+        """(N,) height of the sheet's true surface over its plane, a function of the place on it."""
+        first = np.cross(self.sheet[:3], [0.0, 0.0, 1.0])
+        first /= np.linalg.norm(first)
+        axes = np.stack([first, np.cross(self.sheet[:3], first)])
+        u, v = axes @ (points - [0.0, 0.0, 140.0]).T
+        return np.asarray(self.form_mm * (u**2 + 0.3 * u * v + 0.5 * v**2) / STRIPE_MM**2)
+
+    def on_sheet(self, points: FloatArray) -> FloatArray:
+        """Where the rays (N, 3) from the camera through some points meet the sheet's surface."""
+        found = points
+        for _ in range(5):
+            height = found @ self.sheet[:3] + self.sheet[3] - self.rise_mm(found)
+            found = found - (height / (found @ self.sheet[:3]))[:, None] * found
+        return found
 
     def draw(self, seed: int) -> tuple[list[PosedStripe], PlateReference]:
         """Stripes and probed plate with errors drawn from a seed."""

@@ -23,17 +23,21 @@ from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotati
 from armscan.geometry.fitting import Plane
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
+from armscan.geometry.rotation import rotation_from_vector
 from plate_rig import (
     PLATE_NORMAL,
     SILENT,
     TOOL_FROM_SENSOR,
     PlateRig,
     Postures,
+    RigNoise,
     good_postures,
 )
 
 N = 12
 ARM_MM = 0.0053
+CHI2_999 = 22.46
+"""Of six degrees of freedom."""
 Repose = Callable[[Pose[Base, Tool]], Pose[Base, Tool]]
 
 
@@ -207,13 +211,132 @@ def test_a_plate_probed_on_the_wrong_side_is_refused(offset_mm: float, what: str
     assert "armscan probe --side" in fit.remedy
 
 
-def test_a_plate_that_sank_is_warned_of_with_its_distance() -> None:
+@pytest.mark.parametrize("by_mm", [0.15, 0.5, -0.5])
+def test_a_plate_that_moved_after_probing_is_refused_with_its_distance(by_mm: float) -> None:
     stripes, plate = _scan()
-    fit = calibrate_on_plate(stripes, _raised(plate, 0.15))
+    fit = calibrate_on_plate(stripes, _raised(plate, by_mm))
+    assert isinstance(fit, FitFailure)
+    assert "disagree" in fit.reason and "--solve-plate" in fit.remedy
+    distance = float(fit.reason.split("lies ")[1].split(" mm")[0])
+    assert distance == pytest.approx(abs(by_mm), abs=0.06)
+    assert ("below" in fit.reason) == (by_mm > 0.0)
+
+
+def test_a_moved_plate_that_is_solved_along_is_held_by_the_stated_covariance() -> None:
+    stripes, plate = _scan()
+    fit = calibrate_on_plate(stripes, _raised(plate, 0.5), HandEyeOptions(solve_plate=True))
     assert isinstance(fit, HandEyeFit)
-    warning = next(w for w in fit.warnings if "disagree" in w)
-    distance = float(warning.split("lies ")[1].split(" mm")[0])
-    assert distance == pytest.approx(0.15, abs=0.06)
+    error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+    assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
+
+
+@pytest.mark.parametrize("tilt_deg", [0.05, 0.2, 0.5])
+def test_a_tilted_plate_is_named(tilt_deg: float) -> None:
+    """Below a twentieth of a millimetre it is said and held by the sigmas, above it is refused."""
+    stripes, plate = _scan()
+    turn = rotation_from_vector(np.array([np.radians(tilt_deg), 0.0, 0.0]))
+    tilted = Plane(plate.plane.point_mm, plate.plane.axes @ turn.T)
+    fit = calibrate_on_plate(stripes, replace(plate, plane=tilted))
+    words = fit.reason if isinstance(fit, FitFailure) else " ".join(fit.warnings)
+    assert "probed plane and scan disagree" in words
+    assert float(words.split("tilted by ")[1].split(" deg")[0]) == pytest.approx(tilt_deg, rel=0.2)
+    if isinstance(fit, HandEyeFit):
+        error = hand_eye_difference(fit.calibration.tool_from_sensor, TOOL_FROM_SENSOR)
+        assert error @ np.linalg.solve(fit.calibration.covariance, error) < CHI2_999
+    else:
+        assert tilt_deg > 0.1
+
+
+@pytest.mark.parametrize(("shift_mm", "first"), [(0.1, 6), (1.0, 6), (1.0, 8), (4.0, 6)])
+def test_an_arm_that_was_referenced_anew_is_refused_with_the_posture(
+    shift_mm: float, first: int
+) -> None:
+    stripes, plate = _scan()
+    shift = shift_mm * PLATE_NORMAL
+    late = [
+        s
+        if k < first
+        else replace(
+            s,
+            base_from_tool=Pose(s.base_from_tool.rotation, s.base_from_tool.translation_mm + shift),
+        )
+        for k, s in enumerate(stripes)
+    ]
+    fit = calibrate_on_plate(late, plate)
+    assert isinstance(fit, FitFailure)
+    assert f"up to posture{first - 1:02d} and those from posture{first:02d} on" in fit.reason
+
+
+def test_a_sensor_of_the_wrong_scale_is_refused_with_its_scale() -> None:
+    """A light sheet 1 mm from where it was calibrated: points 1.09 % farther out."""
+    stripes, plate = _scan()
+    larger = [replace(s, points_mm=1.0109 * s.points_mm) for s in stripes]
+    fit = calibrate_on_plate(larger, plate)
+    assert isinstance(fit, FitFailure)
+    assert "sensor's calibration" in fit.reason
+    assert float(fit.reason.split("large by ")[1].split(" %")[0]) == pytest.approx(1.08, abs=0.1)
+
+
+def _mirrored(pose: Pose[Base, Tool], axis: int) -> Pose[Base, Tool]:
+    mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+    return Pose(mirror @ pose.rotation @ mirror, mirror @ pose.translation_mm)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_left_handed_poses_are_refused_by_name(axis: int) -> None:
+    stripes, plate = PlateRig(good_postures(N, np.random.default_rng(1)), form_mm=0.2).draw(1)
+    fit = calibrate_on_plate(_reposed(stripes, lambda pose: _mirrored(pose, axis)), plate)
+    assert isinstance(fit, FitFailure)
+    assert "left-handed" in fit.reason and f"{'xyz'[axis]} pointing the other way" in fit.reason
+
+
+def test_left_handed_poses_and_plate_are_told_by_the_sheets_bow() -> None:
+    rig = PlateRig(good_postures(N, np.random.default_rng(1)), form_mm=0.2)
+    stripes, plate = rig.draw(1)
+    mirror = np.diag([1.0, -1.0, 1.0])
+    axes = plate.plane.axes @ mirror * np.array([[-1.0], [1.0], [1.0]])
+    there = replace(plate, plane=Plane(mirror @ plate.plane.point_mm, axes))
+    fit = calibrate_on_plate(_reposed(stripes, lambda pose: _mirrored(pose, 1)), there)
+    assert isinstance(fit, FitFailure)
+    assert "poses and plate were left-handed" in fit.reason
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "left and right"), (1, "top and bottom")])
+def test_mirrored_images_are_refused_by_name(axis: int, name: str) -> None:
+    """Their middle is not the camera's: it is sought along."""
+    rig = PlateRig(good_postures(N, np.random.default_rng(1)), form_mm=0.2)
+    stripes, plate = rig.draw(1)
+    reversed_ = []
+    for stripe in stripes:
+        points = stripe.points_mm.copy()
+        points[:, axis] = 0.01 * points[:, 2] - points[:, axis]
+        reversed_.append(replace(stripe, points_mm=rig.on_sheet(points)))
+    fit = calibrate_on_plate(reversed_, plate)
+    assert isinstance(fit, FitFailure)
+    assert f"if {name} of the images were exchanged" in fit.reason
+
+
+def test_a_scatter_that_no_arm_has_is_refused_unless_it_was_given() -> None:
+    """The limit on the rms, raised, does not let it pass either."""
+    noise = RigNoise(posture_mm=0.6, posture_rad=0.6 / 265.0)
+    stripes, plate = PlateRig(good_postures(N, np.random.default_rng(1)), noise).draw(1)
+    fit = calibrate_on_plate(stripes, plate, HandEyeOptions(max_rms_mm=2.0))
+    assert isinstance(fit, FitFailure)
+    assert "--arm-position-mm" in fit.remedy
+    given = HandEyeOptions(max_rms_mm=2.0, arm_position_mm=0.6)
+    assert isinstance(calibrate_on_plate(stripes, plate, given), HandEyeFit)
+
+
+def test_words_about_the_plane_follow_its_test() -> None:
+    """One fact states how well the stripes alone confirm the plane, whatever the outcome."""
+    stripes, plate = _scan()
+    clean = calibrate_on_plate(stripes, plate)
+    turn = rotation_from_vector(np.array([np.radians(0.03), 0.0, 0.0]))
+    tilted = replace(plate, plane=Plane(plate.plane.point_mm, plate.plane.axes @ turn.T))
+    off = calibrate_on_plate(stripes, tilted)
+    assert isinstance(clean, HandEyeFit) and isinstance(off, HandEyeFit)
+    assert "agree with it" in dict(clean.reference)["plane, checked"]
+    assert "contradict it" in dict(off.reference)["plane, checked"]
 
 
 def test_a_plate_without_covariance_is_not_said_to_be_coefficients() -> None:

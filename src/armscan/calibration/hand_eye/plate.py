@@ -8,14 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from armscan.calibration.hand_eye.alternatives import find_alternatives
 from armscan.calibration.hand_eye.conditioning import (
     conditioning_warnings,
     describe_conditioning,
     refuse_few_postures,
     refuse_open_hand_eye,
 )
+from armscan.calibration.hand_eye.contradictions import find_contradiction, plane_in_words
 from armscan.calibration.hand_eye.least_squares import design
 from armscan.calibration.hand_eye.left_out import leave_each_out
+from armscan.calibration.hand_eye.mirrors import find_mirror
 from armscan.calibration.hand_eye.noise_model import noise_components, total_covariance
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
@@ -24,9 +27,14 @@ from armscan.calibration.hand_eye.plate_checks import (
     explain_misfit,
     influence_warnings,
     point_warnings,
-    refuse_other_plane,
+    refuse_scatter,
 )
-from armscan.calibration.hand_eye.plate_fit import hand_eye_information, plane_after
+from armscan.calibration.hand_eye.plate_fit import (
+    PlateFit,
+    fit_plate,
+    hand_eye_information,
+    plane_after,
+)
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
 from armscan.calibration.hand_eye.plate_outliers import CheckedFit, fit_without_wrong_postures
 from armscan.calibration.hand_eye.plate_residuals import PlateState, place_nodes, shifted_plane
@@ -34,14 +42,20 @@ from armscan.calibration.hand_eye.plate_result import (
     hand_eye_calibration,
     posture_results,
     reference_facts,
+    sigma_of,
     stripe_residuals,
 )
+from armscan.calibration.hand_eye.plate_rivals import settle_rivals
 from armscan.calibration.hand_eye.plate_search import Start, find_start
 from armscan.calibration.hand_eye.posture_geometry import REMEDY, common_to_postures
 from armscan.calibration.hand_eye.posture_names import check_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
+
+AS_WELL = 1.5
+"""What moved explains all postures if it leaves no more than this times the scatter of the arm that
+is left without the postures that look wrong."""
 
 
 def calibrate_on_plate(
@@ -95,14 +109,57 @@ def calibrate_on_plate(
     if refusal is not None:
         also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept, options))
         return FitFailure(refusal.reason + also, refusal.remedy)
-    checked = fit_without_wrong_postures(nodes, plate, start, options)
+    settled = settle_rivals(nodes, plate, start, options, common_to_postures(nodes, plate.plane))
+    if isinstance(settled, FitFailure):
+        return settled
+    mirror = find_mirror(nodes, plate, settled, options)
+    if mirror is not None:
+        return mirror
+    checked = _checked(nodes, plate, settled, options)
     if isinstance(checked, FitFailure):
         return checked
-    disagreement = refuse_other_plane(checked.nodes, plate, checked.fit, options)
-    if isinstance(disagreement, FitFailure):
-        return disagreement
-    checked = replace(checked, warnings=(*checked.warnings, *disagreement))
-    return _result(stripes, kept, plate, options, start=start, checked=checked)
+    return _result(stripes, kept, plate, options, start=settled, checked=checked)
+
+
+def _checked(
+    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
+) -> CheckedFit | FitFailure:
+    """Refine, leave wrong postures out, and look for something that moved or is not as given.
+
+    A plate that moved makes postures look wrong, and wrong postures may look like a plate that
+    moved. If what moved explains all postures about as well as leaving some out explains the rest,
+    it is believed.
+    """
+    state = PlateState(start.tool_from_sensor, np.zeros(3))
+    right = nodes.select(~start.is_wrong[nodes.posture])
+    first = fit_plate(right, plate, state, options)
+    if isinstance(first, FitFailure):
+        return first
+    checked = fit_without_wrong_postures(nodes, plate, start, first, options)
+    usual_mm = sigma_of(first if isinstance(checked, FitFailure) else checked.fit, "arm")
+    trials = [(right, first)]
+    if start.is_wrong.any():
+        whole = fit_plate(nodes, plate, state, options)
+        trials += [(nodes, whole)] if isinstance(whole, PlateFit) else []
+    for tried, fit in trials:
+        found = find_alternatives(tried, plate, fit, options)
+        moved = find_contradiction(found, tried, plate, fit)
+        is_all = isinstance(checked, CheckedFit) and fit is checked.fit
+        if moved is None or not moved.is_refused:
+            continue
+        if is_all or moved.arm_mm < AS_WELL * usual_mm:
+            return moved.failure
+    if isinstance(checked, FitFailure):
+        return checked
+    found = find_alternatives(checked.nodes, plate, checked.fit, options)
+    moved = find_contradiction(found, checked.nodes, plate, checked.fit)
+    checked = replace(checked, plane_check=plane_in_words(found))
+    if moved is None:
+        refusal = refuse_scatter(checked.fit, options)
+        return checked if refusal is None else refusal
+    if moved.is_refused:
+        return moved.failure
+    return replace(checked, widening=moved.widening, warnings=(*checked.warnings, moved.reason))
 
 
 def _refuse_start(
@@ -120,12 +177,6 @@ def _refuse_start(
         return refusal
     if not start.typical_mm <= options.max_rms_mm:
         return explain_misfit(nodes, plate, start, options)
-    if start.n_rivals:
-        return FitFailure(
-            f"{len(nodes.used_postures)} postures leave {start.n_rivals + 1} or more different "
-            f"hand-eyes that explain the stripes equally well{cause}",
-            f"add postures: {REMEDY}",
-        )
     return None
 
 
@@ -152,6 +203,7 @@ def _result(
             plate,
             options,
             conditioning=conditioning,
+            widening=checked.widening,
             residuals=residuals,
             postures=postures,
         ),
@@ -159,7 +211,7 @@ def _result(
         residuals,
         postures,
         conditioning.singular_values,
-        reference_facts(plate, options, fit),
+        reference_facts(plate, options, fit, checked.plane_check),
         (
             *checked.warnings,
             *conditioning_warnings(conditioning, len(postures), cause),

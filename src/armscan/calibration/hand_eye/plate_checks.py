@@ -4,38 +4,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
-from armscan.calibration.hand_eye.conditioning import GOOD_POSTURES
+from armscan.calibration.hand_eye.contradictions import FIND_WHAT_MOVED, PROBE_AGAIN
 from armscan.calibration.hand_eye.left_out import LeftOut
+from armscan.calibration.hand_eye.mirrors import find_mirror
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
+from armscan.calibration.hand_eye.plate_fit import PlateFit
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
+from armscan.calibration.hand_eye.plate_residuals import PlateState, place_nodes
 from armscan.calibration.hand_eye.plate_result import sigma_of
-from armscan.calibration.hand_eye.plate_search import Start
-from armscan.calibration.hand_eye.pose_hypotheses import find_reading
+from armscan.calibration.hand_eye.plate_search import (
+    GROSS_MM,
+    GROSS_RATIO,
+    Start,
+    find_start,
+    posture_rms,
+)
+from armscan.calibration.hand_eye.pose_hypotheses import BETTER, find_reading
 from armscan.calibration.hand_eye.probed_side import find_free_plane, offset_in_words
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 
-DISAGREEING = 1e-3
-MIN_DISAGREEMENT_MM = 0.02
 LARGE_ARM_MM = 0.1
 REJECTED_SHARE = 0.2
 MAX_MOVE_SIGMA = 5.0
+MOST_ARM_MM = 0.25
+"""An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
+LEAST_TO_SPLIT = 8
 GROSS_TILT_DEG = 3.0
 GROSS_OFFSET_MM = 10.0
 """A plate that seems to lie further off than this was hardly probed wrongly: poses that are read
 wrongly are asked for first."""
-PROBE_AGAIN = (
-    "where the tip was compensated to the wrong side, run `armscan probe --side` with the side "
-    "that was touched; else probe the plate again, from the side that is scanned and after its "
-    "last move, or solve the plate along"
-)
 
 
 def explain_misfit(
@@ -48,6 +50,12 @@ def explain_misfit(
     )
     free = find_free_plane(nodes, plate.plane)
     is_plate = free is not None and free.typical_mm < 0.2 * start.typical_mm
+    mirror = find_mirror(nodes, plate, start, options, smaller=BETTER)
+    if mirror is not None:
+        return mirror
+    change = _split(nodes, plate, start, fact)
+    if change is not None:
+        return change
     if free is not None and is_plate and _is_gross(free.offset_mm, free.tilt_deg):
         best_mm = min(free.typical_mm, options.max_rms_mm)
         misread = _misread(nodes, plate, fact, start.typical_mm, best_mm)
@@ -60,7 +68,7 @@ def explain_misfit(
             f"plane then lies {offset_in_words(free.offset_mm, free.tilt_deg, plate)}",
             PROBE_AGAIN,
         )
-    misread = _misread(nodes, plate, fact, start.typical_mm, np.inf)
+    misread = _misread(nodes, plate, fact, start.typical_mm, options.max_rms_mm)
     if misread is not None:
         return misread
     return FitFailure(
@@ -68,6 +76,50 @@ def explain_misfit(
         "check the rotation convention of the poses, that every exposure has its own pose, that "
         "the plate was neither moved nor exchanged between probing and scanning, and that the "
         "sensor's calibration is this one",
+    )
+
+
+def _split(nodes: PlateNodes, plate: PlateReference, start: Start, fact: str) -> FitFailure | None:
+    """Refuse postures of which the first and the last each agree, but not with each other."""
+    used = np.sort(nodes.used_postures)
+    if len(used) < LEAST_TO_SPLIT:
+        return None
+    most_mm = BETTER * start.typical_mm
+    for order in (used, used[::-1]):
+        half = find_start(
+            nodes.select(np.isin(nodes.posture, order[: len(order) // 2])), plate.plane
+        )
+        if half.typical_mm > most_mm:
+            continue
+        state = PlateState(half.tool_from_sensor, np.zeros(3))
+        rms = posture_rms(nodes, place_nodes(nodes, plate.plane, state).residual_mm)[order]
+        far = np.flatnonzero(rms > max(GROSS_RATIO * half.typical_mm, GROSS_MM))
+        if not len(far) or not (rms[far[0] :] > GROSS_MM).all():
+            continue
+        before, after = nodes.postures[order[far[0] - 1]], nodes.postures[order[far[0]]]
+        first, second = (before, after) if order is used else (after, before)
+        return FitFailure(
+            f"{fact}; the postures up to {first} and those from {second} on do not agree with each "
+            f"other: with the hand-eye of {'the former' if order is used else 'the latter'} "
+            f"({half.typical_mm:.3f} mm) the others lie {float(np.median(rms[far[0] :])):.2f} mm "
+            "from the plate",
+            FIND_WHAT_MOVED,
+        )
+    return None
+
+
+def refuse_scatter(fit: PlateFit, options: HandEyeOptions) -> FitFailure | None:
+    """Refuse residuals that no arm explains; none where the arm's scatter was given."""
+    arm_mm = sigma_of(fit, "arm")
+    names = [component.name for component in fit.components]
+    sigma_log = float(np.sqrt(fit.noise.log_covariance[names.index("arm"), names.index("arm")]))
+    if options.arm_position_mm is not None or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
+        return None
+    return FitFailure(
+        f"the arm would have to scatter by {arm_mm:.2f} mm an axis to explain the stripes: no "
+        f"measuring arm and hardly a robot does (limit {MOST_ARM_MM:g} mm)",
+        "check that plate, poses, sensor and stripes belong together; where the arm is that bad, "
+        "say so with --arm-position-mm",
     )
 
 
@@ -87,33 +139,6 @@ def _misread(
     )
 
 
-def refuse_other_plane(
-    nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
-) -> FitFailure | tuple[str, ...]:
-    """Compare the probed plane with the one that the scan alone gives: refuse, or warn of it."""
-    state = fit.refined.state
-    if options.solve_plate or len(nodes.used_postures) < GOOD_POSTURES:
-        return ()
-    free = fit_plate(nodes, plate, state, replace(options, solve_plate=True))
-    if isinstance(free, FitFailure):
-        return ()
-    prior = np.zeros((3, 3)) if plate.covariance is None else plate.covariance
-    difference, spread = free.refined.state.plane, free.covariance[6:, 6:] + prior
-    statistic = float(difference @ np.linalg.solve(spread, difference))
-    probability = float(chi2_distribution.sf(statistic, 3))
-    middle = -fit.refined.placed.by_plane.mean(axis=0)
-    offset_mm = float(middle @ difference)
-    sigma_mm = float(np.sqrt(middle @ spread @ middle))
-    if probability > DISAGREEING or abs(offset_mm) < MIN_DISAGREEMENT_MM:
-        return ()
-    tilt_deg = float(np.degrees(np.hypot(difference[0], difference[1])))
-    fact = (
-        f"probed plane and scan disagree (probability {probability:.1g}): the plane solved along "
-        f"lies {offset_in_words(offset_mm, tilt_deg, plate)} (+- {sigma_mm:.3f} mm)"
-    )
-    return FitFailure(fact, PROBE_AGAIN) if abs(offset_mm) > options.max_rms_mm else (fact,)
-
-
 def agreement_warnings(
     nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
 ) -> tuple[str, ...]:
@@ -126,6 +151,11 @@ def agreement_warnings(
             "the plate's normal points away from the scanner: it was probed from the side that "
             "was not scanned, or its sign is arbitrary; a tip compensated to the wrong side "
             "shifts the plane by its diameter"
+        )
+    if not fit.refined.is_settled:
+        warnings.append(
+            "the refinement had not settled when its steps ran out: the hand-eye may be off by "
+            "more than stated"
         )
     arm_mm = sigma_of(fit, "arm")
     if arm_mm > LARGE_ARM_MM and options.arm_position_mm is None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
-from armscan.calibration.hand_eye.plate_residuals import PlateState
 from armscan.calibration.hand_eye.plate_search import Start
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -26,21 +25,31 @@ WRONG_PROBABILITY = 1e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedFit:
-    """A refined hand-eye, the nodes it rests on, and what was left out, in words."""
+    """A refined hand-eye, the nodes it rests on, and what is weak about it, in words.
+
+    ``widening`` (6, 6) is added to the hand-eye's covariance for what contradicts it a little;
+    ``plane_check`` says what the stripes alone say of the plate.
+    """
 
     fit: PlateFit
     nodes: PlateNodes
     warnings: tuple[str, ...]
+    widening: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    plane_check: str = ""
 
 
 def fit_without_wrong_postures(
-    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
+    nodes: PlateNodes,
+    plate: PlateReference,
+    start: Start,
+    first: PlateFit,
+    options: HandEyeOptions,
 ) -> CheckedFit | FitFailure:
-    """Refine the hand-eye and leave out postures whose pose is wrong.
+    """Leave out postures whose pose is wrong.
 
     Gross ones are known from the start. Of the rest, the posture that the others predict worst is
     left out for trial; if the scatter of the others then makes its distance all but impossible, it
-    stays out, and the next one is tried.
+    stays out, and the next one is tried. ``first`` is the fit without the gross ones.
     """
     n_all = len(nodes.used_postures)
     wrong = start.is_wrong.copy()
@@ -48,9 +57,8 @@ def fit_without_wrong_postures(
     if refusal is not None:
         return refusal
     gross = wrong.copy()
-    state = PlateState(start.tool_from_sensor, np.zeros(3))
-    fit = fit_plate(nodes.select(~wrong[nodes.posture]), plate, state, options)
-    while not isinstance(fit, FitFailure):
+    fit = first
+    while True:
         kept = nodes.select(~wrong[nodes.posture])
         suspect = _suspect(kept, fit)
         if suspect is None or len(kept.used_postures) <= LEAST_LEFT:
@@ -66,8 +74,6 @@ def fit_without_wrong_postures(
         refusal = _refuse_many(nodes, wrong, n_all)
         if refusal is not None:
             return refusal
-    if isinstance(fit, FitFailure):
-        return fit
     warnings = _in_words(nodes, wrong, gross, start.rms_mm)
     return CheckedFit(fit, nodes.select(~wrong[nodes.posture]), warnings)
 

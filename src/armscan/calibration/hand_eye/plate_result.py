@@ -106,17 +106,21 @@ def hand_eye_calibration(
     options: HandEyeOptions,
     *,
     conditioning: Conditioning,
+    widening: FloatArray,
     residuals: Sequence[StripeResidual],
     postures: Sequence[PostureResult],
 ) -> HandEyeCalibration:
-    """The document's part: hand-eye, covariance, coupling to the sensor, noise."""
+    """The document's part: hand-eye, covariance, coupling to the sensor, noise.
+
+    ``widening`` (6, 6) is added to the covariance.
+    """
     by_sensor = residual_by_sensor(nodes, fit.refined.placed)
     coupling = None if by_sensor is None else -fit.linear.gain[:6] @ by_sensor
     used = {posture.posture for posture in postures}
     distances = np.concatenate([r.residual_mm for r in residuals if r.posture in used])
     return HandEyeCalibration(
         fit.refined.state.tool_from_sensor,
-        fit.covariance[:6, :6],
+        fit.covariance[:6, :6] + widening,
         coupling,
         arm_noise(fit.components, fit.noise.sigmas),
         float(np.sqrt((distances**2).mean())),
@@ -148,9 +152,12 @@ def sigma_of(fit: PlateFit, name: str) -> float:
 
 
 def reference_facts(
-    plate: PlateReference, options: HandEyeOptions, fit: PlateFit
+    plate: PlateReference, options: HandEyeOptions, fit: PlateFit, plane_check: str
 ) -> tuple[tuple[str, str], ...]:
-    """What the plate was, and what was taken for scatter, as (label, value)."""
+    """What the plate was, and what was taken for scatter, as (label, value).
+
+    ``plane_check`` is what the stripes alone say of the probed plane.
+    """
     a, b, c, d = plate.plane.coefficients
     facts = [("plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
     if plate.n_points:
@@ -163,7 +170,9 @@ def reference_facts(
     elif plate.covariance is None:
         facts.append(("plane", "taken as exact: only A, B, C, D were given"))
     else:
-        facts.append(("plane", "probed, within its uncertainty"))
+        facts.append(("plane", "as probed, weighted by its uncertainty"))
+    if plane_check:
+        facts.append(("plane, checked", plane_check))
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
         unit = {"stripe": "times its own sigma"}.get(component.name, "mm")
         if component.name.endswith("rotation"):

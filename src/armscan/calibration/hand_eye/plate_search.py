@@ -6,8 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from armscan.calibration.hand_eye.many_starts import (
+    Placing,
+    descend_all,
+    distinct,
+    rotations_all_over,
+)
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
 from armscan.calibration.hand_eye.plate_residuals import PlateState, place_nodes
 from armscan.calibration.hand_eye.plate_start import linear_hand_eye, plate_in_tool
@@ -21,14 +26,27 @@ SUBSET_SIZE = 6
 LEAST_FOR_SUBSETS = 8
 """With fewer postures no majority of them can tell a wrong one."""
 N_ROTATIONS = 240
+MOST_STRIPES = 60
+"""Of a long scan, so many stripes are searched with, evenly spread."""
+N_FIRST = 8
+"""Steps of every start; the best of them go on."""
+N_GO_ON = 40
+N_LAST = 40
 N_DESCENTS = 25
-SAME_DEG = 1.0
-IMPOSSIBLE_MM = 1e3
-"""Counted against a hand-eye that puts the camera behind the plate."""
+N_MINIMA = 12
+SAME_RAD = float(np.radians(1.0))
+RIVAL_RATIO = 3.0
+RIVAL_MM = 0.02
+"""Minima that leave less than this, or than `RIVAL_RATIO` times the least, may be the right one."""
+MIXED = 0.05
+"""Share of the stripes that wrong poses may put on another side of the plate than the rest."""
 GROSS_RATIO = 8.0
 GROSS_MM = 0.05
 """A posture is wrong if its distance from the plate exceeds both this and `GROSS_RATIO` times the
 median of all."""
+
+
+FAR_MM = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,15 +63,15 @@ class Start:
         (n postures,) distance of each posture's points from the plate; NaN where it has none.
     is_wrong
         (n postures,) True for postures that the others contradict.
-    n_rivals
-        Distinct hand-eyes that explain the data about as well.
+    rivals
+        Other minima that leave little more, least first.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
     linear: Pose[Tool, Sensor] | None
     rms_mm: FloatArray
     is_wrong: BoolArray
-    n_rivals: int = 0
+    rivals: tuple[Pose[Tool, Sensor], ...] = ()
 
     @property
     def typical_mm(self) -> float:
@@ -62,29 +80,95 @@ class Start:
 
 
 def find_start(nodes: PlateNodes, plate: Plane) -> Start:
-    """Find the hand-eye with the least median distance of the postures from the plate."""
+    """Find the hand-eye with the least median distance of the postures from the plate.
+
+    Of all minima of the sum of squares: those that descents from all over the rotations end in,
+    that of the linear solution, and, where a posture is wrong, those of subsets of the postures.
+    """
     linear = linear_hand_eye(nodes, plate)
-    candidates = [] if linear is None else [_descend(nodes, plate, linear)]
-    n_rivals = 0
+    candidates = list(minima_from_everywhere(nodes, plate))
+    if linear is not None:
+        candidates.append(_descend(nodes, plate, linear))
     used = nodes.used_postures
     is_many = len(used) >= LEAST_FOR_SUBSETS
-    if is_many and (linear is None or _has_wrong(_rms(nodes, plate, candidates[0]))):
+    if is_many and _has_wrong(_rms(nodes, plate, candidates[0])):
         candidates += _from_subsets(nodes, plate, used)
-    if not candidates:
-        candidates, n_rivals = _from_everywhere(nodes, plate)
-    costs = [float(np.nanmedian(_rms(nodes, plate, pose))) for pose in candidates]
+    candidates, costs = _possible(nodes, plate, candidates, is_robust=is_many)
     best = candidates[int(np.argmin(costs))]
-    if not is_many:
-        return Start(
-            best, linear, _rms(nodes, plate, best), np.zeros(len(nodes.postures), bool), n_rivals
-        )
-    for _ in range(3):
+    wrong = np.zeros(len(nodes.postures), dtype=np.bool_)
+    for _ in range(3 if is_many else 0):
         rms = _rms(nodes, plate, best)
         wrong = rms > max(GROSS_MM, GROSS_RATIO * float(np.nanmedian(rms)))
         best = _descend(nodes.select(~wrong[nodes.posture]), plate, best)
     rms = _rms(nodes, plate, best)
-    wrong = rms > max(GROSS_MM, GROSS_RATIO * float(np.nanmedian(rms)))
-    return Start(best, linear, rms, wrong, n_rivals)
+    if is_many:
+        wrong = rms > max(GROSS_MM, GROSS_RATIO * float(np.nanmedian(rms)))
+    return Start(best, linear, rms, wrong, _rivals(candidates, costs, best))
+
+
+def _possible(
+    nodes: PlateNodes, plate: Plane, candidates: list[Pose[Tool, Sensor]], *, is_robust: bool
+) -> tuple[list[Pose[Tool, Sensor]], FloatArray]:
+    """Hand-eyes that a camera can have, and the typical distance (mm) that each leaves.
+
+    A camera does not pass through the plate. Where all stripes pass one point of the sheet, a
+    hand-eye turned by half a turn explains them as well as the true one, but puts the camera now
+    before the plate and now behind it. One that stays behind counts only where none before the
+    plate will do: the plate's normal may have the wrong sign.
+    """
+    rms = np.array([_rms(nodes, plate, pose) for pose in candidates])
+    costs = np.nanmedian(rms, axis=1) if is_robust else np.sqrt(np.nanmean(rms**2, axis=1))
+    behind = _share_behind(nodes, plate, np.array([pose.translation_mm for pose in candidates]))
+    limit = _limit_mm(costs)
+    for kept in (behind <= MIXED, (behind <= MIXED) | (behind >= 1.0 - MIXED)):
+        if (costs[kept] <= limit).any():
+            return [candidates[k] for k in np.flatnonzero(kept)], costs[kept]
+    return candidates, costs
+
+
+def _limit_mm(costs: FloatArray) -> float:
+    return max(RIVAL_RATIO * float(costs.min()), RIVAL_MM)
+
+
+def _rivals(
+    candidates: list[Pose[Tool, Sensor]], costs: FloatArray, best: Pose[Tool, Sensor]
+) -> tuple[Pose[Tool, Sensor], ...]:
+    limit = _limit_mm(costs)
+    rotations = np.array([best.rotation] + [pose.rotation for pose in candidates])
+    first = np.concatenate([[-1.0], np.where(costs <= limit, costs, np.inf)])
+    kept = distinct(rotations, first, SAME_RAD, N_MINIMA)
+    return tuple(candidates[k - 1] for k in kept if k > 0 and np.isfinite(first[k]))
+
+
+def minima_from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[Pose[Tool, Sensor], ...]:
+    """Distinct minima of the plain sum of squares, least first."""
+    nodes = few_stripes(thinned(nodes))
+    rotations = rotations_all_over(N_ROTATIONS)
+    normals, constants = plate_in_tool(nodes, plate)
+    turned = np.einsum("kij,nj->kni", rotations, nodes.points_mm)
+    heights = np.einsum("kni,ni->kn", turned, normals) + constants
+    shifts = np.asarray(-heights @ np.linalg.pinv(normals, rcond=1e-6).T)
+    place, scale = _placing(nodes, plate), _scale(nodes)
+    rotations, shifts, cost = descend_all(place, rotations, shifts, N_FIRST, scale)
+    best = np.argsort(cost)[:N_GO_ON]
+    rotations, shifts, cost = descend_all(place, rotations[best], shifts[best], N_LAST, scale)
+    kept = distinct(rotations, cost, SAME_RAD, N_MINIMA)
+    return tuple(Pose(rotations[k], shifts[k]) for k in kept)
+
+
+def _share_behind(nodes: PlateNodes, plate: Plane, shifts: FloatArray) -> FloatArray:
+    """(K,) share of the stripes for which a hand-eye puts the camera behind the plate."""
+    cameras = np.einsum("sij,kj->ksi", nodes.rotations, shifts) + nodes.translations_mm
+    return np.asarray(((cameras - plate.point_mm) @ plate.normal < 0.0).mean(axis=1))
+
+
+def few_stripes(nodes: PlateNodes) -> PlateNodes:
+    """At most `MOST_STRIPES` stripes, evenly spread."""
+    used = np.unique(nodes.stripe)
+    if len(used) <= MOST_STRIPES:
+        return nodes
+    chosen = used[np.linspace(0, len(used) - 1, MOST_STRIPES).round().astype(np.int64)]
+    return nodes.select(np.isin(nodes.stripe, chosen))
 
 
 def posture_rms(nodes: PlateNodes, residual_mm: FloatArray) -> FloatArray:
@@ -101,8 +185,9 @@ def _rms(nodes: PlateNodes, plate: Plane, pose: Pose[Tool, Sensor]) -> FloatArra
 
 
 def _has_wrong(rms: FloatArray) -> bool:
+    """True where a posture stands out, or all are far: a grossly wrong one moves all others."""
     largest, typical = float(np.nanmax(rms)), float(np.nanmedian(rms))
-    return largest > max(GROSS_MM, 0.5 * GROSS_RATIO * typical)
+    return largest > max(GROSS_MM, min(0.5 * GROSS_RATIO * typical, FAR_MM))
 
 
 def _from_subsets(nodes: PlateNodes, plate: Plane, used: IntArray) -> list[Pose[Tool, Sensor]]:
@@ -135,93 +220,31 @@ def _descend(
     nodes: PlateNodes, plate: Plane, pose: Pose[Tool, Sensor], n_steps: int = N_DESCENTS
 ) -> Pose[Tool, Sensor]:
     """Plain least squares of eq. 2.76 over six parameters."""
-    rotations, translations = _descend_all(
-        nodes, plate, pose.rotation[None], pose.translation_mm[None], n_steps
+    rotations, shifts, _ = descend_all(
+        _placing(nodes, plate),
+        pose.rotation[None],
+        pose.translation_mm[None],
+        n_steps,
+        _scale(nodes),
     )
-    return Pose(rotations[0], translations[0])
+    return Pose(rotations[0], shifts[0])
 
 
-def _from_everywhere(nodes: PlateNodes, plate: Plane) -> tuple[list[Pose[Tool, Sensor]], int]:
-    """Descend from rotations all over; also count distinct solutions that are about as good."""
-    nodes = thinned(nodes)
-    rotations = Rotation.random(N_ROTATIONS, rng=np.random.default_rng(0)).as_matrix()
+def _scale(nodes: PlateNodes) -> FloatArray:
+    size = float(np.sqrt((nodes.points_mm**2).sum(axis=1).mean()))
+    return np.array([1.0 / size] * 3 + [1.0] * 3)
+
+
+def _placing(nodes: PlateNodes, plate: Plane) -> Placing:
+    """Distances from the plate for many hand-eyes at once, with their derivatives."""
     normals, constants = plate_in_tool(nodes, plate)
-    turned = np.einsum("kij,nj->kni", rotations, nodes.points_mm)
-    heights = np.einsum("kni,ni->kn", turned, normals) + constants
-    translations = -heights @ np.linalg.pinv(normals, rcond=1e-6).T
-    rotations, translations = _descend_all(nodes, plate, rotations, translations, N_DESCENTS)
-    rms = np.sqrt((_residuals(nodes, plate, rotations, translations) ** 2).mean(axis=1))
-    rms += IMPOSSIBLE_MM * _views_from_behind(nodes, plate, rotations, translations)
-    order = np.argsort(rms)
-    best = rotations[order[0]]
-    n_rivals, seen = 0, [best]
-    for k in order[rms[order] <= max(3.0 * rms[order[0]], 0.02)]:
-        if all(_apart_deg(rotations[k], other) > SAME_DEG for other in seen):
-            seen.append(rotations[k])
-            n_rivals += 1
-    pose: Pose[Tool, Sensor] = Pose(best, translations[order[0]])
-    return [pose], n_rivals
 
-
-def _views_from_behind(
-    nodes: PlateNodes, plate: Plane, rotations: FloatArray, translations: FloatArray
-) -> FloatArray:
-    """(K,) share of the stripes for which a hand-eye puts the camera behind the plate.
-
-    Where all stripes pass one point of the sheet, a hand-eye turned by half a turn explains them
-    as well as the true one, but puts the camera now before the plate and now behind it.
-    """
-    cameras = np.einsum("sij,kj->ksi", nodes.rotations, translations) + nodes.translations_mm
-    heights = (cameras - plate.point_mm) @ plate.normal
-    return np.asarray((heights < 0.0).mean(axis=1))
-
-
-def _apart_deg(rotation: FloatArray, other: FloatArray) -> float:
-    cosine = 0.5 * (float((rotation * other).sum()) - 1.0)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _residuals(
-    nodes: PlateNodes, plate: Plane, rotations: FloatArray, translations: FloatArray
-) -> FloatArray:
-    """(K, N) residuals of K hand-eyes."""
-    normals, constants = plate_in_tool(nodes, plate)
-    in_tool = np.einsum("kij,nj->kni", rotations, nodes.points_mm) + translations[:, None]
-    return np.asarray(np.einsum("kni,ni->kn", in_tool, normals) + constants)
-
-
-def _descend_all(
-    nodes: PlateNodes,
-    plate: Plane,
-    rotations: FloatArray,
-    translations: FloatArray,
-    n_steps: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Damped Gauss-Newton from many starts at once: (K, 3, 3) and (K, 3)."""
-    normals, constants = plate_in_tool(nodes, plate)
-    size = np.sqrt((nodes.points_mm**2).sum(axis=1).mean())
-    scale = np.array([1.0 / size] * 3 + [1.0] * 3)
-    damping = np.full(len(rotations), 1e-3)
-    cost = (_residuals(nodes, plate, rotations, translations) ** 2).sum(axis=1)
-    for _ in range(n_steps):
+    def place(rotations: FloatArray, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
         turned = np.einsum("kij,nj->kni", rotations, nodes.points_mm)
-        residual = np.einsum("kni,ni->kn", turned + translations[:, None], normals) + constants
+        residual = np.einsum("kni,ni->kn", turned, normals) + shifts @ normals.T + constants
         slopes = np.concatenate(
             [np.cross(turned, normals[None]), np.broadcast_to(normals, turned.shape)], axis=2
         )
-        slopes = slopes * scale
-        matrix = slopes.transpose(0, 2, 1) @ slopes
-        mean = np.einsum("kii->k", matrix) / 6.0
-        matrix += (damping * mean + 1e-12)[:, None, None] * np.eye(6)
-        gradient = np.einsum("kni,kn->ki", slopes, residual)
-        step = -np.linalg.solve(matrix, gradient[:, :, None])[:, :, 0] * scale
-        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        tried_rotations, tried = turn @ rotations, translations + step[:, 3:]
-        value = (_residuals(nodes, plate, tried_rotations, tried) ** 2).sum(axis=1)
-        better = value < cost
-        rotations = np.where(better[:, None, None], tried_rotations, rotations)
-        translations = np.where(better[:, None], tried, translations)
-        cost = np.where(better, value, cost)
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-    u, _, vt = np.linalg.svd(rotations)
-    return np.asarray(u @ vt), translations
+        return residual, slopes
+
+    return place

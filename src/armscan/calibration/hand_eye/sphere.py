@@ -46,7 +46,7 @@ from armscan.calibration.hand_eye.sphere_residuals import (
     place_on_sphere,
     sphere_nodes,
 )
-from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.calibration.hand_eye.sphere_sections import Section, find_sections
 from armscan.calibration.hand_eye.sphere_start import is_apart, start_candidates
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -116,7 +116,7 @@ def calibrate_on_sphere(
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    starts = _search(sphere_nodes(thinned, START_NODES), radius, options)
+    starts = _search(thinned, radius, options)
     if isinstance(starts, FitFailure):
         return starts
     nodes = sphere_nodes(sections, options.nodes_per_stripe, sensor_covariance)
@@ -160,12 +160,13 @@ def _refuse_postures(linear: LinearSolution | None, diameter_mm: float) -> FitFa
 
 
 def _search(
-    nodes: SphereNodes, radius_mm: float, options: SphereOptions
+    sections: tuple[Section, ...], radius_mm: float, options: SphereOptions
 ) -> tuple[SphereState, ...] | FitFailure:
     """Distinct minima of the plain sum of squares that are nearly the least, best first."""
+    nodes = sphere_nodes(sections, START_NODES)
     plain = np.eye(len(nodes))
     ends = []
-    for start in start_candidates(nodes, radius_mm):
+    for start in start_candidates(sections, radius_mm):
         state, cost, _ = descend(nodes, start, plain, np.arange(RADIUS_COLUMN))
         ends.append((cost, state))
     ends.sort(key=lambda pair: pair[0])

@@ -10,7 +10,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from armscan.calibration.hand_eye.conditioning import Conditioning
 from armscan.calibration.hand_eye.least_squares import solve_linear
-from armscan.calibration.hand_eye.noise_model import arm_noise
+from armscan.calibration.hand_eye.noise_model import arm_noise, total_covariance
 from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, StripeResidual
 from armscan.calibration.hand_eye.sphere_refine import LeftOutPosture, SphereSolution, leave_out
 from armscan.calibration.hand_eye.sphere_residuals import (
@@ -20,7 +20,7 @@ from armscan.calibration.hand_eye.sphere_residuals import (
     SphereState,
     residual_by_sensor,
 )
-from armscan.calibration.hand_eye.variance_components import covariance_over_noise
+from armscan.calibration.hand_eye.variance_components import covariance_over_noise, estimate_noise
 from armscan.geometry.arrays import FloatArray
 from armscan.models.scanner import HandEyeCalibration, HandEyeDiagnostics
 
@@ -189,11 +189,17 @@ def _reference(evidence: _Evidence, diameter_mm: float) -> tuple[tuple[str, str]
 
 
 def diameter_asked(solution: SphereSolution) -> tuple[float, float]:
-    """Diameter that the points themselves ask for, and its standard deviation, both in mm."""
+    """Diameter that the points themselves ask for, and its standard deviation, both in mm.
+
+    The scatter is estimated anew: as long as the diameter is held, a wrong one counts as form of
+    the stripes, and is hidden by it.
+    """
     columns = np.union1d(solution.free, [RADIUS_COLUMN])
-    freed = solve_linear(
-        solution.placed.residual_mm, solution.placed.slopes[:, columns], solution.total
-    )
+    residual, slopes = solution.placed.residual_mm, solution.placed.slopes[:, columns]
+    components, by_sensor = solution.components, solution.by_sensor
+    noise = estimate_noise(residual, slopes, components, by_sensor, solution.noise.sigmas)
+    total = total_covariance(components, noise.sigmas) + by_sensor
+    freed = solve_linear(residual, slopes, total)
     if freed is None:
         return 2.0 * solution.state.radius_mm, float("inf")
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])

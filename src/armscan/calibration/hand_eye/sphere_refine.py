@@ -33,6 +33,8 @@ SETTLED = 1e-10
 ROUNDS = 6
 NOISE_SETTLED = 1e-3
 TYPICAL_ARM_MM = 0.03
+TYPICAL_FORM_MM = 0.003
+FORM_LOG_WIDTH = 2.0
 ARM_LOG_WIDTH = 2.0
 """Arms and robots differ by far more than one arm from day to day."""
 
@@ -162,7 +164,12 @@ def solve_at(
 def noise_of_sphere(
     nodes: SphereNodes, placed: PlacedOnSphere, options: SphereOptions, weights: FloatArray
 ) -> tuple[NoiseComponent, ...]:
-    """Causes of scatter: the arm's pose, common to a posture, and the stripe node by node."""
+    """Causes of scatter: the arm's pose, common to a posture, the stripe's form, and its noise.
+
+    A stripe whose points all lie a little too far out has the wrong curvature, which the arm's pose
+    does not explain: a profile's scale, light that enters the surface. Where the section is nearly
+    a great circle, a hundredth of a millimetre of it moves the sphere's centre by a whole one.
+    """
     same = (nodes.posture[:, None] == nodes.posture[None, :]) / weights[nodes.posture][:, None]
     shift = same * (placed.by_pose[:, :3] @ placed.by_pose[:, :3].T)
     turn = same * (placed.by_pose[:, 3:] @ placed.by_pose[:, 3:].T)
@@ -172,8 +179,10 @@ def noise_of_sphere(
     arm = [NoiseComponent("arm", tied, sigma, position is None, ARM_LOG_WIDTH)]
     if rotation is not None:
         arm.append(NoiseComponent("arm rotation", turn, rotation))
+    section = np.asarray(nodes.section[:, None] == nodes.section[None, :], dtype=np.float64)
+    form = NoiseComponent("form", section, TYPICAL_FORM_MM, True, FORM_LOG_WIDTH)
     own = NoiseComponent("stripe", np.diag(nodes.sigma_mm**2), 1.0, True, 0.5)
-    return (*arm, own)
+    return (*arm, form, own)
 
 
 def _first_sigmas(components: tuple[NoiseComponent, ...], placed: PlacedOnSphere) -> FloatArray:

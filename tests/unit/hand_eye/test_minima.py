@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search for the least minimum, and what keeps the refinement on a sphere near it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from armscan.calibration.hand_eye.many_starts import distinct, rotations_all_over
+from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
+from armscan.calibration.hand_eye.plate_search import minima_from_everywhere
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
+from armscan.calibration.hand_eye.sphere_options import SphereOptions
+from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.calibration.hand_eye.sphere_start import start_candidates
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.frames import Sensor, Tool
+from armscan.geometry.poses import Pose
+from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
+from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
+
+FORM_MM = 0.04
+QUICK = SphereOptions(nodes_per_stripe=10)
+
+
+def test_the_rotations_leave_no_orientation_far_away() -> None:
+    """200 balls of equal size that filled the rotations would reach 22 degrees."""
+    rotations = rotations_all_over(200)
+    traces = np.einsum(
+        "kij,nij->nk", rotations, Rotation.random(2000, rng=np.random.default_rng(1)).as_matrix()
+    )
+    nearest = np.degrees(np.arccos(np.clip(0.5 * (traces.max(axis=1) - 1.0), -1.0, 1.0)))
+    assert nearest.max() < 40.0
+    assert np.linalg.det(rotations) == pytest.approx(1.0)
+
+
+def test_distinct_takes_the_least_costly_of_alike_rotations() -> None:
+    turns = Rotation.from_rotvec([[0.0, 0.0, a] for a in (0.0, 0.01, 1.0, 1.01, 2.0)]).as_matrix()
+    kept = distinct(turns, np.array([2.0, 1.0, 3.0, 4.0, 5.0]), 0.05, 2)
+    assert kept.tolist() == [1, 2]
+
+
+def _hardly_turned(rig: SphereRig, rng: np.random.Generator) -> list[PosedStripe]:
+    """A robot's set: six postures that only shift, nine turned a little about one axis each."""
+    turns = np.zeros((15, 3))
+    turns[np.arange(6, 15), np.repeat([0, 1, 2], 3)] = np.tile([0.1, 0.17, 0.25], 3)
+    heights = np.resize([1.0, -1.5, 0.5, 4.0, 9.0, 0.2, 2.0], 15)
+    poses = [
+        rig.base_from_tool(turn, height, rng.uniform(-8.0, 8.0), rng.uniform(-12.0, 12.0))
+        for turn, height in zip(turns, heights, strict=True)
+    ]
+    return rig.stripes(poses, rng)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_spheres_minimum_is_no_worse_than_the_truths(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stripes = _hardly_turned(SphereRig(pose_noise_mm=0.1, point_noise_mm=0.01), rng)
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, SphereOptions())
+    best = start_candidates(sections, 0.5 * DIAMETER_MM)[0]
+
+    def left(pose: Pose[Tool, Sensor], centre: FloatArray) -> float:
+        total = 0.0
+        for section in sections:
+            moved = section.stripe.base_from_tool @ pose
+            placed = section.points_mm @ moved.rotation.T + moved.translation_mm
+            off = np.linalg.norm(placed - centre, axis=1) - 0.5 * DIAMETER_MM
+            total += float((off**2).mean())
+        return total
+
+    assert left(best.tool_from_sensor, best.centre_mm) < left(HAND_EYE, CENTRE_MM)
+
+
+def test_stripes_of_a_wrong_curvature_do_not_drive_the_refinement_away() -> None:
+    """Radii wrong by 0.04 mm near the great circle, as of real profiles: the centre's height
+    over its sheet is then wrong by a millimetre, and must not be believed.
+    """
+    rng = np.random.default_rng(1)
+    rig = SphereRig(pose_noise_mm=0.1, point_noise_mm=0.01)
+    stripes = []
+    for stripe in _hardly_turned(rig, rng):
+        radial = (
+            stripe.noise_mm[:, :, 0] / np.linalg.norm(stripe.noise_mm[:, :, 0], axis=1)[:, None]
+        )
+        wrong = stripe.points_mm + rng.normal(0.0, FORM_MM) * radial
+        stripes.append(replace(stripe, points_mm=wrong))
+    fit = calibrate_on_sphere(stripes, DIAMETER_MM, QUICK)
+    assert isinstance(fit, HandEyeFit)
+    assert fit.calibration.rms_mm < 0.2
+    assert fit.calibration.arm_noise.position_mm == pytest.approx(0.1, rel=0.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_few_postures_on_a_plate_lead_to_the_truth_from_nowhere(seed: int) -> None:
+    """Five hardly tilted postures: too few for the linear start."""
+    rng = np.random.default_rng(seed)
+    postures = Postures(
+        rng.uniform(0.0, 0.3, 5),
+        rng.uniform(0.0, 6.3, 5),
+        rng.uniform(-1.0, 1.0, 5),
+        rng.uniform(120.0, 160.0, 5),
+        rng.uniform(-80.0, 80.0, (5, 2)),
+    )
+    stripes, plate = PlateRig(postures).draw(seed)
+    options = HandEyeOptions()
+    nodes = condense(stripes, straight_stripes(stripes, options), 3)
+    turns = [
+        Rotation.from_matrix(pose.rotation.T @ TOOL_FROM_SENSOR.rotation).magnitude()
+        for pose in minima_from_everywhere(nodes, plate.plane)
+    ]
+    assert min(turns) < np.radians(3.0)
+
+
+def test_a_pose_that_is_off_by_a_metre_does_not_spoil_the_start() -> None:
+    for seed in range(3):
+        rig = PlateRig(good_postures(12, np.random.default_rng([1, seed])))
+        stripes, plate = rig.draw(seed)
+        pose = stripes[4].base_from_tool
+        far = Pose(pose.rotation, pose.translation_mm + 1000.0 * PLATE_NORMAL)
+        wrong = [*stripes[:4], replace(stripes[4], base_from_tool=far), *stripes[5:]]
+        fit = calibrate_on_plate(wrong, plate)
+        assert isinstance(fit, HandEyeFit)
+        assert any("left out 1 postures" in text and "posture04" in text for text in fit.warnings)

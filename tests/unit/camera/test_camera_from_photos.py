@@ -64,8 +64,8 @@ def test_wrong_columns_are_noticed_and_blank_images_named() -> None:
     exposures = photos("stereo_chessboard/left0[1-4].jpg")
     wrong = calibrate_camera_from_exposures(exposures, Chessboard(8, 7, 25.0))
     assert isinstance(wrong, FitFailure)
-    assert "found in 0 of 4 images" in wrong.reason
-    assert "left01.jpg" in wrong.reason
+    assert "9 x 6" in wrong.reason
+    assert "chessboard:9x6:25" in wrong.remedy
     blank = Exposure(np.full((480, 640), 90, dtype=np.uint8), "blank.png")
     run = calibrate_camera_from_exposures([*exposures, blank], Chessboard(9, 6, 25.0))
     assert isinstance(run, CameraRun)

@@ -155,6 +155,21 @@ def test_empty_parts_and_small_tilts_are_warned_of() -> None:
     assert "tilt it by 20 to 45" in warnings
 
 
+@pytest.mark.parametrize(("fy_px", "is_told"), [(2300.0, False), (2310.0, False), (3066.0, True)])
+def test_stretched_images_are_warned_of(fy_px: float, *, is_told: bool) -> None:
+    lens = replace(CAMERA, fy_px=fy_px)
+    fit = solved(make_views(Scene(camera=lens), 4)[0], ALL_FIVE)
+    assert any("fx / fy" in warning for warning in fit.warnings) == is_told
+
+
+def test_views_of_one_place_are_told_in_one_sentence() -> None:
+    views, _ = make_views(Scene(), 5)
+    again = [replace(view, source=f"again-{view.source}") for view in views[:5]]
+    told = [w for w in solved([*views, *again], ALL_FIVE).warnings if "repeat" in w]
+    assert len(told) == 1
+    assert told[0].startswith("5 views")
+
+
 def test_folding_model_yields_to_one_that_does_not_fold() -> None:
     # Strong barrel distortion seen only in the middle: k3 runs away at the corners.
     lens = CameraModel(520.0, 520.0, 319.5, 239.5, np.array([-0.3, 0.11, 0, 0, 0]), 640, 480)

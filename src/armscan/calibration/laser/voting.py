@@ -26,8 +26,10 @@ LEAST_BOARDS = 3
 """Any two lines that meet are coplanar: only a third one can agree."""
 TOLERANCES_PX = (3.0, 8.0, 20.0)
 """How far across itself a stripe may lie from the common sheet, besides what its board's pose
-leaves open: the first with which most boards agree. A bowed board or sheet needs more than a flat
-one."""
+leaves open: the first with which most boards agree."""
+BOW_SHARE = 0.01
+"""Of the print's longer side: how far a bowed sheet or board may hold a stripe off a plane. Line
+lasers bow by up to 0.7 % over the field that they light, boards of card by about as much."""
 AGREEING_SHARE = 0.6
 SECOND_SHARE = 0.5
 """A further sheet is seen on at least this part of the boards that show the first."""
@@ -73,7 +75,7 @@ class _Lines:
     ``ends_mm`` (S, 2, 3); ``pose_root`` (S, 2, 3, 6) movement of the ends for a sigma of the
     board's pose; ``across_mm_px`` (S, 3) movement for a pixel across; ``length`` (S,) points;
     ``image`` and ``board`` (S,), ``place`` (S,) number of the sighting in its image; ``centre_mm``
-    (S, 3) of the camera that saw it.
+    (S, 3) of the camera that saw it, and ``bow_mm`` (S,) what a bow may do on its board.
     """
 
     ends_mm: FloatArray
@@ -84,6 +86,7 @@ class _Lines:
     board: IntArray
     place: IntArray
     centre_mm: FloatArray
+    bow_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -245,7 +248,12 @@ def _lines_of(images: Sequence[BoardImage], cameras: HeadCameras) -> _Lines:
         np.array([boards[i] for i, _, _ in found], dtype=np.int64),
         np.array([k for _, k, _ in found], dtype=np.int64),
         np.array([cameras.centre_mm(images[i].data.camera) for i, _, _ in found]).reshape(n, 3),
+        np.array([BOW_SHARE * _longer_side_mm(images[i]) for i, _, _ in found]),
     )
+
+
+def _longer_side_mm(image: BoardImage) -> float:
+    return float(np.ptp(image.data.view.points_board_mm, axis=0).max())
 
 
 def _mm_per_px(image: BoardImage, sighting: Sighting) -> float:
@@ -362,7 +370,8 @@ def _misses(
     height = np.einsum("ti,sei->tse", normals, lines.ends_mm[own]) - offsets[:, None, None]
     by_pose = np.einsum("ti,seip->tsep", normals, lines.pose_root[own])
     pose = POSE_SIGMAS * np.sqrt((by_pose**2).sum(axis=3))
-    allowed = tolerance_px * _mm_of_px(lines, own, normals)[:, :, None] + pose
+    allowed = tolerance_px * _mm_of_px(lines, own, normals) + lines.bow_mm[own]
+    allowed = allowed[:, :, None] + pose
     return np.asarray((np.abs(height) / allowed).max(axis=2))
 
 

@@ -184,8 +184,8 @@ def _points_section(fit: LaserFit) -> Section:
         "The stripes are measured with the calibration as it is stored, as any later stripe is, "
         "and compared with the plane of the board on which they lay (positive: beyond it). Camera "
         "and sheets that do not belong together would show here. 'Left out': the board's points "
-        "made with the sheet of all other boards. 'Claimed' is what the calibration's own uncertainty "
-        "allows for these distances."
+        "made with the sheet of all other boards. 'Claimed' is what the calibration's own "
+        "uncertainty allows for these distances."
     )
     table = Table(heads, tuple(rows), "Points against their boards", (1, 2, 3, 4, 5, 6))
     return Section("Points made with this calibration", (words, table))

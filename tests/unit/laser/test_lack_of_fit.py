@@ -19,7 +19,10 @@ def solution(chi2: float, n_parameters: int) -> SheetSolution:
     none: FloatArray = np.zeros(0)
     empty = np.zeros((0, 0))
     linear = LinearSolution(
-        StripeSystem((), 0, 0, none, none), NormalSolution(none, empty, empty, 0), none, none > 0.0
+        StripeSystem((), 0, 0, 0, none, none),
+        NormalSolution(none, empty, empty, 0),
+        none,
+        none > 0.0,
     )
     return SheetSolution((), empty, none, none, none, none, chi2, n_parameters, 0.0, linear)
 

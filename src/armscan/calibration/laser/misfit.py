@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from armscan.calibration.laser.lack_of_fit import lack_of_fit, stripe_noise
+from armscan.calibration.laser.lack_of_fit import StripeNoise, lack_of_fit, stripe_noise
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.solve import CommonErrors, solve_sheets
+from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet
 
-MAX_TRIED = 6
-"""Boards that are left out in turn, those farthest off first."""
 MIN_BOARDS = 4
 """With fewer, two boards are left of which each explains the other."""
 
@@ -41,19 +41,28 @@ def find_misfit_image(
     boards = np.unique(alone.board)
     if len(boards) < MIN_BOARDS:
         return None
-    normalised = (alone.residuals_px([sheet])[1] / alone.sigma_px) ** 2
-    share = np.bincount(alone.board, normalised)[boards] / np.bincount(alone.board)[boards]
-    boards = boards[np.argsort(-share)[:MAX_TRIED]]
-    p_values = []
-    for board in boards:
-        rest = alone.select(alone.board != board)
-        noise = stripe_noise(rest, rest.residuals_px([sheet])[1])
-        solution = solve_sheets(rest, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
-        if isinstance(solution, FitFailure):
-            p_values.append(0.0)
-            continue
-        p_values.append(lack_of_fit(rest, solution, noise).p_value)
+    noise = stripe_noise(alone, alone.residuals_px([sheet])[1])
+    whole = solve_sheets(alone, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
+    if isinstance(whole, FitFailure):
+        return None
+    p_values = [_probability_without(int(board), alone, whole, noise) for board in boards]
     best = int(np.argmax(p_values))
     if p_values[best] < options.lack_of_fit_p:
         return None
     return int(alone.image[alone.board == boards[best]][0])
+
+
+def _probability_without(
+    board: int, observations: SheetObservations, whole: SheetSolution, noise: StripeNoise
+) -> float:
+    """Of the lack of fit of all other boards, by one step from the plane of all."""
+    linear = whole.linear
+    normal = linear.system.solve(linear.weight, 0, without_board=board)
+    if normal is None:
+        return 0.0
+    rest = observations.board != board
+    remaining = (linear.system.residual_px + linear.system.times(normal.step))[rest]
+    common = normal.step[normal.n_sheet :]
+    chi2 = float((linear.weight[rest] * remaining**2).sum() + common @ common)
+    share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
+    return lack_of_fit(observations.select(rest), replace(whole, chi2=chi2), share).p_value

@@ -47,14 +47,16 @@ class StripeSystem:
     ----------
     stripes
         One entry a stripe.
-    n_sheet, n_columns
-        Free parameters of all sheets, which come first, and count of all unknowns.
+    n_sheet, n_boards, n_columns
+        Free parameters of all sheets, which come first; boards, with six unknowns each; count of
+        all unknowns.
     residual_px, height_mm
         (N,) distance of the points from their sheets, in the image and in space.
     """
 
     stripes: tuple[StripeRows, ...]
     n_sheet: int
+    n_boards: int
     n_columns: int
     residual_px: FloatArray
     height_mm: FloatArray
@@ -81,68 +83,122 @@ class StripeSystem:
         None where the matrix is not positive definite to rounding, so that nothing of it means
         anything.
         """
-        n_free = self.n_columns - n_held
-        information = np.diag((np.arange(self.n_columns) >= self.n_sheet).astype(np.float64))
+        n_sheet, n_boards = self.n_sheet, self.n_boards
+        shared = np.concatenate(
+            [np.arange(n_sheet), np.arange(n_sheet + 6 * n_boards, self.n_columns)]
+        )
+        place = np.full(self.n_columns, -1)
+        place[shared] = np.arange(len(shared))
+        own = np.diag((np.arange(len(shared)) >= n_sheet).astype(np.float64))
+        cross, board = np.zeros((n_boards, len(shared), 6)), np.tile(np.eye(6), (n_boards, 1, 1))
         pull = np.zeros(self.n_columns)
         for stripe in self.stripes:
             if stripe.board == without_board:
                 continue
             weighted = stripe.design * weight[stripe.rows, None]
-            information[np.ix_(stripe.columns, stripe.columns)] += weighted.T @ stripe.design
+            block = weighted.T @ stripe.design
+            is_shared = place[stripe.columns] >= 0
+            to = place[stripe.columns[is_shared]]
+            own[np.ix_(to, to)] += block[np.ix_(is_shared, is_shared)]
+            cross[stripe.board, to] += block[np.ix_(is_shared, ~is_shared)]
+            board[stripe.board] += block[np.ix_(~is_shared, ~is_shared)]
             pull[stripe.columns] += weighted.T @ self.residual_px[stripe.rows]
-        held = information[:n_free, n_free:]
-        information = information[:n_free, :n_free]
-        diagonal = np.diag(information)
-        if not np.isfinite(information).all() or not (diagonal > 0.0).all():
+        if not all(np.isfinite(part).all() for part in (own, cross, board)):
             return None
-        scale = 1.0 / np.sqrt(diagonal)
-        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-        if not values[0] > MIN_EIGENVALUE:
+        # Boards do not meet each other: each is eliminated by itself.
+        board = np.asarray(np.linalg.inv(board), dtype=np.float64)
+        carried = cross @ board
+        reduced = own - np.einsum("bik,bjk->ij", carried, cross)
+        boards_pull = pull[n_sheet : n_sheet + 6 * n_boards].reshape(n_boards, 6)
+        shared_pull = pull[shared] - np.einsum("bik,bk->i", carried, boards_pull)
+        n_kept = len(shared) - n_held
+        inverse = _inverse(reduced[:n_kept, :n_kept], own[:n_kept, :n_kept])
+        if inverse is None:
             return None
-        inverse = np.outer(scale, scale) * ((vectors / values) @ vectors.T)
-        step = np.concatenate([-inverse @ pull[:n_free], np.zeros(n_held)])
-        return NormalSolution(step, inverse, -inverse @ held, self.n_sheet)
+        found = np.concatenate([-inverse @ shared_pull[:n_kept], np.zeros(n_held)])
+        boards = -np.einsum("bkl,bl->bk", board, boards_pull)
+        boards -= np.einsum("bik,i->bk", carried, found)
+        to_boards = -np.einsum("si,bik->sbk", inverse[:n_sheet], carried[:, :n_kept])
+        return NormalSolution(
+            np.concatenate([found[:n_sheet], boards.ravel(), found[n_sheet:]]),
+            np.concatenate(
+                [
+                    inverse[:n_sheet, :n_sheet],
+                    to_boards.reshape(n_sheet, 6 * n_boards),
+                    inverse[:n_sheet, n_sheet:],
+                ],
+                axis=1,
+            ),
+            np.asarray(-inverse[:n_sheet] @ reduced[:n_kept, n_kept:]),
+            6 * n_boards,
+        )
+
+
+def _inverse(matrix: FloatArray, scaled_by: FloatArray) -> FloatArray | None:
+    """Inverse of a positive definite matrix; None if it is not, to rounding.
+
+    ``scaled_by`` is the same before anything was eliminated: what is left must not be lost in its
+    rounding.
+    """
+    diagonal = np.diag(scaled_by)
+    if not (diagonal > 0.0).all():
+        return None
+    scale = 1.0 / np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    if not values[0] > MIN_EIGENVALUE:
+        return None
+    return np.asarray(np.outer(scale, scale) * ((vectors / values) @ vectors.T))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalSolution:
-    """Solution of the normal equations.
+    """Solution of the normal equations of U unknowns that are free and some that are held.
 
     Parameters
     ----------
     step
         (n_columns,) of the unknowns; zero for those that are held.
-    inverse
-        (U, U) of the normal matrix of the U unknowns that are free: their covariance.
+    gain
+        (S, U) the rows of the inverse that belong to the S parameters of the sheets, which come
+        first: their covariance with all that is free. Their step is minus this times the design's
+        weighted transpose times the residuals.
     follow
-        (U, n_held) how the step follows the unknowns that are held.
-    n_sheet
-        Free parameters of the sheets, which come first.
+        (S, n_held) how they follow the unknowns that are held.
+    n_board
+        Unknowns of all boards, which come next.
     """
 
     step: FloatArray
-    inverse: FloatArray
+    gain: FloatArray
     follow: FloatArray
-    n_sheet: int
+    n_board: int
+
+    @property
+    def n_sheet(self) -> int:
+        """Count S of the sheets' free parameters."""
+        return len(self.gain)
 
     @property
     def n_free(self) -> int:
         """Count U of free unknowns."""
-        return len(self.inverse)
+        return int(self.gain.shape[1])
 
     @property
-    def gain(self) -> FloatArray:
-        """(S, U): the sheets' step is minus this times the design's weighted transpose times r."""
-        return np.asarray(self.inverse[: self.n_sheet])
+    def covariance(self) -> FloatArray:
+        """(S, S) of the sheets by all that is free."""
+        return self.gain[:, : self.n_sheet]
+
+    @property
+    def by_cameras(self) -> FloatArray:
+        """(S, P) covariance of the sheets with the cameras' errors; none if these are held."""
+        return self.gain[:, self.n_sheet + self.n_board :]
 
     @property
     def by_boards(self) -> FloatArray:
-        """(S, 6 M) how the sheets' errors follow those of the boards, in sigmas of these."""
-        return np.asarray(self.inverse[: self.n_sheet, self.n_sheet :])
+        """(S, U - S) how the sheets' errors follow those of the boards, in sigmas of these."""
+        return self.gain[:, self.n_sheet :]
 
     @property
     def by_stripes(self) -> FloatArray:
         """(S, S) covariance of the sheets by the stripes' noise alone."""
-        return np.asarray(
-            self.inverse[: self.n_sheet, : self.n_sheet] - self.by_boards @ self.by_boards.T
-        )
+        return np.asarray(self.covariance - self.by_boards @ self.by_boards.T)

@@ -214,7 +214,7 @@ def solve_sheets(
         common,
         float((robust * (remaining / sigma) ** 2).sum() + common @ common),
         n_active,
-        float((np.abs(step[:n_active]) / np.sqrt(np.diag(normal.inverse)[:n_active])).max()),
+        float((np.abs(step[:n_active]) / np.sqrt(np.diag(normal.covariance))).max()),
         LinearSolution(system, normal, robust / sigma**2, active),
     )
 
@@ -264,7 +264,7 @@ def _linearised(
         )
         design = [by_sheet[rows][:, own], by_pose[rows] @ pose_roots[board], by_camera[rows]]
         stripes.append(StripeRows(rows, board, columns, np.concatenate(design, axis=1)))
-    return StripeSystem(tuple(stripes), n_active, n_columns, residual, height)
+    return StripeSystem(tuple(stripes), n_active, len(pose_roots), n_columns, residual, height)
 
 
 def _huber(normalised: FloatArray) -> FloatArray:
@@ -279,13 +279,12 @@ def _joint_covariance(
 
     With the cameras' error ``e_c = L w`` in its own sigmas: sheets of cameras that are held follow
     it, ``e_s = F w + n`` with F from the normal equations and n by stripes and boards. Sheets of
-    free cameras err by ``e_s`` with ``cov(e_s, w) = inverse[s, w]``.
+    free cameras err by ``e_s`` with ``cov(e_s, w)`` from the inverse.
     """
-    n_active, n_sheets, p = int(active.sum()), len(active), errors.n_camera
-    own = normal.inverse[:n_active, :n_active]
-    by_camera = normal.inverse[:n_active, normal.n_free - p :]
+    n_sheets, p = len(active), errors.n_camera
+    own, by_camera = normal.covariance, normal.by_cameras
     if normal.follow.shape[1]:
-        by_camera = normal.follow[:n_active]
+        by_camera = normal.follow
         own = own + by_camera @ by_camera.T
     joint = np.zeros((p + n_sheets, p + n_sheets))
     joint[:p, :p] = errors.camera_covariance

@@ -197,10 +197,10 @@ class _Claim:
         normal, n_sheet = self.normal, self.normal.n_sheet
         pull = self.linear.system.transposed(factor)
         by_sheet, by_board = pull[:n_sheet], pull[n_sheet : normal.n_free]
-        by_camera = pull[normal.n_free :] + normal.follow[:n_sheet].T @ by_sheet
+        by_camera = pull[normal.n_free :] + normal.follow.T @ by_sheet
         total = float((factor**2 / self.linear.weight).sum() + by_camera @ by_camera)
         if not self.is_in_fit:
-            own = normal.inverse[:n_sheet, :n_sheet]
+            own = normal.covariance
             return total + float(by_board @ by_board + by_sheet @ own @ by_sheet)
         by_board = by_board + normal.by_boards.T @ by_sheet
         fitted = by_sheet @ (
@@ -226,7 +226,7 @@ class _Claim:
         by_camera = stripe.design[:, ~is_free] + by_sheet @ normal.follow[own]
         total = self.noise_px[stripe.rows] ** 2 + (by_camera**2).sum(axis=1)
         if not self.is_in_fit:
-            sheet = normal.inverse[np.ix_(own, own)]
+            sheet = normal.covariance[np.ix_(own, own)]
             return np.asarray(
                 total + (by_board**2).sum(axis=1) + ((by_sheet @ sheet) * by_sheet).sum(axis=1)
             )

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -92,7 +92,7 @@ def search(paths: list[Path], target: Target, flags: int) -> Found:
         found.n_classic += classic
         found.n_sectors += sectors
         if isinstance(view, TargetView):
-            found.views.append(view)
+            found.views.append(replace(view, source=str(path)))
             found.by_opencv.append(classic or sectors)
         elif classic or sectors:
             found.missed.append(f"{path.name}: {view.reason}")

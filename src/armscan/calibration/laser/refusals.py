@@ -18,10 +18,6 @@ at hand have 0.0005."""
 LARGEST_MISS = 0.03
 """Of the depth: how far points of a board lie off it if the sheet rests on the other boards. Real
 sets at hand have 0.0001 to 0.007, the largest at a triangulation angle of 4 degrees."""
-LARGEST_COPLANARITY = 30.0
-"""Sigmas by which two stripes miss a common plane, where their lack of fit was not explained."""
-LEAST_REJECTED = 0.001
-"""Probability of a model's lack of fit below which it counts as not explained."""
 
 
 def reasons_to_refuse(fit: LaserFit) -> tuple[str, ...]:
@@ -55,11 +51,5 @@ def _reasons(sheet: SheetFit, largest_rms_px: float) -> tuple[str, ...]:
             f"points on a board lie {sheet.points.left_out_rms_mm:.3g} mm (rms) off it if the "
             f"sheet rests on the other boards, {100.0 * miss:.1f} % of the depth: "
             f"{100.0 * LARGEST_MISS:.0f} % is the limit"
-        )
-    sigmas = sheet.coplanarity_mm / max(sheet.coplanarity_sigma_mm, 1e-12)
-    if sigmas > LARGEST_COPLANARITY and sheet.final_test.p_value < LEAST_REJECTED:
-        found.append(
-            f"its stripes miss a common plane by {sheet.coplanarity_mm:.3g} mm, {sigmas:.0f} times "
-            f"what their errors explain: {LARGEST_COPLANARITY:.0f} is the limit"
         )
     return tuple(found)

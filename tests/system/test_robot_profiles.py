@@ -115,7 +115,7 @@ def test_the_authors_translation_lies_within_what_the_residuals_allow(
 def test_the_authors_rotation_fits_the_shifted_postures_worse(
     fit: HandEyeFit, author: FloatArray, stripes: tuple[PosedStripe, ...]
 ) -> None:
-    """About Y of Tool the author's rotation lies five of our sigmas (1.2 degrees) off.
+    """About Y of Tool the author's rotation lies four of our sigmas (1.2 degrees) off.
 
     So the data decide. Between postures that do not turn, the section centre moves in the sheet as
     the hand-eye says, whatever its translation and the sphere's centre. All 15 pairs of the six
@@ -126,7 +126,7 @@ def test_the_authors_rotation_fits_the_shifted_postures_worse(
     turn = vector_from_rotation(nearest_rotation(theirs @ ours.T))
     in_sigmas = np.abs(turn) / np.sqrt(np.diag(calibration.covariance))[:3]
     assert in_sigmas[[0, 2]].max() < 2.5
-    assert 4.5 < in_sigmas[1] < 5.5
+    assert 3.5 < in_sigmas[1] < 4.5
     moved = shifted_pairs(stripes)
     assert len(moved) == 15
     in_sheet = np.eye(3)[[0, 2]]

@@ -29,6 +29,7 @@ from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.reconstruct import NOTHING_MEASURED_REMEDY, nothing_measured
+from armscan.pipeline.scan_doubts import doubt_scan
 from armscan.pipeline.scan_result import (
     ScanExposure,
     ScanExposureFate,
@@ -37,6 +38,7 @@ from armscan.pipeline.scan_result import (
     scan_warnings,
 )
 from armscan.pipeline.sheet_rules import measurer_for
+from armscan.reconstruction.equal_poses import stripes_at_equal_poses
 from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
@@ -164,12 +166,23 @@ def measure_scan(
             placed[row] = place_image(one, pose, placing, options.volume)
             weak += one.warnings
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
-    exposures = _records(source, images, poses, placed, reasons)
-    found = _joined(placed, exposures, poses, placing, options)
+    hung = stripes_at_equal_poses({row: one.cloud for row, one in placed.items()}, poses)
+    kept = {row: one for row, one in placed.items() if row not in hung}
+    exposures = _records(source, images, poses, kept, reasons=reasons, hung=hung)
+    found = _joined(kept, exposures, poses, placing, options)
+    doubt = doubt_scan(
+        source,
+        scanner,
+        poses,
+        cloud=found.cloud,
+        images=found.images,
+        image_rows=found.image_rows,
+    )
     return replace(
         found,
         cloud=replace(found.cloud, is_simulated=source.is_simulated),
-        warnings=(*found.warnings, *collected(weak)),
+        warnings=(*found.warnings, *doubt.warnings, *collected(weak)),
+        doubt=doubt,
     )
 
 
@@ -214,7 +227,9 @@ def _records(
     images: ScanInstants,
     poses: ExposurePoses,
     placed: dict[int, PlacedImage],
+    *,
     reasons: dict[int, str],
+    hung: dict[int, float],
 ) -> tuple[ScanExposure, ...]:
     records = []
     alone = set(images.without_partner)
@@ -223,6 +238,9 @@ def _records(
             records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
         elif k in reasons:
             records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
+        elif k in hung:
+            reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
+            records.append(ScanExposure(row, ScanExposureFate.EQUAL_POSE, reason))
         elif not images.is_lit[k]:
             records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
         elif k in alone:

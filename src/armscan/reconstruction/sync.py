@@ -89,7 +89,7 @@ def exposure_poses(
     if has_ids and any(row.trigger_id is not None for row in rows):
         poses = _by_trigger(rows, arm, clock, latency_ns)
     elif clock == "shared":
-        poses = _by_time(rows, arm, latency_ns, options)
+        poses = poses_by_time(rows, arm, latency_ns, options)
     else:
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
@@ -205,9 +205,14 @@ def _at_samples(arm: ArmTrack, found: IntArray, fate: IntArray) -> tuple[FloatAr
     return rotations, translations
 
 
-def _by_time(
-    rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int, options: SyncOptions
+def poses_by_time(
+    rows: Sequence[ExposureRow],
+    arm: ArmTrack,
+    latency_ns: int = 0,
+    options: SyncOptions | None = None,
 ) -> ExposurePoses:
+    """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
+    options = options or SyncOptions()
     times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
     max_gap = largest_gap_ns(arm, options)
     before = np.searchsorted(arm.t_ns, times, side="right") - 1

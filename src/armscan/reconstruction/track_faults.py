@@ -33,7 +33,7 @@ FEWEST_STEPS = 8
 ACCELERATION_MM_S2 = 10_000.0
 """About gravity: what a hand or a robot may do at any time."""
 SPEED_SHARE = 3.0
-"""A stop, a start, or times that jitter change a step by up to its own length; thrice is granted."""
+"""A stop, a start or a late time changes a step by up to its own length; thrice is granted."""
 NOISE_SIGMAS = 8.0
 OUTSTANDING = 5.0
 """A step is at fault if, in units of what is granted, it also exceeds the rest of the recording so
@@ -119,7 +119,7 @@ class TrackCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Steps:
-    """All steps that can be judged: first sample, leap (K, 12), size, what is granted; all in mm."""
+    """Steps that can be judged: first sample, leap (K, 12), its size, what is granted; in mm."""
 
     sample: IntArray
     leap: FloatArray

@@ -23,7 +23,7 @@ LONGEST_PASS = 24
 """Longer passes are cut: a hand that goes to and fro without a pause turns round in between."""
 CELL_MM = 0.5
 """Points of one exposure are thinned to one a cell of this size."""
-MOST_QUERIES, MOST_OWN = 1500, 150
+MOST_QUERIES, MOST_OWN = 3000, 150
 """Points that are compared with other passes, and of each pass with itself."""
 NEIGHBOURS, FEWEST_NEIGHBOURS, FEWEST_STRIPES = 60, 12, 3
 """Cells of the other pass about a point; the fewest of them, and of their exposures, that make a
@@ -36,7 +36,7 @@ CELLS = 8.0
 """Cells to its radius: stripes then count alike however dense their points are."""
 CENTRED = 0.4
 """The neighbours' middle lies within this part of their radius: a point is among the stripes."""
-FEWEST_POINTS = 30
+FEWEST_POINTS = 20
 """Points that a pair of passes must have in common to be compared."""
 AGREES = 5.0
 """A point agrees with another pass within so many of their joint standard deviations."""

@@ -19,7 +19,9 @@ TABLES_IN = types.Array(types.int64, 2, "C", readonly=True)
 
 
 @njit(
-    types.UniTuple(types.int64, 2)(BYTES_IN, TABLES_IN, TABLES_IN, types.int64, types.int64),
+    types.Tuple((types.int64, types.int64))(  # type: ignore[no-untyped-call]
+        BYTES_IN, TABLES_IN, TABLES_IN, types.int64, types.int64
+    ),
     cache=True,
     nogil=True,
 )

@@ -15,6 +15,7 @@ from armscan.errors import ArmscanError, EstimationError, InputError, OptionErro
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
+from armscan.models.calibration import SensorCalibration
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair
 from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
@@ -181,7 +182,12 @@ def measure_scan(
     return replace(
         found,
         cloud=replace(found.cloud, is_simulated=source.is_simulated),
-        warnings=(*found.warnings, *doubt.warnings, *collected(weak)),
+        warnings=(
+            *found.warnings,
+            *doubt.warnings,
+            *_unknown_lasers(source, scanner.sensor, options.measure),
+            *collected(weak),
+        ),
         doubt=doubt,
     )
 
@@ -199,6 +205,22 @@ def place_image(
     depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
     inside = cloud if volume is None else cut_cloud(cloud, volume)
     return PlacedImage(image, inside, depths, len(cloud) - len(inside))
+
+
+def _unknown_lasers(
+    source: ScanSource, sensor: SensorCalibration, options: MeasureOptions
+) -> tuple[str, ...]:
+    """Lasers that exposures name but the calibration has no sheet of."""
+    sheets = [sheet.name for sheet in sensor.sheets]
+    known = {*sheets, *(name.partition(".")[0] for name in sheets)}
+    named = {laser for row in source.rows for laser in row.lasers}
+    if options.sheet or not named - known:
+        return ()
+    lasers, names = ", ".join(sorted(named - known)), ", ".join(sheets)
+    return (
+        f"exposures name the laser {lasers}, of which the calibration has no sheet: their stripes "
+        f"were measured as if they were of {names}; name the sheet with --sheet if that is so",
+    )
 
 
 def _in_threads(

@@ -10,7 +10,7 @@ head that is not where its document says, a jump between two passes.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -51,6 +51,7 @@ CLAIMED_SIGMAS = 5.0
 LAGS_MS = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 100.0)
 DENSE_NS = 50_000_000
 HAND_EYE_ROUNDS = 6
+SHEET_STEP_MM, LARGEST_SHIFT_MM = 0.01, 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,12 +219,21 @@ def _readings(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
     yield from _late(scan)
     yield from _other_poses(scan, rotations, translations)
     yield from _mirrored_images(scan)
+    shifted = _other_sheet(scan)
+    if shifted is not None:
+        stripes, shift_mm = shifted
+        yield (
+            f"a light sheet that lies {abs(shift_mm):.2g} mm beside the document's would make them "
+            "agree",
+            "the document is not of this head, or the laser was knocked: calibrate again",
+            stripes,
+        )
     moved = _other_hand_eye(scan.stripes)
     if moved is not None:
         stripes, shift_mm, turn_deg = moved
         yield (
-            f"a head that sits {shift_mm:.2g} mm and {turn_deg:.2g} deg elsewhere on the arm, or a "
-            "light sheet shifted as much, would make them agree",
+            f"a head that sits {shift_mm:.2g} mm and {turn_deg:.2g} deg elsewhere on the arm would "
+            "make them agree",
             "the scanner's document is not of this head, or the head was knocked: calibrate again",
             stripes,
         )
@@ -335,6 +345,42 @@ def _mirrored_images(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
             "switch off the camera's reversal (Reverse X or Y)",
             scan.stripes.with_points(points),
         )
+
+
+def _other_sheet(scan: _Scan) -> tuple[Stripes, float] | None:
+    """The light sheets, shifted along their normals, that make passes agree best; and the shift."""
+    sensor = scan.scanner.sensor
+    if sensor is None or sensor.second is not None or not scan.pixels.any():
+        return None
+
+    def at(shift_mm: float) -> Stripes | None:
+        sheets = tuple(
+            replace(one, sheet=replace(one.sheet, origin_mm=one.sheet.origin_mm + shift))
+            for one in sensor.sheets
+            for shift in (shift_mm * one.sheet.axes[2],)
+        )
+        points, is_met = meet_sheets(scan.pixels, scan.sheet, replace(sensor, sheets=sheets))
+        return scan.stripes.with_points(points) if is_met.all() else None
+
+    shift, stripes = 0.0, at(0.0)
+    for _ in range(HAND_EYE_ROUNDS):
+        other = at(shift + SHEET_STEP_MM)
+        found = None if stripes is None else pass_distances(stripes)
+        if stripes is None or other is None or found is None:
+            return None
+        by_shift = np.zeros(len(found.row))
+        for rows, sign in ((found.row, 1.0), (found.nearest, -1.0)):
+            turned = stripes.rotations[stripes.exposure[rows]]
+            change = (other.points_sensor_mm - stripes.points_sensor_mm)[rows] / SHEET_STEP_MM
+            by_shift += sign * np.einsum("ni,nij,nj->n", found.normal, turned, change)
+        # the weighted median of what each point asks for: half of them may be wrong
+        asked = -found.distance_mm / np.where(by_shift == 0.0, np.inf, by_shift)
+        order = np.argsort(asked)
+        weight = np.cumsum(np.abs(by_shift)[order])
+        step = float(asked[order][int(np.searchsorted(weight, 0.5 * weight[-1]))])
+        shift += float(np.clip(step, -LARGEST_SHIFT_MM, LARGEST_SHIFT_MM))
+        stripes = at(shift)
+    return None if stripes is None else (stripes, shift)
 
 
 def _other_hand_eye(stripes: Stripes) -> tuple[Stripes, float, float] | None:

@@ -75,7 +75,7 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
         _refuse_decimal_commas(line, path)
     if start and len(_words(lines[0])) > 1 and len(_words(filled[0])) == 2 * len(_words(lines[0])):
         raise FileFormatError(
-            f"twice as many numbers as columns, as if commas were decimal signs: '{filled[0][:60]}'",
+            f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
             where=str(path),
             remedy="write numbers with points: 1.5,2.5,3.5",
         )

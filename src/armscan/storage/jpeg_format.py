@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
+from math import ceil
 
 import numpy as np
 
@@ -55,37 +56,38 @@ def jpeg_defect(data: bytes) -> str:
         marker = data[position + 1]
         if marker == END:
             return ""
-        if marker in (0x00, 0xFF):
-            position += 2 if marker == 0x00 else 1
-            continue
-        if marker in NO_LENGTH:
-            position += 2
+        if marker in NO_LENGTH or marker in (0x00, 0xFF):
+            position += 1 if marker == 0xFF else 2
             continue
         (length,) = struct.unpack_from(">H", data, position + 2)
         body = data[position + 4 : position + 2 + length]
         position += 2 + length
-        if marker in FRAMES:
-            picture.is_sequential = marker in SEQUENTIAL
-            height, width, n = struct.unpack_from(">HHB", body, 1)
-            picture.size_px = (width, height)
-            picture.components = {
-                body[6 + 3 * k]: (body[7 + 3 * k] >> 4, body[7 + 3 * k] & 15) for k in range(n)
-            }
-            if width * height > MOST_PIXELS_A_BYTE * len(data):
-                return f"claims {width} x {height} px, more than its {len(data)} bytes can hold"
-        elif marker == HUFFMAN:
-            _read_tables(body, picture.tables)
-        elif marker == RESTART_INTERVAL:
-            (picture.restart,) = struct.unpack_from(">H", body)
-        elif marker == SCAN:
+        if marker == SCAN:
             end = _end_of_scan(data, position)
-            if end < 0:
-                return "is cut short"
-            if picture.is_sequential:
-                defect = _scan_defect(data[position:end], body, picture)
-                if defect:
-                    return defect
+            defect = "is cut short" if end < 0 else _scan_defect(data[position:end], body, picture)
             position = end
+        else:
+            defect = _heading_defect(marker, body, picture, len(data))
+        if defect:
+            return defect
+
+
+def _heading_defect(marker: int, body: bytes, picture: _Picture, n_bytes: int) -> str:
+    """Take in what a marker says of the picture."""
+    if marker in FRAMES:
+        picture.is_sequential = marker in SEQUENTIAL
+        height, width, n = struct.unpack_from(">HHB", body, 1)
+        picture.size_px = (width, height)
+        picture.components = {
+            body[6 + 3 * k]: (body[7 + 3 * k] >> 4, body[7 + 3 * k] & 15) for k in range(n)
+        }
+        if width * height > MOST_PIXELS_A_BYTE * n_bytes:
+            return f"claims {width} x {height} px, more than its {n_bytes} bytes can hold"
+    elif marker == HUFFMAN:
+        _read_tables(body, picture.tables)
+    elif marker == RESTART_INTERVAL:
+        (picture.restart,) = struct.unpack_from(">H", body)
+    return ""
 
 
 def _read_tables(body: bytes, tables: dict[int, IntArray]) -> None:
@@ -122,6 +124,8 @@ def _end_of_scan(data: bytes, position: int) -> int:
 
 
 def _scan_defect(codes: bytes, header: bytes, picture: _Picture) -> str:
+    if not picture.is_sequential:
+        return ""
     n = header[0]
     chosen = [(header[1 + 2 * k], header[2 + 2 * k]) for k in range(n)]
     kinds = sorted(picture.tables)
@@ -139,10 +143,10 @@ def _scan_defect(codes: bytes, header: bytes, picture: _Picture) -> str:
         n_blocks = h * v if n > 1 else 1
         places += [(kinds.index(pair[0]), kinds.index(pair[1]))] * n_blocks
     if n > 1:
-        n_units = -(-width // (8 * across)) * -(-height // (8 * down))
+        n_units = ceil(width / (8 * across)) * ceil(height / (8 * down))
     else:
         h, v = picture.components[chosen[0][0]]
-        n_units = -(-(-(-width * h // across)) // 8) * -(-(-(-height * v // down)) // 8)
+        n_units = ceil(ceil(width * h / across) / 8) * ceil(ceil(height * v / down) / 8)
     tables = np.stack([picture.tables[kind] for kind in kinds])
     defect, left = walk_scan(
         np.frombuffer(codes, np.uint8), tables, np.array(places), n_units, picture.restart

@@ -27,8 +27,9 @@ from scipy.spatial.transform import Rotation
 import armscan.pipeline.scan as scan_module
 from armscan.devices.twin import TwinScene
 from armscan.errors import ArmscanError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Pose
+from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.measure import LitProfile
@@ -80,8 +81,7 @@ def recorded(scene: str, seed: int) -> Recording:
     scan = twin.scan(cast(TwinScene, scene))
     rng = np.random.default_rng([seed, 77])
     profiles = tuple(_profile(scan, row, rng) for row in range(len(scan.rows)))
-    assert scan.arm is not None
-    return Recording(profiles, scan.rows, scan.arm, scan.session)
+    return Recording(profiles, scan.rows, cast(ArmTrack, scan.arm), scan.session)
 
 
 def _profile(scan: TwinScan, row: int, rng: np.random.Generator) -> Profile:
@@ -122,7 +122,9 @@ def measured(
 ) -> ScanReconstruction:
     """The scan, its stripes put where the extraction of images would give them."""
 
-    def stripes_of(pair: tuple[Exposure, Exposure | None], camera: CameraModel, _: object) -> LitProfile:
+    def stripes_of(
+        pair: tuple[Exposure, Exposure | None], camera: CameraModel, options: object
+    ) -> LitProfile:
         row = int(pair[0].image[0, 0]) * 256 + int(pair[0].image[0, 1])
         return LitProfile(pixels(recording.profiles[row]), pair[0].lasers)
 
@@ -158,6 +160,11 @@ def _poses(good: Recording) -> tuple[FloatArray, FloatArray, int]:
     return np.array(arm.rotations), np.array(arm.translations_mm), len(arm)
 
 
+def _ids(good: Recording) -> IntArray:
+    """Trigger ids of the twin's samples, -1 for none."""
+    return cast(IntArray, good.arm.trigger_ids)
+
+
 def _pauses(good: Recording) -> list[int]:
     return np.flatnonzero(np.diff(good.arm.t_ns) > 100_000_000).tolist()
 
@@ -175,8 +182,7 @@ def _jumps(good: Recording) -> Iterator[Changed]:
         later = np.arange(n) > pauses[3]
         moved = translations + np.where(later, size, 0.0)[:, None] * direction
         yield f"shift of {size:g} mm in a pause", ("all before",), good.with_poses(rotations, moved)
-    ids = good.arm.trigger_ids
-    assert ids is not None
+    ids = _ids(good)
     one = int(np.flatnonzero(ids >= 0)[30])
     moved = translations.copy()
     moved[one] += 1000.0 * direction
@@ -202,8 +208,10 @@ def _stuck(good: Recording) -> Iterator[Changed]:
     yield "encoder stuck to a pause", words, held(pauses[0] + 30, pauses[1] + 1)
     yield "encoder stuck throughout", words, held(0, n)
     block = (pauses[2] - pauses[1]) // 2
-    yield "block of samples repeated", ("off the track", "the pose of"), held(
-        start, start + block // 2, start - block // 2
+    yield (
+        "block of samples repeated",
+        ("off the track", "the pose of"),
+        held(start, start + block // 2, start - block // 2),
     )
 
 
@@ -237,8 +245,7 @@ def _clock(good: Recording) -> Iterator[Changed]:
         order = np.clip(np.arange(len(good.rows)) + step, 0, len(good.rows) - 1)
         profiles = tuple(good.profiles[k] for k in order)
         yield f"images off by {step:+d}", ("off by",), replace(good, profiles=profiles)
-    ids = good.arm.trigger_ids
-    assert ids is not None
+    ids = _ids(good)
     later = np.where(ids >= 0, ids + 1, ids)
     session = replace(good.session, clock="separate")
     arm = replace(good.arm, trigger_ids=later)
@@ -263,27 +270,25 @@ def _instrument(good: Recording, scanner: ScannerCalibration) -> Iterator[Fault]
         ("sheet", "head"),
         good,
         scanner,
-        lambda profile: replace(profile, points_px=profile.points_px + [0.0, 8.0]),
+        lambda profile: replace(profile, points_px=profile.points_px + np.array([0.0, 8.0])),
     )
-    sensor, hand_eye = scanner.sensor, scanner.hand_eye
-    assert sensor is not None
+    sensor, hand_eye = cast(SensorCalibration, scanner.sensor), scanner.hand_eye
     for shift in (0.2, 1.0):
         sheets = tuple(
-            replace(s, sheet=replace(s.sheet, origin_mm=s.sheet.origin_mm + shift * s.sheet.axes[2]))
-            for s in sensor.sheets
+            replace(one, sheet=replace(one.sheet, origin_mm=one.sheet.origin_mm + by_mm))
+            for one in sensor.sheets
+            for by_mm in (shift * one.sheet.axes[2],)
         )
         other = replace(scanner, sensor=replace(sensor, sheets=sheets))
         yield Fault(f"light sheet shifted by {shift:g} mm", ("light sheet",), good, other)
     camera = sensor.camera.camera
     longer = replace(camera, fx_px=1.02 * camera.fx_px, fy_px=1.02 * camera.fy_px)
     wrong = replace(sensor, camera=replace(sensor.camera, camera=longer))
-    yield Fault(
-        "focal length 2 % wrong", ("sheet", "head"), good, replace(scanner, sensor=wrong)
-    )
+    yield Fault("focal length 2 % wrong", ("sheet", "head"), good, replace(scanner, sensor=wrong))
     pose = hand_eye.tool_from_sensor
     for shift, turn_deg in ((0.5, 0.0), (0.0, 0.3)):
         turn = Rotation.from_rotvec([np.radians(turn_deg), 0.0, 0.0]).as_matrix()
-        moved = Pose(turn @ pose.rotation, pose.translation_mm + [shift, 0.0, 0.0])
+        moved = Pose(turn @ pose.rotation, pose.translation_mm + np.array([shift, 0.0, 0.0]))
         other = replace(scanner, hand_eye=replace(hand_eye, tool_from_sensor=moved))
         name = f"head moved by {shift:g} mm, {turn_deg:g} deg"
         yield Fault(name, ("head that sits",), good, other)
@@ -355,8 +360,7 @@ def _verified(scan: ScanReconstruction, scanner: ScannerCalibration) -> str:
 def resampled(recording: Recording, rng: np.random.Generator) -> tuple[Recording, str]:
     """The recording as another arm's controller would have given it."""
     arm, kind = recording.arm, str(rng.choice(["as is", "by time", "sparse", "triggers", "late"]))
-    ids = arm.trigger_ids
-    assert ids is not None
+    ids = _ids(recording)
     kept = np.arange(len(arm))
     if kind == "by time":
         kept = kept[ids < 0]
@@ -378,7 +382,8 @@ def resampled(recording: Recording, rng: np.random.Generator) -> tuple[Recording
         rows = tuple(replace(row, trigger_id=None) for row in rows)
     if kind == "late":
         jitter = rng.integers(0, 1_500_000, len(track))
-        track = replace(track, t_ns=np.maximum.accumulate(track.t_ns + jitter) + np.arange(len(track)))
+        times = np.maximum.accumulate(track.t_ns + jitter) + np.arange(len(track))
+        track = replace(track, t_ns=times)
     return replace(recording, arm=track, rows=rows), f"{kind}, {decimals} decimals"
 
 

@@ -23,16 +23,16 @@ LONGEST_PASS = 24
 """Longer passes are cut: a hand that goes to and fro without a pause turns round in between."""
 CELL_MM = 0.5
 """Points of one exposure are thinned to one a cell of this size."""
-MOST_QUERIES, MOST_OWN = 3000, 150
+MOST_QUERIES, MOST_OWN = 2000, 150
 """Points that are compared with other passes, and of each pass with itself."""
 NEIGHBOURS, FEWEST_NEIGHBOURS, FEWEST_STRIPES = 60, 12, 3
 """Cells of the other pass about a point; the fewest of them, and of their exposures, that make a
 quadric of six unknowns with something to check it."""
-SPACINGS = 1.8
+SPACINGS = 2.4
 """The neighbourhood reaches so many times as far as the next stripe of the pass usually is: two
 stripes on either side of a point between them."""
 LEAST_RADIUS_MM, LARGEST_RADIUS_MM = 1.5, 40.0
-CELLS = 8.0
+CELLS = 6.0
 """Cells to its radius: stripes then count alike however dense their points are."""
 CENTRED = 0.4
 """The neighbours' middle lies within this part of their radius: a point is among the stripes."""
@@ -282,8 +282,7 @@ class _PassSurface:
             is_near &= stripes.exposure[near] != stripes.exposure[asked, None]
         stripe = np.sort(np.where(is_near, stripes.exposure[near], -1), axis=1)
         n_stripes = (np.diff(stripe, axis=1) > 0).sum(axis=1) + is_near.all(axis=1)
-        fewest = FEWEST_STRIPES - int(is_own)
-        enough = (is_near.sum(axis=1) >= FEWEST_NEIGHBOURS) & (n_stripes >= fewest)
+        enough = (is_near.sum(axis=1) >= FEWEST_NEIGHBOURS) & (n_stripes >= FEWEST_STRIPES)
         asked, near, is_near = asked[enough], near[enough], is_near[enough]
         offset = (points[near] - points[asked][:, None]) * is_near[:, :, None]
         distance, normal, scatter, is_among = _quadric_offsets(offset, is_near, self.radius_mm)
@@ -305,7 +304,7 @@ class _PassSurface:
 
 def _radius_mm(points: FloatArray, exposure: IntArray) -> float:
     """Reach that holds the next stripes of the same pass."""
-    sample = np.arange(0, len(points), max(1, len(points) // 300))
+    sample = np.arange(0, len(points), max(1, len(points) // 100))
     count = min(64, len(points))
     distance, near = cKDTree(points).query(points[sample], k=np.arange(1, count + 1))
     is_other = exposure[near] != exposure[sample, None]

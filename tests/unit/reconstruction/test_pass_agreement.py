@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Passes over a ball whose points are known: what they say of each other, against what was put in."""
+"""Passes over a ball whose points are known: what they say of each other."""
 
 from __future__ import annotations
 

@@ -48,7 +48,12 @@ KEEPS = 0.5
 """And if passes overlap at least this much as they did."""
 CLAIMED_SIGMAS = 5.0
 """Where no passes overlap as read, a reading must agree within so many times what is claimed."""
-LAGS_MS = (1.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 100.0)
+LAGS_MS = (1.0, 3.0, 8.0, 20.0, 50.0, 100.0)
+SEARCHED_POINTS = 2500
+"""Points with which other readings are tried; the scan as read is compared with all of them."""
+SPLIT_RATIO, SPLIT_SHARE = 1.5, 0.7
+"""Pairs of passes this far apart, in units of what is expected, are told from the others, and a
+break of the scan is named if so large a part of pairs on either side of it and across it fit."""
 DENSE_NS = 50_000_000
 HAND_EYE_ROUNDS = 6
 SHEET_STEP_MM, LARGEST_SHIFT_MM = 0.01, 5.0
@@ -93,6 +98,16 @@ class _Scan:
     pixels: FloatArray
     sheet: IntArray
 
+    def coarse(self) -> _Scan:
+        """The same with fewer points."""
+        step = max(1, len(self.sheet) // SEARCHED_POINTS)
+        return replace(
+            self,
+            stripes=self.stripes.of_rows(np.arange(0, len(self.sheet), step)),
+            pixels=self.pixels[::step],
+            sheet=self.sheet[::step],
+        )
+
     def at(self, rotations: FloatArray, translations_mm: FloatArray) -> Stripes:
         """The stripes at other poses of the tool, (E, 3, 3) and (E, 3)."""
         hand_eye = self.scanner.hand_eye.tool_from_sensor
@@ -128,7 +143,7 @@ def doubt_scan(
     is_off = found is not None and (found.ratio > WARNED_RATIO or found.worst_ratio > WARNED_PAIR)
     if found is not None and not is_off and found.distance_mm < SUSPECT_SIGMAS * found.claimed_mm:
         return ScanDoubt(found)
-    cause, remedy = _cause(scan, found)
+    cause, remedy = _cause(scan.coarse(), found)
     if found is None:
         start = "passes do not overlap as read, but would agree"
     else:
@@ -179,18 +194,19 @@ def _thinned(
     return _Scan(source, scanner, rows, poses, stripes, pixels[kept], cloud.sheet[kept])
 
 
-def _cause(scan: _Scan, found: PassAgreement | None) -> tuple[str, str]:
+def _cause(scan: _Scan, full: PassAgreement | None) -> tuple[str, str]:
     """Words and remedy of the mistake that explains most; empty if none does."""
     best, cause = np.inf, ("", "")
+    found = pass_agreement(scan.stripes)
     for words, remedy, stripes in _readings(scan):
         other = pass_agreement(stripes)
         if other is not None and _explains(other, found) and other.distance_mm < 0.9 * best:
             best, cause = other.distance_mm, (words, remedy)
             if best < SUSPECT_SIGMAS * other.claimed_mm:
                 break
-    if cause[0] or found is None:
+    if cause[0] or full is None:
         return cause
-    return _shifted_passes(scan, found)
+    return _shifted_passes(scan, full)
 
 
 def _explains(other: PassAgreement, found: PassAgreement | None) -> bool:
@@ -419,29 +435,50 @@ def _by_hand_eye(stripes: Stripes, row: IntArray, normal: FloatArray) -> FloatAr
 
 
 def _shifted_passes(scan: _Scan, found: PassAgreement) -> tuple[str, str]:
-    """A time before and after which passes agree among themselves, but not with each other."""
-    bad = [pair for pair in found.pairs if pair.ratio > WARNED_PAIR]
-    good = [pair for pair in found.pairs if pair.ratio <= WARNED_PAIR]
-    if not bad or not good:
-        return "", ""
+    """A time before and after which passes agree among themselves, but not with each other.
+
+    What is tried: one pass lies off all others, the scan breaks between two passes, or within one.
+    """
     n_passes = int(scan.stripes.pass_of.max()) + 1
+    pairs = np.array([(pair.surface, pair.other) for pair in found.pairs])
+    is_bad = np.array([pair.ratio > SPLIT_RATIO for pair in found.pairs])
+    if not is_bad.any() or is_bad.all():
+        return "", ""
     times = np.array([scan.source.rows[row].t_ns for row in scan.rows]) / 1e9
     starts = [float(times[scan.stripes.pass_of == k].min()) for k in range(n_passes)]
-    apart = float(np.median([pair.distance_mm for pair in bad]))
-    for cut in range(1, n_passes):
-        if all((p.surface < cut) != (p.other < cut) for p in bad) and all(
-            (p.surface < cut) == (p.other < cut) for p in good
-        ):
-            return (
-                f"all before {starts[cut]:.3f} s agrees, and all after it, but the two lie "
-                f"{apart:.2g} mm apart",
-                "the arm was moved or referenced anew in between, or the object moved: scan again",
-            )
-    for odd in range(n_passes):
-        if all(odd in (p.surface, p.other) for p in bad):
-            return (
-                f"only the pass from {starts[odd]:.3f} s lies off the others, by {apart:.2g} mm",
-                "its poses are wrong (a hung encoder, repeated samples) or the object moved: leave "
-                "it out or scan again",
-            )
-    return "", ""
+    best, cause = SPLIT_SHARE, ("", "")
+    for cut in range(n_passes):
+        inside = (pairs == cut).any(axis=1)
+        apart = {
+            "odd": inside,
+            "between": (pairs[:, 0] < cut) != (pairs[:, 1] < cut),
+            "within": (pairs[:, 0] < cut) != (pairs[:, 1] < cut),
+        }
+        for kind, is_apart in apart.items():
+            asked = ~inside if kind == "within" else np.ones(len(pairs), dtype=np.bool_)
+            told = is_apart & asked
+            if not told.any() or not (asked & ~told).any():
+                continue
+            share = min(float(is_bad[told].mean()), float((~is_bad[asked & ~told]).mean()))
+            if share > best + 1e-9:
+                apart_mm = np.median(
+                    [p.distance_mm for p, t in zip(found.pairs, told, strict=True) if t]
+                )
+                best, cause = share, _split_words(kind, starts[cut], float(apart_mm))
+    return cause
+
+
+def _split_words(kind: str, start_s: float, apart_mm: float) -> tuple[str, str]:
+    if kind == "odd":
+        return (
+            f"only the pass from {start_s:.3f} s lies off the others, by {apart_mm:.2g} mm",
+            "its poses are wrong (a hung encoder, repeated samples) or the object moved: leave it "
+            "out or scan again",
+        )
+    where = (
+        f"before {start_s:.3f} s" if kind == "between" else f"before the pass at {start_s:.3f} s"
+    )
+    return (
+        f"all {where} agrees, and all after it, but the two lie {apart_mm:.2g} mm apart",
+        "the arm was moved or referenced anew there, or the object moved: scan again",
+    )

@@ -228,7 +228,7 @@ def _stuck(good: Recording) -> Iterator[Changed]:
     block = (pauses[2] - pauses[1]) // 2
     yield (
         "block of samples repeated",
-        ("off the track", "the pose of"),
+        ("repeat others", "the pose of"),
         held(start, start + block // 2, start - block // 2),
     )
 

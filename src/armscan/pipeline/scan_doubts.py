@@ -143,7 +143,10 @@ def doubt_scan(
     is_off = found is not None and (found.ratio > WARNED_RATIO or found.worst_ratio > WARNED_PAIR)
     if found is not None and not is_off and found.distance_mm < SUSPECT_SIGMAS * found.claimed_mm:
         return ScanDoubt(found)
-    cause, remedy = _cause(scan.coarse(), found)
+    if is_off and any(fault.kind == "jump" for fault in poses.track_faults):
+        cause, remedy = "the jump of the arm's track explains it", "scan again"
+    else:
+        cause, remedy = _cause(scan.coarse(), found)
     if found is None:
         start = "passes do not overlap as read, but would agree"
     else:

@@ -19,7 +19,7 @@ from scipy.ndimage import maximum_filter1d
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.records.arm_track import ArmTrack
 
-FaultKind = Literal["jump", "off the track", "stands still"]
+FaultKind = Literal["jump", "off the track", "stands still", "repeated"]
 
 LEVER_MM = 200.0
 """Rotations are judged by points so far from the tool's origin: about where a head measures."""
@@ -42,6 +42,7 @@ FEW_STEPS, FEW_SHARE = 8, 0.05
 """Steps, or part of all steps, that are not counted as "the rest of the recording"."""
 RETURNS = 0.15
 """A second jump undoes a first one if their sum is less than this part of them."""
+FEWEST_REPEATED = 5
 SAME_MM = 1e-7
 
 
@@ -53,7 +54,8 @@ class TrackFault:
     ----------
     kind
         ``jump``: all that follows is shifted, or all that came before; ``off the track``: a stretch
-        between two parts that fit together; ``stands still``: equal samples, then a leap.
+        between two parts that fit together; ``stands still``: equal samples, then a leap;
+        ``repeated``: after a leap, a run of the very samples that stand elsewhere in the track.
     first, last
         Samples concerned, both included; of a jump the ones before and after it.
     t_ns
@@ -84,6 +86,8 @@ class TrackFault:
                 f"{n} {what} of the arm at {start:.3f} s lie {self.size_mm:.4g} mm off the track "
                 "on both sides"
             )
+        if self.kind == "repeated":
+            return f"{n} {what} of the arm from {start:.3f} s on repeat others of the same track"
         return (
             f"the arm's pose stands still for {n} {what} from {start:.3f} s, then leaps by "
             f"{self.size_mm:.4g} mm: an encoder or the transmission hung"
@@ -152,7 +156,7 @@ def check_track(arm: ArmTrack) -> TrackCheck:
             (int(arm.t_ns[known[first]]), int(arm.t_ns[known[last]])),
             size,
         )
-        for kind, first, last, size in _explained(steps, events, equal)
+        for kind, first, last, size in _explained(steps, events, equal, places)
     ]
     faulty, broken = none, none.copy()
     for fault in found:
@@ -253,12 +257,20 @@ def _events(steps: _Steps, n_samples: int) -> IntArray:
 
 
 def _explained(
-    steps: _Steps, events: IntArray, equal: BoolArray
+    steps: _Steps, events: IntArray, equal: BoolArray, places: FloatArray
 ) -> Iterator[tuple[FaultKind, int, int, float]]:
     """Kind, first and last sample, and size of each fault."""
     open_events: list[int] = []
+    done = -1
     for event in events.tolist():
         sample, size = int(steps.sample[event]), float(steps.size[event])
+        if sample <= done:
+            continue
+        n_repeated = _repeated(places, sample + 1)
+        if n_repeated:
+            done = sample + n_repeated
+            yield "repeated", sample + 1, done, size
+            continue
         start = sample
         while start > 0 and equal[start - 1]:
             start -= 1
@@ -288,6 +300,21 @@ def _explained(
         sample = int(steps.sample[first])
         yield "jump", sample, sample + 1, float(steps.size[first])
         k += 1
+
+
+def _repeated(places: FloatArray, start: int) -> int:
+    """How many samples from ``start`` on are the very ones that stand elsewhere, in their order."""
+    same = np.abs(places - places[start]).max(axis=1) < SAME_MM
+    same[start:] = False
+    longest = 0
+    for other in np.flatnonzero(same).tolist():
+        n = min(len(places) - start, start - other)
+        equal = np.abs(places[start : start + n] - places[other : other + n]).max(axis=1) < SAME_MM
+        length = n if equal.all() else int(equal.argmin())
+        # a track at rest repeats one pose; that is no repeated way
+        if np.ptp(places[start : start + length], axis=0).max(initial=0.0) > SAME_MM:
+            longest = max(longest, length)
+    return longest if longest >= FEWEST_REPEATED else 0
 
 
 def _undoes(steps: _Steps, first: int, after: int, n_steps: int) -> bool:

@@ -86,6 +86,15 @@ def test_a_stuck_encoder_is_named_from_its_second_equal_sample(share: float) -> 
     assert np.flatnonzero(check.is_faulty).tolist() == list(range(401, last))
 
 
+def test_a_block_of_samples_that_comes_twice_is_named() -> None:
+    def repeat(rotations: FloatArray, places: FloatArray) -> None:
+        rotations[800:860], places[800:860] = rotations[500:560], places[500:560]
+
+    check = check_track(changed(repeat))
+    assert [fault.kind for fault in check.faults] == ["repeated"]
+    assert np.flatnonzero(check.is_faulty).tolist() == list(range(800, 860))
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("period_ns", [4_000_000, 12_500_000, 100_000_000, 400_000_000])
 @pytest.mark.parametrize("decimals", [1, 3, 12])

@@ -347,14 +347,16 @@ def run_faults(
             scan = measured(fault.recording, fault.scanner, fault.pixels)
         except ArmscanError as error:
             told, effect, left, check = (str(error),), np.inf, "all", "refused"
+            strong: tuple[str, ...] = told
         else:
-            told = (*scan.contradictions, *scan.warnings)
+            strong = scan.contradictions
+            told = (*strong, *scan.warnings)
             effect = effect_sigmas(scan, truth)
             left = str(len(truth.images) - len(scan.images))
             check = _verified(scan, fault.scanner)
         text = " ".join(told)
         is_named = any(word in text for word in fault.words)
-        is_warned = bool(told) and not is_named
+        is_warned = bool(strong) or check not in ("still valid", "no ball")
         verdict = "named" if is_named else "warned" if is_warned else "SILENT"
         if verdict == "SILENT" and effect < EXCEEDS:
             verdict = "no effect"

@@ -209,7 +209,21 @@ def _cause(scan: _Scan, full: PassAgreement | None) -> tuple[str, str]:
                 break
     if cause[0] or full is None:
         return cause
-    return _shifted_passes(scan, full)
+    # six free parameters bend to much else, so they come last
+    return _shifted_passes(scan, full) or _knocked(scan, found)
+
+
+def _knocked(scan: _Scan, found: PassAgreement | None) -> tuple[str, str]:
+    """Whether a head that sits elsewhere on the arm explains the disagreement."""
+    moved = _other_hand_eye(scan.stripes)
+    other = None if moved is None else pass_agreement(moved[0])
+    if moved is None or other is None or not _explains(other, found):
+        return "", ""
+    return (
+        f"a head that sits {moved[1]:.2g} mm and {moved[2]:.2g} deg elsewhere on the arm would "
+        "make them agree",
+        "the scanner's document is not of this head, or the head was knocked: calibrate again",
+    )
 
 
 def _explains(other: PassAgreement, found: PassAgreement | None) -> bool:
@@ -245,15 +259,6 @@ def _readings(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
             f"a light sheet that lies {abs(shift_mm):.2g} mm beside the document's would make them "
             "agree",
             "the document is not of this head, or the laser was knocked: calibrate again",
-            stripes,
-        )
-    moved = _other_hand_eye(scan.stripes)
-    if moved is not None:
-        stripes, shift_mm, turn_deg = moved
-        yield (
-            f"a head that sits {shift_mm:.2g} mm and {turn_deg:.2g} deg elsewhere on the arm would "
-            "make them agree",
-            "the scanner's document is not of this head, or the head was knocked: calibrate again",
             stripes,
         )
 
@@ -321,6 +326,12 @@ def _other_poses(
             f"quaternions whose scalar stands {place} would make them agree",
             "name the columns qw,qx,qy,qz in the order in which the numbers stand",
             scan.at(turned, translations),
+        )
+    for factor, unit in ((25.4, "inches"), (10.0, "centimetres"), (1000.0, "metres")):
+        yield (
+            f"positions of the arm in {unit} would explain it",
+            "give the translations of the poses in mm",
+            scan.at(rotations, factor * translations),
         )
     for axis, name in enumerate("xyz"):
         mirror = np.eye(3)
@@ -437,7 +448,7 @@ def _by_hand_eye(stripes: Stripes, row: IntArray, normal: FloatArray) -> FloatAr
     return np.hstack([np.cross(stripes.points_sensor_mm[row], local), local])
 
 
-def _shifted_passes(scan: _Scan, found: PassAgreement) -> tuple[str, str]:
+def _shifted_passes(scan: _Scan, found: PassAgreement) -> tuple[str, str] | None:
     """A time before and after which passes agree among themselves, but not with each other.
 
     What is tried: one pass lies off all others, the scan breaks between two passes, or within one.
@@ -446,10 +457,11 @@ def _shifted_passes(scan: _Scan, found: PassAgreement) -> tuple[str, str]:
     pairs = np.array([(pair.surface, pair.other) for pair in found.pairs])
     is_bad = np.array([pair.ratio > SPLIT_RATIO for pair in found.pairs])
     if not is_bad.any() or is_bad.all():
-        return "", ""
+        return None
     times = np.array([scan.source.rows[row].t_ns for row in scan.rows]) / 1e9
     starts = [float(times[scan.stripes.pass_of == k].min()) for k in range(n_passes)]
-    best, cause = SPLIT_SHARE, ("", "")
+    best: float = SPLIT_SHARE
+    cause: tuple[str, str] | None = None
     for cut in range(n_passes):
         inside = (pairs == cut).any(axis=1)
         apart = {

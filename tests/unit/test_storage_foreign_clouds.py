@@ -71,6 +71,11 @@ def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
         ("two.xyz", "1 2 3\n4 5\n", "not understood"),
         ("words.xyz", "1 2 3\nfour five six\n", "not understood"),
         ("nan.xyz", "1 2 3\nnan 5 6\n", "not finite"),
+        ("comma.csv", "1,5;2,5;3,5\n4,5;5,5;6,5\n", "commas"),
+        ("comma.xyz", "1 2 3\n1,5 2,5 3,5\n", "commas"),
+        ("named.csv", "x,y,z\n1,5,2,5,3,5\n", "commas"),
+        ("letter.xyz", "1.0 2.0 3.O\n4 5 6\n7 8 9\n", "first line"),
+        ("letters.xyz", "1.O 2.O 3.O\n4 5 6\n7 8 9\n", "first line"),
         ("cloud.stl", "1 2 3\n", "no point cloud that armscan knows"),
     ],
 )

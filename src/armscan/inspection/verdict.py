@@ -129,6 +129,29 @@ def check_size(
     )
 
 
+def check_contradictions(found: tuple[str, ...]) -> Check:
+    """Whether arm, clock and images contradict each other, whatever the standard says.
+
+    Parameters
+    ----------
+    found
+        Each contradiction in words.
+    """
+    return Check(
+        name="contradictions",
+        definition="places at which the arm's track, the clock or passes of this scan contradict "
+        "each other" + (": " + "; ".join(found) if found else ""),
+        unit="",
+        error=float(len(found)),
+        predicted=0.0,
+        limit=0.0,
+        limit_rule="none may be there: the calibration may be right, but the measurement is not",
+        uncertainty=0.0,
+        uncertainty_rule="none: a count",
+        verdict=judge(float(len(found)), 0.0, 0.0),
+    )
+
+
 def check_spread(
     residuals_mm: FloatArray, variance_mm2: FloatArray, exposure: IntArray
 ) -> Check | None:

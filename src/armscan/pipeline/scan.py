@@ -15,6 +15,7 @@ from armscan.errors import ArmscanError, EstimationError, InputError, OptionErro
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
+from armscan.models.calibration import SensorCalibration
 from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.exposure_pairs import ExposurePair
 from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
@@ -30,6 +31,7 @@ from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.reconstruct import NOTHING_MEASURED_REMEDY, nothing_measured
+from armscan.pipeline.scan_doubts import doubt_scan
 from armscan.pipeline.scan_result import (
     ScanExposure,
     ScanExposureFate,
@@ -38,6 +40,7 @@ from armscan.pipeline.scan_result import (
     scan_warnings,
 )
 from armscan.pipeline.sheet_rules import measurer_for
+from armscan.reconstruction.equal_poses import stripes_at_equal_poses
 from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
 from armscan.reconstruction.merge import merge_clouds
 from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
@@ -165,8 +168,18 @@ def measure_scan(
             placed[row] = place_image(one, pose, placing, options.volume)
             weak += one.warnings
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
-    exposures = _records(source, images, poses, placed, reasons)
-    found = _joined(placed, exposures, poses, placing, options)
+    hung = stripes_at_equal_poses({row: one.cloud for row, one in placed.items()}, poses)
+    kept = {row: one for row, one in placed.items() if row not in hung}
+    exposures = _records(source, images, poses, kept, reasons=reasons, hung=hung)
+    found = _joined(kept, exposures, poses, placing, options)
+    doubt = doubt_scan(
+        source,
+        scanner,
+        poses,
+        cloud=found.cloud,
+        images=found.images,
+        image_rows=found.image_rows,
+    )
     return replace(
         found,
         cloud=replace(
@@ -174,7 +187,13 @@ def measure_scan(
             is_simulated=source.is_simulated,
             forced=scanner.provenance.forced,
         ),
-        warnings=(*found.warnings, *collected(weak)),
+        warnings=(
+            *found.warnings,
+            *doubt.warnings,
+            *_unknown_lasers(source, scanner.sensor, options.measure),
+            *collected(weak),
+        ),
+        doubt=doubt,
     )
 
 
@@ -191,6 +210,22 @@ def place_image(
     depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
     inside = cloud if volume is None else cut_cloud(cloud, volume)
     return PlacedImage(image, inside, depths, len(cloud) - len(inside))
+
+
+def _unknown_lasers(
+    source: ScanSource, sensor: SensorCalibration, options: MeasureOptions
+) -> tuple[str, ...]:
+    """Lasers that exposures name but the calibration has no sheet of."""
+    sheets = [sheet.name for sheet in sensor.sheets]
+    known = {*sheets, *(name.partition(".")[0] for name in sheets)}
+    named = {laser for row in source.rows for laser in row.lasers}
+    if options.sheet or not named - known:
+        return ()
+    lasers, names = ", ".join(sorted(named - known)), ", ".join(sheets)
+    return (
+        f"exposures name the laser {lasers}, of which the calibration has no sheet: their stripes "
+        f"were measured as if they were of {names}; name the sheet with --sheet if that is so",
+    )
 
 
 def _in_threads(
@@ -219,7 +254,9 @@ def _records(
     images: ScanInstants,
     poses: ExposurePoses,
     placed: dict[int, PlacedImage],
+    *,
     reasons: dict[int, str],
+    hung: dict[int, float],
 ) -> tuple[ScanExposure, ...]:
     records = []
     alone = set(images.without_partner)
@@ -228,6 +265,9 @@ def _records(
             records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
         elif k in reasons:
             records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
+        elif k in hung:
+            reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
+            records.append(ScanExposure(row, ScanExposureFate.EQUAL_POSE, reason))
         elif not images.is_lit[k]:
             records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
         elif k in alone:

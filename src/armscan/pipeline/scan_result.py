@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 from armscan.pipeline.instants import PARTNER_MISSING
+from armscan.pipeline.scan_doubts import ScanDoubt
 from armscan.reconstruction.exposure_poses import ExposurePoses
 from armscan.reconstruction.result import PointFate, ReconstructedImage
 from armscan.records.cloud import PointCloud
@@ -24,6 +25,7 @@ class ScanExposureFate(Enum):
     LASER_OFF = "laser off"
     UNREADABLE = "image cannot be read"
     NO_PARTNER = PARTNER_MISSING
+    EQUAL_POSE = "left out: the pose of another exposure, but another stripe"
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +76,8 @@ class ScanReconstruction:
         Of every row; how poses were found.
     warnings
         What is weak, in words.
+    doubt
+        How far the passes of the scan agree.
     """
 
     cloud: PointCloud
@@ -82,6 +86,16 @@ class ScanReconstruction:
     exposures: tuple[ScanExposure, ...]
     poses: ExposurePoses
     warnings: tuple[str, ...] = ()
+    doubt: ScanDoubt = field(default_factory=lambda: ScanDoubt(None))
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """What shows that arm, clock, images and calibration do not belong together, in words."""
+        hung = self.count(ScanExposureFate.EQUAL_POSE)
+        found = [fault.words for fault in self.poses.track_faults]
+        if hung:
+            found.append(f"{hung} exposures bear the pose of another one but show another stripe")
+        return (*found, *self.doubt.warnings)
 
     @property
     def without_pose(self) -> tuple[tuple[str, str], ...]:
@@ -89,7 +103,7 @@ class ScanReconstruction:
         return tuple(
             (exposure.row.source, exposure.reason)
             for exposure in self.exposures
-            if exposure.fate is ScanExposureFate.NO_POSE
+            if exposure.fate in (ScanExposureFate.NO_POSE, ScanExposureFate.EQUAL_POSE)
         )
 
     @property
@@ -125,6 +139,12 @@ def scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tu
         warnings.append(
             f"{len(alone)} of {len(exposures)} images were not used, {PARTNER_MISSING}: "
             f"{', '.join(alone[:LISTED])}"
+        )
+    hung = [e for e in exposures if e.fate is ScanExposureFate.EQUAL_POSE]
+    if hung:
+        warnings.append(
+            f"{len(hung)} of {len(exposures)} exposures were left out: {hung[0].reason}: the arm's "
+            "pose hung or was repeated, or the object moved"
         )
     n_outside = sum(exposure.n_outside_volume for exposure in exposures)
     if n_outside:

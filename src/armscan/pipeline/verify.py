@@ -10,10 +10,11 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cleaning import Region
 from armscan.inspection.consistency import StandardDistances, check_consistency
+from armscan.inspection.off_standard import check_exposures_off
 from armscan.inspection.options import InspectionOptions
 from armscan.inspection.plane import inspect_plane, linearised_plane
 from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
@@ -23,6 +24,7 @@ from armscan.inspection.verdict import (
     COVERAGE,
     Check,
     Verdict,
+    check_contradictions,
     check_size,
     check_spread,
     worst,
@@ -132,7 +134,9 @@ def verify_on_ball(
         by_standard=np.full((len(used), 1), -u_radius),
     )
     return _judged(
-        _Evidence(measured, used, fit, found.diameter, standard),
+        _Evidence(
+            measured, used, fit, found.diameter, standard, region, inspection or InspectionOptions()
+        ),
         found,
         ("diameter", "fitted minus nominal diameter (P_Size.Sph.All of ISO 10360-8)"),
         found.diameter.value_mm - diameter_mm,
@@ -174,7 +178,15 @@ def verify_on_plate(
     u = max(options.reference_u_mm, COVERAGE * _plate_sigma_mm(plate, found))
     unknown = () if plate.covariance is not None else ("the plate's own uncertainty is not known",)
     return _judged(
-        _Evidence(measured, used, linearised_plane(found.plane, points), offset, standard),
+        _Evidence(
+            measured,
+            used,
+            linearised_plane(found.plane, points),
+            offset,
+            standard,
+            region,
+            inspection or InspectionOptions(),
+        ),
         found,
         ("height", "of the scanned plane over the probed one, at the middle of the points"),
         offset.value_mm,
@@ -194,13 +206,21 @@ class _Standard:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """What the checks look at: the fit's points, the fitted length, the standard."""
+    """What the checks look at: the fit's points, the fitted length, the standard, the options."""
 
     measured: Measured
     used: IntArray
     fit: FitLinearised
     length: MeasuredLength
     standard: _Standard
+    region: Region | None
+    inspection: InspectionOptions
+
+    @property
+    def within(self) -> BoolArray:
+        """(N,) points in the region that was asked for."""
+        points = self.measured.cloud.points_mm
+        return np.ones(len(points), np.bool_) if self.region is None else self.region.holds(points)
 
 
 def _judged(
@@ -253,7 +273,9 @@ def _judged(
         mpe_mm=options.mpe_mm,
     )
     spread = check_spread(fit.residuals_mm, variance, exposure)
-    checks = tuple(check for check in (size, consistency, spread) if check is not None)
+    off = check_exposures_off(cloud, found, evidence.within, evidence.inspection)
+    sound = None if scan is None else check_contradictions(scan.contradictions)
+    checks = tuple(c for c in (size, consistency, spread, off, sound) if c is not None)
     if spread is None or (scan is not None and consistency is None):
         warnings = (*warnings, "too few exposures to see whether they agree")
     if not variance.any():

@@ -13,6 +13,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
 from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
+from armscan.reconstruction.track_faults import TrackFault
 
 PoseSource = Literal["trigger", "time"]
 
@@ -33,6 +34,8 @@ class PoseFate(IntEnum):
     """Later than the arm's last sample."""
     GAP = 6
     """Between two samples too far apart, or next to one without pose."""
+    CONTRADICTED = 7
+    """At samples that the arm's own track shows to be wrong."""
 
     @property
     def label(self) -> str:
@@ -48,6 +51,7 @@ _LABELS = {
     PoseFate.BEFORE_TRACK: "before the arm's first sample",
     PoseFate.AFTER_TRACK: "after the arm's last sample",
     PoseFate.GAP: "in a gap of the arm's samples",
+    PoseFate.CONTRADICTED: "at samples that the arm's own track shows to be wrong",
 }
 
 
@@ -69,6 +73,8 @@ class ExposurePoses:
         Widest step between samples that was bridged; 0 by trigger id.
     warnings
         What is weak, in words.
+    track_faults
+        What the arm's track says against itself.
     """
 
     rotations: FloatArray
@@ -78,6 +84,7 @@ class ExposurePoses:
     source: PoseSource
     max_gap_ns: int
     warnings: tuple[str, ...] = ()
+    track_faults: tuple[TrackFault, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.fate))

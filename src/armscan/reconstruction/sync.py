@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.slerp import slerp
 from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
+from armscan.reconstruction.track_faults import check_track
 from armscan.records.arm_track import NO_TRIGGER, ArmTrack
 from armscan.records.session import Clock, ExposureRow
 
@@ -19,6 +20,8 @@ GAP_PERIODS = 3
 """Steps between samples up to this many median periods are bridged, unless the user says more."""
 LARGEST_DEFAULT_GAP_NS = 500_000_000
 """And never longer ones: an arm that gives a pose now and then may have gone anywhere between."""
+LISTED_FAULTS = 3
+"""Faults of a track that are told one by one."""
 BEND_MM = 0.02
 """Interpolation errors of this size in the tool's place are warned of: an arm's own scatter."""
 
@@ -49,6 +52,9 @@ def exposure_poses(
     options: SyncOptions | None = None,
 ) -> ExposurePoses:
     """Find ``base_from_tool`` of each exposure; a pose that is not known is never guessed.
+
+    The arm's track is checked by itself (`armscan.reconstruction.track_faults`): exposures at
+    samples that cannot be right get no pose.
 
     Trigger ids decide if exposures and samples have them. Else the pose is interpolated in time
     between two neighbouring known samples: the rotation by SLERP, the place along a straight line.
@@ -83,13 +89,14 @@ def exposure_poses(
     if has_ids and any(row.trigger_id is not None for row in rows):
         poses = _by_trigger(rows, arm, clock, latency_ns)
     elif clock == "shared":
-        poses = _by_time(rows, arm, latency_ns, options)
+        poses = poses_by_time(rows, arm, latency_ns, options)
     else:
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
             remedy="record trigger_id in both tables, or times of one clock "
             'and then clock = "shared"',
         )
+    poses = _without_contradicted(poses, rows, arm, latency_ns)
     if not poses.has_pose.any():
         raise EstimationError(
             f"none of {len(rows)} exposures has a pose: {poses.missing or 'there are none'}"
@@ -97,6 +104,44 @@ def exposure_poses(
             remedy="check the times and trigger ids of exposures and arm samples",
         )
     return poses
+
+
+def _without_contradicted(
+    poses: ExposurePoses, rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int
+) -> ExposurePoses:
+    """Take the pose from exposures at samples that the track itself shows to be wrong."""
+    check = check_track(arm)
+    if not check.faults:
+        return poses
+    sample = np.maximum(poses.sample, 0)
+    is_wrong = check.is_faulty[sample]
+    if poses.source == "time":
+        times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
+        after = np.minimum(sample + 1, len(arm) - 1)
+        is_between = times > arm.t_ns[sample]
+        is_wrong |= is_between & (check.is_faulty[after] | check.is_broken_step[sample])
+    is_wrong &= poses.has_pose
+    fate = np.where(is_wrong, int(PoseFate.CONTRADICTED), poses.fate)
+    rotations = np.where(is_wrong[:, None, None], np.eye(3), poses.rotations)
+    translations = np.where(is_wrong[:, None], 0.0, poses.translations_mm)
+    named = [fault.words for fault in check.faults[:LISTED_FAULTS]]
+    if len(check.faults) > LISTED_FAULTS:
+        named.append(f"and {len(check.faults) - LISTED_FAULTS} more of this kind")
+    warnings = [*poses.warnings, "; ".join(named)]
+    if check.jumps:
+        warnings.append(
+            "a jump shifts all that was scanned before it against all that was scanned after it, "
+            "and the track does not tell which of the two is right: scan again"
+        )
+    return replace(
+        poses,
+        rotations=rotations,
+        translations_mm=translations,
+        fate=fate,
+        sample=np.where(is_wrong, -1, poses.sample),
+        warnings=tuple(warnings),
+        track_faults=check.faults,
+    )
 
 
 def largest_gap_ns(arm: ArmTrack, options: SyncOptions) -> int:
@@ -160,9 +205,14 @@ def _at_samples(arm: ArmTrack, found: IntArray, fate: IntArray) -> tuple[FloatAr
     return rotations, translations
 
 
-def _by_time(
-    rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int, options: SyncOptions
+def poses_by_time(
+    rows: Sequence[ExposureRow],
+    arm: ArmTrack,
+    latency_ns: int = 0,
+    options: SyncOptions | None = None,
 ) -> ExposurePoses:
+    """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
+    options = options or SyncOptions()
     times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
     max_gap = largest_gap_ns(arm, options)
     before = np.searchsorted(arm.t_ns, times, side="right") - 1

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -67,15 +67,4 @@ def cut_cloud(cloud: PointCloud, box: BaseBox) -> PointCloud:
     """
     if cloud.frame != "Base":
         raise InputError(f"a volume of Base cannot cut a cloud in {cloud.frame}")
-    kept = np.flatnonzero(box.holds(cloud.points_mm))
-    return replace(
-        cloud,
-        points_mm=cloud.points_mm[kept],
-        covariance_mm2=cloud.covariance_mm2[kept],
-        sigma_noise_mm=cloud.sigma_noise_mm[kept],
-        sheet=cloud.sheet[kept],
-        exposure=cloud.exposure[kept],
-        segment=cloud.segment[kept],
-        intensity=cloud.intensity[kept],
-        normals=None if cloud.normals is None else cloud.normals[kept],
-    )
+    return cloud.select(np.flatnonzero(box.holds(cloud.points_mm)))

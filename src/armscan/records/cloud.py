@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -89,6 +89,20 @@ class PointCloud:
     def __len__(self) -> int:
         """Count of points."""
         return len(self.points_mm)
+
+    def select(self, rows: IntArray) -> PointCloud:
+        """The points of these rows (M,); lists of names stay as they are."""
+        return replace(
+            self,
+            points_mm=self.points_mm[rows],
+            covariance_mm2=self.covariance_mm2[rows],
+            sigma_noise_mm=self.sigma_noise_mm[rows],
+            sheet=self.sheet[rows],
+            exposure=self.exposure[rows],
+            segment=self.segment[rows],
+            intensity=self.intensity[rows],
+            normals=None if self.normals is None else self.normals[rows],
+        )
 
     @property
     def sigma_mm(self) -> FloatArray:

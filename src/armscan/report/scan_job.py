@@ -160,12 +160,14 @@ def scan_summary(
     median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
     low_corner, high_corner = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
     counts = {fate: scan.count(fate) for fate in ScanExposureFate}
+    agreement = scan.doubt.agreement
     exposures = ", ".join(f"{count} {fate.value}" for fate, count in counts.items() if count)
     facts = (
         ("points", f"{len(cloud)} in the {cloud.frame} frame"),
         ("exposures", exposures),
         ("poses", scan.poses.how),
         ("sigma", f"{significant(median)} mm median, 95 % below {significant(high)} mm"),
+        ("passes", passes_text(scan)),
         *(
             (axis, f"{low:.2f} to {top:.2f} mm")
             for axis, low, top in zip("XYZ", low_corner, high_corner, strict=True)
@@ -192,5 +194,29 @@ def scan_summary(
             "exposures": {fate.name.lower(): count for fate, count in counts.items()},
             "without_pose": [{"source": name, "reason": why} for name, why in scan.without_pose],
             "hand_eye_of": scanner.provenance.document_id,
+            "contradictions": list(scan.contradictions),
+            "passes": None
+            if agreement is None
+            else {
+                "distance_mm": agreement.distance_mm,
+                "worst_mm": agreement.worst_mm,
+                "claimed_mm": agreement.claimed_mm,
+                "ratio": agreement.ratio,
+                "worst_ratio": agreement.worst_ratio,
+                "n_pairs": len(agreement.pairs),
+                "cause": scan.doubt.cause,
+            },
         },
+    )
+
+
+def passes_text(scan: ScanReconstruction) -> str:
+    """How far the passes of a scan agree, in words."""
+    found = scan.doubt.agreement
+    if found is None:
+        return "no two of them overlap, so the scan cannot be checked against itself"
+    return (
+        f"{significant(found.distance_mm)} mm apart where they overlap (median of "
+        f"{len(found.pairs)} pairs; at most {significant(found.worst_mm)} mm), "
+        f"{significant(found.ratio, '', 2)} times what is expected"
     )

@@ -43,7 +43,10 @@ KnownOrNot = Annotated[
 """A figure that is not known, as of a foreign calibration: ``null`` in the file, NaN in the
 program."""
 
-Triple = tuple[float, float, float]
+Bounded = Annotated[float, Field(ge=-1e7, le=1e7)]
+"""Lengths in mm, pixels and coefficients beyond this are damage: they overflow later."""
+
+Triple = tuple[Bounded, Bounded, Bounded]
 
 
 class Body(BaseModel):
@@ -95,15 +98,15 @@ class IntrinsicsBody(Body):
     pixel_origin: Literal["centre of the top-left pixel"] = "centre of the top-left pixel"
     width_px: int = Field(ge=1)
     height_px: int = Field(ge=1)
-    fx_px: float = Field(gt=0)
-    fy_px: float = Field(gt=0)
-    cx_px: float
-    cy_px: float
-    k1: float
-    k2: float
-    p1: float
-    p2: float
-    k3: float
+    fx_px: Bounded = Field(gt=0)
+    fy_px: Bounded = Field(gt=0)
+    cx_px: Bounded
+    cy_px: Bounded
+    k1: Bounded
+    k2: Bounded
+    p1: Bounded
+    p2: Bounded
+    k3: Bounded
 
 
 class CovarianceBody(Body):

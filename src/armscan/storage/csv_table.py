@@ -24,6 +24,9 @@ NAN = re.compile(r"[-+]?nan", re.IGNORECASE)
 DECIMAL = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 
+LARGEST_MM, LARGEST = 1e7, 1e12
+"""Lengths beyond ten kilometres, and any numbers beyond this, are slips that overflow later."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CsvTable:
@@ -111,6 +114,12 @@ class CsvTable:
                     where=self.place(row),
                     remedy="write it as -12.5 or 1.25e-3"
                     + (", or leave it empty where it is not known" if may_lack else ""),
+                )
+            if abs(value) > (LARGEST_MM if name.endswith("_mm") else LARGEST):
+                raise FileFormatError(
+                    f"{value:g} in column {name} is beyond all that is measured",
+                    where=self.place(row),
+                    remedy="correct the number, or leave the line out",
                 )
             values.append(value)
         return values

@@ -21,6 +21,10 @@ FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
 
+LOOKED_AT = 1000
+"""Lines in which decimal commas are sought: a table that has them has them everywhere."""
+
+
 def read_cloud(path: Path) -> PointCloud:
     """Read a cloud that armscan wrote, or the points of another program's PLY, XYZ or CSV file.
 
@@ -59,16 +63,25 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
     text = data.decode("utf-8-sig", errors="replace")
     named = re.match(r"#.*\bframe (\w+)", text)
     frame = named[1] if named is not None else ""
-    lines = text.replace(",", " ").replace(";", " ").splitlines()
-    # other programs put a count or column names first
-    start = 1 if lines and not lines[0].startswith("#") and not _is_point(lines[0]) else 0
-    body = "\n".join(lines[start:])
-    if not any(line.strip() and not line.startswith("#") for line in lines[start:]):
+    lines = text.splitlines()
+    start = 1 if _is_heading(lines, path) else 0
+    body = [line.partition("#")[0] for line in lines[start:]]
+    filled = [line for line in body[:LOOKED_AT] if line.strip()]
+    if not filled:
         raise FileFormatError(
             "the file holds no points", where=str(path), remedy="write lines of x y z in mm"
         )
+    for line in filled:
+        _refuse_decimal_commas(line, path)
+    if start and len(_words(lines[0])) > 1 and len(_words(filled[0])) == 2 * len(_words(lines[0])):
+        raise FileFormatError(
+            f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
+            where=str(path),
+            remedy="write numbers with points: 1.5,2.5,3.5",
+        )
+    joined = "\n".join(body).replace(",", " ").replace(";", " ")
     try:
-        points = np.loadtxt(io.StringIO(body), usecols=(0, 1, 2), ndmin=2)
+        points = np.loadtxt(io.StringIO(joined), usecols=(0, 1, 2), ndmin=2)
     except (ValueError, IndexError) as error:
         raise FileFormatError(
             f"the points are not understood ({error})",
@@ -80,11 +93,57 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
     return _bare_cloud(points, known, path, is_simulated=is_simulated)
 
 
-def _is_point(line: str) -> bool:
+def _is_heading(lines: list[str], path: Path) -> bool:
+    """Whether the first line is no point but a count of points, or names of columns.
+
+    Raises
+    ------
+    FileFormatError
+        If it is none of these: a damaged point is not to be dropped in silence.
+    """
+    words = _words(lines[0]) if lines else []
+    if not words or lines[0].startswith("#"):
+        return False
+    if len(words) == 1 and words[0].isdecimal():
+        return True
+    if all(_is_number(word) for word in words):
+        return False
+    if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
+        raise FileFormatError(
+            f"the first line is neither a point nor a heading: '{lines[0][:60]}'",
+            where=str(path),
+            remedy="correct the line, or put # before it",
+        )
+    return True
+
+
+def _refuse_decimal_commas(line: str, path: Path) -> None:
+    """Raise for a line whose commas can only be decimal signs, or may be.
+
+    ``1,5;2,5;3,5`` and ``1,5 2,5 3,5`` hold commas and another separator between numbers; so do
+    six whole numbers ``1,5,2,5,3,5`` from a table of three columns, which is not told from one of
+    six: only what is certain is refused.
+    """
+    fields = [word for word in re.split(r"[;\s]+", line.strip().strip(",;")) if word]
+    with_comma = [word for word in fields if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word)]
+    if len(fields) >= 2 and with_comma:
+        raise FileFormatError(
+            f"the numbers have commas as decimal signs: '{line.strip()[:60]}'",
+            where=str(path),
+            remedy="write them with points: 1.5 2.5 3.5",
+        )
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
+
+
+def _is_number(word: str) -> bool:
     try:
-        return len([float(word) for word in line.split()]) >= 3
+        float(word)
     except ValueError:
         return False
+    return True
 
 
 def _bare_cloud(

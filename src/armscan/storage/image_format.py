@@ -11,10 +11,9 @@ import struct
 import zlib
 
 from armscan.errors import FileFormatError
+from armscan.storage.jpeg_format import jpeg_defect
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_NO_LENGTH = frozenset({0x01, *range(0xD0, 0xD8)})
-JPEG_END, JPEG_SCAN = 0xD9, 0xDA
 TIFF_TYPE_BYTES = {1: 1, 3: 2, 4: 4}
 TIFF_DATA_TAGS = {273: 279, 324: 325}
 """Tags of the offsets of strips and tiles, with the tags of their byte counts."""
@@ -52,7 +51,7 @@ def check_complete(data: bytes, where: str) -> None:
     FileFormatError
         If the file is cut short or damaged.
     """
-    checks = {"PNG": _png_defect, "JPEG": _jpeg_defect, "BMP": _bmp_defect, "TIFF": _tiff_defect}
+    checks = {"PNG": _png_defect, "JPEG": jpeg_defect, "BMP": _bmp_defect, "TIFF": _tiff_defect}
     name = image_format(data)
     if name not in checks:
         return
@@ -78,25 +77,6 @@ def _png_defect(data: bytes) -> str:
             return ""
         position = end
     return "is cut short"
-
-
-def _jpeg_defect(data: bytes) -> str:
-    position = 2
-    while True:
-        position = data.find(b"\xff", position)
-        if position < 0 or position + 1 >= len(data):
-            return "is cut short"
-        marker = data[position + 1]
-        if marker == JPEG_END:
-            return ""
-        # 0x00 stuffs a data byte 0xff, 0xff fills; neither is a marker
-        if marker in (0x00, 0xFF):
-            position += 2 if marker == 0x00 else 1
-        elif marker in JPEG_NO_LENGTH:
-            position += 2
-        else:
-            (length,) = struct.unpack_from(">H", data, position + 2)
-            position += 2 + length
 
 
 def _bmp_defect(data: bytes) -> str:

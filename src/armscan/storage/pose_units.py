@@ -7,8 +7,10 @@ import math
 
 import numpy as np
 
+from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotation import vector_from_rotation
+from armscan.storage.csv_table import LARGEST_MM
 
 REACH_MM = 10.0
 """No arm keeps its last link this near to the origin of Base; in metres, no arm gets farther."""
@@ -19,6 +21,24 @@ METRES_REMEDY = (
     "multiply x, y and z by 1000; if they are millimetres, add 1000 to each x, for Base may lie "
     "anywhere"
 )
+
+
+def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
+    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass.
+
+    Raises
+    ------
+    FileFormatError
+        If one lies beyond `armscan.storage.csv_table.LARGEST_MM`.
+    """
+    beyond = np.abs(points_mm) > LARGEST_MM
+    if beyond.any():
+        row, column = (int(value) for value in np.argwhere(beyond)[0])
+        raise FileFormatError(
+            f"coordinate {points_mm[row, column]:g} mm (entry {row + 1}) is beyond all reach",
+            where=where,
+            remedy="correct it, or leave the entry out",
+        )
 
 
 def are_within_reach_of_base(translations_mm: FloatArray) -> bool:

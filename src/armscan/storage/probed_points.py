@@ -12,7 +12,7 @@ import numpy as np
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.records.probing import ProbedPoints
-from armscan.storage.csv_table import CsvTable, csv_bytes, number_text, parse_csv
+from armscan.storage.csv_table import LARGEST_MM, CsvTable, csv_bytes, number_text, parse_csv
 from armscan.storage.images import read_bytes
 
 COORDINATES = ("x_mm", "y_mm", "z_mm")
@@ -77,9 +77,11 @@ def parse_plane(text: str, where: str = "") -> FloatArray:
         if not np.isfinite(value):
             raise OptionError(f"{name.upper()} is {value:g}", where=where, remedy=remedy)
     length = math.sqrt(float(values[:3] @ values[:3]))
-    if length == 0.0:
+    if not 0.0 < length < math.inf or abs(float(values[3])) > LARGEST_MM * length:
         raise OptionError(
-            "the plane's normal A,B,C is zero", where=where, remedy="give a plane's A,B,C,D"
+            "the plane's normal A,B,C is zero, or the plane is beyond all reach",
+            where=where,
+            remedy="give a plane's A,B,C,D",
         )
     return np.asarray(values / length)
 

@@ -16,6 +16,7 @@ from armscan.records.point_profile import PointProfile
 from armscan.storage.csv_table import parse_csv
 from armscan.storage.image_paths import expand_paths, natural_key
 from armscan.storage.images import read_bytes, source_names
+from armscan.storage.pose_units import refuse_beyond_reach
 
 PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})
 SCAN_LINE = re.compile(r"^\s*scan_line\s*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
@@ -71,6 +72,7 @@ def _read(path: Path, name: str) -> PointProfile:
     is_yaml = path.suffix.lower() in (".yml", ".yaml") or text.startswith("%YAML")
     values = _from_yaml(text, str(path)) if is_yaml else _from_csv(data, str(path))
     is_known = np.isfinite(values).all(axis=1)
+    refuse_beyond_reach(values[is_known], str(path))
     if not bool(is_known.any()):
         raise FileFormatError(
             f"the profile holds no point ({len(values)} gaps)",

@@ -16,7 +16,7 @@ from armscan.geometry.frames import Base, Tool
 from armscan.geometry.poses import Pose
 from armscan.storage.images import read_bytes
 from armscan.storage.json_text import parse_json
-from armscan.storage.pose_units import METRES_REMEDY, are_surely_metres
+from armscan.storage.pose_units import METRES_REMEDY, are_surely_metres, refuse_beyond_reach
 
 JSON_KEY = "RobPoses"
 HEADERS = (("x", "y", "z", "w", "p", "r"), ("x", "y", "z", "a", "b", "c"))
@@ -53,6 +53,7 @@ def read_robot_poses(path: Path, convention: EulerConvention) -> tuple[Pose[Base
             where=where,
             remedy="write x, y, z in mm, then three angles in degrees",
         )
+    refuse_beyond_reach(table[:, :3], where)
     rotations = rotations_from_euler(np.radians(table[:, 3:]), convention)
     if are_surely_metres(rotations, table[:, :3]):
         raise FileFormatError(

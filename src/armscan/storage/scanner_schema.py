@@ -89,6 +89,6 @@ class ScannerDocument(Body):
     schema_version: Literal[1] = SCHEMA_VERSION
     sensor: SensorDocument | None
     hand_eye: HandEyeBody
-    latency_ns: int
+    latency_ns: int = Field(ge=-(10**12), le=10**12)
     observations: ObservationsBody | None = None
     provenance: ProvenanceBody

@@ -115,7 +115,7 @@ def test_a_head_that_has_moved_on_a_plate(
     scan = measure_scan(source, scanner, ScanOptions(normals=None, threads=1))
     found = verify_on_plate(Measured(scan.cloud, scan, scanner), PLATE)
     assert found.verdict == verdict
-    place, correction, _ = found.checks
+    place, correction, *_ = found.checks
     down = scan_fake.looking_down(0.0).rotation[2]
     assert place.error == pytest.approx(float(down @ shift_mm), abs=0.03)
     # looking straight down, a shift along the normal is the hand-eye's own sigma along it

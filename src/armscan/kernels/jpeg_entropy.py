@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Walk through the entropy-coded data of a sequential JPEG without making a picture of it.
+
+Decoders fill what is missing with grey and say so on stderr at most; here the codes themselves are
+counted (ITU T.81, annex F.2.2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+from armscan.kernels.arrays import Int64Array, MaskArray
+
+WHOLE, NO_CODE, TOO_SHORT, OUT_OF_BLOCK, NO_RESTART = range(5)
+BLOCK = 64
+BYTES_IN = types.Array(types.uint8, 1, "C", readonly=True)
+TABLES_IN = types.Array(types.int64, 2, "C", readonly=True)
+
+
+@njit(
+    types.Tuple((types.int64, types.int64))(  # type: ignore[no-untyped-call]
+        BYTES_IN, TABLES_IN, TABLES_IN, types.int64, types.int64
+    ),
+    cache=True,
+    nogil=True,
+)
+def walk_scan(
+    data: MaskArray,
+    tables: Int64Array,
+    table_of_block: Int64Array,
+    n_units: int,
+    restart: int,
+) -> tuple[int, int]:
+    """Decode all codes of one scan.
+
+    Parameters
+    ----------
+    data
+        (N,) from behind the scan's header to the marker that ends it.
+    tables
+        (T, 65536) of each Huffman table, by the next 16 bits: 256 times the length of the code
+        plus its value; 0 where there is no such code.
+    table_of_block
+        (B, 2) rows of ``tables`` of the DC and AC codes of each block of a unit (MCU).
+    n_units
+        Units of the picture.
+    restart
+        Units between restart markers; 0 for none.
+
+    Returns
+    -------
+    defect, left
+        `WHOLE` and the bytes that were left over, or the defect and the units that are missing.
+    """
+    n = len(data)
+    position, bits, n_bits, borrowed = 0, np.int64(0), 0, 0
+    for unit in range(n_units):
+        if restart > 0 and unit > 0 and unit % restart == 0:
+            bits, n_bits, borrowed = np.int64(0), 0, 0
+            while position + 1 < n and data[position] == 255 and data[position + 1] == 255:
+                position += 1
+            number = 0xD0 + (unit // restart - 1) % 8
+            if position + 1 >= n or data[position] != 255 or data[position + 1] != number:
+                return NO_RESTART, n_units - unit
+            position += 2
+        for block in range(len(table_of_block)):
+            index = 0
+            while index < BLOCK:
+                while n_bits < 32:
+                    byte = np.int64(255)
+                    if position < n and data[position] != 255:
+                        byte = np.int64(data[position])
+                        position += 1
+                    elif position + 1 < n and data[position + 1] == 0:
+                        position += 2
+                    else:
+                        # behind the end; harmless until one of these bits is used
+                        borrowed += 8
+                    bits = ((bits << 8) | byte) & 0xFFFFFFFFFFFF
+                    n_bits += 8
+                row = table_of_block[block, min(index, 1)]
+                entry = tables[row, (bits >> (n_bits - 16)) & 0xFFFF]
+                if entry == 0:
+                    return NO_CODE, n_units - unit
+                value = entry & 0xFF
+                n_bits -= (entry >> 8) + (value & 0x0F)
+                if n_bits < borrowed:
+                    return TOO_SHORT, n_units - unit
+                if index == 0:
+                    index = 1
+                elif value == 0:
+                    index = BLOCK
+                else:
+                    index += (value >> 4) + 1
+                    if index > BLOCK:
+                        return OUT_OF_BLOCK, n_units - unit
+    unused = max(n_bits - borrowed, 0) // 8
+    return WHOLE, n - position + unused

@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the passes of a scan show one surface: what a track or a clock cannot tell of itself.
+
+A pass is what was scanned without a pause, in one direction. Its own stripes lie side by side, so
+a wrong clock or pose bends it smoothly and nothing shows; where two passes cross, they then lie
+apart. So each pass makes local quadrics of its own stripes, and points of other passes that fall
+among those stripes are compared with them, in units of what both claim of themselves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+
+PAUSE_PERIODS = 4.0
+"""A pause of so many median periods between exposures begins a new pass."""
+LONGEST_PASS = 24
+"""Longer passes are cut: a hand that goes to and fro without a pause turns round in between."""
+CELL_MM = 0.5
+"""Points of one exposure are thinned to one a cell of this size."""
+MOST_QUERIES, MOST_OWN = 2000, 150
+"""Points that are compared with other passes, and of each pass with itself."""
+NEIGHBOURS, FEWEST_NEIGHBOURS, FEWEST_STRIPES = 60, 12, 3
+"""Cells of the other pass about a point; the fewest of them, and of their exposures, that make a
+quadric of six unknowns with something to check it."""
+SPACINGS = 2.4
+"""The neighbourhood reaches so many times as far as the next stripe of the pass usually is: two
+stripes on either side of a point between them."""
+LEAST_RADIUS_MM, LARGEST_RADIUS_MM = 1.5, 40.0
+CELLS = 6.0
+"""Cells to its radius: stripes then count alike however dense their points are."""
+CENTRED = 0.4
+"""The neighbours' middle lies within this part of their radius: a point is among the stripes."""
+FEWEST_POINTS = 20
+"""Points that a pair of passes must have in common to be compared."""
+AGREES = 5.0
+"""A point agrees with another pass within so many of their joint standard deviations."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stripes:
+    """Thinned points of all exposures, in the Sensor frame of each.
+
+    Parameters
+    ----------
+    points_sensor_mm
+        (M, 3).
+    covariance_mm2
+        (M, 3, 3) in Base, as the scan placed them.
+    exposure
+        (M,) number of their exposure, from 0.
+    pass_of
+        (E,) number of the pass that each exposure belongs to.
+    rotations, translations_mm
+        (E, 3, 3) and (E, 3): ``base_from_sensor`` of each exposure.
+    """
+
+    points_sensor_mm: FloatArray
+    covariance_mm2: FloatArray
+    exposure: IntArray
+    pass_of: IntArray
+    rotations: FloatArray
+    translations_mm: FloatArray
+
+    @property
+    def points_base_mm(self) -> FloatArray:
+        """(M, 3)."""
+        turned = np.einsum("mij,mj->mi", self.rotations[self.exposure], self.points_sensor_mm)
+        return np.asarray(turned + self.translations_mm[self.exposure])
+
+    def placed(self, rotations: FloatArray, translations_mm: FloatArray) -> Stripes:
+        """The same stripes at other poses of the sensor."""
+        return replace(self, rotations=rotations, translations_mm=translations_mm)
+
+    def with_points(self, points_sensor_mm: FloatArray) -> Stripes:
+        """Other points (M, 3) in their place."""
+        return replace(self, points_sensor_mm=points_sensor_mm)
+
+    def of_rows(self, rows: IntArray) -> Stripes:
+        """Some of the points."""
+        return replace(
+            self,
+            points_sensor_mm=self.points_sensor_mm[rows],
+            covariance_mm2=self.covariance_mm2[rows],
+            exposure=self.exposure[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PassPair:
+    """How far points of the pass ``other`` lie from the surface of the pass ``surface``.
+
+    ``distance_mm`` is their median distance and ``ratio`` that over what is expected.
+    """
+
+    surface: int
+    other: int
+    distance_mm: float
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PassDistances:
+    """Points of passes among the stripes of other passes.
+
+    Parameters
+    ----------
+    row, nearest
+        (N,) rows of `Stripes`: the point, and its nearest neighbour in the other pass.
+    surface
+        (N,) number of the other pass.
+    normal
+        (N, 3) of its surface, in Base.
+    distance_mm, sigma_mm
+        (N,) signed distance from it, and the standard deviation that both claim, with what quadrics
+        between stripes leave out.
+    claimed_mm
+        (N,) the same without the latter.
+    """
+
+    row: IntArray
+    nearest: IntArray
+    surface: IntArray
+    normal: FloatArray
+    distance_mm: FloatArray
+    sigma_mm: FloatArray
+    claimed_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class PassAgreement:
+    """How far passes lie from each other where they overlap.
+
+    Parameters
+    ----------
+    pairs
+        Of passes of which one lies among the stripes of the other.
+    n_points
+        Points that were compared; a point counts for each pass that it lies among.
+    agreeing
+        Part of the compared points that agree with the other pass within `AGREES`.
+    distance_mm, worst_mm
+        Median over pairs of their distances, and the largest.
+    claimed_mm
+        Median standard deviation that the points claim for such a distance.
+    ratio, worst_ratio
+        Root mean square over pairs of distance over what is expected, and the largest.
+    """
+
+    pairs: tuple[PassPair, ...]
+    n_points: int
+    agreeing: float
+    distance_mm: float
+    worst_mm: float
+    claimed_mm: float
+    ratio: float
+    worst_ratio: float
+
+
+def passes_of(t_ns: IntArray) -> IntArray:
+    """(E,) number of the pass of each exposure, from their times in order."""
+    n = len(t_ns)
+    if n < 2:
+        return np.zeros(n, dtype=np.int64)
+    step = np.diff(t_ns)
+    is_pause = step > PAUSE_PERIODS * float(np.median(step))
+    start = np.concatenate([[0], 1 + np.flatnonzero(is_pause), [n]])
+    numbers = np.zeros(n, dtype=np.int64)
+    count = 0
+    for first, end in pairwise(start):
+        n_parts = max(1, int(np.ceil((end - first) / LONGEST_PASS)))
+        for part in np.array_split(np.arange(first, end), n_parts):
+            numbers[part] = count
+            count += 1
+    return numbers
+
+
+def thinned_rows(points_mm: FloatArray, exposure: IntArray, size_mm: float = CELL_MM) -> IntArray:
+    """Rows of one point for each cell of each exposure."""
+    cell = np.floor((points_mm - points_mm.min(axis=0)) / size_mm).astype(np.int64)
+    spans = cell.max(axis=0) + 1
+    key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
+    order = np.lexsort((key, exposure))
+    is_first = np.ones(len(order), dtype=np.bool_)
+    is_first[1:] = (np.diff(key[order]) != 0) | (np.diff(exposure[order]) != 0)
+    return np.asarray(np.sort(order[is_first]))
+
+
+def pass_agreement(stripes: Stripes) -> PassAgreement | None:
+    """Compare every pass with the surfaces of the others; None where no two passes overlap."""
+    found = pass_distances(stripes)
+    if found is None:
+        return None
+    owner = stripes.pass_of[stripes.exposure][found.row]
+    pairs = []
+    for surface, other in np.unique(np.stack([found.surface, owner], axis=1), axis=0).tolist():
+        own = (found.surface == surface) & (owner == other)
+        if int(own.sum()) >= FEWEST_POINTS:
+            distance = float(np.median(np.abs(found.distance_mm[own])))
+            expected = float(np.median(found.sigma_mm[own]))
+            pairs.append(PassPair(surface, other, distance, distance / expected))
+    if not pairs:
+        return None
+    distances = np.array([pair.distance_mm for pair in pairs])
+    ratios = np.array([pair.ratio for pair in pairs])
+    return PassAgreement(
+        pairs=tuple(pairs),
+        n_points=len(found.row),
+        agreeing=float((np.abs(found.distance_mm) <= AGREES * found.sigma_mm).mean()),
+        distance_mm=float(np.median(distances)),
+        worst_mm=float(distances.max()),
+        claimed_mm=float(np.median(found.claimed_mm)),
+        ratio=float(np.sqrt(np.mean(ratios**2))),
+        worst_ratio=float(ratios.max()),
+    )
+
+
+def pass_distances(stripes: Stripes) -> PassDistances | None:
+    """Distances of the points of passes from the surfaces of the others; None if there are none."""
+    n_passes = int(stripes.pass_of.max()) + 1 if len(stripes.pass_of) else 0
+    if n_passes < 2 or len(stripes.exposure) < FEWEST_POINTS:
+        return None
+    points, owner = stripes.points_base_mm, stripes.pass_of[stripes.exposure]
+    chosen = np.arange(0, len(points), max(1, len(points) // MOST_QUERIES))
+    parts = []
+    for surface in range(n_passes):
+        own = np.flatnonzero(owner == surface)
+        asked = chosen[owner[chosen] != surface]
+        if len(own) < FEWEST_NEIGHBOURS or not len(asked):
+            continue
+        built = _PassSurface.of(stripes, points, own)
+        if built is not None:
+            parts.append(built.distances(asked, surface))
+    if not sum(len(part.row) for part in parts):
+        return None
+    names = [item.name for item in fields(PassDistances)]
+    return PassDistances(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PassSurface:
+    """The stripes of one pass as a surface.
+
+    ``rows`` are its thinned points, ``misfit_mm`` is how far its own stripes lie off the surface
+    of their neighbours: what quadrics between stripes leave out.
+    """
+
+    stripes: Stripes
+    points: FloatArray
+    rows: IntArray
+    tree: cKDTree
+    radius_mm: float
+    misfit_mm: float = 0.0
+
+    @staticmethod
+    def of(stripes: Stripes, points: FloatArray, own: IntArray) -> _PassSurface | None:
+        """The surface of the points ``own``; None if its stripes do not lie side by side."""
+        radius = _radius_mm(points[own], stripes.exposure[own])
+        rows = own[thinned_rows(points[own], stripes.exposure[own], radius / CELLS)]
+        bare = _PassSurface(stripes, points, rows, cKDTree(points[rows]), radius)
+        some = rows[:: max(1, len(rows) // MOST_OWN)]
+        left_out = bare.distances(some, -1, is_own=True).distance_mm
+        if len(left_out) < FEWEST_POINTS:
+            return None
+        return replace(bare, misfit_mm=1.4826 * float(np.median(np.abs(left_out))))
+
+    def distances(self, asked: IntArray, number: int, *, is_own: bool = False) -> PassDistances:
+        """Of the points that lie among its stripes; ``is_own`` leaves out a point's own stripe."""
+        stripes, points, rows = self.stripes, self.points, self.rows
+        count = min(NEIGHBOURS, len(rows))
+        near_mm, near = self.tree.query(
+            points[asked], k=np.arange(1, count + 1), distance_upper_bound=self.radius_mm
+        )
+        is_near = np.isfinite(near_mm)
+        near = rows[np.where(is_near, near, 0)]
+        if is_own:
+            is_near &= stripes.exposure[near] != stripes.exposure[asked, None]
+        stripe = np.sort(np.where(is_near, stripes.exposure[near], -1), axis=1)
+        n_stripes = (np.diff(stripe, axis=1) > 0).sum(axis=1) + is_near.all(axis=1)
+        enough = (is_near.sum(axis=1) >= FEWEST_NEIGHBOURS) & (n_stripes >= FEWEST_STRIPES)
+        asked, near, is_near = asked[enough], near[enough], is_near[enough]
+        offset = (points[near] - points[asked][:, None]) * is_near[:, :, None]
+        distance, normal, scatter, is_among = _quadric_offsets(offset, is_near, self.radius_mm)
+        nearest = near[np.arange(len(near)), is_near.argmax(axis=1)]
+        claimed = np.zeros(len(asked))
+        for one in (asked, nearest):
+            claimed += np.einsum("ni,nij,nj->n", normal, stripes.covariance_mm2[one], normal)
+        sigma = np.sqrt(claimed + scatter**2 + self.misfit_mm**2)
+        return PassDistances(
+            asked[is_among],
+            nearest[is_among],
+            np.full(int(is_among.sum()), number),
+            normal[is_among],
+            distance[is_among],
+            np.maximum(sigma[is_among], 1e-9),
+            np.sqrt(np.maximum(claimed[is_among], 0.0)),
+        )
+
+
+def _radius_mm(points: FloatArray, exposure: IntArray) -> float:
+    """Reach that holds the next stripes of the same pass."""
+    sample = np.arange(0, len(points), max(1, len(points) // 100))
+    count = min(64, len(points))
+    distance, near = cKDTree(points).query(points[sample], k=np.arange(1, count + 1))
+    is_other = exposure[near] != exposure[sample, None]
+    spacing = np.where(is_other, distance, np.inf).min(axis=1)
+    spacing = np.minimum(spacing, LARGEST_RADIUS_MM)
+    wanted = SPACINGS * float(np.median(spacing))
+    return float(np.clip(wanted, LEAST_RADIUS_MM, LARGEST_RADIUS_MM))
+
+
+def _quadric_offsets(
+    offset: FloatArray, is_near: BoolArray, radius_mm: float
+) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Fit a quadric to each neighbourhood (N, K, 3) about its point, which is the origin.
+
+    Returns the point's distance from it along the normal, the normal, the standard deviation of
+    that distance from the neighbours' scatter, and whether the point lies among its neighbours.
+    """
+    weight = is_near.astype(np.float64)
+    count = weight.sum(axis=1)
+    mean = offset.sum(axis=1) / count[:, None]
+    centred = (offset - mean[:, None]) * weight[:, :, None]
+    values, axes = np.linalg.eigh(centred.transpose(0, 2, 1) @ centred)
+    normal = axes[:, :, 0]
+    u, v, w = (
+        np.einsum("nki,ni->nk", offset, axes[:, :, column]) / radius_mm for column in (2, 1, 0)
+    )
+    design = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2) * weight[:, :, None]
+    gram = design.transpose(0, 2, 1) @ design
+    # the ridge is far below any scatter; it only keeps neighbourhoods on one line from failing
+    inverse = np.linalg.inv(gram + 1e-6 * np.eye(6))
+    solution = np.einsum("nij,nkj,nk->ni", inverse, design, w)
+    left = (w - np.einsum("nki,ni->nk", design, solution)) * weight
+    scatter = np.sqrt((left**2).sum(axis=1) / np.maximum(count - 6.0, 1.0))
+    middle = np.hypot((u * weight).sum(axis=1), (v * weight).sum(axis=1)) / count
+    # a neighbourhood on one line has no surface
+    wide = values[:, 1] > 0.02 * values[:, 2]
+    is_among = (middle <= CENTRED) & wide & (np.sqrt(inverse[:, 0, 0]) < 1.0)
+    sigma = radius_mm * scatter * np.sqrt(1.0 + inverse[:, 0, 0])
+    return -radius_mm * solution[:, 0], normal, sigma, is_among

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passes over a ball whose points are known: what they say of each other."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.geometry.arrays import FloatArray
+from armscan.reconstruction.pass_agreement import (
+    Stripes,
+    pass_agreement,
+    passes_of,
+    thinned_rows,
+)
+
+RADIUS_MM, NOISE_MM = 17.5, 0.005
+
+
+def ball_passes(shift_mm: FloatArray, seed: int = 1) -> Stripes:
+    """Two passes of ten sections each, square to each other; the second is shifted."""
+    rng = np.random.default_rng(seed)
+    points, exposure = [], []
+    for number in range(20):
+        at = np.linspace(-9.0, 9.0, 10)[number % 10]
+        along = np.linspace(-10.0, 10.0, 80)
+        x, y = (along, np.full(80, at)) if number < 10 else (np.full(80, at), along)
+        z = np.sqrt(RADIUS_MM**2 - x**2 - y**2) + NOISE_MM * rng.standard_normal(80)
+        points.append(np.stack([x, y, z], axis=1) + (number >= 10) * shift_mm)
+        exposure.append(np.full(80, number))
+    n = 20 * 80
+    return Stripes(
+        np.concatenate(points),
+        np.broadcast_to(NOISE_MM**2 * np.eye(3), (n, 3, 3)),
+        np.concatenate(exposure),
+        np.repeat([0, 1], 10),
+        np.broadcast_to(np.eye(3), (20, 3, 3)),
+        np.zeros((20, 3)),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_passes_over_one_ball_agree(seed: int) -> None:
+    found = pass_agreement(ball_passes(np.zeros(3), seed))
+    assert found is not None
+    assert len(found.pairs) == 2
+    # the median distance of points with three noises of this size: 0.67 of their sum at most
+    assert found.distance_mm < 2.0 * NOISE_MM
+    assert found.worst_ratio < 1.0
+    assert found.agreeing > 0.99
+
+
+@pytest.mark.parametrize("shift_mm", [0.1, 1.0])
+def test_a_pass_that_is_shifted_lies_that_far_away(shift_mm: float) -> None:
+    found = pass_agreement(ball_passes(np.array([0.0, 0.0, shift_mm])))
+    assert found is not None
+    # along normals that lean by up to 40 degrees
+    assert 0.75 * shift_mm < found.distance_mm < 1.02 * shift_mm
+    assert found.ratio > 5.0
+    assert found.agreeing < 0.1
+
+
+def test_a_shift_along_a_surface_shows_by_its_slope() -> None:
+    found = pass_agreement(ball_passes(np.array([0.5, 0.0, 0.0])))
+    assert found is not None
+    assert found.ratio > 3.0
+
+
+def test_what_does_not_overlap_is_not_compared() -> None:
+    assert pass_agreement(ball_passes(np.array([200.0, 0.0, 0.0]))) is None
+
+
+def test_passes_end_at_pauses() -> None:
+    times = np.concatenate([np.arange(5) * 10, 1000 + np.arange(4) * 10, 3000 + np.arange(2) * 10])
+    assert passes_of(times).tolist() == [0] * 5 + [1] * 4 + [2] * 2
+
+
+def test_thinning_keeps_one_point_a_cell_and_exposure() -> None:
+    points = np.array([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [0.9, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    assert thinned_rows(points, np.array([0, 0, 0, 1])).tolist() == [0, 2, 3]

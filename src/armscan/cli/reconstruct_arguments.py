@@ -22,8 +22,8 @@ DepthMargin = Annotated[
     float | None,
     typer.Option(
         help="Widen the calibrated depth range by this part of its width at either end; "
-        "points beyond are left out. Without it 3; with two cameras 0.5; 0 refuses every "
-        "extrapolation.",
+        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
+        "extrapolated.",
         show_default=False,
     ),
 ]

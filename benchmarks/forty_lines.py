@@ -56,19 +56,25 @@ class Board:
 
 
 def find_board(image: Array, board: Board) -> Array | None:
-    """(N, 2) points of the target in px, or None."""
+    """(N, 2) points of the target in px, the first towards the image's top left, or None."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     size = (board.columns, board.rows)
     if board.kind == "circle-grid":
         found, points = cv2.findCirclesGrid(grey, size)
-        return np.asarray(points, dtype=float).reshape(-1, 2) if found else None
+        return upright(points) if found else None
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     found, points = cv2.findChessboardCornersSB(grey, size, flags=flags)
     if not found:
         found, points = cv2.findChessboardCorners(grey, size)
         if found:
             points = cv2.cornerSubPix(grey, points, (5, 5), (-1, -1), (3, 40, 0.001))
-    return np.asarray(points, dtype=float).reshape(-1, 2) if found else None
+    return upright(points) if found else None
+
+
+def upright(points: Array) -> Array:
+    """The same points; the two ends of a target look alike."""
+    points = np.asarray(points, dtype=float).reshape(-1, 2)
+    return points[::-1] if points[0].sum() > points[-1].sum() else points
 
 
 def calibrate_camera(views: list[Array], board: Board, size: Any) -> tuple[float, Array, Array]:
@@ -87,9 +93,10 @@ def board_pose(view: Array, board: Board, matrix: Array, distortion: Array) -> t
     return cv2.Rodrigues(rotation)[0], translation.ravel()
 
 
-def board_mask(pose: Any, board: Board, camera: Any, shape: Any, margin_mm: float) -> Array:
-    """Pixels of the board's outline: the rectangle of its points and a margin of the same plate."""
-    low, high = board.points_mm.min(0) - margin_mm, board.points_mm.max(0) + margin_mm
+def board_mask(pose: Any, board: Board, camera: Any, shape: Any, margin_mm: Any) -> Array:
+    """Pixels of the board's plate: its points' rectangle and a margin left, top, right, bottom."""
+    margins = np.array(margin_mm)
+    low, high = board.points_mm.min(0) - margins[:2], board.points_mm.max(0) + margins[2:]
     u, v = np.meshgrid(np.linspace(0, 1, 12), np.linspace(0, 1, 12))
     grid = np.column_stack([u.ravel(), v.ravel()]) * (high - low) + low
     outline = cv2.convexHull(grid.astype(np.float32)).reshape(-1, 2)
@@ -110,14 +117,15 @@ def signals(on: Array, off: Array | None) -> dict[str, Array]:
     return {name: light @ np.float32(mix) for name, mix in MIXES.items()}
 
 
-def peaks(signal: Array, mask: Array, n_lines: int) -> Array:
-    """(N, 2) px: one peak a row (more for several lines) with its grey centroid."""
+def peaks(signal: Array, mask: Array, n_lines: int) -> tuple[Array, Array]:
+    """(N, 2) px: a peak a row, more for several lines, by grey centroid; (N,) height over noise."""
     inside = np.where(mask, signal, np.nan)
     rows = np.flatnonzero(mask.sum(1) > 10)
     if not len(rows):
-        return np.zeros((0, 2))
-    level = np.full(len(signal), np.nan)
+        return np.zeros((0, 2)), np.zeros(0)
+    level, noise = np.zeros(len(signal)), np.ones(len(signal))
     level[rows] = np.nanmedian(inside[rows], axis=1)
+    noise[rows] += np.nanmedian(np.abs(inside[rows] - level[rows, None]), axis=1)
     light = np.where(mask, signal - level[:, None], 0.0).astype(np.float32)
     smooth = np.where(mask, cv2.GaussianBlur(light, (0, 0), 1.5), 0.0)
     top = smooth.max(1)
@@ -131,13 +139,12 @@ def peaks(signal: Array, mask: Array, n_lines: int) -> Array:
         is_peak = smooth == cv2.dilate(smooth, np.ones((1, 2 * half + 1), np.uint8))
         is_peak &= smooth > 0.3 * top[:, None]
     y, x = np.nonzero(is_peak & (smooth > 0) & mask)
-    offsets = np.arange(-half, half + 1)
-    columns = np.clip(x[:, None] + offsets, 0, signal.shape[1] - 1)
+    columns = np.clip(x[:, None] + np.arange(-half, half + 1), 0, signal.shape[1] - 1)
     window = light[y[:, None], columns]
     weight = np.clip(window - 0.25 * window.max(1, keepdims=True), 0, None)
-    total = weight.sum(1)
-    good = total > 0
-    return np.column_stack([(weight * columns).sum(1)[good] / total[good], y[good]])
+    good = weight.sum(1) > 0
+    centre = (weight * columns).sum(1)[good] / weight.sum(1)[good]
+    return np.column_stack([centre, y[good]]), (smooth[y, x] / noise[y])[good]
 
 
 def ransac_line(points: Array, random: np.random.Generator) -> Array:
@@ -153,43 +160,42 @@ def ransac_line(points: Array, random: np.random.Generator) -> Array:
     return np.asarray(on_line[on_line.sum(1).argmax()])
 
 
-def lines_of(signal: Array, mask: Array, camera: Any, n_lines: int, corner: Array) -> list[Array]:
-    """Points (M, 2) px of each straight line, from left to right; along rows or columns."""
-    found: list[Array] = []
+def lines_of(signal: Array, mask: Array, camera: Any, n_lines: int, corner: Array) -> Any:
+    """How well straight lines stand out, and the points (M, 2) px of each from left to right."""
+    best, found = 0.0, []
     for is_turned in (False, True):
-        points = peaks(signal.T if is_turned else signal, mask.T if is_turned else mask, n_lines)
-        if is_turned:
-            points = points[:, ::-1]
-        points = points + corner
-        lines, random = [], np.random.default_rng(0)
+        points, height = peaks(*((signal.T, mask.T) if is_turned else (signal, mask)), n_lines)
+        points = (points[:, ::-1] if is_turned else points) + corner
+        lines, random, score = [], np.random.default_rng(0), 0.0
         for _ in range(n_lines):
             if len(points) < 20:
                 break
             straight = cv2.undistortPoints(points, *camera, P=camera[0]).reshape(-1, 2)
             on_line = ransac_line(straight, random)
-            lines.append(points[on_line])
-            points = points[~on_line]
-        lines = [line for line in lines if len(line) >= 20]
-        if sum(map(len, lines)) > sum(map(len, found)):
+            if on_line.sum() >= 20:
+                lines.append(points[on_line])
+                score += on_line.sum() * min(float(np.median(height[on_line])), 10.0)
+            points, height = points[~on_line], height[~on_line]
+        if score > best:
             axis = 1 if is_turned else 0
-            found = sorted(lines, key=lambda line: float(line[:, axis].mean()))
-    return found
+            best, found = score, sorted(lines, key=lambda line: float(line[:, axis].mean()))
+    return best, found
 
 
 def find_lines(on: Array, off: Array | None, mask: Array, camera: Any, n_lines: int) -> Any:
     """Name of the best channel, and its lines; a line must hold in 30 % of its rows."""
-    best: tuple[str, list[Array]] = ("none", [])
+    best: tuple[float, str, list[Array]] = (0.0, "none", [])
     y, x = np.nonzero(mask)
     if not len(y):
-        return best
+        return "none", []
     top, left = int(y.min()), int(x.min())
     crop = slice(top, int(y.max()) + 1), slice(left, int(x.max()) + 1)
     for name, signal in signals(on[crop], None if off is None else off[crop]).items():
-        lines = lines_of(signal, mask[crop], camera, n_lines, np.array([left, top]))
-        if sum(map(len, lines)) > sum(map(len, best[1])):
-            best = (name, lines)
+        score, lines = lines_of(signal, mask[crop], camera, n_lines, np.array([left, top]))
+        if score > best[0]:
+            best = (score, name, lines)
     span = min(mask.any(1).sum(), mask.any(0).sum())
-    return best[0], [line for line in best[1] if len(line) >= max(20, 0.3 * span)]
+    return best[1], [line for line in best[2] if len(line) >= max(20, 0.3 * span)]
 
 
 def rays(pixels: Array, camera: Any) -> Array:

@@ -4,8 +4,8 @@
     python benchmarks/real_lasers.py ROOT [SET ...] [--out FOLDER] [--tree SRC] [--images]
 
 ROOT holds the repositories of `laser_sets.py`. SRC is the ``src`` folder whose armscan is measured
-(default: this tree). Detections and lines of the script are kept in FOLDER and not made again while
-`forty_lines.py` stays as it is. Nothing is random. The table is written to ``FOLDER/TREE.md``.
+(default: this tree). The script's detections of targets are kept in FOLDER, and the table goes to
+``FOLDER/LABEL.md``. Nothing is random.
 
 Both are judged alike, by numpy and OpenCV here, not by numbers that they state. A point is where
 the ray of a stripe's pixel meets the sheet, both of the document that was written; its error is its
@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import inspect
 import json
 import os
 import pickle
@@ -51,6 +52,8 @@ from scipy.spatial import cKDTree
 Array = Any
 HERE = Path(__file__).resolve().parent
 FOLDS = 24
+TABLE_MARK = "<!-- table: written by benchmarks/real_lasers.py -->"
+TABLE_END = "<!-- end of table -->"
 BOW_TERMS = ("u2_v0", "u1_v1", "u0_v2", "u3_v0", "u2_v1")
 NEAR_PX = 1.5
 MIN_POINTS = 20
@@ -113,59 +116,79 @@ def pose_of(pixels: Array, points_mm: Array, camera: Any) -> Any:
 
 
 # --------------------------------------------------------------------------- the script's side
-def source_key(*parts: Any) -> str:
-    text = (HERE / "forty_lines.py").read_text(encoding="utf-8")
-    return hashlib.sha256(repr((text, parts)).encode()).hexdigest()[:16]
+class Detections:
+    """Targets that the script found, with their processor time, kept in a file of its own."""
+
+    def __init__(self, folder: Path, photos: LaserSet) -> None:
+        self.board = script.Board.of(photos.target)
+        detector = inspect.getsource(script.find_board)
+        key = hashlib.sha256((detector + photos.target).encode()).hexdigest()[:12]
+        self.path = folder / f"boards-{photos.repository.split('/')[1]}-{key}.pickle"
+        stored = self.path.read_bytes() if self.path.is_file() else b""
+        self.found: dict[str, Any] = pickle.loads(stored) if stored else {}  # our own file
+        self.cpu_seconds = 0.0
+
+    def find(self, path: Path, image: Array) -> Array | None:
+        """(N, 2) px or None."""
+        if str(path) not in self.found:
+            began = time.process_time()
+            view = script.find_board(image, self.board)
+            self.found[str(path)] = (view, time.process_time() - began)
+        view, seconds = self.found[str(path)]
+        self.cpu_seconds += seconds
+        return view
+
+    def write(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self.path.write_bytes(pickle.dumps(self.found))
 
 
 def script_findings(photos: LaserSet, root: Path, cache: Path) -> dict[str, Any]:
-    """Camera, boards and lines of the script, with its processor time; kept in a file."""
-    stored = cache / f"{source_key(photos)}.pickle"
-    if stored.is_file():
-        return dict(pickle.loads(stored.read_bytes()))  # our own file
-    began = time.process_time()
-    board = script.Board.of(photos.target)
+    """Camera, boards and lines of the script, with its processor time."""
+    detections, board = Detections(cache, photos), script.Board.of(photos.target)
+    own_seconds = 0.0
     views, size = [], (0, 0)
     for path in photos.files(root, photos.camera):
         image = cv2.imread(str(path))
         size = image.shape[1::-1]
-        found = script.find_board(image, board)
+        found = detections.find(path, image)
         if found is not None:
             views.append(found)
+    began = time.process_time()
     rms, matrix, distortion = script.calibrate_camera(views, board, size)
+    own_seconds += time.process_time() - began
     camera = (matrix, distortion)
     on, off = photos.files(root, photos.on), photos.files(root, photos.off)
     boards, notes = {}, {}
     for k, path in enumerate(on):
         image = cv2.imread(str(path))
         dark = cv2.imread(str(off[k])) if off else None
-        view = script.find_board(image if dark is None else dark, board)
+        view = detections.find(path if dark is None else off[k], image if dark is None else dark)
         if view is None and dark is not None:
-            view = script.find_board(image, board)
+            view = detections.find(path, image)
         if view is None:
             notes[path.name] = "no board"
             continue
+        began = time.process_time()
         pose = script.board_pose(view, board, *camera)
         mask = script.board_mask(pose, board, camera, image.shape, photos.margin_mm)
         channel, lines = script.find_lines(image, dark, mask, camera, photos.n_lines)
+        own_seconds += time.process_time() - began
         if len(lines) != photos.n_lines:
             notes[path.name] = f"{len(lines)} lines of {photos.n_lines} in {channel}"
             lines = []
         else:
             notes[path.name] = f"{sum(map(len, lines))} points in {channel}"
         boards[path.name] = (view, pose, lines)
-    result = {
+    detections.write()
+    return {
         "camera": camera,
         "camera_rms_px": rms,
-        "n_views": len(views),
         "size": size,
         "boards": boards,
         "notes": notes,
-        "cpu_seconds": time.process_time() - began,
+        "cpu_seconds": own_seconds + detections.cpu_seconds,
     }
-    stored.parent.mkdir(parents=True, exist_ok=True)
-    stored.write_bytes(pickle.dumps(result))
-    return result
 
 
 def plane_meeter(plane: Array) -> Any:
@@ -252,7 +275,10 @@ def sheets_of(document: dict[str, Any]) -> dict[int, Any]:
 
 
 def our_side(folder: Path) -> Side:
-    result = json.loads((folder / "ours.json").read_text(encoding="utf-8"))
+    stored = folder / "ours.json"
+    if not stored.is_file():
+        return Side(None, {}, {}, [], 0.0, "not run")
+    result = json.loads(stored.read_text(encoding="utf-8"))
     seconds = sum(result.get(stage, {}).get("cpu_seconds", 0.0) for stage in ("camera", "laser"))
     if "document" not in result:
         stage = "laser" if "laser" in result else "camera"
@@ -285,12 +311,12 @@ def our_side(folder: Path) -> Side:
     return Side(camera, boards, sheets_of(document), folds, seconds, "", notes)
 
 
-def run_ours(name: str, root: Path, folder: Path, tree: Path, camera: str) -> None:
+def run_ours(name: str, root: Path, folder: Path, tree: Path, *options: str) -> None:
     environment = {**os.environ, "PYTHONPATH": str(tree), "OPENCV_LOG_LEVEL": "ERROR"}
     command = [sys.executable, str(HERE / "real_lasers_ours.py"), name, str(root), str(folder)]
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
-        [*command, *([camera] if camera else [])],
+        [*command, *options],
         env=environment,
         capture_output=True,
         text=True,
@@ -392,7 +418,7 @@ def judge_cloud(folder: Path, ours: Side, theirs: dict[str, Any], photos: LaserS
     pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), *ours.camera)[0].reshape(-1, 2)
     target = script.Board.of(photos.target)
     pitch = float(np.diff(np.unique(target.points_mm[:, 0])).min())
-    margin = min(photos.margin_mm, pitch)
+    margin = np.minimum(photos.margin_mm, pitch)
     cloud, own, sigmas, claimed = Cloud(), [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for k, source in enumerate(sources):
         mine = vertices["exposure"] == k
@@ -518,6 +544,8 @@ def main() -> None:
     parser.add_argument(
         "--keep-camera", action="store_true", help="ours takes its camera of before"
     )
+    parser.add_argument("--page", type=Path, help="Markdown page whose table is replaced")
+    parser.add_argument("--folds", type=int, default=FOLDS, help="of ours; 0: none, and quick")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     rows = []
@@ -534,7 +562,8 @@ def main() -> None:
             camera = str(write_camera(arguments.out / "script" / f"{name}.yml", found))
         if not arguments.again:
             tree = arguments.tree.resolve()
-            run_ours(name, arguments.root.resolve(), folder, tree, camera)
+            options = (str(arguments.folds), *([camera] if camera else []))
+            run_ours(name, arguments.root.resolve(), folder, tree, *options)
             if (folder / "camera.json").is_file():
                 before.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(folder / "camera.json", before)
@@ -547,6 +576,11 @@ def main() -> None:
     text = markdown(rows)
     (arguments.out / f"{arguments.label}.md").write_text(text, encoding="utf-8")
     print("\n" + text)
+    if arguments.page:
+        before, mark, rest = arguments.page.read_text(encoding="utf-8").partition(TABLE_MARK)
+        after = rest.partition(TABLE_END)
+        page = f"{before}{mark}\n{text}{after[1]}{after[2]}"
+        arguments.page.write_text(page, encoding="utf-8")
 
 
 def write_camera(path: Path, found: dict[str, Any]) -> Path:

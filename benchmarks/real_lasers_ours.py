@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our side of `real_lasers.py`: the commands, in this process, with what the judge needs kept.
 
-``python benchmarks/real_lasers_ours.py SET ROOT OUT [CAMERA]`` runs ``armscan calibrate camera``
-(or takes CAMERA), ``calibrate laser`` and ``reconstruct``, then calibrates again without one board
-at a time from the stripes found already. PYTHONPATH chooses the tree.
+``python benchmarks/real_lasers_ours.py SET ROOT OUT FOLDS [CAMERA]`` runs ``armscan calibrate
+camera`` (or takes CAMERA), ``calibrate laser`` and ``reconstruct``, then calibrates again without
+one board at a time from the stripes found already. PYTHONPATH chooses the tree.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from laser_sets import SETS, LaserSet
+from laser_sets import SETS
 
 import armscan.pipeline.laser
 import armscan.report.laser_job
@@ -23,7 +23,6 @@ from armscan.cli import main
 from armscan.geometry.estimate import FitFailure
 from armscan.storage.calibration_files import sensor_document
 
-FOLDS = 24
 ON_BOARD = {"USED", "OFF_SHEET", "UNNAMED", "OUTLYING_BOARD"}
 
 
@@ -83,14 +82,14 @@ def board_arrays(fit: Any) -> dict[str, Any]:
     }
 
 
-def leave_out(kept: Kept, fit: Any, out: Path) -> list[dict[str, Any]]:
+def leave_out(kept: Kept, n_folds: int) -> list[dict[str, Any]]:
     """Documents of calibrations without one board, or one group of boards, at a time."""
     (boards, *rest), options = kept.calls[-1]
     provenance = kept.documents[-1][1]
     places = sorted({board.place for board in boards})
     folds = []
-    for k in range(min(FOLDS, len(places))):
-        left = set(places[k::FOLDS])
+    for k in range(min(n_folds, len(places))):
+        left = set(places[k::n_folds])
         others = [board for board in boards if board.place not in left]
         again = kept.estimate(others, *rest, **options)
         entry: dict[str, Any] = {
@@ -106,8 +105,9 @@ def leave_out(kept: Kept, fit: Any, out: Path) -> list[dict[str, Any]]:
     return folds
 
 
-def compute(name: str, photos: LaserSet, root: Path, out: Path, camera: str) -> dict[str, Any]:
+def compute(name: str, root: Path, out: Path, n_folds: int, camera: str) -> dict[str, Any]:
     """Run the commands on one set."""
+    photos = SETS[name]
     result: dict[str, Any] = {"set": name}
     out.mkdir(parents=True, exist_ok=True)
     for old in out.glob("*"):
@@ -125,7 +125,7 @@ def compute(name: str, photos: LaserSet, root: Path, out: Path, camera: str) -> 
     lines = ("--sheets", str(photos.n_lines)) if photos.n_lines > 1 else ()
     sensor = str(out / "sensor.json")
     laser = ("--camera", camera, "--on", f"{folder}/{photos.on}", *off, *lines)
-    margin = ("--margin-mm", str(photos.margin_mm))
+    margin = ("--margin-mm", str(max(photos.margin_mm)))
     if not run(result, "laser", "calibrate", "laser", *laser, *margin, *target, "-o", sensor):
         return result
     fit = kept.documents[-1][0]
@@ -136,16 +136,15 @@ def compute(name: str, photos: LaserSet, root: Path, out: Path, camera: str) -> 
     lit = (f"{folder}/{photos.on}", *background, "--sensor", sensor)
     run(result, "reconstruct", "reconstruct", *lit, "-o", str(out / "cloud.ply"), "--force")
     began = time.perf_counter()
-    result["folds"] = leave_out(kept, fit, out)
+    result["folds"] = leave_out(kept, n_folds)
     result["folds_seconds"] = time.perf_counter() - began
     return result
 
 
 def command() -> None:
-    name, root, out = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
-    camera = sys.argv[4] if len(sys.argv) > 4 else ""
-    main(["doctor", "--warm"])
-    result = compute(name, SETS[name], root, out, camera)
+    name, root, out, folds = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])
+    camera = sys.argv[5] if len(sys.argv) > 5 else ""
+    result = compute(name, root, out, folds, camera)
     (out / "ours.json").write_text(json.dumps(result), encoding="utf-8")
 
 

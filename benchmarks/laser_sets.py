@@ -26,7 +26,7 @@ class LaserSet:
         As the command line takes it.
     margin_mm
         How far the flat plate goes on around the target's points to the left, top, right and
-        bottom, as one would measure it. Ours is told the largest, it takes one number.
+        bottom, as one would measure it; the script is told, ours is not.
     n_lines
         Lines in the light at once.
     is_held_out

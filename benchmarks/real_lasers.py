@@ -17,13 +17,13 @@ Columns
   points        stripe points used
   leave-one-out rms (median) of the points of each used board with the sheet of all the others;
                 beyond 24 boards, 24 groups of boards. Each with its own target points. *all*:
-                boards that were named outliers count too. *same boards*: those that both used.
+                boards that were named outliers count too. *same points*: those that both used.
   own           mean and rms of the calibration's own stripes with the document as written, and
                 their rms over the claimed sigma along the board's normal
   kept          the script's inlier points within 1.5 px of a used point of ours
   off           points of ``armscan reconstruct`` inside the target's rectangle (one square around
                 it) that lie farther off the board than the smaller of 5 sigma and 1 mm; the board
-                there is the one that OpenCV found
+                there is the one that OpenCV found; then those beyond 5 sigma alone
   time          processor time of ours over the script's: camera and sheets, programs loaded
 """
 
@@ -352,8 +352,15 @@ class Errors:
         return float(np.median(np.abs(self.values)))
 
 
-def left_out(side: Side, names: set[str], *, is_all: bool = False) -> Errors:
-    """Points of boards with the sheets of the others."""
+def kept_points(board: BoardView) -> Array:
+    """(N, 2) px of the stripe points that were used, of all sheets."""
+    return np.concatenate([np.zeros((0, 2)), *(board.lines[s][board.kept[s]] for s in board.lines)])
+
+
+def left_out(
+    side: Side, names: set[str], *, is_all: bool = False, shared: Side | None = None
+) -> Errors:
+    """Points of boards with the sheets of the others; only those that another side used, too."""
     values = [np.zeros(0)]
     for left, camera, sheets in side.folds:
         for name in left & names & set(side.boards):
@@ -363,6 +370,9 @@ def left_out(side: Side, names: set[str], *, is_all: bool = False) -> Errors:
                 if sheet not in sheets:
                     continue
                 points = line if is_all else line[board.kept[sheet]]
+                if shared is not None:
+                    theirs = kept_points(shared.boards[name])
+                    points = points[cKDTree(theirs).query(points)[0] < NEAR_PX]
                 if len(points):
                     met = sheets[sheet](rays_of(points, camera))
                     values.append(board_distance(met, pose))
@@ -402,6 +412,7 @@ class Cloud:
 
     n_on_board: int = 0
     n_off: int = 0
+    n_beyond_5_sigma: int = 0
     worst_mm: float = 0.0
     own: Errors = field(default_factory=lambda: Errors(np.zeros(0)))
     own_sigmas: Errors = field(default_factory=lambda: Errors(np.zeros(0)))
@@ -439,13 +450,13 @@ def judge_cloud(folder: Path, ours: Side, theirs: dict[str, Any], photos: LaserS
             is_off = distance > np.minimum(5 * sigma, 1.0)
             cloud.n_on_board += len(distance)
             cloud.n_off += int(is_off.sum())
+            cloud.n_beyond_5_sigma += int((distance > 5 * sigma).sum())
             if is_off.any():
                 cloud.off_by_image[source] = f"{is_off.sum()} of {len(distance)} off"
                 cloud.worst_mm = max(cloud.worst_mm, float(distance.max()))
         if source in ours.used():
             board = ours.boards[source]
-            stripe = np.concatenate([board.lines[s][board.kept[s]] for s in board.lines])
-            near = cKDTree(stripe).query(pixels[mine])[0] < NEAR_PX
+            near = cKDTree(kept_points(board)).query(pixels[mine])[0] < NEAR_PX
             normal = board.pose[0][:, 2]
             sigma = np.sqrt(np.einsum("i,nij,j->n", normal, covariance[near], normal))
             distance = board_distance(points[mine][near], board.pose)
@@ -462,11 +473,10 @@ def kept_share(ours: Side, theirs: Side) -> float:
     n = n_near = 0
     for name in theirs.used():
         board = theirs.boards[name]
-        points = np.concatenate([board.lines[s][board.kept[s]] for s in board.lines])
+        points = kept_points(board)
         n += len(points)
         if name in ours.boards:
-            mine = ours.boards[name]
-            used = np.concatenate([mine.lines[s][mine.kept[s]] for s in mine.lines])
+            used = kept_points(ours.boards[name])
             if len(used):
                 n_near += int((cKDTree(used).query(points)[0] < NEAR_PX).sum())
     return n_near / n if n else float("nan")
@@ -480,11 +490,11 @@ HEADINGS = (
     "left out: ours",
     "all: script",
     "all: ours",
-    "same boards: script",
-    "same boards: ours",
+    "same points: script",
+    "same points: ours",
     "own mean, rms mm (rms/sigma)",
     "kept %",
-    "off % (of)",
+    "off %, 5 sigma % (of)",
     "time",
 )
 
@@ -506,10 +516,10 @@ def judge(name: str, photos: LaserSet, theirs: Side, ours: Side, cloud: Cloud) -
     sigmas = f"{cloud.own_sigmas.rms:.2f}" if len(cloud.own_sigmas.values) else "-"
     row += [str(left_out(ours, our_used))]
     row += [str(left_out(side, set(side.boards), is_all=True)) for side in (theirs, ours)]
-    row += [str(left_out(side, both)) for side in (theirs, ours)]
+    row += [str(left_out(theirs, both, shared=ours)), str(left_out(ours, both, shared=theirs))]
     row += [f"{mean:+.3f}, {own.rms:.3f} ({sigmas})", f"{100 * kept_share(ours, theirs):.0f}"]
-    share = 100 * cloud.n_off / max(cloud.n_on_board, 1)
-    row += [f"{share:.1f} ({cloud.n_on_board})"]
+    shares = [100 * n / max(cloud.n_on_board, 1) for n in (cloud.n_off, cloud.n_beyond_5_sigma)]
+    row += [f"{shares[0]:.1f}, {shares[1]:.1f} ({cloud.n_on_board})"]
     return [*row, f"{ours.cpu_seconds:.0f} / {theirs.cpu_seconds:.0f} s"]
 
 

@@ -125,8 +125,7 @@ def compute(name: str, root: Path, out: Path, n_folds: int, camera: str) -> dict
     lines = ("--sheets", str(photos.n_lines)) if photos.n_lines > 1 else ()
     sensor = str(out / "sensor.json")
     laser = ("--camera", camera, "--on", f"{folder}/{photos.on}", *off, *lines)
-    margin = ("--margin-mm", str(max(photos.margin_mm)))
-    if not run(result, "laser", "calibrate", "laser", *laser, *margin, *target, "-o", sensor):
+    if not run(result, "laser", "calibrate", "laser", *laser, *target, "-o", sensor):
         return result
     fit = kept.documents[-1][0]
     np.savez(out / "boards.npz", **board_arrays(fit))

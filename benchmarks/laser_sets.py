@@ -20,7 +20,7 @@ class LaserSet:
     repository
         ``owner/name`` on GitHub; its name is the folder under the root.
     camera, on, off
-        Patterns under that folder: photographs of the board for the camera, with the laser, and of
+        Patterns under that folder, by blanks: photographs of the board for the camera, with the laser, and of
         the same placements without it (empty: none were taken).
     target
         As the command line takes it.
@@ -46,9 +46,9 @@ class LaserSet:
     shows: str
 
     def files(self, root: Path, pattern: str) -> list[Path]:
-        """Images of one of its patterns, by name."""
+        """Images of one of its fields, by name."""
         folder = root / self.repository.split("/")[1]
-        return sorted(folder.glob(pattern)) if pattern else []
+        return sorted(path for part in pattern.split() for path in folder.glob(part))
 
 
 DESKTOP = "srv/desktop_3d_scanner"
@@ -143,7 +143,7 @@ SETS = {
         "blaser_data/640_unified/*.png",
         "",
         "chessboard:9x6:5",
-        (10.0,) * 4,
+        (25.0,) * 4,
         1,
         is_held_out=True,
         shows="VGA endoscope, red speckled line above and over the squares, near range",
@@ -154,7 +154,7 @@ SETS = {
         "blaser_data/1280_unified/*.png",
         "",
         "chessboard:9x6:5",
-        (10.0,) * 4,
+        (25.0,) * 4,
         1,
         is_held_out=True,
         shows="as blaser-640 with 1280x960",
@@ -162,10 +162,10 @@ SETS = {
     "blaser-handheld": LaserSet(
         BLASER,
         "blaser_data/handheld_1280x720/*.png",
-        "blaser_data/handheld_1280x720/*.png",
+        "blaser_data/handheld_1280x720/im[1-9].png blaser_data/handheld_1280x720/im1[0-7].png",
         "",
         "chessboard:9x6:30",
-        (30.0,) * 4,
+        (60.0,) * 4,
         1,
         is_held_out=True,
         shows="wide angle, strong distortion, saturated red line over the squares",

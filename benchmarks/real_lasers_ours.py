@@ -118,22 +118,25 @@ def compute(name: str, root: Path, out: Path, n_folds: int, camera: str) -> dict
     target = ("--target", photos.target, "--force")
     if not camera:
         camera = str(out / "camera.json")
-        images = f"{folder}/{photos.camera}"
-        if not run(result, "camera", "calibrate", "camera", images, *target, "-o", camera):
+        images = [f"{folder}/{part}" for part in photos.camera.split()]
+        if not run(result, "camera", "calibrate", "camera", *images, *target, "-o", camera):
             return result
-    off = ("--off", f"{folder}/{photos.off}") if photos.off else ()
+    lit = [f"{folder}/{part}" for part in photos.on.split()]
+    dark = [f"{folder}/{part}" for part in photos.off.split()]
+    off = [word for path in dark for word in ("--off", path)]
+    on = [word for path in lit for word in ("--on", path)]
     lines = ("--sheets", str(photos.n_lines)) if photos.n_lines > 1 else ()
     sensor = str(out / "sensor.json")
-    laser = ("--camera", camera, "--on", f"{folder}/{photos.on}", *off, *lines)
+    laser = ("--camera", camera, *on, *off, *lines)
     if not run(result, "laser", "calibrate", "laser", *laser, *target, "-o", sensor):
         return result
     fit = kept.documents[-1][0]
     np.savez(out / "boards.npz", **board_arrays(fit))
     result["skipped"] = {item.source: item.reason for item in fit.skipped}
     result["document"] = json.loads(Path(sensor).read_text(encoding="utf-8"))
-    background = ("--background", f"{folder}/{photos.off}") if photos.off else ()
-    lit = (f"{folder}/{photos.on}", *background, "--sensor", sensor)
-    run(result, "reconstruct", "reconstruct", *lit, "-o", str(out / "cloud.ply"), "--force")
+    background = [word for path in dark for word in ("--background", path)]
+    made = ("--sensor", sensor, "-o", str(out / "cloud.ply"), "--force")
+    run(result, "reconstruct", "reconstruct", *lit, *background, *made)
     began = time.perf_counter()
     result["folds"] = leave_out(kept, n_folds)
     result["folds_seconds"] = time.perf_counter() - began

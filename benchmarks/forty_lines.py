@@ -78,12 +78,19 @@ def upright(points: Array) -> Array:
 
 
 def calibrate_camera(views: list[Array], board: Board, size: Any) -> tuple[float, Array, Array]:
-    """Rms in px, camera matrix and OpenCV's five distortion coefficients."""
-    image_points = [view.astype(np.float32).reshape(-1, 1, 2) for view in views]
-    object_points = [board.object_points()] * len(views)
-    rms, matrix, distortion, _, _ = cv2.calibrateCamera(
-        object_points, image_points, size, None, None
-    )
+    """Rms in px, camera matrix and OpenCV's five coefficients; once more without bad views."""
+    target = board.object_points()
+    for _ in range(2):
+        pixels = [view.astype(np.float32).reshape(-1, 1, 2) for view in views]
+        rms, matrix, distortion, rotations, translations = cv2.calibrateCamera(
+            [target] * len(views), pixels, size, None, None
+        )
+        errors = [
+            np.sqrt(np.mean((cv2.projectPoints(target, r, t, matrix, distortion)[0] - p) ** 2))
+            for r, t, p in zip(rotations, translations, pixels, strict=True)
+        ]
+        limit = 3 * float(np.median(errors))
+        views = [view for view, error in zip(views, errors, strict=True) if error < limit]
     return rms, matrix, distortion
 
 

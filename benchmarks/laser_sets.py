@@ -20,8 +20,8 @@ class LaserSet:
     repository
         ``owner/name`` on GitHub; its name is the folder under the root.
     camera, on, off
-        Patterns under that folder, by blanks: photographs of the board for the camera, with the laser, and of
-        the same placements without it (empty: none were taken).
+        Patterns under that folder, parted by blanks: photographs of the board for the camera, with
+        the laser, and of the same placements without it (empty: none were taken).
     target
         As the command line takes it.
     margin_mm

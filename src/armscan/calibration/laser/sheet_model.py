@@ -160,35 +160,51 @@ def choose_model(
         model = replace(plane_model, decision=decision)
         return _with_explained_stripes(model, alone, errors, options)
 
-    is_enough = plane_test.p_value >= options.lack_of_fit_p
-    if is_enough or not options.is_bow_allowed:
-        asked = "a plane was asked for, and does not explain the stripes"
-        return plane(f"{'a plane is enough' if is_enough else asked} ({test})")
+    if plane_test.p_value >= options.lack_of_fit_p:
+        return plane(f"a plane is enough ({test})")
     n_boards = len(np.unique(observations.board))
     if n_boards < options.min_boards_for_bow:
         return plane(
             f"a plane does not explain the stripes ({test}), but {n_boards} boards cannot tell a "
             f"bow from their own errors: {options.min_boards_for_bow} are needed"
         )
+    return _bow_or_boards(plane_model, flat, alone, errors, options)
+
+
+def _bow_or_boards(
+    plane_model: SheetModel,
+    flat: SheetSolution,
+    alone: SheetObservations,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> SheetModel | FitFailure:
+    """What a plane leaves unexplained: is the sheet bowed, or do its boards scatter?"""
+    noise, plane_test = plane_model.noise, plane_model.plane_test
+    test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
+    boards = board_scatter(alone, flat, errors, noise)
+
+    def plane(decision: str) -> SheetModel | FitFailure:
+        model = replace(plane_model, decision=decision)
+        return _with_scattered_boards(model, boards.factor, alone, errors, options)
+
+    if not options.is_bow_allowed:
+        return plane(f"a plane was asked for, and does not explain the stripes ({test})")
     condition = _bow_condition(alone, flat)
-    bowed = _solve_bowed(alone, start, errors, noise.sigma_factor)
+    bowed = _solve_bowed(alone, flat.sheets[0], errors, noise.sigma_factor)
     if condition > MAX_BOW_CONDITION or isinstance(bowed, FitFailure):
         return plane(
             f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
             f"to determine a bow (condition {condition:.2g})"
         )
-    boards = board_scatter(alone, flat, errors, noise)
     boards_bowed = board_scatter(alone, bowed, errors, noise)
     gain = 2.0 * (boards_bowed.log_likelihood - boards.log_likelihood)
     p_value = float(stats.chi2.sf(max(gain, 0.0), bowed.n_parameters - flat.n_parameters))
     likelihood = f"likelihood ratio {gain:.1f}, p {p_value:.2g}"
     if p_value >= options.lack_of_fit_p:
-        decision = (
+        return plane(
             f"a plane does not explain the stripes ({test}), and a bow does no better than boards "
             f"that err {boards.factor:.1f} times as much as their targets say ({likelihood})"
         )
-        model = replace(plane_model, decision=decision)
-        return _with_scattered_boards(model, boards.factor, alone, errors, options)
     final = lack_of_fit(alone, bowed, noise)
     decision = (
         f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
@@ -197,12 +213,9 @@ def choose_model(
     model = SheetModel(
         bowed.sheets[0], True, noise, plane_test, final, decision, noise.sigma_factor
     )
-    is_left = final.p_value < options.lack_of_fit_p
-    return (
-        _with_scattered_boards(model, boards_bowed.factor, alone, errors, options)
-        if is_left
-        else model
-    )
+    if final.p_value >= options.lack_of_fit_p:
+        return model
+    return _with_scattered_boards(model, boards_bowed.factor, alone, errors, options)
 
 
 def _with_scattered_boards(

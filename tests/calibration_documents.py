@@ -144,7 +144,7 @@ def scanner_calibration(*, has_sensor: bool = True) -> ScannerCalibration:
         ),
     )
     sensor = sensor_calibration() if has_sensor else None
-    return ScannerCalibration(sensor, hand_eye, provenance(), latency_ns=-(2**53 + 1))
+    return ScannerCalibration(sensor, hand_eye, provenance(), latency_ns=-(10**12 - 1))
 
 
 def assert_same(left: Any, right: Any) -> None:

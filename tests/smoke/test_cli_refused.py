@@ -30,15 +30,17 @@ def page_of(path: Path) -> str:
     return re.sub(r"base64,[A-Za-z0-9+/=]+", "", path.read_text("utf-8"))
 
 
-def test_a_target_that_is_nowhere_leaves_a_page_with_every_image(
-    bench: Bench, fails: Fails, tmp_path: Path
+@pytest.mark.parametrize(("target", "n_tried"), [("circle-grid:9x7:6", 7), ("chessboard:9x7:6", 4)])
+def test_a_target_that_is_nowhere_leaves_a_page_with_every_image_tried(
+    bench: Bench, fails: Fails, tmp_path: Path, target: str, n_tried: int
 ) -> None:
-    said = fails(*camera_words(bench, tmp_path / "c.json", "chessboard:9x7:6"), "--no-cache")
+    """A wrong kind is looked for in all seven images; a wrong count is told after four."""
+    said = fails(*camera_words(bench, tmp_path / "c.json", target), "--no-cache")
     assert str(tmp_path / "c.refused.html") in said
     assert [path.name for path in tmp_path.iterdir()] == ["c.refused.html"]
     page = page_of(tmp_path / "c.refused.html")
     assert "(refused)" in page
-    assert page.count("<svg") == 7
+    assert page.count("<svg") == n_tried
     assert "9 x 7" in page
     assert "none was written" in page
 

@@ -168,17 +168,18 @@ def measure_scan(
             placed[row] = place_image(one, pose, placing, options.volume)
             weak += one.warnings
     progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
-    hung = stripes_at_equal_poses({row: one.cloud for row, one in placed.items()}, poses)
+    hung = _hung(placed, wanted, poses)
     kept = {row: one for row, one in placed.items() if row not in hung}
     exposures = _records(source, images, poses, kept, reasons=reasons, hung=hung)
     found = _joined(kept, exposures, poses, placing, options)
+    first_row = {row: instant.rows[0] for instant in wanted for row in instant.rows}
     doubt = doubt_scan(
         source,
         scanner,
         poses,
         cloud=found.cloud,
         images=found.images,
-        image_rows=found.image_rows,
+        pose_rows=tuple(first_row[row] for row in found.image_rows),
     )
     return replace(
         found,
@@ -210,6 +211,27 @@ def place_image(
     depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
     inside = cloud if volume is None else cut_cloud(cloud, volume)
     return PlacedImage(image, inside, depths, len(cloud) - len(inside))
+
+
+def _hung(
+    placed: dict[int, PlacedImage], instants: Sequence[Instant], poses: ExposurePoses
+) -> dict[int, float]:
+    """Rows whose pose stood still, and how far in mm their stripes lie from an earlier one's.
+
+    The cameras of one instant share its pose and see parts of one stripe: they count as one.
+    """
+    seen = [instant for instant in instants if instant.rows[0] in placed]
+    clouds = {
+        instant.rows[0]: merge_clouds([placed[row].cloud for row in instant.rows])
+        for instant in seen
+    }
+    apart = stripes_at_equal_poses(clouds, poses)
+    return {
+        row: apart[instant.rows[0]]
+        for instant in seen
+        if instant.rows[0] in apart
+        for row in instant.rows
+    }
 
 
 def _unknown_lasers(

@@ -123,7 +123,7 @@ def doubt_scan(
     *,
     cloud: PointCloud,
     images: tuple[ReconstructedImage, ...],
-    image_rows: tuple[int, ...],
+    pose_rows: tuple[int, ...],
 ) -> ScanDoubt:
     """Compare the passes of a scan with each other, and look for the mistake if they disagree.
 
@@ -133,10 +133,11 @@ def doubt_scan(
         What the cloud was made from.
     cloud
         All measured points; ``exposure`` counts ``images``.
-    images, image_rows
-        Stripe points of each exposure, and its row of the recording.
+    images, pose_rows
+        Stripe points of each image, and the row of the recording whose pose they were placed with:
+        that of the first camera, for all images of one instant.
     """
-    scan = _thinned(source, scanner, poses, cloud=cloud, images=images, image_rows=image_rows)
+    scan = _thinned(source, scanner, poses, cloud=cloud, images=images, pose_rows=pose_rows)
     if scan is None:
         return ScanDoubt(None)
     found = pass_agreement(scan.stripes)
@@ -169,13 +170,13 @@ def _thinned(
     *,
     cloud: PointCloud,
     images: tuple[ReconstructedImage, ...],
-    image_rows: tuple[int, ...],
+    pose_rows: tuple[int, ...],
 ) -> _Scan | None:
     if len(cloud) == 0 or scanner.sensor is None:
         return None
-    kept = thinned_rows(cloud.points_mm, cloud.exposure)
-    used, exposure = np.unique(cloud.exposure[kept], return_inverse=True)
-    rows = np.array(image_rows)[used]
+    row_of = np.array(pose_rows)[cloud.exposure]
+    kept = thinned_rows(cloud.points_mm, row_of)
+    rows, exposure = np.unique(row_of[kept], return_inverse=True)
     measured = [image.fate == int(PointFate.MEASURED) for image in images]
     pixels = np.concatenate([i.profile.points_px[m] for i, m in zip(images, measured, strict=True)])
     if len(pixels) != len(cloud):

@@ -30,7 +30,7 @@ def stripes_at_equal_poses(
     Parameters
     ----------
     clouds
-        Points in Base of exposures, by row.
+        Points in Base of each instant, of all its cameras, by the row whose pose it has.
     poses
         Of all rows.
 

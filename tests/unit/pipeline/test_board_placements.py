@@ -8,7 +8,7 @@ import pytest
 
 from armscan.calibration.laser.cameras import HeadCameras
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline import board_placements
+from armscan.pipeline import cached_detection
 from armscan.pipeline.board_placements import find_placements
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.definition import Chessboard
@@ -19,7 +19,7 @@ from sheet_rig import thesis_rig
 def test_the_first_images_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without laser it is looked for first; that reason was lost, being no true value."""
     monkeypatch.setattr(
-        board_placements,
+        cached_detection,
         "detect_target",
         lambda image, *_: FitFailure(f"nothing in {image.source}"),
     )

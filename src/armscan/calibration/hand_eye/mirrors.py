@@ -41,6 +41,8 @@ SMALLER = 0.7
 """And they leave less than this part of what the data as given leave."""
 LARGEST_SHIFT = 0.1
 """Of the middle of a mirrored image, over the focal length."""
+NO_FIT_MM = 1e6
+"""What a shift without a hand-eye leaves: finite, for the search fits parabolas."""
 BOW_DEGREE = 2
 LEAST_OF_SHEET = 12
 
@@ -158,7 +160,7 @@ def _reversed_image(
         tried = _along_reversed_rays(nodes, axis, shift)
         pose = linear_hand_eye(tried, plate)
         if pose is None:
-            return np.inf
+            return NO_FIT_MM
         placed = place_nodes(tried, plate, PlateState(pose, np.zeros(3)))
         return float(np.nanmedian(posture_rms(tried, placed.residual_mm)))
 

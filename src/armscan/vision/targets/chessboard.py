@@ -40,6 +40,11 @@ _MANY_BAD, _FEW_BAD = 0.5, 0.95
 _MAX_TRIED = 2
 """Rectangles of one lattice that are measured."""
 _PROBE = 0.3
+_PROBED_CORNERS = 12
+"""Corners that tell in which channel all of them are measured."""
+_CLEARER = 0.75
+"""A channel is measured instead of the one in which the board was found if its corners' standard
+deviation is smaller than this part of theirs: noise alone changes it by less in twelve corners."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,18 +148,45 @@ def _darkness(grey: Grey32, numbered: NumberedCorners) -> float:
 def _best_measured(
     grey: RawGrey, others: Sequence[RawGrey], target: Chessboard, numbered: NumberedCorners
 ) -> _Corners:
-    """The corners in the channel in which most can be measured.
+    """The corners in the channel that shows them clearest, or in which most can be measured.
 
+    A board that is lit in one colour is found in the mean of all, but is twice as sharp in its own.
     A laser line of one colour crosses the board in one or two channels; the others show it whole.
     """
-    best = _measured(grey, target, numbered)
-    for other in others:
+    clearest = _clearest([grey, *others], numbered)
+    best = _measured(clearest, target, numbered)
+    for other in (channel for channel in (grey, *others) if channel is not clearest):
         if not _MANY_BAD < best.is_good.mean() <= _FEW_BAD:
             break
         corners = _measured(other, target, numbered)
         if corners.is_good.sum() > best.is_good.sum():
             best = corners
     return best
+
+
+def _clearest(channels: Sequence[RawGrey], numbered: NumberedCorners) -> RawGrey:
+    """The channel with the smallest standard deviation of some corners; the first if none is clear.
+
+    Only channels count in which as many of these corners can be measured as in the first.
+    """
+    if len(channels) == 1:
+        return channels[0]
+    some = np.linspace(0, len(numbered.cells) - 1, _PROBED_CORNERS).round().astype(np.int64)
+    cells, start = numbered.cells[some], numbered.points_px[some]
+    known = numbered.cells, numbered.points_px
+    step_x = predict_cells(*known, cells + np.array([1, 0])) - start
+    step_y = predict_cells(*known, cells + np.array([0, 1])) - start
+    clearest, least, fewest = channels[0], np.inf, 0
+    for channel in channels:
+        _, covariance, is_good = fit_saddles(channel, start, step_x, step_y)
+        if is_good.sum() < max(fewest, 0.5 * len(some)):
+            continue
+        sigma = float(np.sqrt(np.median(np.trace(covariance[is_good], axis1=1, axis2=2))))
+        if channel is channels[0]:
+            fewest, least = int(is_good.sum()), _CLEARER * sigma
+        elif sigma < least:
+            clearest, least = channel, sigma
+    return clearest
 
 
 def _measured(grey: RawGrey, target: Chessboard, numbered: NumberedCorners) -> _Corners:

@@ -32,6 +32,7 @@ from armscan.pipeline.exposure_pairs import (
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.stripe_channel import choose_channel
+from armscan.pipeline.target_count import wrong_count
 from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.options import SIGMA_RANGE_PX, LaserColour, StripeOptions
@@ -180,6 +181,10 @@ def calibrate_sheets_from_pairs(
         if isinstance(found, FitFailure)
     ]
     if not boards:
+        seen = [item for place in places.values() for item in place.seen.values()]
+        wrong = wrong_count([item for item in seen if isinstance(item, FitFailure)], target)
+        if wrong is not None and not shown:
+            return wrong
         return FitFailure(
             f"no board with stripes in any of {len(pairs)} images; {skipped[0].source}: "
             f"{skipped[0].reason}",

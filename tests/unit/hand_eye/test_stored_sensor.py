@@ -99,4 +99,4 @@ def test_points_of_other_postures_are_right_with_a_poor_camera() -> None:
         normalised = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
         claims.append(float(normalised.mean()) / 3.0)
     assert np.sqrt(np.mean(squares)) < 2.5 * 0.0071
-    assert 0.6 < np.mean(claims) < 1.5, "20 draws have 1.03; a run's scatter by half"
+    assert 0.6 < np.mean(claims) < 1.5, "20 draws have 1.03"

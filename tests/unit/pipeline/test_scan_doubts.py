@@ -96,7 +96,7 @@ def _other_angles(rotations: FloatArray, places: FloatArray) -> tuple[FloatArray
         (_scalar_moved, "scalar"),
         (_other_angles, "angles"),
         (lambda r, t: (r, t / 25.4), "inches"),
-        (lambda r, t: (r, t / 1000.0), "metres"),
+        (lambda r, t: (r, t / 10.0), "centimetres"),
     ],
 )
 def test_poses_taken_for_something_else(scan: BallScan, wrong: Misread, words: str) -> None:

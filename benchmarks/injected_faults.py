@@ -285,7 +285,7 @@ def _instrument(good: Recording, scanner: ScannerCalibration) -> Iterator[Fault]
         yield Fault(f"images mirrored in {name}", ("mirrored",), good, scanner, mirrored)
     yield Fault(
         "window of the camera 8 px off",
-        ("sheet", "head"),
+        ("window",),
         good,
         scanner,
         lambda profile: replace(profile, points_px=profile.points_px + np.array([0.0, 8.0])),
@@ -302,7 +302,7 @@ def _instrument(good: Recording, scanner: ScannerCalibration) -> Iterator[Fault]
     camera = sensor.camera.camera
     longer = replace(camera, fx_px=1.02 * camera.fx_px, fy_px=1.02 * camera.fy_px)
     wrong = replace(sensor, camera=replace(sensor.camera, camera=longer))
-    yield Fault("focal length 2 % wrong", ("sheet", "head"), good, replace(scanner, sensor=wrong))
+    yield Fault("focal length 2 % wrong", ("focal",), good, replace(scanner, sensor=wrong))
     pose = hand_eye.tool_from_sensor
     for shift, turn_deg in ((0.5, 0.0), (0.0, 0.3)):
         turn = Rotation.from_rotvec([np.radians(turn_deg), 0.0, 0.0]).as_matrix()

@@ -16,13 +16,18 @@ from armscan.inspection.results import PlaneInspection, SphereInspection, StepIn
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
 from armscan.pipeline.head_calibration import Instrument, succeeded
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.reconstruction.choose_sheet import DepthRange
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.cloud import PointCloud
 
 STILL_HEIGHT_MM = 20.0
 STEREO_STILL_HEIGHT_MM = 5.0
+STILL_MARGIN = 0.3
+"""The block fills the view, and its lower face lies up to 13 mm beyond the 55 mm of depth in which
+the crossed lines are calibrated."""
 PART_REACH_MM = 1.0
 """Points of the part's scan further than this from its surface lie on what stands around it."""
 
@@ -118,7 +123,8 @@ def measure_still_step(
     base_from_sensor = poses.pose(0) @ instrument.scanner.hand_eye.tool_from_sensor
     normal = base_from_sensor.rotation.T @ normal_base
     first, *others = (source.exposure(row) for row in range(len(source.rows)))
-    cloud = reconstruct([first], instrument.sensor, rights=others).cloud
+    options = MeasureOptions(depths=DepthRange(margin=STILL_MARGIN))
+    cloud = reconstruct([first], instrument.sensor, rights=others, options=options).cloud
     return succeeded(inspect_step(cloud, height_mm, normal=normal), source.name), normal
 
 

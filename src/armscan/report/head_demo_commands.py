@@ -7,6 +7,7 @@ from pathlib import Path
 
 from armscan.devices.twin import Twin
 from armscan.pipeline.head_demo import HeadDemo
+from armscan.pipeline.head_measurements import STILL_MARGIN
 from armscan.report.summary import Table
 
 
@@ -28,7 +29,8 @@ def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
         found = _measured(recordings, "steps", f"step steps.ply --height {height:g}")
         lines += found if k == 0 else found[1:]
     lines += [
-        f"armscan reconstruct {recordings / 'still-step'} --sensor sensor.json -o still.ply",
+        f"armscan reconstruct {recordings / 'still-step'} --sensor sensor.json "
+        f"--depth-margin {STILL_MARGIN:g} -o still.ply",
         f"armscan inspect step still.ply --height {still:g} --normal={normal}",
         f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
     ]

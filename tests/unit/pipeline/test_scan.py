@@ -10,6 +10,7 @@ import pytest
 
 from armscan.errors import EstimationError, InputError, OptionError
 from armscan.models.scanner import ScannerCalibration
+from armscan.pipeline.measure_options import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.pipeline.scan_result import ScanExposureFate
@@ -177,3 +178,20 @@ def test_a_few_points_without_normal_are_normal(device: ScannerCalibration) -> N
     narrow = ScanOptions(normals=NormalOptions(radius_mm=0.6))
     result = measure_scan(as_source(fake_scan(3)), device, narrow)
     assert any("have no normal: within 0.6 mm" in warning for warning in result.warnings)
+
+
+def test_a_laser_without_sheet_is_told_of(device: ScannerCalibration) -> None:
+    """Unless the sheet was named; sources of a fan are those before the dot of its sheets."""
+    scan = with_rows(fake_scan(), [{"lasers": ("B",)}] * 6)
+
+    def told(head: ScannerCalibration, sheet: str = "") -> bool:
+        options = ScanOptions(measure=MeasureOptions(sheet=sheet), normals=None)
+        texts = measure_scan(as_source(scan), head, options).warnings
+        return any("laser B" in text and "A" in text for text in texts)
+
+    assert told(device)
+    assert not told(device, "A")
+    assert device.sensor is not None
+    (sheet,) = device.sensor.sheets
+    named = replace(device.sensor, sheets=(replace(sheet, name="B.1"),))
+    assert not told(replace(device, sensor=named))

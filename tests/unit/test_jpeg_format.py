@@ -49,6 +49,21 @@ def test_files_that_lack_a_tenth_are_refused(name: str) -> None:
         assert jpeg_defect(data[:place] + data[place + len(data) // 10 :])
 
 
+def test_pictures_of_a_video_stream_have_no_tables_of_their_own() -> None:
+    data = written((480, 640, 3), [])
+    bare = bytearray(data[:2])
+    position = 2
+    while data[position + 1] != 0xDA:
+        end = position + 2 + int.from_bytes(data[position + 2 : position + 4])
+        if data[position + 1] != 0xC4:
+            bare += data[position:end]
+        position = end
+    bare += data[position:]
+    assert len(bare) < len(data) - 400
+    assert jpeg_defect(bytes(bare)) == ""
+    assert jpeg_defect(bytes(bare[: len(bare) // 2] + bare[len(bare) // 2 + 3000 :]))
+
+
 def test_a_header_that_claims_more_than_the_data_hold_is_refused() -> None:
     data = bytearray(written((120, 160), []))
     frame = data.index(b"\xff\xc0")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,15 @@ def test_an_own_text_file_keeps_its_frame(tmp_path: Path) -> None:
     assert found.frame == "Sensor"
     assert found.points_mm == pytest.approx(POINTS)
     assert not found.covariance_mm2.any()
+
+
+def test_an_own_text_file_keeps_its_marks(tmp_path: Path) -> None:
+    path = tmp_path / "own.xyz"
+    marked = replace(cloud_of(POINTS), is_simulated=True, forced=("rms 9 px", "f unknown"))
+    path.write_bytes(xyz_bytes(marked))
+    found = read_cloud(path)
+    assert found.forced == ("rms 9 px", "f unknown")
+    assert found.is_simulated
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.cached_detection import cached_profile, cached_target
 from armscan.pipeline.exposure_pairs import ExposurePair
-from armscan.pipeline.laser import LaserOptions
+from armscan.pipeline.laser import LaserOptions, around_board
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.profile import Profile
 from armscan.storage.detection_cache import DetectionCache
@@ -59,7 +59,11 @@ def look_at_pairs(
             again = cached_target(exposure, target, options.target, cache)
             if not isinstance(again, FitFailure):
                 board, tried = again, exposure
-        profile = cached_profile(exposure, options.stripes, background, cache)
+        lit, dark = exposure, background
+        if not isinstance(board, FitFailure):
+            lit = around_board(board, exposure)
+            dark = None if background is None else around_board(board, background)
+        profile = cached_profile(lit, options.stripes, dark, cache)
         seen.append(SeenPair(exposure.source, board, tried.source, profile))
     progress(ProgressEvent(STAGE, len(pairs), len(pairs)))
     if cache is not None:

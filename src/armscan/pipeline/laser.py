@@ -176,7 +176,7 @@ def calibrate_sheets_from_pairs(
         looked = _looked_twice(looked, again, cameras, options.sheets)
     boards = [found for found in looked if isinstance(found, BoardStripes)]
     skipped = [
-        SkippedImage(pair[0].source, found.reason)
+        SkippedImage(pair[0].source, found.reason.removeprefix(f"{pair[0].source}: "))
         for pair, found in zip(pairs, looked, strict=True)
         if isinstance(found, FitFailure)
     ]
@@ -279,8 +279,8 @@ def _board_stripes(
     if isinstance(seen, FitFailure):
         return seen
     camera, view, pose = seen
-    dark = None if background is None else _around(view, background)
-    profile = cached_profile(_around(view, exposure), options, dark, cache)
+    dark = None if background is None else around_board(view, background)
+    profile = cached_profile(around_board(view, exposure), options, dark, cache)
     if not bool(profile.is_accepted.any()):
         return FitFailure("no stripe was found on or around the board", "check laser and exposure")
     edges = find_target_edges(view, target, pose.value, cameras.model(camera))
@@ -288,7 +288,7 @@ def _board_stripes(
     return BoardStripes(profile, view, pose, exposure.lasers, edges, camera, placed, name)
 
 
-def _around(view: TargetView, exposure: Exposure) -> Exposure:
+def around_board(view: TargetView, exposure: Exposure) -> Exposure:
     """The part of an exposure that shows the board, with as much again on every side.
 
     What is bright elsewhere, a lamp or a window, then does not set the threshold.

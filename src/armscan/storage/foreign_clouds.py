@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import cast, get_args
 
@@ -13,7 +14,7 @@ import numpy as np
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.records.cloud import CloudFrame, PointCloud
-from armscan.storage.clouds import COVARIANCE, POINT, SIMULATED, read_ply
+from armscan.storage.clouds import COVARIANCE, FORCED, POINT, SIMULATED, read_ply
 from armscan.storage.images import read_bytes
 from armscan.storage.ply_format import parse_ply
 
@@ -90,7 +91,9 @@ def _text_cloud(data: bytes, path: Path) -> PointCloud:
         ) from error
     known = cast(CloudFrame, frame) if frame in get_args(CloudFrame) else FOREIGN_FRAME
     is_simulated = named is not None and f"; {SIMULATED};" in text.partition("\n")[0]
-    return _bare_cloud(points, known, path, is_simulated=is_simulated)
+    mark = f"# {FORCED}: "
+    forced = tuple(line.removeprefix(mark) for line in lines if line.startswith(mark))
+    return replace(_bare_cloud(points, known, path), is_simulated=is_simulated, forced=forced)
 
 
 def _is_heading(lines: list[str], path: Path) -> bool:
@@ -146,9 +149,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _bare_cloud(
-    points_mm: FloatArray, frame: CloudFrame, path: Path, *, is_simulated: bool = False
-) -> PointCloud:
+def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCloud:
     n = len(points_mm)
     zeros = np.zeros(n, dtype=np.int64)
     try:
@@ -163,7 +164,6 @@ def _bare_cloud(
             exposure_sources=(path.name,),
             segment=zeros,
             intensity=np.zeros(n),
-            is_simulated=is_simulated,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error

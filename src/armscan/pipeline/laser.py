@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.calibrate import calibrate_sheets, sight_on_boards
 from armscan.calibration.laser.cameras import HeadCameras
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit, SkippedImage
@@ -32,15 +32,20 @@ from armscan.pipeline.exposure_pairs import (
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.stripe_channel import choose_channel
+from armscan.pipeline.target_count import wrong_count
 from armscan.records.exposure import Exposure
 from armscan.storage.detection_cache import DetectionCache
-from armscan.vision.stripe.options import LaserColour, StripeOptions
+from armscan.vision.stripe.options import SIGMA_RANGE_PX, LaserColour, StripeOptions
 from armscan.vision.targets.definition import Target
 from armscan.vision.targets.options import TargetOptions
 from armscan.vision.targets.view import TargetView
 
 BOARDS_STAGE = "boards"
 STRIPES_STAGE = "stripes"
+LITTLE = 0.5
+"""Of the usual count of points on the common sheet: with fewer an image is looked at again."""
+LEAST_WIDTHS = 3
+"""Images with a stripe on the common sheet from which on the line's width is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +147,11 @@ def calibrate_sheets_from_pairs(
     }
     shown = [pair for pair in pairs if _seen(pair, places) is not None]
 
-    def stripes_of(pair: ExposurePair, colour: LaserColour) -> BoardStripes | FitFailure:
-        chosen = replace(options.stripes, laser_colour=colour)
+    def stripes_of(
+        pair: ExposurePair, colour: LaserColour, line_sigma_px: float | None = None
+    ) -> BoardStripes | FitFailure:
+        sigma = options.stripes.line_sigma_px or line_sigma_px
+        chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma)
         place = places[placement_of(pair)]
         return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
 
@@ -155,17 +163,28 @@ def calibrate_sheets_from_pairs(
     if colour == "auto" and any(pair[0].colour != "mono" for pair in shown):
         choice = choose_channel(len(shown), tried, cameras, options.sheets)
         colour = "auto" if choice is None else choice.channel
-    boards: list[BoardStripes] = []
-    skipped: list[SkippedImage] = []
+    looked: list[BoardStripes | FitFailure] = []
     for done, pair in enumerate(pairs):
         progress(ProgressEvent(STRIPES_STAGE, done, len(pairs), pair[0].source))
-        found = stripes_of(pair, colour)
-        if isinstance(found, FitFailure):
-            skipped.append(SkippedImage(pair[0].source, found.reason))
-        else:
-            boards.append(found)
+        looked.append(stripes_of(pair, colour))
     progress(ProgressEvent(STRIPES_STAGE, len(pairs), len(pairs)))
+    if options.stripes.line_sigma_px is None:
+
+        def again(k: int, line_sigma_px: float) -> BoardStripes | FitFailure:
+            return stripes_of(pairs[k], colour, line_sigma_px)
+
+        looked = _looked_twice(looked, again, cameras, options.sheets)
+    boards = [found for found in looked if isinstance(found, BoardStripes)]
+    skipped = [
+        SkippedImage(pair[0].source, found.reason)
+        for pair, found in zip(pairs, looked, strict=True)
+        if isinstance(found, FitFailure)
+    ]
     if not boards:
+        seen = [item for place in places.values() for item in place.seen.values()]
+        wrong = wrong_count([item for item in seen if isinstance(item, FitFailure)], target)
+        if wrong is not None and not shown:
+            return wrong
         return FitFailure(
             f"no board with stripes in any of {len(pairs)} images; {skipped[0].source}: "
             f"{skipped[0].reason}",
@@ -181,6 +200,45 @@ def calibrate_sheets_from_pairs(
         laser_colour=colour,
         channel_reason="" if choice is None else choice.reason,
     )
+
+
+def _looked_twice(
+    looked: Sequence[BoardStripes | FitFailure],
+    again: Callable[[int, float], BoardStripes | FitFailure],
+    cameras: HeadCameras,
+    options: SheetOptions,
+) -> list[BoardStripes | FitFailure]:
+    """Look again, for a line as wide as in the others, where little lies on the common sheet.
+
+    The width of the line is found in each image by itself, and what is bright beside the line may
+    be narrower or wider than it. One laser in one set has one width.
+    """
+    found = list(looked)
+    shown = [k for k, board in enumerate(found) if isinstance(board, BoardStripes)]
+    boards = [board for board in found if isinstance(board, BoardStripes)]
+    images = sight_on_boards(boards, cameras, options).images if boards else ()
+    widths = [
+        np.median(image.data.profile.width_px[np.concatenate([s.rows for s in image.sightings])])
+        for image in images
+        if image.sightings
+    ]
+    if len(widths) < LEAST_WIDTHS:
+        return found
+    sigma_px = float(np.clip(np.median(widths), *SIGMA_RANGE_PX))
+    counts = {k: sum(len(s.rows) for s in i.sightings) for k, i in zip(shown, images, strict=True)}
+    usual = float(np.median([count for count in counts.values() if count]))
+    for k, first in enumerate(looked):
+        if counts.get(k, 0) >= LITTLE * usual:
+            continue
+        second = again(k, sigma_px)
+        if isinstance(second, BoardStripes) and _clean(second) > _clean(first):
+            found[k] = second
+    return found
+
+
+def _clean(board: BoardStripes | FitFailure) -> int:
+    """Count of clean stripe points."""
+    return 0 if isinstance(board, FitFailure) else int(board.profile.is_accepted.sum())
 
 
 def _found_placements(

@@ -115,7 +115,8 @@ def _repeats(inputs: HandEyeInputs, request: HandEyeRequest) -> tuple[Table | Te
     if len(inputs.groups) < 2:
         return ()
     fits = [calibrated(seen.stripes, inputs, request, name) for name, seen in inputs.groups]
-    return repeat_blocks([name for name, _ in inputs.groups], fits)
+    known = None if inputs.sensor is None else inputs.sensor.covariance
+    return repeat_blocks([name for name, _ in inputs.groups], fits, known)
 
 
 def _input_warnings(inputs: HandEyeInputs) -> tuple[str, ...]:

@@ -15,7 +15,11 @@ from armscan.report.summary import Table
 COLUMNS = ("calibration", "θ °", "γ °", "φ °", "tx mm", "ty mm", "tz mm")
 
 
-def repeat_blocks(names: Sequence[str], fits: Sequence[HandEyeFit]) -> tuple[Table, Text]:
+def repeat_blocks(
+    names: Sequence[str],
+    fits: Sequence[HandEyeFit],
+    sensor_covariance: FloatArray | None = None,
+) -> tuple[Table, Text]:
     """Angles of eq. 2.69 and translation of each calibration, and how far they scatter.
 
     Parameters
@@ -24,8 +28,10 @@ def repeat_blocks(names: Sequence[str], fits: Sequence[HandEyeFit]) -> tuple[Tab
         One a calibration.
     fits
         The calibrations, two or more, of one sensor.
+    sensor_covariance
+        (P, P) of its parameters; None where it is taken as exact.
     """
-    study = study_repeats([fit.calibration for fit in fits])
+    study = study_repeats([fit.calibration for fit in fits], sensor_covariance)
     if isinstance(study, FitFailure):
         return Table(COLUMNS, ()), Text(study.reason)
     rows = [_row(name, row, 3) for name, row in zip(names, study.values, strict=True)]
@@ -37,7 +43,8 @@ def repeat_blocks(names: Sequence[str], fits: Sequence[HandEyeFit]) -> tuple[Tab
     text = (
         "One calibration from each recording. The standard deviation is that of one calibration, "
         f"n - 1 = {len(fits) - 1} in the denominator; the prediction is what the calibrations "
-        "state themselves, the sensor's share left out, as all have one sensor. If it is right, "
+        "state themselves; of the sensor's share, as all have one sensor, only what their postures "
+        "make differ. If it is right, "
         f"their ratio falls between {low:.2f} and {high:.2f} in 95 % of such studies."
     )
     if study.unlike_predicted:

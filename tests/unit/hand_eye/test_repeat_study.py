@@ -91,6 +91,30 @@ def test_sound_predictions_are_found_sound_and_bad_ones_named() -> None:
     assert five.ratio_range[0] < 1.0 < five.ratio_range[1]
 
 
+def test_one_sensors_error_that_moves_the_repeats_apart_is_predicted() -> None:
+    """Hand-eyes D s of one error s; a part of D that all share moves them alike and is no scatter.
+
+    400 parameters of a sensor: |s|^2 is their count to 7 %.
+    """
+    generator = np.random.default_rng(SEED)
+    scale = np.array([1e-4, 1e-4, 1e-4, 0.01, 0.02, 0.03])[:, None] / 20.0
+    error, shared = generator.normal(size=400), 10.0 * generator.normal(size=(6, 400))
+    calibrations = []
+    for _ in range(100):
+        coupling = scale * (shared + generator.normal(size=(6, 400)))
+        change = coupling @ error
+        turned = rotation_from_vector(change[:3]) @ pose(TABLE_4_MEAN).rotation
+        moved = Pose(nearest_rotation(turned), TABLE_4_MEAN[3:] + change[3:])
+        calibrations.append(
+            HandEyeCalibration(
+                moved, 1e-16 * np.eye(6), coupling, ArmNoise(0.01, 1e-5), 0.01, 12, 24, 1000
+            )
+        )
+    study = solved(study_repeats(calibrations, np.eye(400)))
+    assert study.ratio is not None
+    np.testing.assert_allclose(study.ratio, 1.0, atol=4.0 * np.hypot(0.07, 0.035))
+
+
 def test_refusals() -> None:
     one = pose(TABLE_4[0])
     assert isinstance(study_poses([one]), FitFailure)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.laser.lack_of_fit import StripeNoise, gain_of_bow, lack_of_fit
+from armscan.calibration.laser.lack_of_fit import StripeNoise, lack_of_fit
 from armscan.calibration.laser.normal_equations import NormalSolution, StripeSystem
 from armscan.calibration.laser.observations import SheetObservations
 from armscan.calibration.laser.solve import LinearSolution, SheetSolution
@@ -61,10 +61,3 @@ def test_raised_sigmas_shrink_the_noise_in_chi2_by_their_square() -> None:
 
 def test_a_solution_with_no_stripe_to_spare_is_not_tested() -> None:
     assert lack_of_fit(observations(2), solution(1e6, 8), NOISE).p_value == 1.0
-
-
-def test_gain_of_five_bow_terms() -> None:
-    """chi2 falls by 20 with five more parameters: F is 4 with 5 and 125 degrees of freedom."""
-    ratio, p_value = gain_of_bow(solution(150.0, 3), solution(130.0, 8), NOISE)
-    assert ratio == pytest.approx(4.0)
-    assert p_value == pytest.approx(stats.f.sf(4.0, 5, 125))

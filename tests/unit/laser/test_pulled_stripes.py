@@ -8,6 +8,7 @@ import numpy as np
 from armscan.calibration.laser.calibrate import calibrate_sheets
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit, PointUse
+from armscan.calibration.laser.sightings import PULL_WIDTHS
 from armscan.calibration.laser.target_edges import TargetEdges
 from sheet_rig import SheetRig, thesis_rig
 
@@ -109,3 +110,23 @@ def test_coplanarity_of_two_boards_against_correlated_noise() -> None:
         sheet = fitted(rig, boards).sheets[0]
         sigmas.append(sheet.coplanarity_mm / sheet.coplanarity_sigma_mm)
     assert 0.82 < np.sqrt(np.mean(np.square(sigmas))) < 1.18
+
+
+def test_a_stripe_that_runs_along_the_pattern_is_used_as_less_certain() -> None:
+    """On one board an edge runs along the whole stripe: it is not lost, and weighs little."""
+    rig = thesis_rig()
+    boards = rig.boards(rig.camera, np.random.default_rng(4))
+    profile = boards[2].profile
+    along = np.stack([-profile.normals_px[:, 1], profile.normals_px[:, 0]], axis=1)
+    beside = TargetEdges(profile.points_px + 2.0 * profile.normals_px, along)
+    pulled_px = profile.points_px + PULL_PX * profile.normals_px
+    boards[2] = replace(boards[2], edges=beside, profile=replace(profile, points_px=pulled_px))
+    fit = fitted(rig, boards)
+    used = fit.images[2].use == PointUse.USED
+    assert used.sum() > 0.8 * len(profile)
+    widened = fit.images[2].profile.sigma_px[used]
+    assert (widened >= PULL_WIDTHS * profile.width_px[used]).all()
+    without = fitted(rig, boards[:2] + boards[3:])
+    shift = fit.sheets[0].sheet.plane - without.sheets[0].sheet.plane
+    assert height_mm(rig, fit) < 3.0 * fit.sheets[0].offset_sigma_mm
+    assert abs(shift[3]) < without.sheets[0].offset_sigma_mm

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same pose with another stripe is told; with the same, or one of another sheet, it is not."""
+"""The same pose with another stripe is told; with the same stripe or another sheet it is not."""
 
 from __future__ import annotations
 

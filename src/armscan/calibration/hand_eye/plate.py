@@ -33,6 +33,7 @@ from armscan.calibration.hand_eye.plate_fit import (
     PlateFit,
     fit_plate,
     hand_eye_information,
+    hold_sensor,
     plane_after,
 )
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
@@ -82,8 +83,9 @@ def calibrate_on_plate(
         Defaults if None.
     sensor_covariance
         (P, P) of the sensor's parameters, in the order of the stripes' ``by_sensor``: its errors
-        bend all stripes alike, and are weighted accordingly. The covariance returned is for the
-        sensor as it is; ``sensor_coupling`` carries its errors on. None takes it as exact.
+        bend all stripes alike, and are not taken for something that moved. The hand-eye returned,
+        and its covariance, are for the sensor as it is; ``sensor_coupling`` carries its errors on.
+        None takes it as exact.
 
     Returns
     -------
@@ -188,22 +190,25 @@ def _result(
     *,
     start: Start,
     checked: CheckedFit,
-) -> HandEyeFit:
+) -> HandEyeFit | FitFailure:
+    """Checks let the sensor err within its covariance; what is stored belongs to the sensor."""
     fit, nodes = checked.fit, checked.nodes
+    stored = hold_sensor(nodes, plate, fit, options)
+    if isinstance(stored, FitFailure):
+        return stored
     conditioning = describe_conditioning(hand_eye_information(fit.slopes, fit.total))
-    plane = shifted_plane(plate.plane, plane_after(fit, plate))
-    residuals = stripe_residuals(stripes, kept, fit.refined.state.tool_from_sensor, plane)
+    plane = shifted_plane(plate.plane, plane_after(stored, plate))
+    residuals = stripe_residuals(stripes, kept, stored.refined.state.tool_from_sensor, plane)
     left = leave_each_out(nodes, fit.refined.placed.residual_mm, fit.linear)
-    postures = posture_results(nodes, fit, residuals, left, plane)
+    postures = posture_results(nodes, stored, residuals, left, plane)
     cause = common_to_postures(nodes, plate.plane)
     return HandEyeFit(
         hand_eye_calibration(
-            nodes,
-            fit,
+            checked,
+            stored,
             plate,
             options,
             conditioning=conditioning,
-            widening=checked.widening,
             residuals=residuals,
             postures=postures,
         ),
@@ -215,7 +220,7 @@ def _result(
         (
             *checked.warnings,
             *conditioning_warnings(conditioning, len(postures), cause),
-            *agreement_warnings(nodes, plate, fit, options),
+            *agreement_warnings(nodes, plate, stored, options),
             *influence_warnings(nodes, left, fit.covariance[:6, :6]),
             *point_warnings(stripes, kept, options),
         ),

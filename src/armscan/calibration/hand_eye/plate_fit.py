@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -57,7 +57,8 @@ class PlateFit:
     components, noise
         Causes of scatter and their standard deviations.
     total
-        (N, N) covariance of the residuals, by the probed plane and the sensor too.
+        (N, N) covariance of the residuals, by the probed plane and, unless it is held
+        (`hold_sensor`), by the sensor too.
     linear
         Solution linearised at the minimum.
     covariance
@@ -145,11 +146,51 @@ def known_covariance(
 
     Both err alike in all postures. The plane is left out where it is solved along or exact.
     """
-    known = np.zeros((len(nodes), len(nodes)))
-    if not options.solve_plate and plate.covariance is not None:
-        known += plane_covariance(placed, plate.covariance)
+    by_plane = _covariance_by_plane(placed, plate, options)
     by_sensor = sensor_covariance(nodes, placed)
-    return known if by_sensor is None else known + by_sensor
+    return by_plane if by_sensor is None else by_plane + by_sensor
+
+
+def _covariance_by_plane(
+    placed: PlacedNodes, plate: PlateReference, options: HandEyeOptions
+) -> FloatArray:
+    if options.solve_plate or plate.covariance is None:
+        return np.zeros((len(placed.residual_mm), len(placed.residual_mm)))
+    return plane_covariance(placed, plate.covariance)
+
+
+def hold_sensor(
+    nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
+) -> PlateFit | FitFailure:
+    """The hand-eye that belongs to the sensor as it is stored, under the scatter of ``fit``.
+
+    A fit that knows the sensor's covariance explains a part of the residuals by a sensor that is
+    moved within it: its hand-eye is that of the moved sensor, and beside the stored one it makes
+    wrong points. Here the sensor stands still and the hand-eye takes up what it can of the
+    sensor's errors. Its ``total`` and ``covariance`` are without the sensor's part.
+    """
+    placed = fit.refined.placed
+    by_sensor = sensor_covariance(nodes, placed)
+    if by_sensor is None:
+        return fit
+    by_plane = _covariance_by_plane(placed, plate, options)
+    total = total_covariance(fit.components, fit.noise.sigmas) + by_plane
+    try:
+        refined = refine(
+            nodes, plate.plane, fit.refined.state, total, solve_plate=options.solve_plate
+        )
+    except LinAlgError:
+        return _no_solution()
+    slopes = design(refined.placed, options.solve_plate)
+    linear = solve_linear(refined.placed.residual_mm, slopes, total)
+    if linear is None:
+        return _no_solution()
+    # What the sensor's errors leave in the residuals is the coupling's part, not the scatter's.
+    own = placed.residual_mm - by_sensor @ fit.linear.projected @ placed.residual_mm
+    covariance = covariance_over_noise(own, slopes, fit.components, by_plane, fit.noise)
+    return replace(
+        fit, refined=refined, slopes=slopes, total=total, linear=linear, covariance=covariance
+    )
 
 
 def plane_after(fit: PlateFit, plate: PlateReference) -> FloatArray:

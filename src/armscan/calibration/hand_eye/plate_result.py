@@ -15,6 +15,7 @@ from armscan.calibration.hand_eye.observations import PlateReference, PosedStrip
 from armscan.calibration.hand_eye.options import HandEyeOptions
 from armscan.calibration.hand_eye.plate_fit import PlateFit, plane_after
 from armscan.calibration.hand_eye.plate_nodes import PlateNodes
+from armscan.calibration.hand_eye.plate_outliers import CheckedFit
 from armscan.calibration.hand_eye.plate_residuals import (
     residual_by_sensor,
     sensor_covariance,
@@ -89,45 +90,47 @@ def posture_results(
 def fitted_covariance(nodes: PlateNodes, fit: PlateFit) -> FloatArray:
     """(N, N) covariance of the residuals from the plane that scan and probing give together.
 
-    The hand-eye and the plane follow the errors that they can explain. With ``C`` the covariance
-    of all errors, ``P`` of `LinearSolution` and ``D`` that of scatter and sensor, without the
-    plane, these residuals are ``D P e``, so that their covariance is ``D P D``.
+    The hand-eye and the plane follow the errors that they can explain. With ``P`` of
+    `LinearSolution` and ``D`` the covariance of the scatter alone, these residuals are ``D P e``.
+    The errors ``e`` are those that the fit weighed, and the sensor's, which was held.
     """
     scatter = total_covariance(fit.components, fit.noise.sigmas)
+    left = scatter @ fit.linear.projected
+    spread = left @ scatter
     by_sensor = sensor_covariance(nodes, fit.refined.placed)
-    own = scatter if by_sensor is None else scatter + by_sensor
-    return np.asarray(own @ fit.linear.projected @ own)
+    return np.asarray(spread if by_sensor is None else spread + left @ by_sensor @ left.T)
 
 
 def hand_eye_calibration(
-    nodes: PlateNodes,
-    fit: PlateFit,
+    checked: CheckedFit,
+    stored: PlateFit,
     plate: PlateReference,
     options: HandEyeOptions,
     *,
     conditioning: Conditioning,
-    widening: FloatArray,
     residuals: Sequence[StripeResidual],
     postures: Sequence[PostureResult],
 ) -> HandEyeCalibration:
     """The document's part: hand-eye, covariance, coupling to the sensor, noise.
 
-    ``widening`` (6, 6) is added to the covariance.
+    ``stored`` is the hand-eye of the sensor as it is (`hold_sensor`); whether all is as given is
+    told by ``checked``, where the sensor may err.
     """
-    by_sensor = residual_by_sensor(nodes, fit.refined.placed)
-    coupling = None if by_sensor is None else -fit.linear.gain[:6] @ by_sensor
+    fit = checked.fit
+    by_sensor = residual_by_sensor(checked.nodes, stored.refined.placed)
+    coupling = None if by_sensor is None else -stored.linear.gain[:6] @ by_sensor
     used = {posture.posture for posture in postures}
     distances = np.concatenate([r.residual_mm for r in residuals if r.posture in used])
     return HandEyeCalibration(
-        fit.refined.state.tool_from_sensor,
-        fit.covariance[:6, :6] + widening,
+        stored.refined.state.tool_from_sensor,
+        stored.covariance[:6, :6] + checked.widening,
         coupling,
         arm_noise(fit.components, fit.noise.sigmas),
         float(np.sqrt((distances**2).mean())),
         len(postures),
         sum(posture.n_exposures for posture in postures),
         sum(posture.n_points for posture in postures),
-        shifted_plane(plate.plane, plane_after(fit, plate)),
+        shifted_plane(plate.plane, plane_after(stored, plate)),
         HandEyeDiagnostics(
             "plate",
             conditioning.rank,

@@ -79,17 +79,29 @@ class RepeatStudy:
         )
 
 
-def study_repeats(calibrations: Sequence[HandEyeCalibration]) -> RepeatStudy | FitFailure:
+def study_repeats(
+    calibrations: Sequence[HandEyeCalibration], sensor_covariance: FloatArray | None = None
+) -> RepeatStudy | FitFailure:
     """Compare the scatter of repeated calibrations with the standard deviations they state.
 
     Parameters
     ----------
     calibrations
-        Two or more of one head; each with its covariance. The sensor's part of the covariance is
-        left out, as it is common to all calibrations with one sensor.
+        Two or more of one head; each with its covariance.
+    sensor_covariance
+        (P, P) of the one sensor that all were calibrated with. What its error does to all alike is
+        left out; how differently it moves them, as their postures differ, is a part of the
+        scatter. None takes it as exact.
     """
     poses = [one.tool_from_sensor for one in calibrations]
-    return study_poses(poses, [one.covariance for one in calibrations])
+    covariances = [one.covariance for one in calibrations]
+    follow = [one.sensor_coupling for one in calibrations if one.sensor_coupling is not None]
+    n = len(calibrations)
+    if sensor_covariance is not None and len(follow) == n > 1:
+        apart = np.array(follow) - np.mean(follow, axis=0)
+        unlike = n / (n - 1) * (apart @ sensor_covariance @ apart.transpose(0, 2, 1))
+        covariances = [own + more for own, more in zip(covariances, unlike, strict=True)]
+    return study_poses(poses, covariances)
 
 
 def study_poses(

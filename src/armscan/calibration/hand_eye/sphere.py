@@ -35,6 +35,7 @@ from armscan.calibration.hand_eye.sphere_refine import (
     SphereSolution,
     descend,
     free_columns,
+    hold_sensor,
     refine_with_noise,
     solve_at,
     with_weights,
@@ -69,6 +70,7 @@ POSTURES_REMEDY = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
     "at another height"
 )
+_OPEN = FitFailure("the postures do not determine hand-eye and sphere together", POSTURES_REMEDY)
 
 
 def calibrate_on_sphere(
@@ -89,7 +91,7 @@ def calibrate_on_sphere(
     options
         Rejection, noise, and what is solved along.
     sensor_covariance
-        As of `armscan.calibration.hand_eye.plate.calibrate_on_plate`: weighted, but not stated.
+        As of `armscan.calibration.hand_eye.plate.calibrate_on_plate`.
 
     Returns
     -------
@@ -123,11 +125,14 @@ def calibrate_on_sphere(
     best = _best(nodes, starts, options)
     if isinstance(best, FitFailure):
         return best
-    start, solution = best
-    conditioning = _conditioning(solution.linear)
+    start, checked = best
+    stored = hold_sensor(nodes, checked)
+    if stored is None:
+        return _OPEN
+    conditioning = _conditioning(checked.linear)
     warnings = (*left_out, *conditioning_warnings(conditioning, n_postures, ""))
     given = replace(start, radius_mm=radius)
-    return sphere_fit(nodes, solution, conditioning, given, warnings)
+    return sphere_fit(nodes, checked, stored, conditioning, start=given, warnings=warnings)
 
 
 def _refuse_sections(
@@ -210,9 +215,7 @@ def _best(
     found = [(start, _refine(nodes, start, options)) for start in starts]
     solved = [(start, one) for start, one in found if one is not None]
     if not solved:
-        return FitFailure(
-            "the postures do not determine hand-eye and sphere together", POSTURES_REMEDY
-        )
+        return _OPEN
     solved.sort(key=lambda pair: -pair[1].linear.log_likelihood)
     best = solved[0]
     if _typical_mm(nodes, best[1].state) > options.max_rms_mm:

@@ -36,20 +36,25 @@ SHORT_ARC = 0.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Evidence:
-    """``covariance`` (F, F) of all unknowns, and without the sensor's part (`own_covariance`)."""
+    """What is stored, ``solution``, and what it was ``checked`` by, where the sensor may err.
+
+    ``covariance`` (F, F) of all unknowns, and without the sensor's part (`own_covariance`).
+    """
 
     nodes: SphereNodes
+    checked: SphereSolution
     solution: SphereSolution
     covariance: FloatArray
     own_covariance: FloatArray
-    left_out: tuple[LeftOutPosture, ...]
     postures: tuple[PostureResult, ...]
 
 
 def sphere_fit(
     nodes: SphereNodes,
+    checked: SphereSolution,
     solution: SphereSolution,
     conditioning: Conditioning,
+    *,
     start: SphereState,
     warnings: tuple[str, ...],
 ) -> HandEyeFit:
@@ -57,22 +62,32 @@ def sphere_fit(
 
     Parameters
     ----------
-    nodes, solution, conditioning
-        Data, minimum with noise model, and how well it is determined.
+    nodes
+        Data.
+    checked
+        Minimum with noise model, where the sensor may err within its covariance.
+    solution
+        The one to be stored, of the sensor as it is (`hold_sensor`).
+    conditioning
+        How well the hand-eye is determined.
     start
         Where the refinement started, with the sphere's radius as given.
     warnings
         What was noticed before.
     """
-    residual, by_sensor = solution.placed.residual_mm, solution.by_sensor
-    covariance = covariance_over_noise(
-        residual, solution.slopes, solution.components, by_sensor, solution.noise
+    residual = checked.placed.residual_mm
+    # What the sensor's errors leave in the residuals is the coupling's part, not the scatter's.
+    own = residual - checked.by_sensor @ checked.linear.projected @ residual
+    own_covariance = covariance_over_noise(
+        own, solution.slopes, solution.components, np.zeros_like(solution.total), solution.noise
     )
     gain = solution.linear.gain
-    own_covariance = covariance - gain @ by_sensor @ gain.T
-    left_out = tuple(leave_out(nodes, solution, k) for k in range(len(nodes.postures)))
-    postures = tuple(_posture(nodes, solution, k, one) for k, one in enumerate(left_out))
-    evidence = _Evidence(nodes, solution, covariance, own_covariance, left_out, postures)
+    covariance = own_covariance + gain @ solution.by_sensor @ gain.T
+    postures = tuple(
+        _posture(nodes, solution, k, leave_out(nodes, checked, k))
+        for k in range(len(nodes.postures))
+    )
+    evidence = _Evidence(nodes, checked, solution, covariance, own_covariance, postures)
     return HandEyeFit(
         _calibration(evidence, conditioning),
         start.tool_from_sensor,
@@ -85,9 +100,9 @@ def sphere_fit(
 
 
 def _calibration(evidence: _Evidence, conditioning: Conditioning) -> HandEyeCalibration:
-    nodes, solution = evidence.nodes, evidence.solution
-    residual = solution.placed.residual_mm
-    chi2 = float(residual @ solution.linear.projected @ residual)
+    nodes, checked, solution = evidence.nodes, evidence.checked, evidence.solution
+    residual = checked.placed.residual_mm
+    chi2 = float(residual @ checked.linear.projected @ residual)
     freedom = len(nodes) - len(solution.free)
     diagnostics = HandEyeDiagnostics(
         method="sphere",
@@ -128,9 +143,8 @@ def _posture(
     points = np.flatnonzero(np.repeat(nodes.posture, nodes.count) == posture)
     residual = solution.placed.point_residual_mm[points]
     share = nodes.count[own] / nodes.count[own].sum()
-    slopes = solution.slopes[own]
-    spread = solution.total[np.ix_(own, own)] - slopes @ solution.linear.covariance @ slopes.T
-    mean_sigma = float(np.sqrt(max(share @ spread @ share, 1e-18)))
+    left = share @ solution.total[own] @ solution.linear.projected
+    mean_sigma = float(np.sqrt(max(left @ (solution.total + solution.by_sensor) @ left, 1e-18)))
     sources = {nodes.sections[k].stripe.source for k in nodes.section[own]}
     return PostureResult(
         posture=nodes.postures[posture],
@@ -173,7 +187,7 @@ def _reference(evidence: _Evidence, diameter_mm: float) -> tuple[tuple[str, str]
         ("Sphere's centre in Base", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
         ("Its standard deviation", ", ".join(f"{one:.3f}" for one in sigma[6:9]) + " mm"),
     ]
-    found, uncertainty = diameter_asked(evidence.solution)
+    found, uncertainty = diameter_asked(evidence.checked)
     if RADIUS_COLUMN not in solution.free:
         text = f"{found:.3f} mm, standard deviation {uncertainty:.3f} mm"
         rows.append(("Diameter that the points ask for", text))
@@ -230,7 +244,7 @@ def _warnings(evidence: _Evidence) -> tuple[str, ...]:
                 f"{section.stripe.source} is weak: its arc of {arc:.0f} degrees is short, "
                 f"{np.median(arcs):.0f} are usual"
             )
-    asked, uncertainty = diameter_asked(solution)
+    asked, uncertainty = diameter_asked(evidence.checked)
     given = 2.0 * solution.state.radius_mm
     if abs(asked - given) > WRONG_DIAMETER * uncertainty:
         found.append(

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -51,7 +51,7 @@ class SphereSolution:
         Causes of scatter and their standard deviations.
     by_sensor, total
         (M, M) covariance of the residuals by the sensor's calibration, which errs alike in all
-        postures, and by everything.
+        postures, and by everything that the solution weighs: not by a sensor that is held.
     linear
         Linearised at the minimum, in the free columns.
     free
@@ -147,6 +147,29 @@ def refine_with_noise(
         return None
     return SphereSolution(
         state, placed, components, noise, by_sensor, total, linear, free, weights, is_settled
+    )
+
+
+def hold_sensor(nodes: SphereNodes, solution: SphereSolution) -> SphereSolution | None:
+    """The hand-eye that belongs to the sensor as it is stored, under the scatter of ``solution``.
+
+    As `armscan.calibration.hand_eye.plate_fit.hold_sensor`: its ``total`` is without the sensor's
+    part. None where that leaves unknowns open.
+    """
+    total = total_covariance(solution.components, solution.noise.sigmas)
+    state, _, is_settled = descend(nodes, solution.state, total, solution.free)
+    placed = place_on_sphere(nodes, state)
+    linear = solve_linear(placed.residual_mm, placed.slopes[:, solution.free], total)
+    if linear is None:
+        return None
+    return replace(
+        solution,
+        state=state,
+        placed=placed,
+        by_sensor=covariance_by_sensor(nodes, placed),
+        total=total,
+        linear=linear,
+        is_settled=solution.is_settled and is_settled,
     )
 
 

@@ -31,6 +31,9 @@ from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import SheetCalibration
 
+NOTED_FACTOR = 1.5
+"""Scatter of boards over its claim from which on it is told."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetCase:
@@ -89,7 +92,7 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
     solution = solve_sheets(
         used,
         [model.sheet for model in models],
-        case.errors,
+        case.errors.with_boards(max(model.board_factor for model in models)),
         is_bowed,
         sigma_factor=factors[used.sheet],
         are_cameras_held=True,
@@ -121,6 +124,11 @@ def assemble_fit(case: SheetCase) -> LaserFit | FitFailure | LooseSheet:
             warnings.append(
                 f"sheet {name}: its model does not explain the stripes within their noise and the "
                 f"boards' errors; the stripes' sigmas are taken {raised:.1f} times larger"
+            )
+        if model.board_factor > NOTED_FACTOR:
+            warnings.append(
+                f"sheet {name}: the boards err {model.board_factor:.1f} times as much as their "
+                "targets' points say: they may be bent, or the camera's lens is not as calibrated"
             )
     if not case.cameras.has_covariance:
         warnings.append(

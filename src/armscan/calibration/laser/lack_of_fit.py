@@ -148,12 +148,3 @@ def lack_of_fit(
     ratio = squares / freedom
     p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
     return LackOfFit(ratio, freedom, p_value)
-
-
-def gain_of_bow(
-    flat: SheetSolution, bowed: SheetSolution, noise: StripeNoise
-) -> tuple[float, float]:
-    """F ratio and probability of the bow's gain in chi2 if there were no bow."""
-    n_terms = bowed.n_parameters - flat.n_parameters
-    ratio = max(flat.chi2 - bowed.chi2, 0.0) / n_terms
-    return ratio, float(stats.f.sf(ratio, n_terms, max(noise.effective_freedom, 1.0)))

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
+from armscan.calibration.laser.board_scatter import board_scatter
 from armscan.calibration.laser.conditioning import (
     SheetGeometry,
     describe_geometry,
@@ -17,7 +19,6 @@ from armscan.calibration.laser.conditioning import (
 )
 from armscan.calibration.laser.lack_of_fit import (
     StripeNoise,
-    gain_of_bow,
     lack_of_fit,
     stripe_noise,
 )
@@ -67,6 +68,8 @@ class SheetModel:
     sigma_factor
         By which the stripes' sigmas are multiplied in the joint fit: their noise, its correlation,
         and what the model leaves unexplained.
+    board_factor
+        By which the sigmas of the boards' poses are multiplied in the joint fit.
     """
 
     sheet: LightSheet
@@ -76,6 +79,7 @@ class SheetModel:
     final_test: LackOfFit
     decision: str
     sigma_factor: float
+    board_factor: float = 1.0
 
 
 def sheet_geometry(
@@ -148,42 +152,97 @@ def choose_model(
     plane_test = lack_of_fit(alone, flat, noise)
     test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
 
+    plane_model = SheetModel(
+        flat.sheets[0], False, noise, plane_test, plane_test, "", noise.sigma_factor
+    )
+
     def plane(decision: str) -> SheetModel | FitFailure:
-        factor = noise.sigma_factor
-        model = SheetModel(flat.sheets[0], False, noise, plane_test, plane_test, decision, factor)
+        model = replace(plane_model, decision=decision)
         return _with_explained_stripes(model, alone, errors, options)
 
-    is_enough = plane_test.p_value >= options.lack_of_fit_p
-    if is_enough or not options.is_bow_allowed:
-        asked = "a plane was asked for, and does not explain the stripes"
-        return plane(f"{'a plane is enough' if is_enough else asked} ({test})")
+    if plane_test.p_value >= options.lack_of_fit_p:
+        return plane(f"a plane is enough ({test})")
     n_boards = len(np.unique(observations.board))
     if n_boards < options.min_boards_for_bow:
         return plane(
             f"a plane does not explain the stripes ({test}), but {n_boards} boards cannot tell a "
             f"bow from their own errors: {options.min_boards_for_bow} are needed"
         )
+    return _bow_or_boards(plane_model, flat, alone, errors, options)
+
+
+def _bow_or_boards(
+    plane_model: SheetModel,
+    flat: SheetSolution,
+    alone: SheetObservations,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> SheetModel | FitFailure:
+    """What a plane leaves unexplained: is the sheet bowed, or do its boards scatter?"""
+    noise, plane_test = plane_model.noise, plane_model.plane_test
+    test = f"lack of fit F {plane_test.f_ratio:.2f}, p {plane_test.p_value:.2g}"
+    boards = board_scatter(alone, flat, errors, noise)
+
+    def plane(decision: str) -> SheetModel | FitFailure:
+        model = replace(plane_model, decision=decision)
+        return _with_scattered_boards(model, boards.factor, alone, errors, options)
+
+    if not options.is_bow_allowed:
+        return plane(f"a plane was asked for, and does not explain the stripes ({test})")
     condition = _bow_condition(alone, flat)
-    bowed = _solve_bowed(alone, start, errors, noise.sigma_factor)
+    bowed = _solve_bowed(alone, flat.sheets[0], errors, noise.sigma_factor)
     if condition > MAX_BOW_CONDITION or isinstance(bowed, FitFailure):
         return plane(
             f"a plane does not explain the stripes ({test}), but the boards do not spread enough "
             f"to determine a bow (condition {condition:.2g})"
         )
-    ratio, p_value = gain_of_bow(flat, bowed, noise)
+    boards_bowed = board_scatter(alone, bowed, errors, noise)
+    gain = 2.0 * (boards_bowed.log_likelihood - boards.log_likelihood)
+    p_value = float(stats.chi2.sf(max(gain, 0.0), bowed.n_parameters - flat.n_parameters))
+    likelihood = f"likelihood ratio {gain:.1f}, p {p_value:.2g}"
     if p_value >= options.lack_of_fit_p:
         return plane(
-            f"a plane does not explain the stripes ({test}), and a bow does not either "
-            f"(gain F {ratio:.2f}, p {p_value:.2g}): look at the boards' flatness and poses"
+            f"a plane does not explain the stripes ({test}), and a bow does no better than boards "
+            f"that err {boards.factor:.1f} times as much as their targets say ({likelihood})"
         )
     final = lack_of_fit(alone, bowed, noise)
     decision = (
         f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
-        f"(gain F {ratio:.1f}); left F {final.f_ratio:.2f}, p {final.p_value:.2g}"
+        f"({likelihood}); left F {final.f_ratio:.2f}, p {final.p_value:.2g}"
     )
-    factor = noise.sigma_factor
-    model = SheetModel(bowed.sheets[0], True, noise, plane_test, final, decision, factor)
-    return _with_explained_stripes(model, alone, errors, options)
+    model = SheetModel(
+        bowed.sheets[0], True, noise, plane_test, final, decision, noise.sigma_factor
+    )
+    if final.p_value >= options.lack_of_fit_p:
+        return model
+    return _with_scattered_boards(model, boards_bowed.factor, alone, errors, options)
+
+
+def _with_scattered_boards(
+    model: SheetModel,
+    board_factor: float,
+    observations: SheetObservations,
+    errors: CommonErrors,
+    options: SheetOptions,
+) -> SheetModel | FitFailure:
+    """Charge to the boards what they scatter, and to the stripes what is then left."""
+    wider = errors.with_boards(board_factor)
+    solution = solve_sheets(
+        observations,
+        [model.sheet],
+        wider,
+        [model.is_bowed],
+        sigma_factor=model.noise.sigma_factor,
+    )
+    if isinstance(solution, FitFailure):
+        return solution
+    model = replace(
+        model,
+        sheet=solution.sheets[0],
+        final_test=lack_of_fit(observations, solution, model.noise),
+        board_factor=board_factor,
+    )
+    return _with_explained_stripes(model, observations, wider, options)
 
 
 def _solve_bowed(
@@ -226,8 +285,8 @@ def _with_explained_stripes(
 ) -> SheetModel | FitFailure:
     """Raise the stripes' sigmas until the model fits, if it did not.
 
-    What a model leaves unexplained is charged to the stripes, not to the boards: else the boards'
-    poses would be bent to follow it. The covariance of the sheet grows with it.
+    What neither the model nor the boards' scatter explains is charged to the stripes. The
+    covariance of the sheet grows with it.
     """
     factor, test, sheet = model.sigma_factor, model.final_test, model.sheet
     for _ in range(MAX_RAISES):

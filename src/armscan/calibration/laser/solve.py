@@ -52,6 +52,10 @@ class CommonErrors:
     pose_covariances: Sequence[FloatArray]
     camera_covariance: FloatArray
 
+    def with_boards(self, factor: float) -> CommonErrors:
+        """The same with the boards' standard deviations multiplied."""
+        return replace(self, pose_covariances=[factor**2 * one for one in self.pose_covariances])
+
     @property
     def n_camera(self) -> int:
         """Count P of the cameras' parameters."""

@@ -29,7 +29,9 @@ TOLERANCES_PX = (3.0, 8.0, 20.0)
 leaves open: the first with which most boards agree."""
 BOW_SHARE = 0.01
 """Of the print's longer side: how far a bowed sheet or board may hold a stripe off a plane. Line
-lasers bow by up to 0.7 % over the field that they light, boards of card by about as much."""
+lasers bow by up to 0.7 % over the field that they light, boards of card by about as much. Beside
+the print, whose pose is that of its own middle plane, a bent carrier leaves it with the square of
+the distance."""
 AGREEING_SHARE = 0.6
 SECOND_SHARE = 0.5
 """A further sheet is seen on at least this part of the boards that show the first."""
@@ -248,12 +250,18 @@ def _lines_of(images: Sequence[BoardImage], cameras: HeadCameras) -> _Lines:
         np.array([boards[i] for i, _, _ in found], dtype=np.int64),
         np.array([k for _, k, _ in found], dtype=np.int64),
         np.array([cameras.centre_mm(images[i].data.camera) for i, _, _ in found]).reshape(n, 3),
-        np.array([BOW_SHARE * _longer_side_mm(images[i]) for i, _, _ in found]),
+        np.array([_bow_mm(images[i], s) for i, _, s in found]),
     )
 
 
-def _longer_side_mm(image: BoardImage) -> float:
-    return float(np.ptp(image.data.view.points_board_mm, axis=0).max())
+def _bow_mm(image: BoardImage, sighting: Sighting) -> float:
+    print_mm = image.data.view.points_board_mm
+    side_mm = float(np.ptp(print_mm, axis=0).max())
+    pose = image.placed.sensor_from_board
+    ends = (sighting.ends_mm - pose.translation_mm) @ pose.rotation
+    middle = 0.5 * (print_mm.min(axis=0) + print_mm.max(axis=0))
+    far_mm = float(np.linalg.norm(ends[:, :2] - middle[:2], axis=1).max())
+    return BOW_SHARE * side_mm * max(1.0, (far_mm / (0.5 * side_mm)) ** 2)
 
 
 def _mm_per_px(image: BoardImage, sighting: Sighting) -> float:

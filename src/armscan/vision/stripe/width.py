@@ -12,7 +12,10 @@ from armscan.kernels.stripe_hessian import gaussian_taps, refine_candidates
 from armscan.vision.stripe.chains import strong_median
 from armscan.vision.stripe.level import ImageLevel
 
-SCALE_PX = 3.0
+SCALES_PX = (3.0, 8.0)
+RIDGE_POWER = 1.5
+"""Of the scale, by which second derivatives of ridges are compared (Lindeberg 1998): lines of sigma
+above 5 px are sought at the wider scale."""
 SAMPLE = 3000
 MEASURED = 300
 STRONG_SHARE = 0.4
@@ -37,13 +40,9 @@ def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLe
     level
         Background and threshold.
     """
-    sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
-    points = np.zeros((len(sample), 6))
-    n = refine_candidates(image, sample, len(sample), gaussian_taps(SCALE_PX), 0.0, points)
-    if n == 0:
+    points = _strongest(image, runs)
+    if not len(points):
         return FALLBACK_PX
-    points = points[:n]
-    points = points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
     points = points[:: max(len(points) // MEASURED, 1)]
     profiles = _across(image, points)
     half_widths, heights = _half_widths(profiles)
@@ -55,6 +54,23 @@ def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLe
     blur = STEP_PX**2 / 3.0
     sigma = np.sqrt(max((fwhm / FWHM_PER_SIGMA) ** 2 - blur, 0.0))
     return float(np.clip(sigma, *SIGMA_LIMITS_PX))
+
+
+def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
+    """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
+
+    A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
+    it would be taken for the line.
+    """
+    sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
+    best, best_strength = np.zeros((0, 6)), 0.0
+    for scale in SCALES_PX:
+        points = np.zeros((len(sample), 6))
+        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), 0.0, points)
+        strength = scale**RIDGE_POWER * strong_median(points[:n, 4])
+        if strength > best_strength:
+            best, best_strength = points[:n], strength
+    return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
 
 
 def _across(image: NDArray[np.float32], points: FloatArray) -> FloatArray:

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Boards that err more than they say are told from a sheet that is bowed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.laser.result import BoardStripes, LaserFit
+from sheet_rig import SheetRig, placed, thesis_rig
+
+SEEDS = range(8)
+N_BOARDS = 14
+
+
+def rig_of_many(bow_uu_mm: float = 0.0) -> SheetRig:
+    rng = np.random.default_rng(0)
+    tilts = rng.uniform(-30.0, 30.0, (N_BOARDS, 2))
+    depths = np.linspace(122.0, 150.0, N_BOARDS)
+    poses = tuple(
+        placed(float(x), float(y), float(z), (16.0, 12.0))
+        for (x, y), z in zip(tilts, depths, strict=True)
+    )
+    return replace(thesis_rig(bow_uu_mm), poses=poses, camera_covariance=1e-12 * np.eye(9))
+
+
+def overrated(board: BoardStripes, factor: float) -> BoardStripes:
+    """The same board that claims to be known better than it is."""
+    pose = board.sensor_from_board
+    claimed = replace(pose, covariance=pose.covariance / factor**2)
+    return replace(board, sensor_from_board=claimed)
+
+
+def fits(bow_uu_mm: float, factor: float, options: SheetOptions | None = None) -> list[LaserFit]:
+    found = []
+    rig = rig_of_many(bow_uu_mm)
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        boards = [overrated(board, factor) for board in rig.boards(rig.camera, rng)]
+        fit = calibrate_sheets(boards, rig.calibration(rig.camera), options)
+        assert isinstance(fit, LaserFit), fit
+        found.append(fit)
+    return found
+
+
+@pytest.mark.parametrize("options", [None, SheetOptions(is_bow_allowed=False)])
+def test_boards_that_claim_too_much_make_no_bow_and_are_charged_their_scatter(
+    options: SheetOptions | None,
+) -> None:
+    """Poses claimed 8 times better than they are: the sheet stays flat and the points' claim right.
+
+    Root mean square over claim averages 1 within four of its own standard errors: the boards' two
+    heights each, over all seeds, are 2 x 14 x 8 numbers, so 1 +- 0.047.
+    """
+    found = fits(0.0, 8.0, options)
+    assert not any(fit.sheets[0].sheet.is_bowed for fit in found)
+    ratios = [
+        f.sheets[0].points.fitted.rms_mm / f.sheets[0].points.fitted.claimed_rms_mm for f in found
+    ]
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=4 * 0.047)
+    told = [w for fit in found for w in fit.warnings if "times as much as their targets" in w]
+    factors = [float(w.split("err ")[1].split(" times")[0]) for w in told]
+    assert len(factors) == len(found)
+    assert np.median(factors) == pytest.approx(8.0, rel=0.25)
+
+
+def test_a_bow_is_a_bow_though_the_boards_scatter() -> None:
+    for fit in fits(0.15, 4.0):
+        assert fit.sheets[0].sheet.is_bowed
+        sheet = fit.sheets[0].sheet
+        truth_mm = 0.15 * (sheet.scale_mm / 20.0) ** 2
+        assert abs(sheet.bow_mm[0]) == pytest.approx(truth_mm, rel=0.25)
+
+
+def test_honest_boards_are_charged_nothing() -> None:
+    """No warning, and a bowed sheet with honest boards is explained by its bow alone."""
+    for fit in (*fits(0.0, 1.0), *fits(0.15, 1.0)):
+        assert not any("times as much as their targets" in warning for warning in fit.warnings)

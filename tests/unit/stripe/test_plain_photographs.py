@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What ordinary photographs do to a stripe: thick saturated lines, crops, patterns."""
+
+import numpy as np
+
+from armscan.records.exposure import Exposure
+from armscan.records.sensor_window import SensorWindow
+from armscan.simulation.stripe_image import StripeScene
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.level import measure_level
+from armscan.vision.stripe.ridge import find_candidates
+from armscan.vision.stripe.width import find_line_sigma
+from stripe_scenes import line
+
+
+def thick_line(seed: int, sigma_px: float) -> np.ndarray:
+    """A line that saturates over most of its width, among many narrow bright scratches."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:400, :500].astype(np.float64)
+    image = 20.0 + 2000.0 * np.exp(-0.5 * ((x - 240.0 - 0.05 * y) / sigma_px) ** 2)
+    for _ in range(60):
+        x0, y0 = rng.uniform(0, 480), rng.uniform(0, 380)
+        slant = rng.uniform(-1.0, 1.0)
+        near = np.abs(x - x0 - slant * (y - y0)) < 1.0
+        image += 60.0 * (near & (np.abs(y - y0) < 14.0))
+    image += rng.normal(0.0, 2.0, image.shape)
+    return np.clip(image, 0, 255).astype(np.uint8)
+
+
+def test_a_thick_saturated_line_sets_the_width_and_is_found() -> None:
+    """Sigma 5 px, eight times full scale: 20 px of white, where narrow filters see nothing."""
+    for seed in range(4):
+        image = thick_line(seed, 5.0)
+        plane = image.astype(np.float32)
+        level = measure_level(plane, None)
+        sigma = find_line_sigma(plane, find_candidates(plane, level), level)
+        assert sigma > 4.0, "not that of the scratches, about 1"
+        profile = extract_stripes(Exposure(image, "thick"))
+        good = profile.points_px[profile.is_accepted]
+        off = good[:, 0] - 240.0 - 0.05 * good[:, 1]
+        on_line = np.abs(off) < 3.0
+        assert on_line.sum() > 340
+        assert np.sqrt((off[on_line] ** 2).mean()) < 0.15
+
+
+def test_a_crop_gives_the_same_points_in_full_sensor_pixels() -> None:
+    image = StripeScene((line(75.0),), 320, 240).expose(1)
+    whole = extract_stripes(image)
+    part = extract_stripes(image.cropped(40, 30, 300, 220))
+    assert part.points_px.min(axis=0)[0] >= 40.0
+    inner = [p for p in part.points_px[part.is_accepted] if 60 < p[0] < 280 and 50 < p[1] < 200]
+    good = whole.points_px[whole.is_accepted]
+    nearest = [float(np.abs(good - point).sum(axis=1).min()) for point in inner]
+    assert len(inner) > 100
+    assert np.median(nearest) < 0.02, "the noise model is estimated from other pixels"
+
+
+def test_a_crop_of_a_binned_window_counts_sensor_pixels() -> None:
+    image = Exposure(np.zeros((50, 60), np.uint8), "w", window=SensorWindow(100, 200, 2))
+    crop = image.cropped(5, 7, 25, 37)
+    assert (crop.width_px, crop.height_px) == (20, 30)
+    assert crop.window == SensorWindow(110, 214, 2)

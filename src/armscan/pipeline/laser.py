@@ -141,10 +141,16 @@ def calibrate_sheets_from_pairs(
     for pair in pairs:
         images = [image for image in pair if image is not None]
         check_sizes(images, cameras.model(pair[0].camera))
-    places = {
-        p.name: p
-        for p in _found_placements(pairs, target, cameras, options, cache=cache, progress=progress)
-    }
+    places: dict[str, Placement] = {}
+    answers: list[TargetView | FitFailure] = []
+    for place in _found_placements(pairs, target, cameras, options, cache=cache, progress=progress):
+        places[place.name] = place
+        answers += [
+            item if isinstance(item, FitFailure) else item[1] for item in place.seen.values()
+        ]
+        wrong = wrong_count(answers, target)
+        if wrong is not None:
+            return wrong
     shown = [pair for pair in pairs if _seen(pair, places) is not None]
 
     def stripes_of(
@@ -181,10 +187,6 @@ def calibrate_sheets_from_pairs(
         if isinstance(found, FitFailure)
     ]
     if not boards:
-        seen = [item for place in places.values() for item in place.seen.values()]
-        wrong = wrong_count([item for item in seen if isinstance(item, FitFailure)], target)
-        if wrong is not None and not shown:
-            return wrong
         return FitFailure(
             f"no board with stripes in any of {len(pairs)} images; {skipped[0].source}: "
             f"{skipped[0].reason}",

@@ -56,9 +56,12 @@ from armscan.storage.recording_reader import read_recording
 from armscan.storage.recording_session import SESSION_FILE
 from armscan.storage.simulated import are_simulated
 from armscan.storage.stereo_files import read_stereo_calibration
+from armscan.vision.targets.definition import Target
 from armscan.vision.targets.specification import parse_target
 
 REQUESTED = "left out by request"
+COUNTS = ("columns", "rows")
+SIZES = ("square_mm", "pitch_mm")
 SCAN_TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
 
 
@@ -137,6 +140,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     if isinstance(fit, FitFailure):
         refuse(files, _refused(request, images, camera.provenance, progress), fit)
     fit = replace(fit, skipped=(*images.left_out, *fit.skipped))
+    fit = replace(fit, warnings=(*fit.warnings, *_other_size(target, camera.provenance)))
     nonsense = reasons_to_refuse(fit)
     options = request.options
     provenance = new_provenance(
@@ -171,7 +175,9 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     files.refused_page.unlink(missing_ok=True)
     written = (files.document, files.observations, files.page)
     summary = laser_summary(fit, written, is_simulated=is_simulated)
-    return replace(summary, forced=provenance.forced)
+    notes = tuple(sentence(warning) for warning in images.warnings)
+    warnings = (*notes, *summary.warnings)
+    return replace(summary, warnings=warnings, forced=provenance.forced)
 
 
 def _refused(
@@ -195,6 +201,21 @@ def _refused(
         {exposure.source: exposure for exposure in images.exposures},
         provenance,
         is_simulated=are_simulated(images.paths),
+    )
+
+
+def _other_size(target: Target, parent: Provenance) -> tuple[str, ...]:
+    """Warn of a board of the camera's kind and count that is of another size."""
+    kind = type(target).__name__
+    known = dict(parent.options)
+    same = all(known.get(f"{kind}.{name}") == str(getattr(target, name)) for name in COUNTS)
+    name = next((name for name in SIZES if hasattr(target, name)), "")
+    size = known.get(f"{kind}.{name}")
+    if not same or size is None or float(size) == target.size_mm:
+        return ()
+    return (
+        f"the camera was calibrated with a board of {float(size):g} mm from point to point, this "
+        f"one is said to have {target.size_mm:g} mm: is it the same board?",
     )
 
 

@@ -41,7 +41,7 @@ MOST_BYTES = 256 * 2**20
 """The folder is kept below this: some thousand images; what was not used for longest goes."""
 STALE_SECONDS = 3600.0
 """A temporary file that is older was left by a program that was stopped."""
-CODE = ("vision", "kernels", "records", "geometry")
+CODE = ("vision", "kernels", "records", "geometry", "models")
 """Packages whose source an entry depends on."""
 TAG = """Signature: 8a477f597d28d172789f06886806bc55
 # Target and stripe points that armscan found in images, so that the next run is quicker.

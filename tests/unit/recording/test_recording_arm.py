@@ -164,6 +164,7 @@ BAD_ARM = {
     "other digits": (ARM.replace("900,", "\u0669\u0660\u0660,"), "in column x_mm is no number"),
     "infinity": (ARM.replace("901", "infinity"), "'infinity' in column x_mm is no number"),
     "too large": (ARM.replace("901", "1e999"), "'1e999' in column x_mm is no number"),
+    "10 km away": (ARM.replace("901", "1.1e7"), "line 3: 1.1e+07 in column x_mm is beyond"),
     "text": (ARM.replace("901", "lost"), "'lost' in column x_mm is no number"),
     "order not said": (ARM.replace("qw,qx,qy,qz", "q1,q2,q3,q4"), "order of the quaternion"),
     "no units": (ARM.replace("x_mm,y_mm,z_mm,qw,qx,qy,qz", "x,y,z,w,a,b,c"), "lack units"),

@@ -81,6 +81,12 @@ def set_value(*path: Any) -> Callable[[Any], None]:
         (set_value("hand_eye", "n_postures", 12.0), "hand_eye.n_postures"),
         (set_value("hand_eye", "offset_mm", 1.0), "hand_eye.offset_mm"),
         (set_value("latency_ns", 1.5), "latency_ns"),
+        (set_value("latency_ns", 10**12 + 1), "latency_ns"),
+        (
+            set_value("hand_eye", "tool_from_sensor", "translation_tool_mm", 0, 1.1e7),
+            "hand_eye.tool_from_sensor.translation_tool_mm",
+        ),
+        (set_value("sensor", "camera", "intrinsics", "fx_px", 1.1e7), "fx_px"),
         (set_value("schema_version", 2), "update armscan"),
         (
             set_value("hand_eye", "tool_from_sensor", "rotation_rows", 0, [1, 0, 0]),

@@ -45,11 +45,13 @@ def _reasons(sheet: SheetFit, largest_rms_px: float) -> tuple[str, ...]:
             "limit"
         )
     low, high = sheet.calibration.depth_range_mm
-    miss = sheet.points.left_out_rms_mm / (0.5 * (low + high))
-    if math.isfinite(miss) and miss > LARGEST_MISS:
+    alone = sheet.points.left_out_rms_mm
+    rms_mm = alone if math.isfinite(alone) else sheet.points.fitted.rms_mm
+    miss = rms_mm / (0.5 * (low + high))
+    if miss > LARGEST_MISS:
+        others = " if the sheet rests on the other boards" if math.isfinite(alone) else ""
         found.append(
-            f"points on a board lie {sheet.points.left_out_rms_mm:.3g} mm (rms) off it if the "
-            f"sheet rests on the other boards, {100.0 * miss:.1f} % of the depth: "
-            f"{100.0 * LARGEST_MISS:.0f} % is the limit"
+            f"points on a board lie {rms_mm:.3g} mm (rms) off it{others}, {100.0 * miss:.1f} % of "
+            f"the depth: {100.0 * LARGEST_MISS:.0f} % is the limit"
         )
     return tuple(found)

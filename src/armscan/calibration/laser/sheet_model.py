@@ -156,18 +156,24 @@ def choose_model(
         flat.sheets[0], False, noise, plane_test, plane_test, "", noise.sigma_factor
     )
 
+    n_boards = len(np.unique(observations.board))
+
     def plane(decision: str) -> SheetModel | FitFailure:
         model = replace(plane_model, decision=decision)
+        if n_boards < options.min_boards_for_bow:
+            # the test of so few heights has no power: their likeliest scatter is taken as it is
+            scatter = board_scatter(alone, flat, errors, noise)
+            return _with_scattered_boards(model, scatter.factor, alone, errors, options)
         return _with_explained_stripes(model, alone, errors, options)
 
     if plane_test.p_value >= options.lack_of_fit_p:
         return plane(f"a plane is enough ({test})")
-    n_boards = len(np.unique(observations.board))
     if n_boards < options.min_boards_for_bow:
-        return plane(
+        decision = (
             f"a plane does not explain the stripes ({test}), but {n_boards} boards cannot tell a "
             f"bow from their own errors: {options.min_boards_for_bow} are needed"
         )
+        return plane(decision)
     return _bow_or_boards(plane_model, flat, alone, errors, options)
 
 
@@ -208,7 +214,7 @@ def _bow_or_boards(
     final = lack_of_fit(alone, bowed, noise)
     decision = (
         f"bow fitted: the plane does not explain the stripes ({test}), the bow does better "
-        f"({likelihood}); left F {final.f_ratio:.2f}, p {final.p_value:.2g}"
+        f"({likelihood})"
     )
     model = SheetModel(
         bowed.sheets[0], True, noise, plane_test, final, decision, noise.sigma_factor

@@ -39,6 +39,10 @@ from armscan.geometry.fitting import fit_plane
 from armscan.models.light_sheet import BOW_TERMS, LightSheet
 
 MAX_BOW_CONDITION = 1e7
+NO_SPARE = 2
+"""Boards of which two straight stripes fix a plane but for one height."""
+MOST_OF_TWO = 5.0
+"""Largest scatter that is charged to them; more is a board in the wrong place, and told as such."""
 MAX_RAISES = 10
 FAN_ROUNDS = 5
 FAN_SETTLED = 1e-3
@@ -160,10 +164,11 @@ def choose_model(
 
     def plane(decision: str) -> SheetModel | FitFailure:
         model = replace(plane_model, decision=decision)
-        if n_boards < options.min_boards_for_bow:
-            # the test of so few heights has no power: their likeliest scatter is taken as it is
+        if n_boards == NO_SPARE:
+            # one height is left over, and no test of it has power: its likeliest cause is taken
             scatter = board_scatter(alone, flat, errors, noise)
-            return _with_scattered_boards(model, scatter.factor, alone, errors, options)
+            factor = min(scatter.factor, MOST_OF_TWO)
+            return _with_scattered_boards(model, factor, alone, errors, options)
         return _with_explained_stripes(model, alone, errors, options)
 
     if plane_test.p_value >= options.lack_of_fit_p:

@@ -6,9 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
+from armscan.calibration.laser.board_scatter import board_scatter
+from armscan.calibration.laser.calibrate import calibrate_sheets, sight_on_boards
+from armscan.calibration.laser.cameras import HeadCameras
+from armscan.calibration.laser.lack_of_fit import stripe_noise
+from armscan.calibration.laser.naming import NamedStripes, name_stripes
+from armscan.calibration.laser.observations import collect_observations, placement_covariances
 from armscan.calibration.laser.options import SheetOptions
 from armscan.calibration.laser.result import BoardStripes, LaserFit
+from armscan.calibration.laser.sheet_model import start_sheet
+from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.models.light_sheet import LightSheet
 from sheet_rig import SheetRig, placed, thesis_rig
 
 SEEDS = range(8)
@@ -78,3 +86,25 @@ def test_honest_boards_are_charged_nothing() -> None:
     """No warning, and a bowed sheet with honest boards is explained by its bow alone."""
     for fit in (*fits(0.0, 1.0), *fits(0.15, 1.0)):
         assert not any("times as much as their targets" in warning for warning in fit.warnings)
+
+
+def test_a_stripe_of_which_nothing_is_left_has_no_say() -> None:
+    """Outliers may leave two points of a stripe, which have no slope of their own."""
+    rig = rig_of_many()
+    cameras = HeadCameras.of(rig.calibration(rig.camera))
+    boards = rig.boards(rig.camera, np.random.default_rng(1))
+    images = sight_on_boards(boards, cameras, SheetOptions()).images
+    named = name_stripes(images, cameras.covariance, SheetOptions())
+    assert isinstance(named, NamedStripes)
+    every = collect_observations(images, named)
+    few = every.select((every.stripe != 0) | (np.arange(len(every)) < 2))
+    start = start_sheet("A", few, images)
+    assert isinstance(start, LightSheet)
+    errors = CommonErrors(placement_covariances(images), cameras.covariance)
+    flat = solve_sheets(few, [start], errors, [False])
+    assert isinstance(flat, SheetSolution)
+    noise = stripe_noise(few, flat.remaining_px)
+    without = few.select(few.stripe != 0)
+    found = board_scatter(few, flat, errors, noise)
+    assert np.isfinite(found.log_likelihood)
+    assert found == board_scatter(without, flat, errors, noise)

@@ -20,6 +20,8 @@ from armscan.geometry.arrays import FloatArray
 
 SHAPES = 3
 """Offset, slope and curvature of a stripe; a board's pose makes the first two."""
+LEAST_POINTS = 8
+"""With fewer points left of it a stripe has no shape."""
 FACTORS = np.geomspace(1.0, 100.0, 81)
 
 
@@ -63,7 +65,8 @@ def board_scatter(
     by_camera = np.einsum("ni,nij->nj", by_point, observations.by_camera)
     moved = solution.common[len(solution.common) - errors.n_camera :]
     residual = residual + by_camera @ (square_root(errors.camera_covariance) @ moved)
-    stripes = np.unique(observations.stripe)
+    numbers, counts = np.unique(observations.stripe, return_counts=True)
+    stripes = numbers[counts >= LEAST_POINTS]
     n = SHAPES * len(stripes)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
     log_likelihood = np.zeros(len(FACTORS))

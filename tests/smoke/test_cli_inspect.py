@@ -187,3 +187,17 @@ def test_words_of_small_refusals(clouds: Path, fails: Fails, tmp_path: Path) -> 
     folder = tmp_path / "x"
     said = fails("simulate", "thesis-single", "ball", "-o", folder, "--preset=bad")
     assert "'bad' is not one of" in said and "Value error" not in said
+
+
+def test_a_plane_of_one_sheet_in_the_sensor_frame_says_nothing_and_is_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All points lie on the light sheet by construction, whatever it met."""
+    across = np.random.default_rng(1).uniform(-20.0, 20.0, (400, 2))
+    points = np.column_stack([across, 300.0 + 0.01 * across[:, 0]])
+    for frame, is_told in (("Sensor", True), ("Base", False)):
+        path = tmp_path / f"{frame}.ply"
+        path.write_bytes(ply_bytes(cloud_of(points, frame=frame)))  # type: ignore[arg-type]
+        assert main(["inspect", "plane", str(path), "--json"]) == 0
+        said = json.loads(capsys.readouterr().out)["warnings"]
+        assert any("light sheet" in warning for warning in said) == is_told

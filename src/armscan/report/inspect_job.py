@@ -104,8 +104,18 @@ def run_plane_inspection(
     )
     inputs = (request.cloud, *(() if plate is None else (plate,)))
     report = plane_report(found, cloud)
-    report = replace(report, warnings=(*weak, *report.warnings))
+    report = replace(report, warnings=(*weak, *_flat_by_itself(cloud), *report.warnings))
     return _finished(request, cloud, report, inputs)
+
+
+def _flat_by_itself(cloud: PointCloud) -> tuple[str, ...]:
+    """Warn of points of one light sheet in the Sensor frame: they are flat whatever they met."""
+    if cloud.frame != "Sensor" or len(np.unique(cloud.sheet)) > 1:
+        return ()
+    return (
+        "all points lie on one light sheet, which is flat itself: this says nothing of the form of "
+        "the object; scan it with the arm, or with lines of several sheets",
+    )
 
 
 def run_sphere_inspection(request: InspectRequest, diameter_mm: float) -> Summary:

@@ -221,7 +221,7 @@ def _card(sheet: SheetFit) -> Card:
     low, high = sheet.calibration.depth_range_mm
     return Card(
         f"Sheet {sheet.name}",
-        f"{significant(sheet.calibration.rms_mm)} mm rms",
+        f"{significant(sheet.points.fitted.rms_mm)} mm rms off the boards",
         f"{sheet.calibration.n_boards} boards, Z {low:.0f} to {high:.0f} mm, "
         f"{'bowed' if sheet.sheet.is_bowed else 'plane'}",
     )

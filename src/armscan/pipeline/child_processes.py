@@ -61,6 +61,8 @@ def in_processes(
             results = pool.map(work, items)
         yield from results
     except BaseException as error:
+        # the pool forgets what waits before its processes end: it cannot fail what is cancelled
+        pool.shutdown(wait=False, cancel_futures=True)
         held.close()
         if isinstance(error, BrokenProcessPool):
             raise EstimationError(

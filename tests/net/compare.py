@@ -20,7 +20,7 @@ N_SAMPLES = 12
 VOLATILE = re.compile(
     r"(^|_)(created|created_utc|time_utc|date|version|host|hostname|python|platform|elapsed|"
     r"elapsed_s|duration_s|seconds|sha256|hash|document_id|parent_ids|command|id|hashes|written_by|"
-    r"image_hashes|digest|found|size_bytes|bytes)$"
+    r"image_hashes|digest|size_bytes|bytes)$"
 )
 MASKS = (
     (re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d(\.\d+)?)?(Z|\+\d\d:?\d\d| UTC)?"), "<time>"),
@@ -43,7 +43,7 @@ def masked(text: str, workspace: Path) -> str:
 
 def plain(value: Tree, workspace: Path, key: str = "") -> Tree:
     """The same tree without what changes by itself; long lists of numbers are summed up."""
-    if VOLATILE.search(key):
+    if VOLATILE.search(key) or (key == "found" and "numpy" in str(value)):
         return "<volatile>"
     if isinstance(value, dict):
         return {str(k): plain(v, workspace, str(k)) for k, v in value.items()}
@@ -51,12 +51,10 @@ def plain(value: Tree, workspace: Path, key: str = "") -> Tree:
         return masked(value, workspace)
     if isinstance(value, list):
         array = as_array(value)
-        if array is not None and array.size > KEPT_WHOLE:
-            return summed_up(array)
-        return [plain(v, workspace) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return repr(value)
-    return value
+        is_long = array is not None and array.size > KEPT_WHOLE
+        return summed_up(array) if is_long else [plain(v, workspace) for v in value]
+    is_odd = isinstance(value, float) and not math.isfinite(value)
+    return repr(value) if is_odd else value
 
 
 def as_array(value: list[Tree]) -> np.ndarray | None:

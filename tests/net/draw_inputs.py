@@ -290,7 +290,7 @@ def write_tables(folder: Path, random: np.random.Generator) -> None:
         seen = (markers[part] - [5.0 * k, 3.0, 0]) @ turn.T + [0, 0, 200.0]
         seen += 0.01 * random.normal(size=seen.shape)
         table(folder / f"view{k + 1}.csv", seen, ",", "x_mm,y_mm,z_mm\n")
-        table(folder / f"view{k + 1}.xyz", seen + [0, 0, 1.0], " ")
+        table(folder / f"view{k + 1}.xyz", seen + np.array([0, 0, 1.0]), " ")
     for name, turn, shift in (("before", 0.0, 0.0), ("after", 0.7, 250.0)):
         seen = markers @ cv2.Rodrigues(np.array([0.05, 0.0, 1.0]) * turn)[0].T + [shift, 0, 0]
         seen = seen + 0.01 * random.normal(size=seen.shape)

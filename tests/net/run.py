@@ -14,8 +14,8 @@ import contextlib
 import io
 import json
 import os
-import shlex
 import re
+import shlex
 import shutil
 import sys
 import tempfile
@@ -101,8 +101,7 @@ def run_group(name: str, root: Path) -> dict[str, Tree]:
     prepare(workspace)
     results: dict[str, Tree] = {}
     with contextlib.chdir(workspace):
-        for line in GROUPS[name].strip().splitlines():
-            case, _, command = line.partition(" | ")
+        for case, command in GROUPS[name]:
             start = time.perf_counter()
             found = run_command(shlex.split(command), workspace)
             results[case] = {"~command": command, **found}
@@ -119,10 +118,10 @@ def make_documents() -> None:
         shutil.copytree(INPUTS, workspace, ignore=shutil.ignore_patterns("documents"))
         (workspace / "documents").mkdir()
         with contextlib.chdir(workspace):
-            for line in DOCUMENTS.strip().splitlines():
-                result = run_command(shlex.split(line), workspace)
+            for _, command in DOCUMENTS:
+                result = run_command(shlex.split(command), workspace)
                 if result["exit"] != 0:
-                    raise SystemExit(f"{line}\n{result}")
+                    raise SystemExit(f"{command}\n{result}")
         shutil.rmtree(INPUTS / "documents", ignore_errors=True)
         for path in workspace.rglob("documents/*.ply"):
             thin(path)

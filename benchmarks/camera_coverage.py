@@ -18,14 +18,14 @@ import cv2
 import numpy as np
 from scipy import stats
 
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.models.camera import CameraModel
+from armscan.vision.targets.target import Chessboard, CircleGrid
+from camera_scene import CAMERA, Scene, make_views, normalised_error
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.models.camera import CameraModel
-from armscan.vision.targets.definition import Chessboard, CircleGrid
-from camera_scene import CAMERA, Scene, make_views, normalised_error
 
 WIDE = CameraModel(533.0, 534.0, 342.0, 236.0, np.array([-0.29, 0.11, 1e-3, 0.0, 0.0]), 640, 480)
 HEAD = CameraModel(

@@ -24,16 +24,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
+from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_views
+from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_views
 from armscan.records.exposure import Exposure
 from armscan.storage.images import read_exposure
-from armscan.vision.targets.circle_centres import correct_centres
-from armscan.vision.targets.definition import Chessboard, CircleGrid
+from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, TargetView
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
 FOLDS = 5

@@ -20,15 +20,14 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.flat_target import Lighting, RenderedTarget, render_flat_target
-from armscan.simulation.optics import RenderCamera, add_noise
-from armscan.vision.targets.circle_centres import correct_centres
+from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.optics.camera import RenderCamera, add_noise
 from armscan.vision.targets.circle_edges import measure_circles
-from armscan.vision.targets.definition import CircleGrid
+from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.ellipse_algebraic import thesis_centres
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import CircleGrid, TargetView
 
 TARGET = CircleGrid(13, 9, 3.75)
 DISTORTION = np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0])

@@ -41,16 +41,16 @@ from pathlib import Path
 import numpy as np
 from scipy.special import betaincinv
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from armscan.reconstruction.identify_cross import CrossNamer
-from armscan.reconstruction.identify_rows import RowNamer
-from armscan.reconstruction.named_profile import NamedProfile, NameFate
-from armscan.reconstruction.stripe_namer import StripeNamer
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.labels import LabelledProfile, LabelStatus, StripeLabeller
+from armscan.reconstruction.row_rule import RowLabeller
 from cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+
 LEAST_POINTS = 20
-RULES = {"thesis": RowNamer, "ours": CrossNamer}
+RULES = {"thesis": RowLabeller, "ours": CrossLabeller}
 CONFIDENCE = 0.95
 
 
@@ -76,9 +76,9 @@ class Tally:
     singles: int = 0
     seconds: float = 0.0
 
-    def add(self, exposure: CrossExposure, named: NamedProfile, alone: list[int]) -> None:
+    def add(self, exposure: CrossExposure, named: LabelledProfile, alone: list[int]) -> None:
         """Take in one exposure; ``alone`` points has each laser's stripe if it alone is on."""
-        is_named = named.fate == int(NameFate.NAMED)
+        is_named = named.fate == int(LabelStatus.NAMED)
         is_right = is_named & (named.sheet == exposure.true_sheet)
         for k, n_points in enumerate(alone):
             n_right = int((is_right & (named.sheet == k)).sum())
@@ -120,7 +120,7 @@ def seen_alone(stroke: CrossStroke) -> list[list[int]]:
 
 def scanned(
     stroke: CrossStroke,
-    namer: StripeNamer,
+    namer: StripeLabeller,
     alone: list[list[int]],
     has_arm: bool,
     drop: int,

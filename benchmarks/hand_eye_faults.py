@@ -22,23 +22,25 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import (
+    PlateReference,
+    PosedStripe,
+    hand_eye_difference,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.euler import euler_from_rotations, rotations_from_euler
-from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import euler_from_rotations, rotations_from_euler
+from armscan.geometry.shapes import Plane
 from plate_rig import PLATE_CENTRE, PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, RigNoise
 from plate_rig import good_postures as postures_of
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
 
 N = 12
 FORM_MM = 0.2

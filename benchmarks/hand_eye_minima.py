@@ -22,26 +22,22 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armscan.calibration.hand_eye import search, sphere_estimate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import HandEyeOptions, condense, straight_stripes
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.search import descend_all
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose, Sensor, Tool
+from plate_rig import TOOL_FROM_SENSOR, PlateRig, Postures, RigNoise
+from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from scipy.spatial.transform import Rotation
-
-from armscan.calibration.hand_eye import plate_search, sphere_start
-from armscan.calibration.hand_eye.many_starts import descend_all
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
-from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_sections import find_sections
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Sensor, Tool
-from armscan.geometry.poses import Pose
-from plate_rig import TOOL_FROM_SENSOR, PlateRig, Postures, RigNoise
-from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 KINDS = ("varied", "hardly turned", "one axis", "four to six")
 FOUND = 1.01
@@ -79,8 +75,8 @@ def sphere_set(
     ]
     stripes = rig.stripes(poses, rng)
     sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, SphereOptions())
-    place = sphere_start._placing(sections, 0.5 * DIAMETER_MM)
-    states = sphere_start.start_candidates(sections, 0.5 * DIAMETER_MM)
+    place = sphere_estimate._placing(sections, 0.5 * DIAMETER_MM)
+    states = sphere_estimate.start_candidates(sections, 0.5 * DIAMETER_MM)
     rotations = np.array([state.tool_from_sensor.rotation for state in states])
     others = np.array([[*s.tool_from_sensor.translation_mm, *s.centre_mm] for s in states])
     scale = np.array([0.007] * 3 + [1.0] * 6)
@@ -116,8 +112,8 @@ def plate_set(
     stripes, plate = rig.draw(int(rng.integers(1 << 30)))
     options = HandEyeOptions()
     nodes = condense(stripes, straight_stripes(stripes, options), 3)
-    place, scale = plate_search._placing(nodes, plate.plane), plate_search._scale(nodes)
-    found = plate_search.minima_from_everywhere(nodes, plate.plane)
+    place, scale = search._placing(nodes, plate.plane), search._scale(nodes)
+    found = search.minima_from_everywhere(nodes, plate.plane)
     rotations = np.array([pose.rotation for pose in found])
     shifts = np.array([pose.translation_mm for pose in found])
     ours = descend_all(place, rotations, shifts, STEPS, scale)[2].min()

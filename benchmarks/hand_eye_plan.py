@@ -15,17 +15,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.simulation.aim import Aim
-from armscan.simulation.hand_eye_plan import PLAN
-from armscan.simulation.head import Head, build_head
-from armscan.simulation.sheet_middle import sheet_middle_mm
+from armscan.simulation.arm.hand import HeadOrientation
+from armscan.simulation.head import Head, build_head, sheet_middle_mm
+from armscan.simulation.scenes import PLAN
 
 POINTS = 21
 SCAN_POINT_MM = np.array([0.0, 0.0, 137.0])
 LEAST_LENGTH_MM = 50.0
 
 
-def stripe(head: Head, aim: Aim) -> tuple[np.ndarray, np.ndarray]:
+def stripe(head: Head, aim: HeadOrientation) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) of the stripe in Sensor that the camera sees, and the plate's normal there."""
     laser = head.lasers[0]
     normal = aim.rotation()[2]
@@ -38,7 +37,7 @@ def stripe(head: Head, aim: Aim) -> tuple[np.ndarray, np.ndarray]:
     return points[((pixels > 0.0) & (pixels < size)).all(axis=1) & (reach > 0.0)], normal
 
 
-def bound(head: Head, plan: tuple[Aim, ...]) -> np.ndarray | None:
+def bound(head: Head, plan: tuple[HeadOrientation, ...]) -> np.ndarray | None:
     """(6, 6) covariance of turns (rad) and shifts (mm) in Sensor; None if a stripe is short."""
     rows, places, groups, along = [], [], [], []
     for k, aim in enumerate(plan):
@@ -69,7 +68,7 @@ def at_scan_point(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(np.diag(change @ covariance @ change.T))
 
 
-def cost(head: Head, plan: tuple[Aim, ...]) -> float:
+def cost(head: Head, plan: tuple[HeadOrientation, ...]) -> float:
     """Root mean square over the scan point's three errors and three turns at 40 mm."""
     covariance = bound(head, plan)
     if covariance is None:
@@ -78,16 +77,16 @@ def cost(head: Head, plan: tuple[Aim, ...]) -> float:
     return float(np.sqrt(np.mean(np.square([*at_scan_point(covariance), *turns]))))
 
 
-def drawn(rng: np.random.Generator, steepest_deg: float = 45.0) -> Aim:
+def drawn(rng: np.random.Generator, steepest_deg: float = 45.0) -> HeadOrientation:
     """A posture tilted by 30-45 degrees to any side that laser and camera can stand."""
     while True:
         tilt, azimuth = rng.uniform(30.0, steepest_deg), rng.uniform(0.0, 2.0 * np.pi)
         x, y = tilt * np.cos(azimuth), tilt * np.sin(azimuth)
         if -50.0 < x < 12.0:
-            return Aim(x, y, rng.uniform(-180.0, 180.0), rng.uniform(122.0, 160.0))
+            return HeadOrientation(x, y, rng.uniform(-180.0, 180.0), rng.uniform(122.0, 160.0))
 
 
-def show(name: str, head: Head, plan: tuple[Aim, ...]) -> None:
+def show(name: str, head: Head, plan: tuple[HeadOrientation, ...]) -> None:
     covariance = bound(head, plan)
     if covariance is None:
         print(f"{name:<22} a stripe is out of view")

@@ -20,18 +20,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_difference
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import FloatArray
 from plate_bound import cramer_rao, plain_least_squares
 from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
 
 REGION = float(chi2.ppf(0.95, 6))
 

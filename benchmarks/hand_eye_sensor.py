@@ -24,27 +24,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
-from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
-from armscan.calibration.hand_eye.plate_residuals import (
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.estimate import PlateFit, fit_plate
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateReference,
     PlateState,
+    PosedStripe,
+    condense,
     hand_eye_difference,
     residual_by_sensor,
+    straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.scanner import HandEyeCalibration, ScannerCalibration
 from calibrated_head import CalibratedHead
 from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR
 from sheet_rig import PROVENANCE
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
 
 OPTIONS = HandEyeOptions()
 N_CAMERA = 9

@@ -17,20 +17,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import chi2
+
+from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions
+from armscan.calibration.hand_eye.thesis import TwoStepHandEye, calibrate_in_two_steps
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.rotations import vector_from_rotation
+from sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from scipy.stats import chi2
-
-from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_two_step import TwoStepHandEye, calibrate_in_two_steps
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import vector_from_rotation
-from sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
 
 REGION = float(chi2.ppf(0.95, 6))
 OPTIONS = SphereOptions(nodes_per_stripe=10)

@@ -23,11 +23,11 @@ from typing import cast
 import cv2
 import numpy as np
 
-from armscan.devices.twin import Preset
+from armscan.devices.sources import Preset
 from armscan.pipeline.head_demo import HeadDemo, run_head
-from armscan.pipeline.naming_truth import NamingErrors
-from armscan.pipeline.render_pool import TwinName
-from armscan.report.head_demo_data import fraction_within, head_data
+from armscan.pipeline.simulate import TwinName
+from armscan.pipeline.truth import NamingErrors
+from armscan.report.demo import fraction_within, head_data
 
 HUGE = 1e30
 

@@ -27,26 +27,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import armscan.pipeline.scan as scan_module
-from armscan.devices.twin import TwinScene
+from armscan.devices.sources import TwinScene
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Pose
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.scanner import ScannerCalibration
 from armscan.pipeline.measure import LitProfile
-from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
 from armscan.pipeline.verify import Measured, verify_on_ball
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.stations import BALL_DIAMETER_MM
+from armscan.simulation.objects.fixtures import BALL_DIAMETER_MM
+from armscan.simulation.shots import TwinScan
 from armscan.simulation.twin import SimulatedInstrument
-from armscan.simulation.twin_scan import TwinScan
-from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
 
 NOISE_PX, OUTLIERS = 0.08, 0.01
 INSTRUMENT_SEED = 1

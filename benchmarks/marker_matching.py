@@ -21,13 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.markers.alignments import Matched
+from armscan.markers.match_3d import match_markers
+from armscan.markers.thesis import match_after_thesis
+from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
+
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.markers.match_3d import match_markers
-from armscan.markers.match_result import Matched
-from armscan.markers.thesis_matching import match_after_thesis
-from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
 LIMIT_MM = 8.0 * NOISE_MM
 COMMON = ((8, 1), (12, 4), (6, 4), (5, 4), (4, 4), (3, 4))

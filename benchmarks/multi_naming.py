@@ -33,14 +33,13 @@ from scipy.special import betaincinv
 
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
-from armscan.reconstruction.identify_stereo import name_stripes
-from armscan.reconstruction.stereo_options import StereoNamingOptions
-from armscan.reconstruction.stereo_residuals import (
+from armscan.reconstruction.epipolar import (
     RightStripes,
     find_crossings,
     possible_sheets,
     project_on_sheets,
 )
+from armscan.reconstruction.label_stereo import StereoLabelOptions, name_stripes
 from armscan.records.profile import Profile
 from stereo_head import StereoHead
 from stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
@@ -122,7 +121,7 @@ class Tally:
 
 
 def by_votes(
-    left: Profile, right: Profile, sensor: SensorCalibration, options: StereoNamingOptions
+    left: Profile, right: Profile, sensor: SensorCalibration, options: StereoLabelOptions
 ) -> IntArray:
     """The thesis's way."""
     row = np.flatnonzero(left.is_accepted)[::EVERY]
@@ -144,7 +143,7 @@ def by_votes(
 
 def tallied(kind: str, noise: Noise, seeds: range, head: StereoHead) -> Tally:
     """Scenes of one kind, one a seed."""
-    tally, options = Tally(), StereoNamingOptions()
+    tally, options = Tally(), StereoLabelOptions()
     for seed in seeds:
         rng = np.random.default_rng([seed, KINDS.index(kind)])
         sensor = head.drawn_calibration(rng)

@@ -28,7 +28,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.stereo_measure import measure_stereo
+from armscan.reconstruction.stereo_points import measure_stereo
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from sheet_rig import PROVENANCE

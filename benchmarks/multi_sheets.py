@@ -33,19 +33,19 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
+from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.labels import SheetAssignment, name_stripes
+from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
+from armscan.calibration.sheets.stripes_on_board import observe_board_stripes
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.models.calibration import CameraCalibration
+from armscan.models.two_views import StereoCalibration
+from fan_rig import FanRig, LaserTruth, fan_rig
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.naming import NamedStripes, name_stripes
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import LaserFit, PointUse
-from armscan.calibration.laser.sightings import sight_stripes
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.rotation import vector_from_rotation
-from armscan.models.calibration import CameraCalibration
-from armscan.models.stereo import StereoCalibration
-from fan_rig import FanRig, LaserTruth, fan_rig
 
 Calibration = CameraCalibration | StereoCalibration
 GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
@@ -71,9 +71,9 @@ def name_one(
     calibration = cameras_of(rig, rng)
     boards, truth = rig.boards(calibration, rng, dropped=dropped, n_strays=n_strays)
     cameras = HeadCameras.of(calibration)
-    images = [sight_stripes(board, cameras, SheetOptions()) for board in boards]
+    images = [observe_board_stripes(board, cameras, SheetOptions()) for board in boards]
     names = name_stripes(images, cameras.covariance, SheetOptions(n_sheets=11))
-    if not isinstance(names, NamedStripes):
+    if not isinstance(names, SheetAssignment):
         return "refused", 0, 0
     differences: list[int] = []
     n_true = n_stray = 0

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from laser_sets import SETS
 
+import armscan.jobs.sheets
 import armscan.pipeline.laser
-import armscan.report.laser_job
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.geometry.estimate import FitFailure
-from armscan.storage.calibration_files import sensor_document
+from armscan.storage.documents import sensor_document
 
 ON_BOARD = {"USED", "OFF_SHEET", "UNNAMED", "OUTLYING_BOARD"}
 
@@ -36,7 +36,7 @@ class Kept:
 
     def listen(self) -> None:
         """Note the arguments of the estimator and of the document."""
-        pipeline, job = armscan.pipeline.laser, armscan.report.laser_job
+        pipeline, job = armscan.pipeline.laser, armscan.jobs.sheets
         self.estimate, self.document = pipeline.calibrate_sheets, job.sensor_calibration
 
         def estimate(*arguments: Any, **options: Any) -> Any:
@@ -65,7 +65,7 @@ def run(result: dict[str, Any], name: str, *arguments: str) -> bool:
 def board_arrays(fit: Any) -> dict[str, Any]:
     """Boards and stripe points of a fit, flat."""
     images = fit.images
-    from armscan.calibration.laser.result import PointUse
+    from armscan.calibration.sheets.result import PointUse
 
     labels = np.concatenate([[PointUse(int(u)).name for u in image.use] for image in images])
     counts = [len(image.profile) for image in images]

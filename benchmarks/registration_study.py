@@ -27,22 +27,21 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
 from scipy.stats import chi2
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import PointPairs, closed_form_pose, register_points
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.markers.join_views import JoinedViews, join_views
-from armscan.markers.thesis_matching import match_after_thesis
+from armscan.markers.thesis import match_after_thesis
 from armscan.pipeline.register import register_place
-from armscan.storage.marker_files import MarkerList
+from armscan.storage.points import MarkerList
 from marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
 
 AnyPose = Pose[Frame, Frame]
 

@@ -22,15 +22,13 @@ import cv2
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Board, Part, Plate, Sensor
-from armscan.geometry.poses import Pose
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.free_form import free_form_part
-from armscan.simulation.head import HEADS, Head, Window, build_head
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.render import Speckle
-from armscan.simulation.shapes import Box, Placed
-from armscan.simulation.sheet_middle import sheet_middle_mm
+from armscan.geometry.poses import Base, Board, Part, Plate, Pose, Sensor
+from armscan.simulation.head import HEADS, Head, Window, build_head, sheet_middle_mm
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.body import free_form_part
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed
+from armscan.simulation.optics.render import Speckle
+from armscan.simulation.optics.scene import CERAMIC, GROUND_STEEL, SceneObject, Sphere
 from armscan.simulation.station import (
     ExposureSettings,
     Station,
@@ -39,8 +37,6 @@ from armscan.simulation.station import (
     render_exposure,
     true_stripes,
 )
-from armscan.simulation.surfaces import Sphere
-from armscan.simulation.thing import CERAMIC, GROUND_STEEL, Thing
 
 REPEATS = 4
 REACH_PX = 30
@@ -64,9 +60,9 @@ def over(head: Head, height_mm: float) -> Pose[Base, Sensor]:
     return Pose(rotation, np.array([0.0, 0.0, height_mm]) - rotation @ aim)
 
 
-def plate(seed: int) -> Thing:
+def plate(seed: int) -> SceneObject:
     flat = FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(seed))
-    return Thing("plate", flat, CERAMIC)
+    return SceneObject("plate", flat, CERAMIC)
 
 
 def best_time_s(
@@ -125,14 +121,14 @@ def plate_bias_px(name: str, seeds: range) -> tuple[float, float]:
 def time_head(name: str) -> None:
     head = build_head(name)
     window, full = head.scan_window, head.full_window
-    steel = Thing("block", Box(np.array([22.0, 30.0, 5.0])), GROUND_STEEL)
-    ground = Thing("ground", Placed(plate(2).surface, LYING), GROUND_STEEL)
-    ball = Thing("ball", Sphere(np.array([0.0, 0.0, 17.48]), 17.48), CERAMIC)
+    steel = SceneObject("block", Box(np.array([22.0, 30.0, 5.0])), GROUND_STEEL)
+    ground = SceneObject("ground", Placed(plate(2).surface, LYING), GROUND_STEEL)
+    ball = SceneObject("ball", Sphere(np.array([0.0, 0.0, 17.48]), 17.48), CERAMIC)
     scenes = {
         "plate": (Station((plate(1),)), 0.0),
         "ball": (Station((ball,)), 30.0),
         "block on steel": (Station((ground, steel)), 3.0),
-        "free-form part": (Station((Thing("part", Placed(free_form_part(), PART)),)), 14.0),
+        "free-form part": (Station((SceneObject("part", Placed(free_form_part(), PART)),)), 14.0),
     }
     for scene, (station, height) in scenes.items():
         settings = ExposureSettings(window, head.sources)

@@ -33,16 +33,17 @@ import cv2
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.markers.stereo_matching import RingFate, match_rings
+from armscan.markers.stereo_matching import RingStatus, match_rings
 from armscan.records.exposure import Exposure
-from armscan.records.markers import RingImages
-from armscan.vision.rings.detect import detect_rings
-from armscan.vision.rings.rims import measure_rims
-from armscan.vision.targets.blobs import Blobs
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from armscan.records.points import RingImages
+from armscan.vision.ring_edges import measure_rims
+from armscan.vision.rings import detect_rings
+from armscan.vision.targets.circle_lattice import Blobs
 from ring_pair_scenes import CALIBRATION_COVARIANCE, MarkerScene, random_scene
 from ring_scenes import Mark, Rendered, render, tilted
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+
 
 N_AZIMUTHS, N_IMAGES = 6, 6
 N_CLUTTER = 12
@@ -127,7 +128,7 @@ def mixed_sizes(scene: MarkerScene, seed: int) -> MarkerScene:
 
 def matching(title: str, *, is_mixed: bool) -> None:
     n_both = n_right = n_wrong = 0
-    fates: Counter[RingFate] = Counter()
+    fates: Counter[RingStatus] = Counter()
     for seed in range(FIRST_SCENE, FIRST_SCENE + N_SCENES):
         scene = random_scene(seed)
         if is_mixed:
@@ -140,8 +141,8 @@ def matching(title: str, *, is_mixed: bool) -> None:
         fates.update(matches.fates)
     dropped = ", ".join(
         f"{fates[fate]} {fate.name.lower()}"
-        for fate in RingFate
-        if fate not in (RingFate.MATCHED, RingFate.NO_PARTNER)
+        for fate in RingStatus
+        if fate not in (RingStatus.MATCHED, RingStatus.NO_PARTNER)
     )
     print(
         f"matching, {title}: {n_right} of {n_both} pairs ({100.0 * n_right / n_both:.2f} %), "

@@ -21,19 +21,17 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
 import placing_rig as rig
 from armscan.geometry.arrays import FloatArray
-from armscan.models.arm import thesis_arm
-from armscan.models.arm_forward import forward, parameter_jacobian
-from armscan.reconstruction.normals import estimate_normals
-from armscan.reconstruction.place import place_stripe, prepare_placing
+from armscan.models.arm import forward, parameter_jacobian, thesis_arm
+from armscan.reconstruction.place import estimate_normals, prepare_placing, propagate_to_base
 from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import triangulate_stripe
-from armscan.records.arm_track import ArmTrack
-from armscan.records.session import ExposureRow
+from armscan.records.recording import ArmTrack, ExposureRow
 from sheet_rig import thesis_rig
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 
 ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
 RNG = np.random.default_rng(0)
@@ -81,7 +79,11 @@ def main() -> None:
     few = max(1, repeats // 5)
     table: list[tuple[str, Callable[[], object], int]] = [
         ("triangulate 3000", lambda: triangulate_stripe(profile, sheet, sensor), repeats),
-        ("place 3000", lambda: place_stripe(stripe, profile, rig.BASE_FROM_TOOL, placing), repeats),
+        (
+            "place 3000",
+            lambda: propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing),
+            repeats,
+        ),
         ("poses 2000", lambda: exposure_poses(rows, samples), repeats),
         ("normals 200,000 plate", lambda: estimate_normals(plate, seen), few),
         ("normals 200,000 ball", lambda: estimate_normals(ball, seen), few),

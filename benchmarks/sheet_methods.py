@@ -30,14 +30,14 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit, SheetFit
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Board, Pose, Sensor
+from sheet_rig import THESIS_PLANE, SheetRig, SheetTruth, placed, thesis_rig
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LaserFit, SheetFit
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from sheet_rig import THESIS_PLANE, SheetRig, SheetTruth, placed, thesis_rig
 
 CENTRE = (16.0, 12.0)
 GRID = np.stack(np.meshgrid(np.linspace(-0.9, 0.9, 5), np.linspace(-0.9, 0.9, 5)), -1).reshape(

@@ -28,27 +28,27 @@ from typing import Any
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import BoardStripes, LaserFit
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import BoardStripes, LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.pipeline.documents import camera_calibration
-from armscan.pipeline.truth_errors import sheet_errors
-from armscan.simulation.held_target import PATTERN, made_target
+from armscan.pipeline.truth import sheet_errors
+from armscan.simulation.head import sheet_points_mm
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.light import LineLaser
-from armscan.simulation.sheet_middle import sheet_points_mm
+from armscan.simulation.optics.lasers import LineLaser
+from armscan.simulation.scenes import camera_shots, laser_shots
+from armscan.simulation.shots import RenderRequest
 from armscan.simulation.station import Target
-from armscan.simulation.target_scenes import camera_shots, laser_shots
-from armscan.simulation.twin_scan import Shot
-from armscan.vision.targets.view import TargetView
+from armscan.simulation.targets import PATTERN, made_target
+from armscan.vision.targets.target import TargetView
 from sheet_rig import PROVENANCE, make_profile
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
 
 CIRCLE_PX, STRIPE_PX, CORRELATED, PER_STRIPE = 0.005, 0.08, 11, 900
 CAMERA = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
@@ -78,7 +78,7 @@ def instrument(scene: Scene, seed: int) -> Instrument:
     return replace(drawn, target=target, head=replace(drawn.head, lasers=lasers))
 
 
-def targets_of(shots: Sequence[Shot]) -> Iterator[tuple[str, Target]]:
+def targets_of(shots: Sequence[RenderRequest]) -> Iterator[tuple[str, Target]]:
     """Each place of the target once."""
     seen: set[int] = set()
     for shot in shots:

@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.options import StereoOptions
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions
+from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.cameras.stereo_result import StereoFit
+from stereo_rig import StereoScene, make_pairs, normalised_stereo_error
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
-from stereo_rig import StereoScene, make_pairs, normalised_stereo_error
 
 N_PARAMETERS = 24
 OPTIONS = StereoOptions(CameraOptions(distortion="k1k2p1p2k3", n_folds=0), n_folds=0)

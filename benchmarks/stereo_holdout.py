@@ -33,18 +33,17 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.pairs import StereoPair
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoPair
+from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews, epipolar_distances_px
 from armscan.storage.images import read_exposure
-from armscan.vision.targets.definition import Chessboard
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import Chessboard, TargetView
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
 TARGET = Chessboard(9, 6, 25.0)

@@ -24,10 +24,16 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_curves import CircleCurve, StraightCurve, WaveCurve
-from armscan.simulation.stripe_image import SimulatedStripe, StripeNoise, StripeScene
+from armscan.simulation.stripe_image import (
+    CircleCurve,
+    SimulatedStripe,
+    StraightCurve,
+    StripeNoise,
+    StripeScene,
+    WaveCurve,
+)
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import StripeMethod, StripeOptions
+from armscan.vision.stripe.image import StripeMethod, StripeOptions
 
 METHODS: tuple[StripeMethod, ...] = get_args(StripeMethod)
 FALSE_PX = 1.0

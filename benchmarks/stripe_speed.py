@@ -16,15 +16,12 @@ from importlib.util import find_spec
 import cv2
 import numpy as np
 
-from armscan.kernels.stripe_hessian import gaussian_taps
+from armscan.kernels.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
-from armscan.simulation.stripe_curves import WaveCurve
-from armscan.simulation.stripe_image import SimulatedStripe, StripeScene
+from armscan.simulation.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.level import measure_level
-from armscan.vision.stripe.options import StripeOptions
-from armscan.vision.stripe.plane import mono_plane
-from armscan.vision.stripe.ridge import find_candidates, trace_ridges
+from armscan.vision.stripe.image import StripeOptions, mono_plane
+from armscan.vision.stripe.ridge import find_candidates, measure_level, trace_ridges
 
 SIGMA_PX = 3.0
 

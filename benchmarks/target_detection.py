@@ -27,17 +27,15 @@ import cv2
 import numpy as np
 from camera_holdout import folds_of
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
+from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_views
+from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_views
 from armscan.records.exposure import Exposure
 from armscan.storage.images import read_exposure
-from armscan.vision.targets.circle_centres import correct_centres
-from armscan.vision.targets.definition import CircleGrid, Target
+from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.specification import parse_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import CircleGrid, Target, TargetView, parse_target
 
 SIZE_PX = 1400
 SECTORS = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE

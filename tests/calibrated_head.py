@@ -13,13 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LaserFit
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.models.calibration import SensorCalibration
-from armscan.models.scanner import HandEyeCalibration, ScannerCalibration
-from armscan.reconstruction.place import place_stripe, prepare_placing
+from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
+from armscan.reconstruction.place import prepare_placing, propagate_to_base
 from armscan.reconstruction.triangulate import StripePoints, triangulate_stripe
 from armscan.records.profile import Profile
 from plate_rig import PlateRig, RigNoise, Surface, good_postures
@@ -114,7 +113,7 @@ class CalibratedHead:
         for seen in _seen(rig, surface, rng):
             points = _points(seen, sensor)
             pose = rig.reported_pose(seen.posture, _pose_error(rng, self.noise))
-            cloud = place_stripe(points, seen.profile, pose, placing)
+            cloud = propagate_to_base(points, seen.profile, pose, placing)
             errors.append(cloud.points_mm - seen.base_mm)
             covariances.append(cloud.covariance_mm2)
         return np.concatenate(errors), np.concatenate(covariances)

@@ -9,32 +9,27 @@ from typing import Any
 
 import numpy as np
 
-from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import CameraRight, Sensor, Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import CameraRight, Pose, Sensor, Tool
+from armscan.geometry.shapes import Plane
 from armscan.models.calibration import (
+    ArmNoise,
     CameraCalibration,
-    InputFile,
-    Provenance,
-    SecondCamera,
-    SensorCalibration,
-    SheetCalibration,
-)
-from armscan.models.camera import CameraModel
-from armscan.models.diagnostics import (
-    BowedBoard,
     CameraDiagnostics,
     FTest,
-    SensorDiagnostics,
-    SheetDiagnostics,
-)
-from armscan.models.light_sheet import LightSheet
-from armscan.models.scanner import (
-    ArmNoise,
     HandEyeCalibration,
     HandEyeDiagnostics,
+    InputFile,
+    Provenance,
     ScannerCalibration,
+    SecondCamera,
+    SensorCalibration,
+    SensorDiagnostics,
+    SheetCalibration,
+    SheetDiagnostics,
+    WarpedBoard,
 )
+from armscan.models.camera import CameraModel
+from armscan.models.light_sheet import LightSheet
 
 
 def covariance(size: int, seed: int) -> np.ndarray:
@@ -77,7 +72,7 @@ def camera_calibration() -> CameraCalibration:
             condition=1e3 / 7,
             noise_scale=1.1,
             covered_fraction=2 / 3,
-            board=BowedBoard((0.1 / 3, -0.2), (1e-3, 2e-3), FTest(17.3, 2, 1e-8 / 3)),
+            board=WarpedBoard((0.1 / 3, -0.2), (1e-3, 2e-3), FTest(17.3, 2, 1e-8 / 3)),
         ),
     )
 

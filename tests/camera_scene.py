@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
-from armscan.vision.targets.definition import CircleGrid, Target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import CircleGrid, Target, TargetView
 
 CAMERA = CameraModel(
     2300.0, 2310.0, 1010.0, 770.0, np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]), 2048, 1536

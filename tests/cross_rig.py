@@ -10,14 +10,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.frames import Base, Sensor
-from armscan.geometry.poses import Points, Pose
+from armscan.geometry.poses import Base, Points, Pose, Sensor
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile, StripeFlag
-from armscan.simulation.aim import Aim, sensor_over
-from armscan.simulation.hand_path import Sway
+from armscan.simulation.arm.hand import HeadOrientation, Sway, sensor_over
 from sheet_rig import PROVENANCE
 from thesis_instrument import CAMERA, DISTORTION, IMAGE_PX
 
@@ -182,7 +180,7 @@ class CrossStroke:
             across = np.array([-along[1], along[0], 0.0])
             spot = way[k] * along + stray[4][k] * across + [0.0, 0.0, lift]
             depth = MIDDLE_DEPTH_MM + stray[3][k]
-            aim = Aim(tilt + stray[0][k], lean + stray[1][k], roll + stray[2][k], depth)
+            aim = HeadOrientation(tilt + stray[0][k], lean + stray[1][k], roll + stray[2][k], depth)
             poses.append(sensor_over(np.eye(3), spot, aim, _at_depth(depth)))
         return poses
 

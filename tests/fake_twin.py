@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
+from armscan.records.recording import ArmTrack
 from recording_folders import MemoryScan, memory_scan
 
 N_IMAGES = 6

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The thesis's multi-line head before its target, at feature level: bowed sheets, two cameras.
 
-The light is the simulator's (`armscan.simulation.light`), the projection OpenCV's.
+The light is the simulator's (`armscan.simulation.optics.lasers`), the projection OpenCV's.
 """
 
 from __future__ import annotations
@@ -10,20 +10,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.result import BoardStripes
-from armscan.calibration.laser.second_view import place_board
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.sheets.board_points import HeadCameras, place_board
+from armscan.calibration.sheets.result import BoardStripes
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, CameraRight, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.stereo import StereoCalibration
-from armscan.simulation.head_drawing import Tolerances, draw_lasers
-from armscan.simulation.light import LineLaser
-from armscan.simulation.printed_heads import printed_heads
+from armscan.models.two_views import StereoCalibration
+from armscan.simulation.head import Tolerances, draw_lasers
+from armscan.simulation.heads import printed_heads
+from armscan.simulation.optics.lasers import LineLaser
 from sheet_rig import PROVENANCE, SheetRig, make_profile, project, stripe_on_board
 
 COLUMNS, ROWS, PITCH_MM = 11, 9, 3.75

@@ -8,11 +8,10 @@ import numpy as np
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, StripeResidual
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.models.scanner import ArmNoise, HandEyeCalibration, HandEyeDiagnostics
+from armscan.geometry.poses import Pose, Sensor, Tool
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.geometry.shapes import Plane
+from armscan.models.calibration import ArmNoise, HandEyeCalibration, HandEyeDiagnostics
 
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.4, -0.9, -1.9], [41.4, 21.5, 112.3])
 STAND_OFF_MM = 140.0

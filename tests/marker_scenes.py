@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.records.markers import MarkerSet
+from armscan.geometry.poses import Frame, Pose
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.records.points import MarkerSet
 
 NOISE_MM = 0.02
 LEAST_GAP_MM = 8.0

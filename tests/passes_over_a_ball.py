@@ -8,18 +8,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.models.scanner import ScannerCalibration
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
-from armscan.reconstruction.exposure_poses import ExposurePoses
-from armscan.reconstruction.result import PointFate, ReconstructedImage
-from armscan.reconstruction.triangulate import meet_sheets
-from armscan.records.arm_track import ArmTrack
+from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.sync import ExposurePoses
+from armscan.reconstruction.triangulate import intersect_sheets
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.records.session import CameraSetup, ExposureRow, Session
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from scan_fake import CAMERA, TOOL_FROM_SENSOR, scanner
 
 CENTRE_MM, RADIUS_MM = np.array([600.0, -150.0, 200.0]), 17.5
@@ -134,7 +132,7 @@ def doubt(
             pixels[:, 0] = CAMERA.width_px - 1 - pixels[:, 0]
         for camera in range(n_cameras):
             own = pixels[camera::n_cameras]
-            points, is_met = meet_sheets(own, np.zeros(len(own), dtype=np.int64), head.sensor)
+            points, is_met = intersect_sheets(own, np.zeros(len(own), dtype=np.int64), head.sensor)
             images.append(_image(scan.rows[row].source, own[is_met]))
             rows.append(row)
             pose = poses.pose(row) @ head.hand_eye.tool_from_sensor
@@ -165,7 +163,7 @@ def poses_of(rotations: FloatArray, translations_mm: FloatArray) -> ExposurePose
     return ExposurePoses(rotations, translations_mm, zeros, np.arange(n), "trigger", 0)
 
 
-def _image(source: str, pixels: FloatArray) -> ReconstructedImage:
+def _image(source: str, pixels: FloatArray) -> MeasuredProfile:
     n = len(pixels)
     zeros: IntArray = np.zeros(n, dtype=np.int64)
     normals = np.tile([0.0, 1.0], (n, 1))
@@ -173,7 +171,7 @@ def _image(source: str, pixels: FloatArray) -> ReconstructedImage:
         source, pixels, normals, np.full(n, NOISE_PX), np.full(n, 3.0), np.full(n, 150.0),
         zeros, zeros,
     )  # fmt: skip
-    return ReconstructedImage(profile, np.full(n, int(PointFate.MEASURED)), zeros, "the only one")
+    return MeasuredProfile(profile, np.full(n, int(PointStatus.MEASURED)), zeros, "the only one")
 
 
 def _cloud(points_mm: FloatArray, exposure: IntArray, n_exposures: int) -> PointCloud:

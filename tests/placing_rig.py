@@ -6,13 +6,18 @@ from __future__ import annotations
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.models.calibration import (
+    ArmNoise,
+    CameraCalibration,
+    HandEyeCalibration,
+    ScannerCalibration,
+    SensorCalibration,
+    SheetCalibration,
+)
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.models.scanner import ArmNoise, HandEyeCalibration, ScannerCalibration
 from armscan.records.profile import Profile
 from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 

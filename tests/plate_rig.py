@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
-from armscan.geometry.fitting import Plane, fit_plane
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.shapes import Plane, fit_plane
 
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose(
     Rotation.from_euler("XYZ", [35.0, -20.0, 80.0], degrees=True).as_matrix(),

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
-from armscan.records.session import CameraSetup, ExposureRow, Session
-from armscan.storage.recording_reader import read_recording
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.recording import read_recording
 
 WIDTH_PX, HEIGHT_PX = 8, 6
 SESSION = f"""kind = "scan"

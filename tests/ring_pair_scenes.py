@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from armscan.geometry.poses import Pose
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
-from armscan.records.markers import RingImages
+from armscan.records.points import RingImages
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

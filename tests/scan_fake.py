@@ -8,18 +8,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.models.calibration import (
+    ArmNoise,
+    CameraCalibration,
+    HandEyeCalibration,
+    ScannerCalibration,
+    SensorCalibration,
+    SheetCalibration,
+)
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.models.scanner import ArmNoise, HandEyeCalibration, ScannerCalibration
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from sheet_rig import PROVENANCE, THESIS_PLANE
 
 CAMERA = CameraModel(600.0, 600.0, 160.0, 120.0, np.zeros(5), 320, 240)

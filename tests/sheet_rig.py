@@ -9,15 +9,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.laser.result import BoardStripes
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.sheets.result import BoardStripes
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import TargetView
 
 THESIS_PLANE = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
 """The thesis's printed single-line sheet, camera frame, mm."""

@@ -9,9 +9,8 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.rotations import rotation_from_vector
 
 HAND_EYE: Pose[Tool, Sensor] = Pose.from_vectors([0.3, -1.9, 1.1], [41.4, 21.5, 112.3])
 CENTRE_MM = np.array([650.0, -170.0, 35.0])

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, CameraRight, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import nearest_rotation, rotation_from_vector, skew
+from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import nearest_rotation, rotation_from_vector, skew
 from armscan.models.calibration import (
     CameraCalibration,
     SecondCamera,
@@ -20,7 +19,7 @@ from armscan.models.calibration import (
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import TwoViews
-from armscan.simulation.light import LineLaser
+from armscan.simulation.optics.lasers import LineLaser
 from sheet_rig import PROVENANCE
 
 LEFT = CameraModel(

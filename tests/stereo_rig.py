@@ -7,17 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from armscan.calibration.stereo.pairs import StereoPair
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.pairs import StereoPair
+from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, CameraRight, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
-from armscan.vision.targets.definition import CircleGrid, Target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import CircleGrid, Target, TargetView
 
 LEFT = CameraModel(
     2300.0, 2310.0, 1010.0, 770.0, np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]), 2048, 1536

@@ -15,12 +15,11 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile, StripeFlag
-from armscan.simulation.scene import Scene
-from armscan.simulation.shapes import Box, Placed
-from armscan.simulation.surfaces import Floor, Sphere, Surface
+from armscan.simulation.objects.shapes import Box, Placed
+from armscan.simulation.optics.scene import Floor, Scene, Sphere, Surface
 from stereo_head import WINDOW_PX, StereoHead
 
 KINDS = ("plate", "ball", "waves", "steps")

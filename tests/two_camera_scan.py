@@ -9,16 +9,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from armscan.geometry.poses import Pose
+from armscan.models.calibration import ArmNoise, HandEyeCalibration, ScannerCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.scanner import ArmNoise, HandEyeCalibration, ScannerCalibration
 from armscan.models.two_views import TwoViews
-from armscan.pipeline.exposure_pairs import ExposurePair
+from armscan.pipeline.instants import ExposurePair
 from armscan.pipeline.measure import LitProfile
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.records.session import CameraSetup, ExposureRow, Session
-from armscan.vision.stripe.options import StripeOptions
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.vision.stripe.image import StripeOptions
 from scan_fake import TOOL_FROM_SENSOR
 from sheet_rig import PROVENANCE
 from stereo_head import LEFT, RIGHT, RIGHT_FROM_LEFT, StereoHead, fitted_sheet, sheet_lasers

@@ -15,10 +15,10 @@ from matplotlib.figure import Figure
 
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.sphere import inspect_sphere
-from armscan.models.scanner import ScannerCalibration
+from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan import measure_scan
-from armscan.storage.recording_reader import FolderRecording, read_recording
-from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.recording import FolderRecording, read_recording
 from armscan.vision.stripe.extract import extract_stripes
 
 LINE, ACCENT, MUTED = "#0b6e7f", "#c8541b", "#5d6b7a"

@@ -12,25 +12,25 @@ from typing import Any
 
 import pytest
 
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.hand_eye.options import HandEyeOptions
+from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-from armscan.calibration.laser.options import SheetOptions
+from armscan.calibration.sheets.result import SheetOptions
 from armscan.cli.app import command
-from armscan.inspection.options import InspectionOptions, StepOptions
-from armscan.markers.match_result import MatchOptions
-from armscan.markers.matching_options import MatchingOptions
-from armscan.pipeline.measure_options import MeasureOptions
+from armscan.inspection.selection import InspectionOptions, StepOptions
+from armscan.jobs.demo import HeadDemoRequest
+from armscan.jobs.hand_eye import HandEyeRequest
+from armscan.markers.alignments import MarkerMatchOptions
+from armscan.markers.candidates import RingMatchOptions
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.register import RegisterOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.stereo_options import StereoNamingOptions
-from armscan.report.hand_eye_request import HandEyeRequest
-from armscan.report.head_demo_job import HeadDemoRequest
-from armscan.storage.image_options import ImageOptions
-from armscan.vision.rings.options import RingOptions
-from armscan.vision.stripe.options import StripeOptions
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.label_stereo import StereoLabelOptions
+from armscan.storage.images import ImageOptions
+from armscan.vision.rings import RingOptions
+from armscan.vision.stripe.image import StripeOptions
 
 
 def default_of(request: type[Any], name: str) -> Any:
@@ -64,7 +64,7 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
     },
     ("register",): {
         "sigma_mm": RegisterOptions().sigma_mm,
-        "least_common": MatchOptions().least_common,
+        "least_common": MarkerMatchOptions().least_common,
         "by_id": RegisterOptions().is_by_id,
     },
     ("probe",): {
@@ -76,7 +76,7 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
     ("inspect", "sphere"): FEATURE,
     ("inspect", "step"): {**FEATURE, "margin": StepOptions().margin_mm},
     ("markers",): {
-        "diameter": MatchingOptions().diameter_mm,
+        "diameter": RingMatchOptions().diameter_mm,
         "min_perimeter": RingOptions().min_perimeter_px,
         "max_perimeter": RingOptions().max_perimeter_px,
         "max_roundness": RingOptions().max_roundness,
@@ -122,7 +122,7 @@ def test_the_depth_margin_that_texts_name_is_the_default() -> None:
     text = f"{DepthRange().margin:g}"
     option = parameters(("reconstruct",))["depth_margin"]
     assert option.default is None
-    stereo = f"{StereoNamingOptions().depths.margin:g}"
+    stereo = f"{StereoLabelOptions().depths.margin:g}"
     assert f"Without it {text}; with two cameras {stereo};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())

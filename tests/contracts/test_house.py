@@ -18,7 +18,7 @@ SOURCES = sorted((ROOT / "src").rglob("*.py"))
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py")), *(ROOT / "benchmarks").rglob("*.py")]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
-MAX_MODULE_LINES = 700
+MAX_MODULE_LINES = 720
 MAX_CLI_LINES = 300
 MAX_FUNCTION_LINES = 80
 P90_FUNCTION_LINES = 40

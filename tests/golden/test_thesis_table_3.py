@@ -13,17 +13,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.repeat_study import angle_covariance
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.euler import rotations_from_euler
-from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import nearest_rotation, vector_from_rotation
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import nearest_rotation, rotations_from_euler, vector_from_rotation
+from armscan.geometry.shapes import Plane
 from armscan.models.camera import CameraModel
 from thesis_instrument import (
     CAMERA,

@@ -13,14 +13,20 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from armscan.devices.scan_source import ScanSource
-from armscan.geometry.euler import EulerConvention
-from armscan.models.arm import thesis_arm
-from armscan.models.arm_forward import forward
-from armscan.records.arm_track import NO_TRIGGER, ArmTrack
-from armscan.records.sensor_window import SensorWindow
-from armscan.records.session import CameraSetup, ExposureRow, PixelColour, PoseForm, Session
-from armscan.storage.recording_reader import FolderRecording, read_recording
+from armscan.devices.sources import ScanSource
+from armscan.geometry.rotations import EulerConvention
+from armscan.models.arm import forward, thesis_arm
+from armscan.records.exposure import SensorWindow
+from armscan.records.recording import (
+    NO_TRIGGER,
+    ArmTrack,
+    CameraSetup,
+    ExposureRow,
+    PixelColour,
+    PoseForm,
+    Session,
+)
+from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_writer import write_recording
 from recording_folders import MemoryScan
 

@@ -9,9 +9,8 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Board, Sensor, Tool
-from armscan.geometry.poses import Points, Pose
-from armscan.geometry.rotation import (
+from armscan.geometry.poses import Base, Board, Points, Pose, Sensor, Tool
+from armscan.geometry.rotations import (
     nearest_rotation,
     rotation_from_vector,
     skew,

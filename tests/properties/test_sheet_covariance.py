@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LaserFit
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.models.light_sheet import LightSheet
 from sheet_rig import SheetRig, thesis_rig

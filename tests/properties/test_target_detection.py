@@ -6,13 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
-from armscan.simulation.flat_pattern import ChessboardPattern, CirclePattern
-from armscan.simulation.optics import add_noise
-from armscan.vision.targets.definition import Chessboard, CircleGrid, Target
+from armscan.records.exposure import Exposure, SensorWindow
+from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.simulation.optics.camera import add_noise
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
 from target_scenes import render
 
 CIRCLES = CircleGrid(5, 3, 3.75, is_asymmetric=True)

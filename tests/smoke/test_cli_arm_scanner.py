@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-from armscan.cli import main
-from armscan.records.probing import ProbedPoints
-from armscan.report.probe_job import ProbeRequest, run_probing
+from armscan.cli.run import main
+from armscan.jobs.probe import ProbeRequest, run_probing
+from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import read_ply
-from armscan.storage.probed_points import probed_points_csv
-from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.points import probed_points_csv
 from smoke.drawn_arm import PLANE, PLATE, PLATE_D_MM, ROTATION, TRANSLATION_MM, draw_postures
 from smoke.drawn_bench import Bench
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.cli import main
-from armscan.storage.calibration_files import read_camera_calibration, read_sensor_calibration
+from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
+from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
 from armscan.storage.observations import read_observations
 from smoke.drawn_bench import FOCAL, HEIGHT, OBJECT_PLACE, SHEET, SHEET_D_MM, TARGET, WIDTH, Bench
 
@@ -63,8 +63,8 @@ def test_points_lie_on_the_object(
 
 
 def test_observations_let_the_camera_be_solved_again(calibrated: Bench) -> None:
-    from armscan.calibration.camera.calibrate import calibrate_camera
-    from armscan.calibration.camera.options import CameraOptions
+    from armscan.calibration.cameras.calibrate import calibrate_camera
+    from armscan.calibration.cameras.result import CameraOptions
 
     found = read_observations(calibrated.camera.with_suffix(".npz"))
     again = calibrate_camera(found.views, CameraOptions(distortion="none"))
@@ -78,9 +78,9 @@ def test_observations_let_the_camera_be_solved_again(calibrated: Bench) -> None:
 
 
 def test_observations_let_the_sheet_be_solved_again(calibrated: Bench) -> None:
-    from armscan.calibration.camera.board_pose import estimate_board_pose
-    from armscan.calibration.laser.calibrate import calibrate_sheets
-    from armscan.calibration.laser.result import BoardStripes
+    from armscan.calibration.cameras.board_pose import estimate_board_pose
+    from armscan.calibration.sheets.calibrate import calibrate_sheets
+    from armscan.calibration.sheets.result import BoardStripes
 
     found = read_observations(calibrated.sensor.with_suffix(".npz"))
     document = read_sensor_calibration(calibrated.sensor)

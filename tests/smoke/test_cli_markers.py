@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.camera import CameraModel
-from armscan.models.stereo import StereoCalibration
-from armscan.storage.marker_files import read_marker_list
-from armscan.storage.stereo_files import stereo_document
+from armscan.models.two_views import StereoCalibration
+from armscan.storage.documents import stereo_document
+from armscan.storage.points import read_marker_list
 from ring_scenes import Mark, render, tilted
 
 WIDTH, HEIGHT, FOCAL_PX = 480, 400, 1000.0

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from armscan.calibration.camera import refusals
-from armscan.cli import main
-from armscan.storage.calibration_files import read_camera_calibration, read_sensor_calibration
+from armscan.calibration.cameras import result
+from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
+from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
 from smoke.drawn_bench import TARGET, Bench
 
 Fails = Callable[..., str]
@@ -81,7 +81,7 @@ def test_a_forced_camera_marks_all_that_rests_on_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Camera, sheet, cloud, inspection, conversion and what `info` says of them."""
-    monkeypatch.setattr(refusals, "LARGEST_FOCAL_SIGMA", 1e-9)
+    monkeypatch.setattr(result, "LARGEST_FOCAL_SIGMA", 1e-9)
     camera, sensor, cloud = (tmp_path / name for name in ("c.json", "s.json", "p.ply"))
     assert "--force-bad" in fails(*camera_words(calibrated, camera), writes=tmp_path)
     assert "focal length is known to" in page_of(tmp_path / "c.refused.html")
@@ -180,7 +180,7 @@ def test_a_camera_is_calibrated_from_a_recording(
 def test_a_second_run_finds_no_point_again(
     calibrated: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from armscan.pipeline import cached_detection
+    from armscan.pipeline import targets as cached_detection
 
     words = camera_words(calibrated, tmp_path / "c.json")
     assert main(words) == 0

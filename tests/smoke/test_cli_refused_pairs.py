@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.pipeline.stereo import pair_lists
+from armscan.pipeline.cameras import pair_lists
 from armscan.records.exposure import Exposure
-from armscan.storage.calibration_files import camera_document
+from armscan.storage.documents import camera_document
 from recording_folders import EXPOSURES, SESSION, lab_folder
 from stereo_rig import LEFT, held
 

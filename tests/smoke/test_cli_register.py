@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.records.cloud import PointCloud
 from armscan.storage.clouds import ply_bytes, read_ply
-from armscan.storage.marker_files import markers_csv, read_marker_list
-from armscan.storage.registration_files import read_registration
+from armscan.storage.documents import read_registration
+from armscan.storage.points import markers_csv, read_marker_list
 from inspection_clouds import cloud_of
 from marker_scenes import Walk, marker_set, two_views, walk
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import scan_fake
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.geometry.poses import Pose
+from armscan.storage.documents import scanner_document
 from armscan.storage.recording_writer import write_recording
-from armscan.storage.scanner_files import scanner_document
 
 SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.015, 0.015, 0.015])
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from armscan.jobs.demo import HeadDemoRequest, run_head_demo
 from armscan.pipeline.head_demo import HeadOptions
 from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.report.head_demo_job import HeadDemoRequest, run_head_demo
 from armscan.storage.clouds import read_ply
-from armscan.storage.recording_reader import read_recording
-from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.recording import read_recording
 
 HEAD = "thesis-cross"
 FEW = HeadOptions(

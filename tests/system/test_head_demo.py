@@ -15,20 +15,13 @@ from typing import Any
 
 import pytest
 
-from armscan.cli import main
+from armscan.cli.run import main
+from armscan.jobs.demo import DOCUMENTS, RECORDINGS, RESULTS, TRUTH, HeadDemoRequest, run_head_demo
 from armscan.pipeline.head_demo import HeadOptions
-from armscan.report.head_demo_job import (
-    DOCUMENTS,
-    RECORDINGS,
-    RESULTS,
-    TRUTH,
-    HeadDemoRequest,
-    run_head_demo,
-)
-from armscan.report.summary import Summary
+from armscan.report.quantity import Summary
 from armscan.storage.clouds import read_ply
-from armscan.storage.recording_reader import read_recording
-from armscan.storage.scanner_files import read_scanner_calibration
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.recording import read_recording
 
 FEW = HeadOptions(
     {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}

@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.calibration.sheets.result import LaserFit, PointUse
 from armscan.errors import EstimationError, OptionError
+from armscan.jobs.sheets import LaserRequest, run_laser_calibration
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.laser import calibrate_sheets_from_exposures
-from armscan.pipeline.measure_options import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.reconstruct import reconstruct
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.result import PointFate
-from armscan.report.laser_job import LaserRequest, run_laser_calibration
-from armscan.storage.calibration_files import camera_document, read_sensor_calibration
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.labels import PointStatus
+from armscan.storage.documents import camera_document, read_sensor_calibration
 from armscan.storage.images import read_exposure
-from armscan.vision.targets.definition import Chessboard
+from armscan.vision.targets.target import Chessboard
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data")) / "ciclop"
@@ -151,7 +151,7 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
     cloud = result.cloud
     assert "B" in result.images[0].naming
     assert set(cloud.sheet.tolist()) == {1}
-    assert result.images[0].count(PointFate.MEASURED) == len(cloud) > 700
+    assert result.images[0].count(PointStatus.MEASURED) == len(cloud) > 700
     assert 215.0 < cloud.points_mm[:, 2].min() < cloud.points_mm[:, 2].max() < 300.0
     assert 190.0 < np.ptp(cloud.points_mm[:, 1]) < 225.0, "a bust of about 20 cm"
     assert any("outside its calibrated depth range" in warning for warning in result.warnings)

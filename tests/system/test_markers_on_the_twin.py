@@ -6,12 +6,12 @@ from __future__ import annotations
 import numpy as np
 
 from armscan.devices.registry import load_driver
-from armscan.devices.twin import Twin
+from armscan.devices.sources import Twin
 from armscan.geometry.arrays import FloatArray
 from armscan.markers.stereo_matching import match_rings
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
-from armscan.vision.rings.detect import detect_rings
+from armscan.vision.rings import detect_rings
 
 ARM_MM = 0.1
 """Five times the arm's repeatability: where a marker is expected, by the arm's own report."""

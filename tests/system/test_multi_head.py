@@ -10,16 +10,12 @@ import pytest
 
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
-from armscan.pipeline.fewer_views import FewerViews
-from armscan.pipeline.head_calibration import Instrument, calibrate_head
-from armscan.pipeline.naming_truth import naming_errors
+from armscan.pipeline.head_demo import Instrument, RenderedScans, Stopwatch, calibrate_head
 from armscan.pipeline.progress import silent
-from armscan.pipeline.render_pool import TwinName
-from armscan.pipeline.scan import measure_scan
-from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.pipeline.stopwatch import Stopwatch
-from armscan.pipeline.truth_errors import hand_eye_errors, sheet_errors, true_names
-from armscan.pipeline.twin_scans import RenderedScans
+from armscan.pipeline.scan import ScanReconstruction, measure_scan
+from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.simulate import TwinName
+from armscan.pipeline.truth import hand_eye_errors, naming_errors, sheet_errors, true_names
 
 TWIN = TwinName("thesis-multi-5", "thesis", 4).build()
 FEW = {"camera": 8, "laser": 8, "hand-eye": 6}

@@ -16,17 +16,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.laser.result import PointUse
-from armscan.cli import main
+from armscan.calibration.sheets.result import PointUse
+from armscan.cli.run import main
+from armscan.jobs import demo
+from armscan.jobs.demo import DemoRequest, run_photo_demo
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.photo_demo import PhotoErrors
 from armscan.pipeline.progress import Progress
-from armscan.pipeline.truth_errors import SheetErrors
-from armscan.report import demo_job
-from armscan.report.demo_job import DemoRequest, run_photo_demo
-from armscan.simulation.photo_set import PhotoSetOptions, render_photo_set
-from armscan.simulation.photo_truth import PhotoSetTruth
-from armscan.storage.calibration_files import read_sensor_calibration
+from armscan.pipeline.truth import SheetErrors
+from armscan.simulation.photos import PhotoSetOptions, PhotoSetTruth, render_photo_set
+from armscan.storage.documents import read_sensor_calibration
 
 SIZE = PhotoSetOptions(width_px=640, height_px=480, n_camera=10)
 FOUR_SIGMA = 2.0 * stats.norm.sf(4.0)
@@ -56,7 +55,7 @@ def measured(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
         return truths[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo_job, "render_photos", render)
+        patch.setattr(demo, "render_photos", render)
         run_photo_demo(DemoRequest(folder, request.param))
     data = json.loads((folder / "summary.json").read_text())
     figures = data["errors"]
@@ -71,7 +70,7 @@ def test_every_photo_is_used_and_every_file_written(measured: Measured) -> None:
     assert camera["n_points"] == 10 * 99
     assert sheet.n_boards == 6
     assert measured.data["simulated"] is True
-    assert {path.name for path in measured.folder.iterdir()} == demo_job.OWN_NAMES
+    assert {path.name for path in measured.folder.iterdir()} == demo.DEMO_JOB_OWN_NAMES
     for page in ("camera.html", "sensor.html", "cloud.html"):
         assert "simulated" in (measured.folder / page).read_text().lower()
     assert PointUse.ON_EDGE.label in (measured.folder / "sensor.html").read_text()

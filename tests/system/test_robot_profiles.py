@@ -10,24 +10,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_sections import find_sections
-from armscan.calibration.hand_eye.sphere_two_step import TwoStepHandEye, calibrate_in_two_steps
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
+from armscan.calibration.hand_eye.thesis import TwoStepHandEye, calibrate_in_two_steps
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.euler import EulerConvention
-from armscan.geometry.fitting import Plane
-from armscan.geometry.rotation import nearest_rotation, vector_from_rotation
-from armscan.pipeline.profiles import (
-    calibrate_hand_eye_from_profiles,
-    posed_stripes_from_profiles,
-)
-from armscan.storage.profiles import read_profiles
-from armscan.storage.robot_poses import read_robot_poses
+from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector_from_rotation
+from armscan.geometry.shapes import Plane
+from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
+from armscan.storage.points import read_profiles
+from armscan.storage.poses import read_robot_poses
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))

@@ -12,9 +12,8 @@ import pytest
 
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.definition import Chessboard, CircleGrid
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, TargetView
 
 ROOT = Path(__file__).parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT / "../shared/data"))

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.cli import main
-from armscan.storage.calibration_files import read_sensor_calibration
+from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
+from armscan.storage.documents import read_sensor_calibration
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "01-from-photographs-to-points.md"

@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.geometry.rotation import vector_from_rotation
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.geometry.rotations import vector_from_rotation
 from camera_scene import CAMERA, GRID, Scene, make_views
 
 mrcal = pytest.importorskip("mrcal")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from armscan.cli.compiled_kernels import VARIABLE, give_kernels_a_folder
+from armscan.cli.run import VARIABLE, give_kernels_a_folder
 
 
 @pytest.fixture

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, OptionError, OutputError
-from armscan.storage.calibration_files import read_camera_calibration, read_sensor_calibration
-from armscan.storage.convert import convert_file
+from armscan.storage.clouds import convert_file
+from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 

@@ -7,8 +7,7 @@ import pytest
 
 from armscan.errors import FileFormatError, InputError
 from armscan.models.camera import CameraModel
-from armscan.storage.foreign_opencv import read_foreign_camera
-from armscan.storage.foreign_ros import camera_info_yaml
+from armscan.storage.foreign import camera_info_yaml, read_foreign_camera
 
 CAMERA = CameraModel(
     1430.123456789, 1425.5, 478.25, 642.1, np.array([-0.2, 0.08, 6e-4, -1e-17, 0.01]), 960, 1280

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.storage.images import read_exposure
-from armscan.storage.jpeg_format import jpeg_defect
+from armscan.storage.images import jpeg_defect, read_exposure
 
 WRITERS: dict[str, list[int]] = {
     "plain": [],

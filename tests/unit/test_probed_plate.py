@@ -11,16 +11,16 @@ from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.calibration.hand_eye.probed_plate import (
     ProbedPlate,
     ProbingOptions,
+    find_outliers,
     fit_probed_plate,
     plate_from_coefficients,
     plate_from_probing,
 )
-from armscan.calibration.hand_eye.touch_outliers import find_outliers
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.records.probing import ProbedPoints
+from armscan.records.points import ProbedPoints
 
 NOISE_MM = 0.012
 TIP_MM = 6.0

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import OutputError
-from armscan.storage.atomic import check_outputs, write_files
-from armscan.storage.atomic_folder import check_new_folder, new_folder
+from armscan.storage.atomic import check_new_folder, check_outputs, new_folder, write_files
 
 
 def test_files_are_written_together(tmp_path: Path) -> None:

@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
+from armscan.jobs.info import describe_files
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
-from armscan.report.file_info import describe_files
-from armscan.storage.calibration_files import (
+from armscan.storage.documents import (
     camera_document,
     read_calibration,
     read_camera_calibration,
+    read_scanner_calibration,
     read_sensor_calibration,
+    scanner_document,
     sensor_document,
 )
-from armscan.storage.scanner_files import read_scanner_calibration, scanner_document
 from calibration_documents import (
     assert_same,
     camera_calibration,

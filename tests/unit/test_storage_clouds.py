@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
+from armscan.jobs.info import describe_files
 from armscan.records.cloud import PointCloud
-from armscan.report.file_info import describe_files
-from armscan.storage.clouds import XYZ_LOSES, ply_bytes, read_ply, xyz_bytes
-from armscan.storage.foreign_clouds import read_cloud
-from armscan.storage.ply_format import parse_ply
+from armscan.storage.clouds import XYZ_LOSES, parse_ply, ply_bytes, read_cloud, read_ply, xyz_bytes
 
 ARRAYS = (
     "points_mm", "covariance_mm2", "sigma_noise_mm", "sheet", "exposure", "segment", "intensity",

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.storage.clouds import ply_bytes, xyz_bytes
-from armscan.storage.foreign_clouds import read_cloud
+from armscan.storage.clouds import ply_bytes, read_cloud, xyz_bytes
 from inspection_clouds import cloud_of
 
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5]])

@@ -12,9 +12,8 @@ import pytest
 from PIL import Image
 
 from armscan.errors import FileFormatError, OptionError
-from armscan.storage.image_options import ImageOptions
 from armscan.storage.image_paths import expand_paths, natural_key
-from armscan.storage.images import read_exposure, read_exposures, source_names
+from armscan.storage.images import ImageOptions, read_exposure, read_exposures, source_names
 
 RNG_SEED = 20
 

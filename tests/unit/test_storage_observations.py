@@ -11,7 +11,7 @@ import pytest
 from armscan.errors import FileFormatError
 from armscan.records.profile import Profile
 from armscan.storage.observations import pack_observations, read_observations
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import TargetView
 
 VIEW_FIELDS = ("point_index", "points_px", "covariance_px2", "points_board_mm")
 PROFILE_FIELDS = (

@@ -9,8 +9,17 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import BitsAlign, BitsUsed, Target
-from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
+from armscan.cli.options import (
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    Cache,
+    Force,
+    ForceBad,
+    Target,
+    progress_bar,
+    show,
+)
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -57,10 +66,10 @@ def camera(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a camera from photographs of a flat target."""
-    from armscan.calibration.camera.options import CameraOptions, DistortionModel
+    from armscan.calibration.cameras.result import CameraOptions, DistortionModel
     from armscan.errors import OptionError
-    from armscan.report.camera_job import CameraRequest, run_camera_calibration
-    from armscan.storage.image_options import Alignment, ImageOptions
+    from armscan.jobs.camera import CameraRequest, run_camera_calibration
+    from armscan.storage.images import Alignment, ImageOptions
 
     held = set(fix or ())
     if unknown := sorted(held - {"aspect", "centre"}):

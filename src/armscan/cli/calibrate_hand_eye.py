@@ -11,8 +11,14 @@ from typing import Annotated, cast
 import typer
 
 from armscan.cli import hand_eye_arguments as given
-from armscan.cli.image_arguments import LaserColourOption, StripeMethodOption
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.options import (
+    AsJson,
+    Force,
+    LaserColourOption,
+    StripeMethodOption,
+    progress_bar,
+    show,
+)
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -49,12 +55,11 @@ def hand_eye(
     as_json: AsJson = False,
 ) -> None:
     """Find where the sensor sits on the arm, from postures over a flat plate or a sphere."""
-    from armscan.calibration.hand_eye.options import HandEyeOptions
-    from armscan.calibration.hand_eye.sphere_options import SphereOptions
-    from armscan.geometry.euler import check_convention
-    from armscan.report.hand_eye_job import run_hand_eye_calibration
-    from armscan.report.hand_eye_request import HandEyeRequest
-    from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
+    from armscan.calibration.hand_eye.observations import HandEyeOptions
+    from armscan.calibration.hand_eye.sphere_sections import SphereOptions
+    from armscan.geometry.rotations import check_convention
+    from armscan.jobs.hand_eye import HandEyeRequest, run_hand_eye_calibration
+    from armscan.vision.stripe.image import LaserColour, StripeMethod, StripeOptions
 
     rotation_rad = None if arm_rotation_deg is None else math.radians(arm_rotation_deg)
     request = HandEyeRequest(

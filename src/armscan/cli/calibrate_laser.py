@@ -9,14 +9,19 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import (
+from armscan.cli.options import (
+    AsJson,
     BitsAlign,
     BitsUsed,
+    Cache,
+    Force,
+    ForceBad,
     LaserColourOption,
     StripeMethodOption,
     Target,
+    progress_bar,
+    show,
 )
-from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -96,11 +101,11 @@ def laser(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate light sheets from images of laser lines on a flat target."""
-    from armscan.calibration.laser.options import SheetOptions
+    from armscan.calibration.sheets.result import SheetOptions
+    from armscan.jobs.sheets import LaserRequest, run_laser_calibration
     from armscan.pipeline.laser import LaserOptions
-    from armscan.report.laser_job import LaserRequest, run_laser_calibration
-    from armscan.storage.image_options import Alignment, ImageOptions
-    from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
+    from armscan.storage.images import Alignment, ImageOptions
+    from armscan.vision.stripe.image import LaserColour, StripeMethod, StripeOptions
 
     request = LaserRequest(
         camera=camera,

@@ -10,8 +10,17 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import BitsAlign, BitsUsed, Target
-from armscan.cli.output import AsJson, Cache, Force, ForceBad, progress_bar, show
+from armscan.cli.options import (
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    Cache,
+    Force,
+    ForceBad,
+    Target,
+    progress_bar,
+    show,
+)
 
 EXAMPLE = (
     "\b\nExample:\n"
@@ -67,12 +76,12 @@ def stereo(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate two cameras and where they are to each other."""
-    from armscan.calibration.camera.options import CameraOptions, DistortionModel
-    from armscan.calibration.stereo.options import StereoOptions
+    from armscan.calibration.cameras.pairs import StereoOptions
+    from armscan.calibration.cameras.result import CameraOptions, DistortionModel
     from armscan.errors import OptionError
-    from armscan.models.stereo import IntrinsicsUse
-    from armscan.report.stereo_job import StereoRequest, run_stereo_calibration
-    from armscan.storage.image_options import Alignment, ImageOptions
+    from armscan.jobs.stereo import StereoRequest, run_stereo_calibration
+    from armscan.models.two_views import IntrinsicsUse
+    from armscan.storage.images import Alignment, ImageOptions
 
     given = StereoOptions(
         camera=CameraOptions(distortion=cast(DistortionModel, distortion)),

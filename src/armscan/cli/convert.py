@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, show
 
 EXAMPLE = "\b\nExample:\n  armscan convert camera.json camera_info.yaml"
 
@@ -23,8 +23,8 @@ def convert(
     as_json: AsJson = False,
 ) -> None:
     """Write a calibration's camera for ROS, or a cloud as plain XYZ."""
-    from armscan.report.summary import Summary
-    from armscan.storage.convert import convert_file
+    from armscan.report.quantity import Summary
+    from armscan.storage.clouds import convert_file
 
     done = convert_file(source, output, is_overwriting=force)
     losses = f"the new file does not hold: {', '.join(done.losses)}"

@@ -9,7 +9,7 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.output import AsJson, progress_bar, show
+from armscan.cli.options import AsJson, progress_bar, show
 
 EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
 
@@ -43,10 +43,14 @@ def demo(
     as_json: AsJson = False,
 ) -> None:
     """Render images, calibrate from them, measure things, and state the errors."""
-    from armscan.devices.twin import Preset
-    from armscan.report.demo_job import DemoRequest, run_photo_demo
-    from armscan.report.head_demo_job import HeadDemoRequest, run_head_demo
-    from armscan.report.three_heads_job import run_three_heads
+    from armscan.devices.sources import Preset
+    from armscan.jobs.demo import (
+        DemoRequest,
+        HeadDemoRequest,
+        run_head_demo,
+        run_photo_demo,
+        run_three_heads,
+    )
 
     with progress_bar() as progress:
         if scene is Scene.PHOTOS:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, show
+from armscan.cli.options import AsJson, show
 
 EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
 
@@ -19,7 +19,7 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Check versions, compiler, folders and optional packages."""
-    from armscan.report.installation import examine_installation
+    from armscan.jobs.info import examine_installation
 
     summary = examine_installation(warm=warm)
     show(summary, as_json=as_json)

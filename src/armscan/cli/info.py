@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, show
+from armscan.cli.options import AsJson, show
 
 if TYPE_CHECKING:
-    from armscan.report.summary import Summary
+    from armscan.report.quantity import Summary
+
 
 EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 
@@ -30,6 +31,6 @@ def info(
 
 def describe(files: list[str]) -> Summary:
     """Load the heavy libraries only now, and describe."""
-    from armscan.report.file_info import describe_files
+    from armscan.jobs.info import describe_files
 
     return describe_files(files)

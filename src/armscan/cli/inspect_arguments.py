@@ -12,7 +12,8 @@ import typer
 from armscan.cli.probe import Side
 
 if TYPE_CHECKING:
-    from armscan.report.inspect_job import InspectRequest
+    from armscan.jobs.inspect import InspectRequest
+
 
 CloudArgument = Annotated[
     Path,
@@ -69,8 +70,8 @@ def inspect_request(
     cloud: Path, *, region: str, feature_mm: float, output: Path | None, force: bool
 ) -> InspectRequest:
     """What all inspections ask for."""
-    from armscan.inspection.options import InspectionOptions
-    from armscan.report.inspect_job import InspectRequest
+    from armscan.inspection.selection import InspectionOptions
+    from armscan.jobs.inspect import InspectRequest
 
     return InspectRequest(
         cloud=cloud,

@@ -16,7 +16,7 @@ from armscan.cli.inspect_arguments import (
     SideOption,
     inspect_request,
 )
-from armscan.cli.output import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, show
 
 EXAMPLE = (
     "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plate-inspection.html"
@@ -43,7 +43,7 @@ def plane(
     as_json: AsJson = False,
 ) -> None:
     """Distances of points to a plane: fitted to them, and nominal if one is given."""
-    from armscan.report.inspect_job import run_plane_inspection
+    from armscan.jobs.inspect import run_plane_inspection
 
     request = inspect_request(
         cloud, region=region, feature_mm=feature_mm, output=output, force=force

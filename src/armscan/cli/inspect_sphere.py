@@ -14,7 +14,7 @@ from armscan.cli.inspect_arguments import (
     RegionOption,
     inspect_request,
 )
-from armscan.cli.output import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, show
 
 EXAMPLE = "\b\nExample:\n  armscan inspect sphere ball.ply --diameter 34.96 -o ball-inspection.html"
 
@@ -32,7 +32,7 @@ def sphere(
     as_json: AsJson = False,
 ) -> None:
     """Find a ball in a cloud; compare it with the standard, and with the fitted ball."""
-    from armscan.report.inspect_job import run_sphere_inspection
+    from armscan.jobs.inspect import run_sphere_inspection
 
     request = inspect_request(
         cloud, region=region, feature_mm=feature_mm, output=output, force=force

@@ -15,7 +15,7 @@ from armscan.cli.inspect_arguments import (
     inspect_request,
     numbers,
 )
-from armscan.cli.output import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, show
 
 EXAMPLE = (
     "\b\nExample:\n  armscan inspect step blocks.ply --height 20 -o blocks-inspection.html\n\n"
@@ -45,8 +45,8 @@ def step(
     as_json: AsJson = False,
 ) -> None:
     """Find two parallel faces in a cloud and measure the distance between them."""
-    from armscan.inspection.options import StepOptions
-    from armscan.report.inspect_job import run_step_inspection
+    from armscan.inspection.selection import StepOptions
+    from armscan.jobs.inspect import run_step_inspection
 
     request = inspect_request(
         cloud, region=region, feature_mm=feature_mm, output=output, force=force

@@ -9,8 +9,7 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import BitsAlign, BitsUsed
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.options import AsJson, BitsAlign, BitsUsed, Force, progress_bar, show
 
 EXAMPLE = (
     "\b\nExamples:\n"
@@ -56,17 +55,17 @@ def markers(
     as_json: AsJson = False,
 ) -> None:
     """Find ring markers in images; with two calibrated cameras, where they are."""
-    from armscan.markers.matching_options import MatchingOptions, parse_depth
-    from armscan.report.markers_job import MarkersRequest, run_markers
-    from armscan.storage.image_options import Alignment, ImageOptions
-    from armscan.vision.rings.options import Disc, RingOptions
+    from armscan.jobs.markers import MarkersRequest, run_markers
+    from armscan.markers.candidates import RingMatchOptions, parse_depth
+    from armscan.storage.images import Alignment, ImageOptions
+    from armscan.vision.rings import Disc, RingOptions
 
     request = MarkersRequest(
         images=tuple(images),
         stereo=stereo,
         output=output,
         rings=RingOptions(min_perimeter, max_perimeter, max_roundness, cast(Disc, disc)),
-        matching=MatchingOptions(
+        matching=RingMatchOptions(
             depth_mm=parse_depth(depth) if depth else None, diameter_mm=diameter
         ),
         image_options=ImageOptions(bits_used=bits_used, align=cast(Alignment, bits_align)),

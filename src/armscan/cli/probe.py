@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, Force, show
+from armscan.cli.options import AsJson, Force, show
 
 EXAMPLE = (
     "\b\nExamples:\n"
@@ -71,7 +71,7 @@ def probe(
     # point = tip-centre, tip_diameter_mm = 6
     """
     from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-    from armscan.report.probe_job import ProbeRequest, run_probing
+    from armscan.jobs.probe import ProbeRequest, run_probing
 
     options = ProbingOptions(
         side=None if side is None else side.value,

@@ -9,15 +9,21 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.image_arguments import BitsAlign, BitsUsed, LaserColourOption, StripeMethodOption
-from armscan.cli.output import AsJson, Force, progress_bar, show
-from armscan.cli.reconstruct_arguments import (
+from armscan.cli.options import (
+    AsJson,
     Background,
+    BitsAlign,
+    BitsUsed,
     DepthMargin,
+    Force,
+    LaserColourOption,
     Right,
     RightBackground,
     Sheet,
+    StripeMethodOption,
     Volume,
+    progress_bar,
+    show,
 )
 
 EXAMPLE = (
@@ -69,12 +75,11 @@ def reconstruct(
     as_json: AsJson = False,
 ) -> None:
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
-    from armscan.pipeline.measure_options import MeasureOptions
-    from armscan.reconstruction.choose_sheet import DepthRange
-    from armscan.report.cloud_job import CloudRequest
-    from armscan.report.scan_job import run_measurement
-    from armscan.storage.image_options import Alignment, ImageOptions
-    from armscan.vision.stripe.options import LaserColour, StripeMethod, StripeOptions
+    from armscan.jobs.reconstruct import CloudRequest, run_measurement
+    from armscan.pipeline.measure import MeasureOptions
+    from armscan.reconstruction.label_single import DepthRange
+    from armscan.storage.images import Alignment, ImageOptions
+    from armscan.vision.stripe.image import LaserColour, StripeMethod, StripeOptions
 
     request = CloudRequest(
         sensor=sensor,

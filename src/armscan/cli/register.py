@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, progress_bar, show
+from armscan.cli.options import AsJson, progress_bar, show
 
 EXAMPLE = (
     "\b\nExamples:\n"
@@ -67,17 +67,17 @@ def register(
     one way is refused. Views are joined in the frame of the first one; an arm that moved goes on
     in its old frame.
     """
-    from armscan.markers.match_result import MatchOptions
+    from armscan.jobs.register import run_registration
+    from armscan.markers.alignments import MarkerMatchOptions
     from armscan.pipeline.register import RegisterOptions
-    from armscan.report.register_job import run_registration
-    from armscan.report.register_request import RegisterRequest
+    from armscan.report.register import RegisterRequest
 
     request = RegisterRequest(
         lists=tuple(lists),
         output=output,
         moved=moved,
         clouds=tuple(cloud or ()),
-        options=RegisterOptions(MatchOptions(least_common=least_common), sigma_mm, by_id),
+        options=RegisterOptions(MarkerMatchOptions(least_common=least_common), sigma_mm, by_id),
         command=("armscan", *sys.argv[1:]),
     )
     with progress_bar() as progress:

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one place where failures become a sentence and an exit code."""
+"""From the words after armscan to an exit code; failures become a sentence."""
 
 from __future__ import annotations
 
 import io
 import os
+import stat
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import cast
@@ -13,6 +15,53 @@ from typing import cast
 import typer
 
 from armscan.errors import ArmscanError
+
+VARIABLE = "NUMBA_CACHE_DIR"
+
+
+def give_kernels_a_folder(package: Path, temporary: Path | None = None) -> None:
+    """Point numba at a folder of this user if it would find none, as in a container.
+
+    Without one, numba refuses every kernel. What a folder holds is run as code, so that one that
+    another user made, or may write, is not taken.
+
+    Parameters
+    ----------
+    package
+        The installed package, beside whose kernels numba keeps them where it can.
+    temporary
+        Folder for temporary files; that of the system if None.
+    """
+    if VARIABLE in os.environ:
+        return
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    if _may_be_written(package / "kernels" / "__pycache__") or _may_be_written(
+        Path(home) / "numba"
+    ):
+        return
+    place = Path(tempfile.gettempdir()) if temporary is None else temporary
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    folder = place / f"armscan-kernels-{user}"
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = folder.lstat()
+        is_own = stat.S_ISDIR(status.st_mode) and status.st_uid == user
+        if not is_own or status.st_mode & 0o022:
+            folder = Path(tempfile.mkdtemp(prefix="armscan-kernels-", dir=place))
+    except OSError:
+        return
+    os.environ[VARIABLE] = str(folder)
+
+
+def _may_be_written(folder: Path) -> bool:
+    """Whether a file can be made in a folder, tried as numba tries it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
 
 USAGE_ERROR = cast(type[Exception], typer.BadParameter.__bases__[0])
 EXIT_INPUT = 2
@@ -32,7 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Words after ``armscan``; those of the process if None.
     """
     from armscan.cli.app import command
-    from armscan.cli.compiled_kernels import give_kernels_a_folder
+
+    pass
 
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     give_kernels_a_folder(Path(__file__).parents[1])

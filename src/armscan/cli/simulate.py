@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from armscan.cli.output import AsJson, progress_bar, show
+from armscan.cli.options import AsJson, progress_bar, show
 
 EXAMPLE = (
     "\b\nExamples:\n"
@@ -77,8 +77,8 @@ def simulate(
     one exposure; markers is a part with ring markers, place by place, and markers-moved the same
     part after the arm was put down elsewhere; probing is the plate touched with a tip.
     """
+    from armscan.jobs.simulate import SimulateRequest, run_simulation
     from armscan.pipeline.simulate import SimulateOptions
-    from armscan.report.simulate_job import SimulateRequest, run_simulation
 
     options = SimulateOptions(preset.value, seed, processes)
     with progress_bar() as progress:

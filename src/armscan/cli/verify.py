@@ -16,7 +16,7 @@ from armscan.cli.inspect_arguments import (
     SideOption,
     numbers,
 )
-from armscan.cli.output import AsJson, Force, progress_bar, show
+from armscan.cli.options import AsJson, Force, progress_bar, show
 
 EXAMPLE = (
     "\b\nExample:\n  armscan verify ball/ --scanner scanner.json --ball 34.96 -o verify.html\n\n"
@@ -64,9 +64,9 @@ def verify(
     as_json: AsJson = False,
 ) -> int:
     """Say whether a scanner still measures as its calibration predicts."""
-    from armscan.inspection.options import InspectionOptions
+    from armscan.inspection.selection import InspectionOptions
+    from armscan.jobs.verify import VerifyRequest, run_verification
     from armscan.pipeline.verify import VerifyOptions
-    from armscan.report.verify_job import VerifyRequest, run_verification
 
     request = VerifyRequest(
         scan=scan,

@@ -11,8 +11,48 @@ from numpy.typing import ArrayLike
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
-from armscan.geometry.frames import Frame
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+
+
+class Frame:
+    """A right-handed Cartesian coordinate frame; never instantiated."""
+
+
+class Base(Frame):
+    """Fixed base of the arm."""
+
+
+class Tool(Frame):
+    """What the arm's pose describes: its last link."""
+
+
+class Probe(Frame):
+    """Centre of the touch probe's tip."""
+
+
+class Sensor(Frame):
+    """The scanner head: camera 0, x to the right, y down, z forward along its optical axis."""
+
+
+class CameraRight(Frame):
+    """Camera 1 of a stereo head, axes as for the Sensor."""
+
+
+class Board(Frame):
+    """Calibration target: origin in its first point, x along a row, y along a column."""
+
+
+class Plate(Frame):
+    """Flat reference plate."""
+
+
+class Part(Frame):
+    """The object being measured."""
+
+
+class Cad(Frame):
+    """Coordinate frame of a CAD model."""
+
 
 A = TypeVar("A", bound=Frame)
 B = TypeVar("B", bound=Frame)

@@ -12,9 +12,8 @@ from scipy.stats import chi2
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, skew
+from armscan.geometry.poses import Frame, Pose
+from armscan.geometry.rotations import rotation_from_vector, skew
 
 A = TypeVar("A", bound=Frame)
 B = TypeVar("B", bound=Frame)

@@ -9,19 +9,23 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import Plane, fit_plane
-from armscan.inspection.cleaning import (
+from armscan.geometry.shapes import Plane, fit_plane
+from armscan.inspection.results import (
+    MeasuredLength,
+    PlaneInspection,
+    PointCounts,
+    describe_deviations,
+)
+from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
+    InspectionOptions,
     Region,
     Selection,
+    dominant_flat,
     fit_robustly,
     outlier_rule,
     select,
 )
-from armscan.inspection.histogram import describe_deviations
-from armscan.inspection.options import InspectionOptions
-from armscan.inspection.results import MeasuredLength, PlaneInspection, PointCounts
-from armscan.inspection.search import dominant_flat
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
 

@@ -10,19 +10,18 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.sphere import Sphere, fit_sphere
-from armscan.inspection.cleaning import (
+from armscan.geometry.shapes import Sphere, fit_sphere
+from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
+from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
+    InspectionOptions,
     Region,
     Selection,
+    find_ball,
     fit_robustly,
     outlier_rule,
     select,
 )
-from armscan.inspection.histogram import describe_deviations
-from armscan.inspection.options import InspectionOptions
-from armscan.inspection.results import PointCounts, SphereInspection
-from armscan.inspection.search import find_ball
 from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
 

@@ -1,24 +1,384 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid alignments of two sets of markers: from triangles to all markers that they explain."""
+"""Alignments of two marker sets by congruent triangles and votes; options and results of a
+match.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
+from armscan.errors import OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_ints
+from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import closed_form_pose, spread_mm
-from armscan.markers.distance_labels import LabelledMarkers
-from armscan.markers.match_result import Alignment
+from armscan.records.points import MarkerSet
+
+LEAST_TO_CHECK = 4
+"""Three markers fit wherever their triangle occurs, its mirror image included; a fourth checks."""
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerMatchOptions:
+    """How markers are matched.
+
+    Parameters
+    ----------
+    least_common
+        Markers that must agree, 4 at least.
+    distance_sigmas
+        Two distances agree within this many standard deviations of their difference: of true
+        pairs one in 16,000 is lost at 4.
+    position_sigmas
+        A marker agrees with an alignment within this many standard deviations.
+    false_alarms
+        Expected count of alignments, in sets without anything in common, that would explain as
+        many markers: above it a match is taken for chance.
+    rival_share
+        A second alignment that explains this share of the best one's markers makes it not unique.
+    max_triangles
+        Triangles of markers that are looked for in the other set; all of them where there are
+        no more.
+    """
+
+    least_common: int = LEAST_TO_CHECK
+    distance_sigmas: float = 4.0
+    position_sigmas: float = 4.5
+    false_alarms: float = 1e-4
+    rival_share: float = 0.5
+    max_triangles: int = 400
+
+    def __post_init__(self) -> None:
+        if self.least_common < LEAST_TO_CHECK:
+            raise OptionError(
+                f"{self.least_common} common markers leave no check",
+                where="least_common",
+                remedy=f"ask for {LEAST_TO_CHECK} or more",
+            )
+        for name in ("distance_sigmas", "position_sigmas", "false_alarms", "rival_share"):
+            if not 0.0 < getattr(self, name) < float("inf"):
+                raise OptionError(f"{name} is {getattr(self, name)}", remedy="give a number > 0")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """A rigid motion that carries markers of the second set onto markers of the first.
+
+    Parameters
+    ----------
+    pairs
+        (K, 2) indices into the first and the second set, each index once, ordered by the first.
+    first_from_second
+        The motion, unweighted; `armscan.geometry.registration` gives the weighted one.
+    """
+
+    pairs: IntArray
+    first_from_second: Pose[Frame, Frame]
+
+    def __post_init__(self) -> None:
+        pairs = self.pairs[self.pairs[:, 0].argsort()]
+        object.__setattr__(self, "pairs", frozen_ints(pairs, (None, 2), "pairs of markers"))
+
+    def __len__(self) -> int:
+        """Count of markers explained."""
+        return len(self.pairs)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matched:
+    """The one alignment that explains the markers.
+
+    Parameters
+    ----------
+    alignment
+        Pairs and motion.
+    n_rival
+        Markers that the best other alignment explains.
+    log10_false_alarms
+        Logarithm of the count of alignments as good that chance alone would give.
+    """
+
+    alignment: Alignment
+    n_rival: int
+    log10_false_alarms: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NotUnique:
+    """More than one alignment explains the markers; none is chosen. Falsy."""
+
+    reason: str
+    remedy: str
+    rivals: tuple[Alignment, ...]
+
+    def __bool__(self) -> bool:
+        """Return False: this is no match."""
+        return False
+
+
+@dataclass(frozen=True, slots=True)
+class NoMatch:
+    """No alignment explains enough markers. Falsy.
+
+    Parameters
+    ----------
+    reason, remedy
+        What and what to do.
+    n_best
+        Markers that the best alignment explains.
+    """
+
+    reason: str
+    remedy: str
+    n_best: int = 0
+
+    def __bool__(self) -> bool:
+        """Return False: this is no match."""
+        return False
+
+
+MatchResult: TypeAlias = Matched | NotUnique | NoMatch
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledMarkers:
+    """Markers with their mutual distances.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3).
+    sigma_mm
+        (N,) standard deviation of a marker along its worst direction.
+    distance_mm
+        (N, N) distances.
+    labels_mm
+        (N, N - 1) distances of each marker to all others, the shortest first: its label V.
+    """
+
+    points_mm: FloatArray
+    sigma_mm: FloatArray
+    distance_mm: FloatArray
+    labels_mm: FloatArray
+
+    def __len__(self) -> int:
+        """Count of markers."""
+        return len(self.points_mm)
+
+
+def label_markers(markers: MarkerSet) -> LabelledMarkers:
+    """Give each marker its label: steps (1) to (3) of 4.3.1."""
+    sigma = np.zeros(0)
+    if len(markers):
+        sigma = np.sqrt(np.linalg.eigvalsh(markers.covariance_mm2)[:, -1])
+    return label_points(markers.points_mm, sigma)
+
+
+def label_points(points_mm: FloatArray, sigma_mm: FloatArray) -> LabelledMarkers:
+    """Give each of (N, 3) points its label; ``sigma_mm`` (N,) as in `LabelledMarkers`."""
+    distance = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
+    n = len(points_mm)
+    others = distance[~np.eye(n, dtype=bool)].reshape(n, max(n - 1, 0))
+    return LabelledMarkers(points_mm, sigma_mm, distance, np.sort(others, axis=1))
+
+
+def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float) -> int:
+    """Count C of distances of two labels that pair, one to one, within a limit: step (4).
+
+    Both labels ascend; each distance is used once, which the thesis's wording leaves open.
+    """
+    count = i = j = 0
+    while i < len(label_a_mm) and j < len(label_b_mm):
+        difference = float(label_a_mm[i] - label_b_mm[j])
+        if abs(difference) < limit_mm:
+            count, i, j = count + 1, i + 1, j + 1
+        elif difference > 0.0:
+            j += 1
+        else:
+            i += 1
+    return count
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelVotes:
+    """How well the labels of two sets agree.
+
+    Parameters
+    ----------
+    count
+        (N, M) distances of marker i of the first set that have at least one equal among those of
+        marker k of the second: an upper bound of the markers that agree with the pair (i, k).
+    weight
+        (N, M) the same, each distance weighed by how rarely it pairs by chance (natural units of
+        information).
+    n_agreeing
+        Pairs of distances that agree, each counted from both its ends in either set: four times.
+    """
+
+    count: IntArray
+    weight: FloatArray
+    n_agreeing: int
+
+
+def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> LabelVotes:
+    """Compare every label of one set with every label of the other.
+
+    Two distances agree if they differ by less than ``sigmas`` standard deviations of their
+    difference; that of a distance is taken from its two ends, along their worst directions.
+    """
+    n, m = len(first), len(second)
+    count, weight = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
+    if n < 2 or m < 2:
+        return LabelVotes(count, weight, 0)
+    owner, other = np.nonzero(~np.eye(m, dtype=bool))
+    distances = second.distance_mm[owner, other]
+    order = np.argsort(distances, kind="stable")
+    ordered, owner = distances[order], owner[order]
+    worst = 2.0 * float(second.sigma_mm.max()) ** 2
+    hits = 0
+    for i in range(n):
+        others = np.flatnonzero(np.arange(n) != i)
+        limit = sigmas * np.sqrt(first.sigma_mm[i] ** 2 + first.sigma_mm[others] ** 2 + worst)
+        label = first.distance_mm[i, others]
+        low = np.searchsorted(ordered, label - limit)
+        high = np.searchsorted(ordered, label + limit)
+        size = high - low
+        hits += int(size.sum())
+        # (label, owner) of every agreeing distance, each owner once a label
+        place = np.arange(int(size.sum())) - np.repeat(np.cumsum(size) - size, size)
+        agrees = np.zeros((n - 1, m), dtype=bool)
+        agrees[np.repeat(np.arange(n - 1), size), owner[np.repeat(low, size) + place]] = True
+        share = agrees.sum(axis=1) / m
+        count[i] = agrees.sum(axis=0)
+        weight[i] = -np.log(np.clip(share, 1.0 / m, 1.0 - 0.5 / m)) @ agrees
+    return LabelVotes(count, weight, hits)
+
+
+LEAST_HEIGHT_SIGMAS = 15.0
+"""A triangle lower than this many standard deviations of a marker fixes no turn."""
+BROAD = 0.03
+"""Heights above this share of the whole set's extent: the alignment errs elsewhere by no more than
+some thirty times what a marker does. Flatter triangles are used only where there are no others, or
+few markers, so that each triangle counts."""
+FEW_MARKERS = 12
+MAX_COPIES = 48
+"""Congruent triangles of one triangle that are looked at; only repeated patterns have more."""
+DRAWS = 20
+
+
+def base_triangles(
+    first: LabelledMarkers, votes: LabelVotes, max_triangles: int, least_votes: int
+) -> IntArray:
+    """(T, 3) triangles of markers that may be common, well shaped ones if there are any.
+
+    All of them if there are no more than ``max_triangles``; else a draw that prefers markers whose
+    label weighs much somewhere in the other set. The draw depends on the labels only, so neither
+    on the order of the markers nor on where they stand.
+    """
+    usable = np.flatnonzero((votes.count >= least_votes).any(axis=1))
+    if len(usable) < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    # an order that any numbering and any place of the markers gives
+    usable = usable[np.argsort(first.labels_mm[usable].sum(axis=1), kind="stable")]
+    n_all = len(usable) * (len(usable) - 1) * (len(usable) - 2) // 6
+    if n_all <= max_triangles:
+        chosen = np.array(list(combinations(usable.tolist(), 3)), dtype=np.int64)
+    else:
+        best = votes.weight[usable].max(axis=1)
+        likely = best / best.sum() + 1.0 / len(best)
+        chosen = usable[_drawn(likely / likely.sum(), DRAWS * max_triangles)]
+    height = triangle_heights(first, chosen)
+    lowest = LEAST_HEIGHT_SIGMAS * float(first.sigma_mm.max())
+    extent = float(first.distance_mm.max())
+    broad = 0.0 if len(first) <= FEW_MARKERS else BROAD * extent
+    for limit in (max(lowest, broad), lowest):
+        if (height > limit).any():
+            return chosen[height > limit][:max_triangles]
+    return chosen[:0]
+
+
+def triangle_heights(markers: LabelledMarkers, triangles: IntArray) -> FloatArray:
+    """(T,) least height of (T, 3) triangles, in mm."""
+    a, b, c = (markers.points_mm[triangles[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - a, c - b)], axis=0)
+    return np.asarray(area / np.maximum(longest, 1e-12))
+
+
+class CongruentTriangles:
+    """Finds the triangles of the second set that are congruent to one of the first."""
+
+    def __init__(
+        self,
+        first: LabelledMarkers,
+        second: LabelledMarkers,
+        admissible: BoolArray,
+        sigmas: float,
+    ) -> None:
+        self._first, self._second = first, second
+        self._admissible = admissible
+        self._sigmas = sigmas
+        self._sigma_mm = float(second.sigma_mm.max())
+        tails, heads = np.nonzero(~np.eye(len(second), dtype=bool))
+        lengths = second.distance_mm[tails, heads]
+        order = np.argsort(lengths, kind="stable")
+        self._tails, self._heads = tails[order], heads[order]
+        self._lengths = lengths[order]
+
+    def of(self, triangle: IntArray) -> IntArray:
+        """(H, 3) markers of the second set whose mutual distances are those of ``triangle``."""
+        i, j, m = (int(index) for index in triangle)
+        d = self._first.distance_mm
+        # the longest side is the rarest
+        i, j, m = max(((i, j, m), (j, m, i), (m, i, j)), key=lambda t: d[t[0], t[1]])
+        limit = self._limit(i, j)
+        low, high = np.searchsorted(self._lengths, [d[i, j] - limit, d[i, j] + limit])
+        k, n = self._tails[low:high], self._heads[low:high]
+        keep = self._admissible[i, k] & self._admissible[j, n]
+        k, n = k[keep], n[keep]
+        fits = np.abs(self._second.distance_mm[k] - d[i, m]) < self._limit(i, m)
+        fits &= np.abs(self._second.distance_mm[n] - d[j, m]) < self._limit(j, m)
+        fits &= self._admissible[m][None, :]
+        row, third = np.nonzero(fits)
+        found = np.stack([k[row], n[row], third], axis=1)
+        places = [(i, j, m).index(int(index)) for index in triangle]
+        step = max(1, -(-len(found) // MAX_COPIES))
+        return np.asarray(found[::step][:, places], dtype=np.int64)
+
+    def _limit(self, i: int, j: int) -> float:
+        sigma = self._first.sigma_mm
+        return self._sigmas * float(
+            np.sqrt(sigma[i] ** 2 + sigma[j] ** 2 + 2.0 * self._sigma_mm**2)
+        )
+
+
+def chunks(triangles: IntArray, size: int) -> Iterator[IntArray]:
+    """Triangles in portions."""
+    for start in range(0, len(triangles), size):
+        yield triangles[start : start + size]
+
+
+def _drawn(likely: FloatArray, count: int) -> IntArray:
+    """(T, 3) different triples of different indices, each index as likely as said."""
+    generator = np.random.default_rng(0)
+    triples = generator.choice(len(likely), size=(count, 3), p=likely)
+    triples = np.sort(triples, axis=1)
+    triples = triples[(triples[:, 0] < triples[:, 1]) & (triples[:, 1] < triples[:, 2])]
+    _, place = np.unique(triples, axis=0, return_index=True)
+    return np.asarray(triples[np.sort(place)], dtype=np.int64)
+
 
 REFINEMENTS = 6
 SAME_PLACE_GATES = 3.0
 """Two alignments are one if they carry every marker that they explain to within so many gates."""
 
 
-class MarkerPlacing:
+class MarkerPlacement:
     """Carries the second set onto the first and says which markers agree.
 
     Parameters
@@ -155,3 +515,80 @@ def keeps_side(first: LabelledMarkers, translation: FloatArray, flat_below_mm: f
 
 def _is_subset(part: IntArray, whole: IntArray) -> bool:
     return {(int(i), int(k)) for i, k in part} <= {(int(i), int(k)) for i, k in whole}
+
+
+CHUNK = 40
+MAX_ALIGNMENTS = 20_000
+"""Alignments that are scored before the search ends; only repeated patterns have as many."""
+ENOUGH_TRIANGLES = 20.0
+"""The search ends when so many triangles of any alignment worth naming should have been drawn."""
+FLAT_SHARE = 0.05
+
+
+def find_alignments(
+    placing: MarkerPlacement,
+    votes: LabelVotes,
+    options: MarkerMatchOptions,
+    *,
+    are_seen: bool = False,
+    known: tuple[Alignment, ...] = (),
+) -> list[Alignment]:
+    """Different alignments, the best first; at least the two best are complete.
+
+    Parameters
+    ----------
+    placing, votes, options
+        The two sets, how their labels agree, and the limits.
+    are_seen
+        Both sets are in the frame of a sensor that saw them from its origin.
+    known
+        Alignments that are not to be looked for.
+    """
+    a, b = placing.first, placing.second
+    # among few markers three that agree are looked for too: they may be a rival of four
+    least_votes = LEAST_TO_CHECK - (2 if len(a) <= FEW_MARKERS else 1)
+    admissible = votes.count >= least_votes
+    triangles = base_triangles(a, votes, options.max_triangles, least_votes)
+    finder = CongruentTriangles(a, b, admissible, options.distance_sigmas)
+    flat_mm = FLAT_SHARE * float(spread_mm(a.points_mm)[1])
+    most = min(int(admissible.any(axis=1).sum()), int(admissible.any(axis=0).sum()))
+    found = list(known)
+    n_seen = n_scored = 0
+    for portion in chunks(triangles, CHUNK):
+        copies = [finder.of(triangle) for triangle in portion]
+        corners = np.repeat(portion, [len(item) for item in copies], axis=0)
+        matches = np.concatenate(copies)
+        new = ~agree_with_known(corners, matches, found)
+        corners, matches = corners[new], matches[new]
+        rotation, translation = placing.poses(corners, matches)
+        if are_seen:
+            seen = keeps_side(a, translation, flat_mm)
+            corners, matches = corners[seen], matches[seen]
+            rotation, translation = rotation[seen], translation[seen]
+        counts = placing.counts(rotation, translation, matches)
+        for k in np.argsort(-counts, kind="stable"):
+            second_best = len(found[1]) if len(found) > 1 else 2
+            if counts[k] <= second_best:
+                break
+            if not agree_with_known(corners[k : k + 1], matches[k : k + 1], found).any():
+                _add(placing, found, placing.refined(rotation[k], translation[k], matches[k]))
+        n_seen, n_scored = n_seen + len(portion), n_scored + len(matches)
+        is_settled = len(found) > 1 and len(found[1]) >= max(options.rival_share * most, 4)
+        share = options.rival_share * len(found[0]) / len(a) if found else 0.0
+        if is_settled or n_scored > MAX_ALIGNMENTS or n_seen * share**3 > ENOUGH_TRIANGLES:
+            break
+    return found
+
+
+def _add(placing: MarkerPlacement, known: list[Alignment], alignment: Alignment) -> None:
+    """Keep an alignment unless a better one is the same; best first."""
+    if len(alignment) < 3:
+        return
+    for k, other in enumerate(known):
+        if placing.are_same(alignment, other):
+            if len(alignment) > len(other):
+                known[k] = alignment
+            break
+    else:
+        known.append(alignment)
+    known.sort(key=len, reverse=True)

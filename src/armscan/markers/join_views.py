@@ -1,26 +1,153 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The handheld way: views chained by the markers they share, then solved together."""
+"""Views of markers joined to one map: links of views, chains of markers, a common adjustment."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Part, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.registration import (
-    PointPairs,
-    carried_covariance_mm2,
-    register_points,
-)
-from armscan.markers.joint_map import JointMap, Sightings, adjust_jointly
-from armscan.markers.match_result import MatchOptions
-from armscan.markers.view_links import Tracks, ViewLinks, chain_markers, link_views
-from armscan.records.markers import MarkerSet
+from armscan.geometry.poses import Part, Pose, Sensor
+from armscan.geometry.registration import PointPairs, carried_covariance_mm2, register_points
+from armscan.markers.alignments import MarkerMatchOptions, Matched, NotUnique
+from armscan.markers.joint_map import JointMap, MarkerObservations, adjust_jointly
+from armscan.markers.match_3d import match_markers
+from armscan.records.points import MarkerSet
+
+Node = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """Markers that two views share.
+
+    Parameters
+    ----------
+    first, second
+        Indices of the views.
+    pairs
+        (K, 2) indices of markers in either.
+    """
+
+    first: int
+    second: int
+    pairs: IntArray
+
+    def __len__(self) -> int:
+        """Count of markers shared."""
+        return len(self.pairs)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewLinks:
+    """What matching each view with each other gave.
+
+    Parameters
+    ----------
+    links
+        Pairs of views that match, the strongest first.
+    not_unique
+        Of a view, why a match with another was not unique; the last such reason.
+    n_best
+        Of each view, the most markers that agree with any view it does not match.
+    """
+
+    links: tuple[Link, ...]
+    not_unique: dict[int, str]
+    n_best: tuple[int, ...]
+
+
+def link_views(
+    views: Sequence[MarkerSet],
+    options: MarkerMatchOptions | None = None,
+    advance: Callable[[int, int], None] | None = None,
+) -> ViewLinks:
+    """Match every view with every other.
+
+    Parameters
+    ----------
+    views
+        Markers of each view in its own frame.
+    options
+        How to match.
+    advance
+        Called with how many pairs are done, and of how many.
+    """
+    links: list[Link] = []
+    not_unique: dict[int, str] = {}
+    n_best = [0] * len(views)
+    pairs = list(combinations(range(len(views)), 2))
+    for done, (i, k) in enumerate(pairs, start=1):
+        result = match_markers(views[i], views[k], options)
+        if isinstance(result, Matched):
+            links.append(Link(i, k, result.alignment.pairs))
+        elif isinstance(result, NotUnique):
+            not_unique[i] = not_unique[k] = result.reason
+        else:
+            n_best[i], n_best[k] = max(n_best[i], result.n_best), max(n_best[k], result.n_best)
+        if advance is not None:
+            advance(done, len(pairs))
+    links.sort(key=len, reverse=True)
+    return ViewLinks(tuple(links), not_unique, tuple(n_best))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Markers of the part, each with its sightings.
+
+    Parameters
+    ----------
+    of_view
+        For each view, (N,) number of the part's marker that each of its markers is.
+    n_markers
+        Count of different markers.
+    n_contradictions
+        Pairs that were dropped because they would make two markers of one view the same.
+    """
+
+    of_view: tuple[IntArray, ...]
+    n_markers: int
+    n_contradictions: int
+
+
+def chain_markers(views: Sequence[MarkerSet], links: Sequence[Link]) -> Tracks:
+    """Number the part's markers: what links call the same is one; strong links go first."""
+    root: dict[Node, Node] = {
+        (view, k): (view, k) for view, markers in enumerate(views) for k in range(len(markers))
+    }
+    seen_by: dict[Node, set[int]] = {node: {node[0]} for node in root}
+
+    def found(node: Node) -> Node:
+        while root[node] != node:
+            root[node] = root[root[node]]
+            node = root[node]
+        return node
+
+    n_contradictions = 0
+    for link in links:
+        for i, k in link.pairs.tolist():
+            one, other = found((link.first, i)), found((link.second, k))
+            if one == other:
+                continue
+            if seen_by[one] & seen_by[other]:
+                n_contradictions += 1
+                continue
+            root[other] = one
+            seen_by[one] |= seen_by.pop(other)
+    number: dict[Node, int] = {}
+    of_view = tuple(
+        np.array(
+            [number.setdefault(found((view, k)), len(number)) for k in range(len(markers))],
+            dtype=np.int64,
+        )
+        for view, markers in enumerate(views)
+    )
+    return Tracks(of_view, len(number), n_contradictions)
+
 
 LEAST_TO_PLACE = 4
 
@@ -61,7 +188,7 @@ class JoinedViews:
     placed: tuple[int, ...]
     map: JointMap
     marker_of: tuple[IntArray, ...]
-    sightings: Sightings
+    sightings: MarkerObservations
     left: tuple[LeftView, ...]
     chain: tuple[Pose[Part, Sensor], ...]
     n_links: int
@@ -98,7 +225,7 @@ class JoinedViews:
 
 def join_views(
     views: Sequence[MarkerSet],
-    options: MatchOptions | None = None,
+    options: MarkerMatchOptions | None = None,
     advance: Callable[[int, int], None] | None = None,
 ) -> JoinedViews | FitFailure:
     """Join views that share markers; the first view's frame is the common one.
@@ -126,7 +253,7 @@ def join_views(
         return FitFailure(f"no view can be joined to the first: {left[0].reason}", left[0].remedy)
     numbers = np.unique(np.concatenate([tracks.of_view[view] for view in placed]))
     marker_of = tuple(np.searchsorted(numbers, tracks.of_view[view]) for view in placed)
-    sightings = Sightings(
+    sightings = MarkerObservations(
         np.repeat(np.arange(len(placed)), [len(item) for item in marker_of]),
         np.concatenate(marker_of),
         np.concatenate([views[view].points_mm for view in placed]),

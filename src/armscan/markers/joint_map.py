@@ -10,9 +10,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.frames import Part, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, skew
+from armscan.geometry.poses import Part, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, skew
 
 MAX_ROUNDS = 30
 SETTLED = 1e-10
@@ -21,7 +20,7 @@ OUTLIER_LEVEL = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sightings:
+class MarkerObservations:
     """Which view saw which marker where.
 
     Parameters
@@ -41,9 +40,9 @@ class Sightings:
         """Count of sightings."""
         return len(self.view)
 
-    def chosen(self, kept: BoolArray) -> Sightings:
+    def chosen(self, kept: BoolArray) -> MarkerObservations:
         """Those where ``kept`` (K,) is true."""
-        return Sightings(
+        return MarkerObservations(
             self.view[kept], self.marker[kept], self.point_mm[kept], self.covariance_mm2[kept]
         )
 
@@ -80,7 +79,7 @@ class JointMap:
 
 
 def adjust_jointly(
-    sightings: Sightings, start: Sequence[Pose[Part, Sensor]], markers_mm: FloatArray
+    sightings: MarkerObservations, start: Sequence[Pose[Part, Sensor]], markers_mm: FloatArray
 ) -> JointMap:
     """Solve all poses but the first and all markers; leave out sightings that do not fit.
 
@@ -135,7 +134,7 @@ class _Normal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    sightings: Sightings
+    sightings: MarkerObservations
     poses: tuple[Pose[Part, Sensor], ...]
     markers_mm: FloatArray
 

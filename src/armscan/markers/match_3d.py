@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matching two sets of markers in space by their distances, with a test that the match is unique.
+"""Matching two sets of markers in space by their distances, with a test that the match is
+unique.
 
 Labels vote (4.3.1), congruent triangles give alignments, markers within the noise of their
-positions count for them, and two questions are asked of the best: would chance explain as many
+positions count for them, and two questions are asked of the best: would chance explain as
+many
 (Moisan and Stival 2004, a contrario), and does another alignment explain nearly as many?
 """
 
@@ -16,25 +18,23 @@ from scipy.stats import binom
 
 from armscan.geometry.poses import Pose
 from armscan.geometry.registration import spread_mm
-from armscan.markers.alignment_search import find_alignments
-from armscan.markers.alignments import MarkerPlacing
-from armscan.markers.distance_labels import (
+from armscan.markers.alignments import (
+    LEAST_TO_CHECK,
+    Alignment,
     LabelledMarkers,
     LabelVotes,
+    MarkerMatchOptions,
+    MarkerPlacement,
+    Matched,
+    MatchResult,
+    NoMatch,
+    NotUnique,
+    find_alignments,
     label_markers,
     label_points,
     vote,
 )
-from armscan.markers.match_result import (
-    LEAST_TO_CHECK,
-    Alignment,
-    Matched,
-    MatchOptions,
-    MatchResult,
-    NoMatch,
-    NotUnique,
-)
-from armscan.records.markers import MarkerSet
+from armscan.records.points import MarkerSet
 
 CLEAR_LEAD = 2
 """Markers that the best alignment must explain more than any other."""
@@ -45,7 +45,7 @@ ENOUGH_MARKERS = "give six or more common markers at unequal distances"
 
 
 def match_markers(
-    first: MarkerSet, second: MarkerSet, options: MatchOptions | None = None
+    first: MarkerSet, second: MarkerSet, options: MarkerMatchOptions | None = None
 ) -> MatchResult:
     """Find which markers of two sets are the same, and the rigid motion between the sets.
 
@@ -62,7 +62,7 @@ def match_markers(
     NoMatch
         Nothing in common, or no more than chance would show.
     """
-    options = options or MatchOptions()
+    options = options or MarkerMatchOptions()
     if (n := min(len(first), len(second))) < LEAST_TO_CHECK:
         return NotUnique(
             f"a set holds {n} markers, and fewer than {LEAST_TO_CHECK} fit in more than one way",
@@ -77,7 +77,7 @@ def match_markers(
     if on_line is not None:
         return on_line
     votes = vote(a, b, options.distance_sigmas)
-    placing = MarkerPlacing(a, b, options.position_sigmas)
+    placing = MarkerPlacement(a, b, options.position_sigmas)
     are_seen = first.frame == second.frame == "Sensor"
     found = find_alignments(placing, votes, options, are_seen=are_seen)
     result = _judged(placing, votes, found, options)
@@ -108,7 +108,7 @@ def log10_false_alarms(
 
 
 def _judged(
-    placing: MarkerPlacing, votes: LabelVotes, found: list[Alignment], options: MatchOptions
+    placing: MarkerPlacement, votes: LabelVotes, found: list[Alignment], options: MarkerMatchOptions
 ) -> MatchResult:
     if not found:
         return NoMatch("no three markers have the same distances in both sets", ENOUGH_MARKERS)
@@ -133,7 +133,7 @@ def _judged(
 
 
 def _ambiguity(
-    placing: MarkerPlacing, best: Alignment, n_rival: int, *, has_rival: bool
+    placing: MarkerPlacement, best: Alignment, n_rival: int, *, has_rival: bool
 ) -> tuple[str, str] | None:
     """Why the best alignment is not the only one, and what to do; None if it is."""
     n = len(best)
@@ -171,7 +171,7 @@ def _inverse(alignment: Alignment) -> Alignment:
 
 
 def _unless_symmetric(
-    result: Matched, placing: MarkerPlacing, options: MatchOptions
+    result: Matched, placing: MarkerPlacement, options: MarkerMatchOptions
 ) -> Matched | NotUnique:
     """Refuse a match on a part that fits on itself in another way.
 
@@ -187,7 +187,7 @@ def _unless_symmetric(
     both = label_points(points, sigma)
     everything = np.tile(np.arange(len(points))[:, None], (1, 2))
     itself = Alignment(everything, Pose(np.eye(3), np.zeros(3)))
-    onto_itself = MarkerPlacing(both, both, options.position_sigmas)
+    onto_itself = MarkerPlacement(both, both, options.position_sigmas)
     votes = vote(both, both, options.distance_sigmas)
     found = find_alignments(onto_itself, votes, options, known=(itself,))
     n = len(found[1]) if len(found) > 1 else 0
@@ -213,7 +213,7 @@ def _on_a_line(first: LabelledMarkers, second: LabelledMarkers) -> NotUnique | N
     return None
 
 
-def _rests_on_one(placing: MarkerPlacing, best: Alignment) -> bool:
+def _rests_on_one(placing: MarkerPlacement, best: Alignment) -> bool:
     points = placing.first.points_mm[best.pairs[:, 0]]
     least = LINE_SIGMAS * float(placing.first.sigma_mm.max())
     return any(spread_mm(np.delete(points, k, axis=0))[1] < least for k in range(len(points)))

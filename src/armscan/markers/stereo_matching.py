@@ -10,17 +10,16 @@ from enum import Enum
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.markers.epipolar_candidates import CandidatePairs, find_candidates
-from armscan.markers.matching_options import MatchingOptions
+from armscan.markers.candidates import CandidatePairs, RingMatchOptions, find_candidates
 from armscan.markers.surface_support import only_candidates, only_supported, ranks
 from armscan.models.two_views import TwoViews
-from armscan.records.markers import MarkerSet, RingImages
+from armscan.records.points import MarkerSet, RingImages
 
 _ROUNDS = 2
 """The second round takes the first one's matches as seeds: more of them, and no false ones."""
 
 
-class RingFate(Enum):
+class RingStatus(Enum):
     """What became of a ring of the left image."""
 
     MATCHED = "matched"
@@ -55,15 +54,15 @@ class StereoMatches:
     markers: MarkerSet
     distance_px: FloatArray
     sigma_px: FloatArray
-    fates: tuple[RingFate, ...]
+    fates: tuple[RingStatus, ...]
     n_candidates: int
     n_planes: int
 
     @property
-    def counts(self) -> dict[RingFate, int]:
+    def counts(self) -> dict[RingStatus, int]:
         """How many rings of the left image met each fate."""
         found = Counter(self.fates)
-        return {fate: found[fate] for fate in RingFate}
+        return {fate: found[fate] for fate in RingStatus}
 
 
 def match_rings(
@@ -71,7 +70,7 @@ def match_rings(
     right: RingImages,
     views: TwoViews,
     calibration_covariance: FloatArray,
-    options: MatchingOptions | None = None,
+    options: RingMatchOptions | None = None,
 ) -> StereoMatches:
     """Match rings and triangulate the markers.
 
@@ -93,11 +92,11 @@ def match_rings(
     views
         The cameras.
     calibration_covariance
-        (24, 24) in the order of `armscan.models.stereo.STEREO_PARAMETER_NAMES`.
+        (24, 24) in the order of `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
     options
         Thresholds.
     """
-    options = MatchingOptions() if options is None else options
+    options = RingMatchOptions() if options is None else options
     pairs = find_candidates(left, right, views, calibration_covariance, options)
     matched = only_candidates(pairs)
     rank = best = np.zeros(len(pairs), np.int64)
@@ -115,7 +114,7 @@ def match_rings(
 def _matches(
     left: RingImages,
     chosen: CandidatePairs,
-    fates: tuple[RingFate, ...],
+    fates: tuple[RingStatus, ...],
     n_candidates: int,
     n_planes: int,
 ) -> StereoMatches:
@@ -134,14 +133,14 @@ def _matches(
 
 def _fates(
     n: int, pairs: CandidatePairs, supported: BoolArray, matched: IntArray, crossed: BoolArray
-) -> tuple[RingFate, ...]:
-    fates = [RingFate.NO_PARTNER] * n
+) -> tuple[RingStatus, ...]:
+    fates = [RingStatus.NO_PARTNER] * n
     for row in pairs.left:
-        fates[row] = RingFate.UNSUPPORTED
+        fates[row] = RingStatus.UNSUPPORTED
     for row in pairs.left[supported]:
-        fates[row] = RingFate.AMBIGUOUS
+        fates[row] = RingStatus.AMBIGUOUS
     for row, is_crossed in zip(pairs.left[matched], crossed, strict=True):
-        fates[row] = RingFate.OUT_OF_ORDER if is_crossed else RingFate.MATCHED
+        fates[row] = RingStatus.OUT_OF_ORDER if is_crossed else RingStatus.MATCHED
     return tuple(fates)
 
 

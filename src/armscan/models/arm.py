@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A measuring arm: a Denavit-Hartenberg chain of revolute joints (eqs. 2.1 to 2.10)."""
+"""A measuring arm: Denavit-Hartenberg chain, joint angles to pose and back (eqs. 2.1 to 2.10)."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, frozen_floats
-from armscan.geometry.frames import Tool
-from armscan.geometry.poses import Pose
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import vector_from_rotation
 
 AXIS_PARAMETERS = ("theta_offset_rad", "offset_mm", "length_mm", "twist_rad")
 """The four numbers of an axis, in this order: theta_i0, d_i, l_i, alpha_i of eq. 2.5."""
@@ -168,3 +169,289 @@ def _limits(values: FloatArray, n: int, name: str) -> FloatArray:
         raise InputError(f"{name} must hold {n} numbers")
     limits.setflags(write=False)
     return limits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisFrames:
+    """Where the axes of an arm stand, for N joint vectors.
+
+    Parameters
+    ----------
+    rotations
+        (N, n + 1, 3, 3) frames 0 (Base) to n (last axis) of fig. 2.4, seen in Base.
+    origins_mm
+        (N, n + 1, 3) their origins in Base.
+    """
+
+    rotations: FloatArray
+    origins_mm: FloatArray
+
+
+def link_matrices(
+    theta_rad: FloatArray, offset_mm: FloatArray, length_mm: FloatArray, twist_rad: FloatArray
+) -> FloatArray:
+    """(..., 4, 4) matrices A_i of eq. 2.5 from arrays of one shape; theta holds the offsets."""
+    theta, d, length, twist = np.broadcast_arrays(theta_rad, offset_mm, length_mm, twist_rad)
+    cos_t, sin_t, cos_a, sin_a = np.cos(theta), np.sin(theta), np.cos(twist), np.sin(twist)
+    zero, one = np.zeros_like(theta), np.ones_like(theta)
+    rows = (
+        (cos_t, -sin_t * cos_a, sin_t * sin_a, length * cos_t),
+        (sin_t, cos_t * cos_a, -cos_t * sin_a, length * sin_t),
+        (zero, sin_a, cos_a, d),
+        (zero, zero, zero, one),
+    )
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def axis_frames(arm: ArmModel, joints_rad: FloatArray) -> AxisFrames:
+    """Frames of all axes for (N, n) joint angles as the encoders give them (eq. 2.6).
+
+    Raises
+    ------
+    InputError
+        If the count of joints is not the arm's, or an angle is not finite.
+    """
+    joints = np.atleast_2d(np.asarray(joints_rad, dtype=np.float64))
+    if joints.ndim != 2 or joints.shape[1] != arm.n_axes:
+        raise InputError(
+            f"{np.asarray(joints_rad).shape} joint angles for an arm of {arm.n_axes} axes",
+            where=arm.name,
+        )
+    if not np.isfinite(joints).all():
+        raise InputError("a joint angle is not finite", where=arm.name, remedy="mask the gaps")
+    links = link_matrices(
+        joints + arm.theta_offset_rad, arm.offset_mm, arm.length_mm, arm.twist_rad
+    )
+    frames = np.zeros((len(joints), arm.n_axes + 1, 4, 4))
+    frames[:, 0] = np.eye(4)
+    for axis in range(arm.n_axes):
+        frames[:, axis + 1] = frames[:, axis] @ links[:, axis]
+    return AxisFrames(frames[:, :, :3, :3], frames[:, :, :3, 3])
+
+
+def forward(arm: ArmModel, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pose of the tool for many joint vectors (eq. 2.9, then the flange).
+
+    Parameters
+    ----------
+    arm
+        Geometry.
+    joints_rad
+        (N, n) angles as the encoders give them; the arm's offsets are added here.
+
+    Returns
+    -------
+    rotations
+        (N, 3, 3) of ``base_from_tool``.
+    translations_mm
+        (N, 3).
+
+    Raises
+    ------
+    InputError
+        If the count of joints is not the arm's, or an angle is not finite.
+    """
+    return _after_flange(arm, axis_frames(arm, joints_rad))
+
+
+def _after_flange(arm: ArmModel, frames: AxisFrames) -> tuple[FloatArray, FloatArray]:
+    last = frames.rotations[:, -1]
+    origin = frames.origins_mm[:, -1] + last @ arm.flange.translation_mm
+    return last @ arm.flange.rotation, origin
+
+
+def joint_jacobian(
+    arm: ArmModel, joints_rad: FloatArray, point_tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Derivative of the pose by the joint angles.
+
+    Parameters
+    ----------
+    arm, joints_rad
+        As for `forward`.
+    point_tool_mm
+        (3,) point in Tool whose motion is asked for; Tool's origin if None.
+
+    Returns
+    -------
+    FloatArray
+        (N, 6, n): rows 0 to 2 rotation vector in Base, multiplied from the left
+        (``R <- exp(dr) R``), rows 3 to 5 motion of the point in Base, mm per rad.
+    """
+    return np.asarray(parameter_jacobian(arm, joints_rad, point_tool_mm)[:, :, 0::4])
+
+
+def parameter_jacobian(
+    arm: ArmModel, joints_rad: FloatArray, point_tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """Derivative of the pose by all the numbers of the chain.
+
+    An error of theta_i turns all that follows about z of frame i - 1, one of alpha_i about x of
+    frame i; d_i and l_i shift it along these axes.
+
+    Parameters
+    ----------
+    arm, joints_rad, point_tool_mm
+        As for `joint_jacobian`.
+
+    Returns
+    -------
+    FloatArray
+        (N, 6, 4 n): rows as in `joint_jacobian`, columns in the order of ``arm.parameters``.
+    """
+    frames = axis_frames(arm, joints_rad)
+    rotation, point = _after_flange(arm, frames)
+    if point_tool_mm is not None:
+        point = point + rotation @ np.asarray(point_tool_mm, dtype=np.float64)
+    along_axis = frames.rotations[:, :-1, :, 2]
+    along_normal = frames.rotations[:, 1:, :, 0]
+    lever_axis = point[:, None] - frames.origins_mm[:, :-1]
+    lever_normal = point[:, None] - frames.origins_mm[:, 1:]
+    turns = (along_axis, np.zeros_like(along_axis), np.zeros_like(along_axis), along_normal)
+    shifts = (
+        np.cross(along_axis, lever_axis),
+        along_axis,
+        along_normal,
+        np.cross(along_normal, lever_normal),
+    )
+    by_axis = np.concatenate([np.stack(turns, axis=2), np.stack(shifts, axis=2)], axis=3)
+    n_rows = len(by_axis)
+    return np.asarray(by_axis.transpose(0, 3, 1, 2).reshape(n_rows, 6, 4 * arm.n_axes))
+
+
+@dataclass(frozen=True, slots=True)
+class InverseOptions:
+    """When joint angles are good enough.
+
+    Parameters
+    ----------
+    position_tolerance_mm, rotation_tolerance_rad
+        Largest remaining errors of the pose.
+    lever_mm
+        Length at which an error of the orientation counts as much as one of the position.
+    max_steps
+        Steps before giving up.
+    """
+
+    position_tolerance_mm: float = 1e-6
+    rotation_tolerance_rad: float = 1e-9
+    lever_mm: float = 300.0
+    max_steps: int = 200
+
+    def __post_init__(self) -> None:
+        positive = (self.position_tolerance_mm, self.rotation_tolerance_rad, self.lever_mm)
+        if not min(positive) > 0.0 or self.max_steps < 1:
+            raise OptionError("tolerances, lever and steps of the arm's inverse must be positive")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSolution:
+    """Joint angles that reach a pose, (n,), with what remains of the error."""
+
+    joints_rad: FloatArray
+    position_error_mm: float
+    rotation_error_rad: float
+    n_steps: int
+
+
+def inverse(
+    arm: ArmModel,
+    base_from_tool: Pose[Base, Tool],
+    start_rad: FloatArray,
+    options: InverseOptions | None = None,
+) -> JointSolution | FitFailure:
+    """Joint angles near a start that bring the tool to a pose.
+
+    An arm of more than six axes reaches a pose in many ways: the steps are the shortest ones, so
+    the answer is close to the start. A joint at a limit stays there as long as its step would
+    leave the range.
+
+    Parameters
+    ----------
+    arm
+        Geometry and limits.
+    base_from_tool
+        Wanted pose.
+    start_rad
+        (n,) angles to begin with.
+    options
+        Defaults if None.
+
+    Returns
+    -------
+    JointSolution or FitFailure
+        A failure says how far the nearest pose found is away.
+
+    Raises
+    ------
+    InputError
+        If the start does not fit the arm or lies outside its limits.
+    """
+    options = options or InverseOptions()
+    low, high = arm.joint_limits_rad
+    joints = frozen_floats(start_rad, (arm.n_axes,), "start_rad")
+    if not bool(((joints >= low) & (joints <= high)).all()):
+        raise InputError("the start lies outside the limits of the joints", where=arm.name)
+    error = _error(arm, base_from_tool, joints, options.lever_mm)
+    damping, step = 1e-3, 0
+    while step < options.max_steps and damping < 1e12 and not _is_reached(error, options):
+        step += 1
+        trial = _step(arm, joints, error, damping, options.lever_mm)
+        trial_error = _error(arm, base_from_tool, trial, options.lever_mm)
+        if trial_error @ trial_error < error @ error:
+            joints, error, damping = trial, trial_error, max(damping / 10.0, 1e-12)
+        else:
+            damping *= 10.0
+    position = float(np.linalg.norm(error[3:]))
+    rotation = float(np.linalg.norm(error[:3])) / options.lever_mm
+    if not _is_reached(error, options):
+        return FitFailure(
+            f"the pose is not reached: the nearest found is {position:.3g} mm and "
+            f"{np.degrees(rotation):.3g} degrees away",
+            "ask for a pose within reach and within the joints' limits, or start nearer to it",
+        )
+    return JointSolution(joints, position, rotation, step)
+
+
+def _error(
+    arm: ArmModel, wanted: Pose[Base, Tool], joints: FloatArray, lever_mm: float
+) -> FloatArray:
+    """(6,) what is missing: rotation in Base times the lever, then position, mm."""
+    rotations, translations = forward(arm, joints[None])
+    turn = vector_from_rotation(wanted.rotation @ rotations[0].T)
+    return np.concatenate([lever_mm * turn, wanted.translation_mm - translations[0]])
+
+
+def _is_reached(error: FloatArray, options: InverseOptions) -> bool:
+    is_near = float(np.linalg.norm(error[3:])) <= options.position_tolerance_mm
+    turn_rad = float(np.linalg.norm(error[:3])) / options.lever_mm
+    return is_near and turn_rad <= options.rotation_tolerance_rad
+
+
+def _step(
+    arm: ArmModel, joints: FloatArray, error: FloatArray, damping: float, lever_mm: float
+) -> FloatArray:
+    """Damped step; joints that it would push out of their range are held and the rest redone."""
+    low, high = arm.joint_limits_rad
+    jacobian = joint_jacobian(arm, joints[None])[0]
+    jacobian[:3] *= lever_mm
+    is_free = np.ones(arm.n_axes, dtype=np.bool_)
+    while True:
+        move = _damped(jacobian, error, is_free, damping)
+        blocked = is_free & (((joints <= low) & (move < 0.0)) | ((joints >= high) & (move > 0.0)))
+        if not blocked.any():
+            return np.clip(joints + move, low, high)
+        is_free &= ~blocked
+
+
+def _damped(
+    jacobian: FloatArray, error: FloatArray, is_free: BoolArray, damping: float
+) -> FloatArray:
+    """(n,) shortest step of the free joints in the damped least-squares sense."""
+    move = np.zeros(len(is_free))
+    free = jacobian[:, is_free]
+    if free.shape[1]:
+        normal = free @ free.T
+        normal += damping * max(float(np.trace(normal)) / 6.0, 1e-300) * np.eye(6)
+        move[is_free] = free.T @ np.linalg.solve(normal, error)
+    return move

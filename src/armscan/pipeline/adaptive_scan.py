@@ -3,30 +3,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
-from armscan.devices.twin import SimulatedScan
+from armscan.devices.sources import SimulatedScan, TwinScene
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Sensor
-from armscan.geometry.poses import Pose
-from armscan.models.scanner import ScannerCalibration
-from armscan.reconstruction.exposure_poses import ExposurePoses
-from armscan.reconstruction.named_profile import NamedProfile
-from armscan.reconstruction.stripe_namer import STROKE_GAP_NS, StripeNamer
-from armscan.reconstruction.sync import exposure_poses
-from armscan.records.arm_track import ArmTrack
+from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.scan_part import ScanPart
+from armscan.pipeline.simulate import TwinName, in_processes
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, StripeLabeller
+from armscan.reconstruction.sync import ExposurePoses, exposure_poses
 from armscan.records.exposure import Exposure
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
+from armscan.storage.recording import encoded_png
+from armscan.storage.recording_writer import write_recording, written_session
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.stripe.image import StripeOptions
 
 Keep = Callable[[int, Exposure], None]
 """Told of every exposure that was taken, with its row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TakenStroke:
+class TakenPass:
     """What one stroke of a hand gave.
 
     Parameters
@@ -41,7 +46,7 @@ class TakenStroke:
 
     rows: tuple[int, ...]
     lasers: tuple[tuple[str, ...], ...]
-    named: tuple[NamedProfile, ...]
+    named: tuple[LabelledProfile, ...]
 
 
 def strokes(rows: Sequence[ExposureRow], gap_ns: int = STROKE_GAP_NS) -> tuple[range, ...]:
@@ -92,12 +97,12 @@ def sensor_poses(
 def take_stroke(
     scan: SimulatedScan,
     rows: Sequence[int],
-    namer: StripeNamer,
+    namer: StripeLabeller,
     base_from_sensor: Callable[[int], Pose[Base, Sensor] | None],
     *,
     stripes: StripeOptions | None = None,
     keep: Keep | None = None,
-) -> TakenStroke:
+) -> TakenPass:
     """Take one stroke, exposure by exposure, with the lasers that the namer asks for.
 
     Strokes do not depend on each other, so that several processes may take one each.
@@ -126,7 +131,7 @@ def take_stroke(
             keep(row, exposure)
         profile = extract_stripes(exposure, stripes)
         named.append(namer.name(profile, lasers[-1], base_from_sensor(row), scan.rows[row].t_ns))
-    return TakenStroke(tuple(rows), tuple(lasers), tuple(named))
+    return TakenPass(tuple(rows), tuple(lasers), tuple(named))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,7 +163,7 @@ class ChosenLasers:
             )
 
     @staticmethod
-    def of_strokes(scan: SimulatedScan, taken: Sequence[TakenStroke]) -> ChosenLasers:
+    def of_strokes(scan: SimulatedScan, taken: Sequence[TakenPass]) -> ChosenLasers:
         """Join the strokes of a scan.
 
         Raises
@@ -212,11 +217,11 @@ class ChosenLasers:
 def scan_adaptively(
     scan: SimulatedScan,
     scanner: ScannerCalibration,
-    namer: StripeNamer,
+    namer: StripeLabeller,
     *,
     stripes: StripeOptions | None = None,
     keep: Keep | None = None,
-) -> tuple[ChosenLasers, tuple[TakenStroke, ...]]:
+) -> tuple[ChosenLasers, tuple[TakenPass, ...]]:
     """Take all strokes of a scan one after the other.
 
     Parameters
@@ -243,3 +248,125 @@ def scan_adaptively(
         for rows in strokes(scan.rows)
     )
     return ChosenLasers.of_strokes(scan, taken), taken
+
+
+STAGE = "scan with chosen lasers"
+
+
+@dataclass(frozen=True, slots=True)
+class _Taken:
+    """A stroke with its images as PNG files."""
+
+    stroke: TakenPass
+    images: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rig:
+    """What takes strokes in one process."""
+
+    scan: SimulatedScan
+    scanner: ScannerCalibration
+
+    def take(self, rows: range) -> _Taken:
+        """Take one stroke, and keep its images."""
+        scan, sensor = self.scan, self.scanner.sensor
+        if sensor is None:
+            raise ValueError("a scanner without sensor names no stripes")
+        setup = written_session(scan).cameras[0]
+        images: list[bytes] = []
+
+        def keep(_row: int, exposure: Exposure) -> None:
+            images.append(encoded_png(exposure, setup))
+
+        pose = sensor_poses(scan, self.scanner)
+        stroke = take_stroke(scan, rows, CrossLabeller(sensor), pose, keep=keep)
+        return _Taken(stroke, tuple(images))
+
+
+_here: list[_Rig] = []
+"""What this process takes strokes with; empty in any but a process of the pool."""
+
+
+def record_adaptively(
+    folder: Path,
+    name: TwinName,
+    scene: TwinScene,
+    scanner: ScannerCalibration,
+    *,
+    longest_stroke: int | None = None,
+    processes: int = 2,
+    progress: Progress = silent,
+) -> None:
+    """Take a scene of a twin with the lasers that the naming asks for, and write the recording.
+
+    Parameters
+    ----------
+    folder
+        Must not exist or be empty.
+    name, scene
+        The twin, and what it looks at.
+    scanner
+        The calibrated scanner.
+    longest_stroke
+        Exposures that are taken of each stroke, its first ones; None for all.
+    processes
+        Processes that take strokes; 1 takes them in this one.
+    progress
+        Told of every stroke.
+
+    Raises
+    ------
+    OutputError
+        If the folder holds something or cannot be written.
+    EstimationError
+        If a process came to an end.
+    """
+    scan = _planned(name, scene, longest_stroke)
+    pieces = strokes(scan.rows)
+    done: list[_Taken] = []
+    given = (name, scene, scanner, longest_stroke)
+    with closing(_taken(pieces, processes, given)) as results:
+        for taken in results:
+            progress(ProgressEvent(STAGE, len(done), len(pieces), scene))
+            done.append(taken)
+    progress(ProgressEvent(STAGE, len(pieces), len(pieces)))
+    chosen = ChosenLasers.of_strokes(scan, [taken.stroke for taken in done])
+    write_recording(folder, chosen, encoded=[image for taken in done for image in taken.images])
+
+
+_Given = tuple[TwinName, TwinScene, ScannerCalibration, int | None]
+"""What a rig is made of, in any process."""
+
+
+def _taken(pieces: Sequence[range], processes: int, given: _Given) -> Generator[_Taken]:
+    n_processes = min(processes, len(pieces))
+    if n_processes > 1:
+        yield from in_processes(_take, pieces, n_processes, _prepare, given)
+        return
+    rig = _rig(*given)
+    for rows in pieces:
+        yield rig.take(rows)
+
+
+def _planned(name: TwinName, scene: TwinScene, longest_stroke: int | None) -> SimulatedScan:
+    """The scene, of each stroke as many exposures as are wanted."""
+    whole = name.build().scan(scene)
+    if longest_stroke is None:
+        return whole
+    kept = [row for rows in strokes(whole.rows) for row in rows[:longest_stroke]]
+    return ScanPart(whole, tuple(kept))
+
+
+def _rig(
+    name: TwinName, scene: TwinScene, scanner: ScannerCalibration, longest_stroke: int | None
+) -> _Rig:
+    return _Rig(_planned(name, scene, longest_stroke), scanner)
+
+
+def _prepare(*given: Any) -> None:
+    _here.append(_rig(*given))
+
+
+def _take(rows: range) -> _Taken:
+    return _here[0].take(rows)

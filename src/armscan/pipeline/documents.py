@@ -5,15 +5,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from armscan.calibration.camera.result import BoardWarp, CameraFit
-from armscan.calibration.laser.result import LackOfFit, LaserFit, SheetFit
-from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
-from armscan.models.diagnostics import (
-    BowedBoard,
+from armscan.calibration.cameras.result import BoardWarp, CameraFit
+from armscan.calibration.sheets.result import LackOfFit, LaserFit, SheetFit
+from armscan.models.calibration import (
+    CameraCalibration,
     CameraDiagnostics,
     FTest,
+    Provenance,
+    SensorCalibration,
     SensorDiagnostics,
     SheetDiagnostics,
+    WarpedBoard,
 )
 
 
@@ -61,11 +63,11 @@ def sensor_calibration(fit: LaserFit, provenance: Provenance) -> SensorCalibrati
     )
 
 
-def _bowed_board(warp: BoardWarp) -> BowedBoard:
+def _bowed_board(warp: BoardWarp) -> WarpedBoard:
     bow_x, bow_y = warp.bow_mm.tolist()
     sigma_x, sigma_y = warp.sigma_mm.tolist()
     test = FTest(warp.f_statistic, len(warp.bow_mm), warp.p_value)
-    return BowedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)
+    return WarpedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)
 
 
 def _sheet_diagnostics(fit: SheetFit) -> SheetDiagnostics:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a scan of a flat plate to the hand-eye."""
+"""What a hand-eye calibration observes: stripes in the images of a scan."""
 
 from __future__ import annotations
 
@@ -8,26 +8,30 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasuredImage, cameras_of, collected, see, stripes_for
-from armscan.pipeline.measure_options import MeasureOptions
+from armscan.pipeline.measure import (
+    MeasuredImage,
+    MeasureOptions,
+    cameras_of,
+    collected,
+    see,
+    stripes_for,
+)
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.sheet_rules import measurer_for
-from armscan.reconstruction.result import ReconstructedImage
+from armscan.pipeline.reconstruct import measurer_for
+from armscan.reconstruction.labels import MeasuredProfile
 from armscan.reconstruction.sync import SyncOptions, exposure_poses
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns
-from armscan.records.session import ExposureRow
+from armscan.records.recording import ExposureRow
 
 STAGE = "stripes of the postures"
 SAME_PLACE_MM = 0.05
@@ -85,7 +89,7 @@ class HandEyeRun:
 
     fit: HandEyeFit
     stripes: tuple[PosedStripe, ...]
-    images: tuple[ReconstructedImage, ...]
+    images: tuple[MeasuredProfile, ...]
     not_used: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -101,7 +105,7 @@ class ObservedStripes:
     """
 
     stripes: tuple[PosedStripe, ...]
-    images: tuple[ReconstructedImage, ...]
+    images: tuple[MeasuredProfile, ...]
     not_used: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
 
@@ -175,7 +179,7 @@ def observe_stripes(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
     stripes: list[PosedStripe] = []
-    images: list[ReconstructedImage] = []
+    images: list[MeasuredProfile] = []
     not_used = [
         (source.rows[row].source, "the arm gave no pose for it")
         for one, known in zip(lit, has_pose, strict=True)

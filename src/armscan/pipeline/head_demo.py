@@ -1,40 +1,436 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole chain on a simulated arm scanner of any head, from rendered images to inspections."""
+"""One head of the twin calibrated and measured, scene by scene, and what came out beside the
+truth.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Protocol, TypeVar
 
-from armscan.devices.twin import Twin, TwinScene
-from armscan.geometry.arrays import FloatArray
+import numpy as np
+
+from armscan.calibration.hand_eye.observations import PlateReference
+from armscan.calibration.hand_eye.probed_plate import plate_from_probing
+from armscan.calibration.sheets.result import LaserFit
+from armscan.devices.sources import Probing, ScanSource, Twin, TwinScene, TwinTruth
+from armscan.errors import EstimationError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
-from armscan.pipeline.head_calibration import Instrument, calibrate_head
-from armscan.pipeline.head_measurements import (
-    MeasuredPart,
-    inspect_ball,
-    inspect_part,
-    inspect_plate,
-    inspect_steps,
-    measure_still_step,
-    still_height_mm,
+from armscan.inspection.sphere import inspect_sphere
+from armscan.inspection.step import inspect_step
+from armscan.models.calibration import (
+    CameraCalibration,
+    Provenance,
+    ScannerCalibration,
+    SensorCalibration,
 )
-from armscan.pipeline.naming_truth import NamingErrors, naming_errors
+from armscan.models.probe import tip_centres, tool_from_probe
+from armscan.models.two_views import StereoCalibration
+from armscan.pipeline.adaptive_scan import record_adaptively, scan_adaptively
+from armscan.pipeline.cameras import (
+    calibrate_camera_from_exposures,
+    calibrate_stereo_from_exposures,
+    stereo_calibration,
+    stereo_rows,
+)
+from armscan.pipeline.documents import camera_calibration, sensor_calibration
+from armscan.pipeline.hand_eye import HandEyeRun, calibrate_hand_eye_from_scan
+from armscan.pipeline.laser import calibrate_sheets_from_scan
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.scan import measure_scan
-from armscan.pipeline.scan_result import ScanReconstruction
-from armscan.pipeline.stopwatch import Stopwatch
-from armscan.pipeline.truth_errors import (
+from armscan.pipeline.reconstruct import reconstruct
+from armscan.pipeline.scan import ScanReconstruction, measure_scan
+from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
+from armscan.pipeline.truth import (
     CameraErrors,
     HandEyeErrors,
+    NamingErrors,
     SheetErrors,
     camera_errors,
     hand_eye_errors,
+    naming_errors,
     sheet_errors,
     true_names,
 )
-from armscan.pipeline.twin_scans import RenderedScans, TwinScans
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.sync import exposure_poses
+from armscan.records.cloud import PointCloud
+from armscan.records.exposure import Exposure
+from armscan.records.points import ProbedPoints
+from armscan.storage.recording import FolderRecording, read_recording
+from armscan.vision.targets.target import Target, parse_target
+
+T = TypeVar("T")
+
+
+class Stopwatch:
+    """Seconds of named stages."""
+
+    def __init__(self) -> None:
+        """Start with no stage."""
+        self.seconds: dict[str, float] = {}
+
+    def timed(self, stage: str, work: Callable[[], T]) -> T:
+        """Do the work and note how long it took; parts of one stage are added up."""
+        start = perf_counter()
+        result = work()
+        before = self.seconds.get(stage, 0.0)
+        self.seconds[stage] = round(before + perf_counter() - start, 2)
+        return result
+
+
+class TwinScans(Protocol):
+    """Gives the scans of a twin, in the order in which the chain asks for them."""
+
+    def calibration(self, scene: TwinScene) -> ScanSource:
+        """A scan that a calibration rests on."""
+
+    def scanned(
+        self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
+    ) -> ScanSource:
+        """A scan by hand with the calibrated scanner, which may choose its lasers meanwhile."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedScans:
+    """Scans in memory; pixels are rendered when an exposure is asked for.
+
+    Parameters
+    ----------
+    twin
+        The simulated instrument.
+    most_views
+        Views of a scene that are used, evenly chosen; scenes that are not named are used whole.
+    """
+
+    twin: Twin
+    most_views: Mapping[TwinScene, int] = field(default_factory=dict)
+
+    def calibration(self, scene: TwinScene) -> ScanSource:
+        """See `TwinScans`."""
+        whole, most = self.twin.scan(scene), self.most_views.get(scene)
+        return whole if most is None else FewerViews(whole, most)
+
+    def scanned(
+        self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
+    ) -> ScanSource:
+        """See `TwinScans`."""
+        sensor = scanner.sensor
+        if len(self.twin.sources) < 2 or scene == "still-step" or sensor is None:
+            return self.calibration(scene)
+        taken: dict[int, Exposure] = {}
+        namer = CrossLabeller(sensor)
+        chosen, _ = scan_adaptively(self.twin.scan(scene), scanner, namer, keep=taken.__setitem__)
+        return replace(chosen, taken=taken)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedScans:
+    """See `armscan.pipeline.head_demo.TwinScans`.
+
+    Parameters
+    ----------
+    folder
+        Where the recordings go.
+    name
+        The twin.
+    most_views
+        The most views that are wanted of some scenes; where lasers are chosen meanwhile, the most
+        exposures of a stroke.
+    processes
+        Processes that render.
+    """
+
+    folder: Path
+    name: TwinName
+    most_views: Mapping[TwinScene, int] = field(default_factory=dict)
+    processes: int = 2
+    recordings: dict[TwinScene, FolderRecording] = field(default_factory=dict, init=False)
+
+    def record(self, scenes: Sequence[TwinScene], progress: Progress) -> None:
+        """Render and write scenes, and the touches of the plate."""
+        self.folder.mkdir()
+        record_touches(self.folder / "probing", self.name.build())
+        record_scenes(
+            {scene: self.folder / scene for scene in scenes},
+            self.name,
+            self.most_views,
+            processes=self.processes,
+            progress=progress,
+        )
+        for scene in scenes:
+            self.recordings[scene] = read_recording(self.folder / scene)
+
+    def calibration(self, scene: TwinScene) -> ScanSource:
+        """Read what was recorded."""
+        return self.recordings[scene]
+
+    def scanned(
+        self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
+    ) -> ScanSource:
+        """Read what was recorded, or record it now, with lasers chosen by the naming."""
+        if scene not in self.recordings:
+            record_adaptively(
+                self.folder / scene,
+                self.name,
+                scene,
+                scanner,
+                longest_stroke=self.most_views.get(scene),
+                processes=self.processes,
+                progress=progress,
+            )
+            self.recordings[scene] = read_recording(self.folder / scene)
+        return self.recordings[scene]
+
+
+IN_MEMORY = Provenance("in memory", "", "", (), ())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instrument:
+    """A calibrated scanner with the evidence of each step.
+
+    Parameters
+    ----------
+    camera
+        The camera, or two.
+    laser, sensor
+        The light sheets, and cameras and sheets together.
+    plate
+        The plate as it was probed.
+    hand_eye
+        The hand-eye's.
+    """
+
+    camera: CameraCalibration | StereoCalibration
+    laser: LaserFit
+    sensor: SensorCalibration
+    plate: PlateReference
+    hand_eye: HandEyeRun
+
+    @property
+    def cameras(self) -> tuple[CameraCalibration, ...]:
+        """The camera or cameras, left first."""
+        second = self.sensor.second
+        left = self.sensor.camera
+        return (left,) if second is None else (left, second.camera)
+
+    @property
+    def scanner(self) -> ScannerCalibration:
+        """All together."""
+        return ScannerCalibration(self.sensor, self.hand_eye.fit.calibration, IN_MEMORY)
+
+
+def calibrate_head(
+    twin: Twin, scans: TwinScans, progress: Progress, watch: Stopwatch
+) -> Instrument:
+    """Camera or cameras, light sheets, plate and hand-eye of a twin.
+
+    Raises
+    ------
+    EstimationError
+        If a scan does not determine what rests on it.
+    """
+    target = parse_target(twin.target)
+    camera = watch.timed(
+        "calibrate_camera", lambda: _cameras_of(scans.calibration("camera"), target, progress)
+    )
+    laser = watch.timed(
+        "calibrate_laser",
+        lambda: succeeded(
+            calibrate_sheets_from_scan(
+                scans.calibration("laser"), target, camera, progress=progress
+            ),
+            "laser",
+        ),
+    )
+    sensor = sensor_calibration(laser, IN_MEMORY)
+    plate = watch.timed("probe_plate", lambda: plate_of(twin.probe_plate()))
+    hand_eye = watch.timed(
+        "calibrate_hand_eye",
+        lambda: calibrate_hand_eye_from_scan(
+            scans.calibration("hand-eye"), sensor, plate, progress=progress
+        ),
+    )
+    return Instrument(camera, laser, sensor, plate, succeeded(hand_eye, "hand-eye"))
+
+
+def _cameras_of(
+    source: ScanSource, target: Target, progress: Progress
+) -> CameraCalibration | StereoCalibration:
+    """Camera, or two cameras, from all exposures of a scan of the target."""
+    exposures = [source.exposure(row) for row in range(len(source.rows))]
+    if {row.camera for row in source.rows} == {0}:
+        run = calibrate_camera_from_exposures(exposures, target, progress=progress)
+        return camera_calibration(succeeded(run, source.name).fit, IN_MEMORY)
+    pairs = [
+        (None if left is None else exposures[left], None if right is None else exposures[right])
+        for left, right in stereo_rows(source.rows, source.name)
+    ]
+    found = calibrate_stereo_from_exposures(pairs, target, progress=progress)
+    return stereo_calibration(succeeded(found, source.name).fit, IN_MEMORY)
+
+
+def plate_of(probing: Probing) -> PlateReference:
+    """Plane of the probed plate, the tip compensated on the side where the tool was.
+
+    Raises
+    ------
+    EstimationError
+        If the touches determine no plane.
+    """
+    track = probing.arm
+    centres = tip_centres(track, tool_from_probe(probing.tool_from_probe_mm))
+    points = ProbedPoints(centres, probing.tip_diameter_mm, source="probing")
+    return succeeded(
+        plate_from_probing(points, track.translations_mm[track.is_known]), points.source
+    )
+
+
+def succeeded(result: T | FitFailure, what: str) -> T:
+    """The result, or its failure raised.
+
+    Raises
+    ------
+    EstimationError
+        If there is none.
+    """
+    if isinstance(result, FitFailure):
+        raise EstimationError(result.reason, where=what, remedy=result.remedy)
+    return result
+
+
+STILL_HEIGHT_MM = 20.0
+STEREO_STILL_HEIGHT_MM = 5.0
+STILL_MARGIN = 0.3
+"""The block fills the view, and its lower face lies up to 13 mm beyond the 55 mm of depth in which
+the crossed lines are calibrated."""
+PART_REACH_MM = 1.0
+"""Points of the part's scan further than this from its surface lie on what stands around it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPart:
+    """A free-form part against its true surface.
+
+    Parameters
+    ----------
+    scan
+        The scan of it.
+    rows
+        (N,) rows, in its cloud, of the points within `PART_REACH_MM` of the true surface.
+    distance_mm
+        (N,) their signed distances from it.
+    n_elsewhere
+        Points further away.
+    normalised_rms
+        Root mean square of these distances over the stated sigma along the surface's normal.
+    """
+
+    scan: ScanReconstruction
+    rows: IntArray
+    distance_mm: FloatArray
+    n_elsewhere: int
+    normalised_rms: float
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square distance."""
+        return float(np.sqrt(np.mean(self.distance_mm**2)))
+
+    def fraction_within(self, limit_mm: float) -> float:
+        """Share of the points within a distance of the true surface."""
+        return float(np.mean(np.abs(self.distance_mm) <= limit_mm))
+
+
+def inspect_plate(scan: ScanReconstruction, instrument: Instrument) -> PlaneInspection:
+    """Points of the plate against the fitted and the probed plane.
+
+    Raises
+    ------
+    EstimationError
+        If no plane was found.
+    """
+    plane = instrument.plate.plane
+    return succeeded(inspect_plane(scan.cloud, plane, reference_text="the probed plane"), "plate")
+
+
+def inspect_ball(scan: ScanReconstruction, diameter_mm: float) -> SphereInspection:
+    """Points of the ball against fitted and nominal diameter; raises the same."""
+    return succeeded(inspect_sphere(scan.cloud, diameter_mm), "ball")
+
+
+def inspect_steps(
+    scan: ScanReconstruction, heights_mm: tuple[float, ...]
+) -> tuple[StepInspection, ...]:
+    """Heights of gauge blocks through the arm; raises the same."""
+    return tuple(succeeded(inspect_step(scan.cloud, height), "steps") for height in heights_mm)
+
+
+def still_height_mm(instrument: Instrument) -> float:
+    """Height of the block of the scene ``still-step``: figure 5.19, or 5.33 with two cameras."""
+    return STILL_HEIGHT_MM if instrument.sensor.second is None else STEREO_STILL_HEIGHT_MM
+
+
+def measure_still_step(
+    source: ScanSource, instrument: Instrument, normal_base: FloatArray, height_mm: float
+) -> tuple[StepInspection, FloatArray]:
+    """Height of a block from one exposure, in the Sensor frame; raises the same.
+
+    Within the light sheet the faces stand further apart than the height if the sheet leans; how
+    far it leans follows from the arm's pose and the faces' direction in Base.
+
+    Parameters
+    ----------
+    source
+        One exposure, of each camera.
+    instrument
+        The scanner.
+    normal_base
+        (3,) normal of the faces in Base, as the scan of the blocks gave it.
+    height_mm
+        Nominal height.
+
+    Returns
+    -------
+    step, normal_sensor
+        The inspection, and the normal (3,) in the Sensor frame that it rests on.
+    """
+    poses = exposure_poses(source.rows, source.arm, source.session.clock)
+    base_from_sensor = poses.pose(0) @ instrument.scanner.hand_eye.tool_from_sensor
+    normal = base_from_sensor.rotation.T @ normal_base
+    first, *others = (source.exposure(row) for row in range(len(source.rows)))
+    options = MeasureOptions(depths=DepthRange(margin=STILL_MARGIN))
+    cloud = reconstruct([first], instrument.sensor, rights=others, options=options).cloud
+    return succeeded(inspect_step(cloud, height_mm, normal=normal), source.name), normal
+
+
+def inspect_part(scan: ScanReconstruction, truth: TwinTruth) -> MeasuredPart:
+    """Points of the free-form part against the true surface; raises the same."""
+    cloud = scan.cloud
+    distance = truth.part_distance_mm(cloud.points_mm)
+    rows = np.flatnonzero(np.abs(distance) <= PART_REACH_MM)
+    if len(rows) == 0:
+        raise EstimationError("no measured point lies on the part")
+    sigma = _sigma_along(cloud, truth, rows)
+    normalised = float(np.sqrt(np.mean((distance[rows] / sigma) ** 2)))
+    return MeasuredPart(scan, rows, distance[rows], len(cloud) - len(rows), normalised)
+
+
+def _sigma_along(cloud: PointCloud, truth: TwinTruth, rows: IntArray) -> FloatArray:
+    normals = truth.part_normals(cloud.points_mm[rows])
+    variance = np.einsum("ni,nij,nj->n", normals, cloud.covariance_mm2[rows], normals)
+    return np.asarray(np.sqrt(variance))
+
 
 ONE_SHEET_SCENES: tuple[TwinScene, ...] = ("plate", "ball", "steps", "part")
 """Scenes scanned by hand with a head of one sheet; where sheets are named, waves come besides."""

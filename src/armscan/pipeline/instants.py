@@ -1,19 +1,251 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exposures that the cameras of a head took at one instant."""
+"""Exposures that the cameras of a head took at one instant, and pairs with and without laser."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
+from scipy.ndimage import grey_opening
 
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray
-from armscan.pipeline.exposure_pairs import ExposurePair
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
-from armscan.records.session import ExposureRow
+from armscan.records.recording import ExposureRow
+
+ExposurePair = tuple[Exposure, Exposure | None]
+LISTED = 4
+REDUCED_PX = 120
+OTHER_VIEW = 0.15
+LEAST_CONTRAST = 0.02
+"""A pair shows two scenes if the correlation of their structure is below `OTHER_VIEW`, given that
+both have a contrast of more than this part of full scale: a dark room shows no structure."""
+THIN_BLOCKS = 5
+"""A laser's line is narrower than so many blocks of the reduced image, wide or saturated as it may
+be: a twentieth of the image's shorter side."""
+THIN_SHARE = 0.001
+SWAPPED_RATIO = 3.0
+"""The pair is swapped if the partner's brightest `THIN_SHARE` of the pixels stands this many times
+further above the image than the image's above the partner."""
+CLIPPED_SHARE = 0.99
+SAME_VIEW = 0.3
+MISORDERED = 0.6
+"""An exposure is taken to belong to another partner if its own explains less than this part of what
+that one does, and that one correlates by more than `SAME_VIEW`."""
+
+
+def pair_exposures(
+    exposures: Sequence[Exposure], backgrounds: Sequence[Exposure]
+) -> list[ExposurePair]:
+    """Pair exposures with backgrounds: by file name where the names agree, else by order.
+
+    Parameters
+    ----------
+    exposures
+        With the laser on.
+    backgrounds
+        The same views without laser; empty for none.
+
+    Raises
+    ------
+    InputError
+        If there is no exposure, if the counts differ, if a pair differs in size or window, or if
+        an exposure plainly shows the view of another one's partner.
+    """
+    if not exposures:
+        raise InputError("no images with the laser on", remedy="give at least one image")
+    if not backgrounds:
+        return [(exposure, None) for exposure in exposures]
+    if len(exposures) != len(backgrounds):
+        raise InputError(
+            f"{len(exposures)} images with laser ({_listed(exposures)}) but {len(backgrounds)} "
+            f"without ({_listed(backgrounds)})",
+            remedy="give one image without laser for each image with laser, in the same order, "
+            "or none at all",
+        )
+    by_name = {PurePath(background.source).name: background for background in backgrounds}
+    names = [PurePath(exposure.source).name for exposure in exposures]
+    if len(by_name) == len(backgrounds) and set(names) == set(by_name):
+        partners = [by_name[name] for name in names]
+    else:
+        partners = list(backgrounds)
+    for exposure, partner in zip(exposures, partners, strict=True):
+        _check_pair(exposure, partner)
+    _check_order(exposures, partners)
+    for exposure, partner in zip(exposures, partners, strict=True):
+        _check_scene(exposure, partner)
+        _check_laser_side(exposure, partner)
+    return list(zip(exposures, partners, strict=True))
+
+
+def pair_by_view(exposures: Sequence[Exposure]) -> list[ExposurePair]:
+    """Pair exposures that have a laser on with the one of the same view and camera that has none.
+
+    Several exposures may share a partner; an exposure whose view has none is a pair by itself.
+
+    Raises
+    ------
+    InputError
+        If no exposure has a laser on, or as `pair_exposures`.
+    """
+    lit = [exposure for exposure in exposures if exposure.lasers]
+    if not lit:
+        raise InputError(
+            "no exposure has a laser on",
+            remedy="name the lasers in the column 'lasers' of exposures.csv",
+        )
+    dark: dict[tuple[int, str | None], Exposure] = {
+        (e.camera, e.view): e for e in exposures if not e.lasers and e.view is not None
+    }
+    pairs: list[ExposurePair] = []
+    for camera in sorted({exposure.camera for exposure in lit}):
+        own = [exposure for exposure in lit if exposure.camera == camera]
+        partners = [dark.get((camera, exposure.view)) for exposure in own]
+        both = [(e, p) for e, p in zip(own, partners, strict=True) if p is not None]
+        if both:
+            pairs += pair_exposures([e for e, _ in both], [p for _, p in both])
+        pairs += [(e, None) for e, p in zip(own, partners, strict=True) if p is None]
+    return pairs
+
+
+WINDOW_REMEDY = (
+    "use images of the camera's full size; if the sensor read a window, say where it begins by "
+    "window_x_px and window_y_px under [[camera]] in session.toml"
+)
+
+
+def check_sizes(exposures: Sequence[Exposure], camera: CameraModel) -> None:
+    """Raise `InputError` if an exposure is not of the camera's sensor.
+
+    A window may be anywhere on the sensor; an image without window must have its full size.
+    """
+    for exposure in exposures:
+        window = exposure.window
+        width = window.x_px + exposure.width_px * window.binning
+        height = window.y_px + exposure.height_px * window.binning
+        is_whole = window.x_px == window.y_px == 0 and window.binning == 1
+        fits = width <= camera.width_px and height <= camera.height_px
+        if not fits or (is_whole and (width, height) != (camera.width_px, camera.height_px)):
+            is_window = fits and is_whole
+            raise InputError(
+                f"the image reaches to {width} x {height} px, the camera was calibrated with "
+                f"{camera.width_px} x {camera.height_px} px",
+                where=exposure.source,
+                remedy=WINDOW_REMEDY
+                if is_window
+                else "use images of the camera that was calibrated",
+            )
+
+
+def _check_pair(exposure: Exposure, partner: Exposure) -> None:
+    if exposure.source == partner.source:
+        raise InputError(
+            "the same image is given with and without laser",
+            where=exposure.source,
+            remedy="give the image without laser as its partner",
+        )
+    sizes = [(e.width_px, e.height_px, e.window) for e in (exposure, partner)]
+    if sizes[0] != sizes[1]:
+        raise InputError(
+            f"the image with laser has {exposure.width_px} x {exposure.height_px} px, its partner "
+            f"{partner.source} {partner.width_px} x {partner.height_px} px, or another window",
+            where=exposure.source,
+            remedy="check the order of the images: each pair must show one view",
+        )
+
+
+def _check_order(exposures: Sequence[Exposure], partners: Sequence[Exposure]) -> None:
+    """Raise `InputError` where an exposure shows another background's view and not its own."""
+    if len({(e.width_px, e.height_px, e.window) for e in partners}) > 1:
+        return
+    lit = np.stack([_structure(exposure) for exposure in exposures])
+    dark = np.stack([_structure(partner) for partner in partners])
+    likeness = lit @ dark.T
+    for k, exposure in enumerate(exposures):
+        if _contrast(exposure) < LEAST_CONTRAST:
+            continue
+        best = int(np.argmax(likeness[k]))
+        own, other = float(likeness[k, k]), float(likeness[k, best])
+        if other > SAME_VIEW and own < MISORDERED * other:
+            raise InputError(
+                f"the image looks like {partners[best].source} (correlation {other:.2f}), not like "
+                f"its partner {partners[k].source} ({own:.2f})",
+                where=exposure.source,
+                remedy="check the order of the images with and without laser",
+            )
+
+
+def _check_scene(exposure: Exposure, partner: Exposure) -> None:
+    """Raise `InputError` if the two images of a pair show different scenes."""
+    contrast = min(_contrast(image) for image in (exposure, partner))
+    likeness = float(_structure(exposure) @ _structure(partner))
+    if contrast > LEAST_CONTRAST and likeness < OTHER_VIEW:
+        raise InputError(
+            f"the image does not show the scene of its partner {partner.source} (correlation "
+            f"{likeness:.2f})",
+            where=exposure.source,
+            remedy="give the same view without laser, or no image without laser",
+        )
+
+
+def _check_laser_side(exposure: Exposure, partner: Exposure) -> None:
+    """Raise `InputError` if thin bright parts are in the image that should be without laser.
+
+    The brightness of the two is matched first: the partner may be exposed longer.
+    """
+    lit, dark = (image.image.astype(np.float64).ravel() for image in (exposure, partner))
+    usual = dark <= np.quantile(dark, 1.0 - 10.0 * THIN_SHARE)
+    (_, shared), (_, variance) = np.cov(lit[usual], dark[usual])
+    gain = max(shared, 0.0) / variance if variance > 0.0 else 0.0
+    difference = lit - gain * dark
+    difference -= np.median(difference)
+    below, above = np.quantile(difference, [THIN_SHARE, 1.0 - THIN_SHARE])
+    if -below > SWAPPED_RATIO * max(float(above), LEAST_CONTRAST * exposure.full_scale):
+        raise InputError(
+            f"its partner {partner.source} is the one with thin bright parts: the laser seems to "
+            "be on in the wrong image",
+            where=exposure.source,
+            remedy="swap the images with and without laser",
+        )
+
+
+def _contrast(exposure: Exposure) -> float:
+    """Standard deviation of the scene as a part of full scale; bright lines on black are no scene.
+
+    What is bright and thin is taken away: the lines of a laser in a photograph that is exposed for
+    them alone.
+    """
+    scene = grey_opening(_reduced(exposure), size=(THIN_BLOCKS, THIN_BLOCKS))
+    return float(scene.std()) / exposure.full_scale
+
+
+def _reduced(exposure: Exposure) -> FloatArray:
+    """Mean grey levels of square blocks, about `REDUCED_PX` of them along the shorter side."""
+    grey = exposure.image if exposure.colour == "mono" else exposure.image.mean(axis=2)
+    step = max(1, min(exposure.width_px, exposure.height_px) // REDUCED_PX)
+    rows, columns = (size // step * step for size in grey.shape)
+    blocks = grey[:rows, :columns].reshape(rows // step, step, columns // step, step)
+    return np.asarray(blocks.mean(axis=(1, 3)))
+
+
+def _structure(exposure: Exposure) -> FloatArray:
+    """Edges of a reduced image, bright lines clipped, as a vector of length 1."""
+    small = np.sqrt(_reduced(exposure))
+    edges = np.concatenate([np.diff(small, axis=0).ravel(), np.diff(small, axis=1).ravel()])
+    limit = float(np.quantile(np.abs(edges), CLIPPED_SHARE))
+    edges = np.clip(edges, -limit, limit)
+    length = float(np.linalg.norm(edges))
+    return np.asarray(edges / length if length > 0.0 else edges)
+
+
+def _listed(exposures: Sequence[Exposure]) -> str:
+    names = [PurePath(exposure.source).name for exposure in exposures[:LISTED]]
+    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")
+
 
 SAME_TIME_NS = 1_000_000
 """Times of two cameras that differ by no more are one instant: those of cameras with one trigger

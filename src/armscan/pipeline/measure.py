@@ -1,28 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the stripes of one exposure with their sheets to measured points."""
+"""One exposure to measured points in the Sensor frame."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, cast
 
 import numpy as np
 
 from armscan.geometry.arrays import IntArray
-from armscan.geometry.frames import Base, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.pipeline.exposure_pairs import ExposurePair, check_sizes
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.free_rays import is_without_ray
-from armscan.reconstruction.named_profile import NamedProfile, NameFate
-from armscan.reconstruction.result import PointFate, ReconstructedImage
-from armscan.reconstruction.triangulate import StripePoints, meet_sheets, triangulate_stripe
+from armscan.pipeline.instants import ExposurePair, check_sizes
+from armscan.reconstruction.label_single import DepthRange, is_without_ray
+from armscan.reconstruction.labels import LabelledProfile, LabelStatus, MeasuredProfile, PointStatus
+from armscan.reconstruction.triangulate import StripePoints, intersect_sheets, triangulate_stripe
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import LaserColour, StripeOptions
+from armscan.vision.stripe.image import LaserColour, StripeOptions
+
+
+@dataclass(frozen=True, slots=True)
+class MeasureOptions:
+    """How stripes on objects become points.
+
+    Parameters
+    ----------
+    stripes
+        Stripe extraction.
+    depths
+        Depths that are accepted; points outside are left out and counted. None for those that the
+        head's own rule takes: `DepthRange` of one camera, `StereoLabelOptions.depths` of two.
+    sheet
+        Name of the sheet that drew all stripes; empty to find it. For one camera only.
+    """
+
+    stripes: StripeOptions = field(default_factory=StripeOptions)
+    depths: DepthRange | None = None
+    sheet: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +72,7 @@ class MeasuredImage:
         What is weak, in words.
     """
 
-    image: ReconstructedImage
+    image: MeasuredProfile
     points: StripePoints
     warnings: tuple[str, ...] = ()
 
@@ -100,39 +117,39 @@ def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
 
 
 def triangulated(
-    image: ReconstructedImage, sensor: SensorCalibration, depths: DepthRange
+    image: MeasuredProfile, sensor: SensorCalibration, depths: DepthRange
 ) -> MeasuredImage:
     """Triangulate the points that passed so far; those beyond the accepted depths do not."""
-    points, is_met = meet_sheets(image.profile.points_px, image.sheet, sensor)
+    points, is_met = intersect_sheets(image.profile.points_px, image.sheet, sensor)
     fate = np.array(image.fate)
-    is_open = fate == int(PointFate.MEASURED)
+    is_open = fate == int(PointStatus.MEASURED)
     for k, sheet in enumerate(sensor.sheets):
         low, high = depths.limits_mm(sheet)
         outside = (points[:, 2] < low) | (points[:, 2] > high)
-        fate[is_open & (image.sheet == k) & outside] = int(PointFate.OUT_OF_DEPTH)
-    fate[is_open & ~is_met] = int(PointFate.NO_RAY)
+        fate[is_open & (image.sheet == k) & outside] = int(PointStatus.OUT_OF_DEPTH)
+    fate[is_open & ~is_met] = int(PointStatus.NO_RAY)
     for k, calibrated in enumerate(sensor.sheets):
-        own = np.flatnonzero((fate == int(PointFate.MEASURED)) & (image.sheet == k))
+        own = np.flatnonzero((fate == int(PointStatus.MEASURED)) & (image.sheet == k))
         profile = image.profile
         lost = is_without_ray(
             points[own], profile.intensity[own], profile.segment[own], calibrated.sheet
         )
-        fate[own[lost]] = int(PointFate.NO_LASER_RAY)
+        fate[own[lost]] = int(PointStatus.NO_LASER_RAY)
     measured = replace(image, fate=fate)
     return MeasuredImage(measured, stripe_points(measured, sensor))
 
 
-def stripe_points(image: ReconstructedImage, sensor: SensorCalibration) -> StripePoints:
+def stripe_points(image: MeasuredProfile, sensor: SensorCalibration) -> StripePoints:
     """The measured points of an image of one camera in the Sensor frame."""
-    sheet = np.where(image.fate == int(PointFate.MEASURED), image.sheet, -1)
+    sheet = np.where(image.fate == int(PointStatus.MEASURED), image.sheet, -1)
     return triangulate_stripe(image.profile, sheet, sensor)
 
 
 _FATES = {
-    NameFate.NAMED: PointFate.MEASURED,
-    NameFate.AMBIGUOUS: PointFate.AMBIGUOUS,
-    NameFate.UNEXPLAINED: PointFate.STRAY,
-    NameFate.NOT_ASKED: PointFate.FLAGGED,
+    LabelStatus.NAMED: PointStatus.MEASURED,
+    LabelStatus.AMBIGUOUS: PointStatus.AMBIGUOUS,
+    LabelStatus.UNEXPLAINED: PointStatus.STRAY,
+    LabelStatus.NOT_ASKED: PointStatus.FLAGGED,
 }
 
 
@@ -143,7 +160,7 @@ def collected(warnings: Sequence[str]) -> tuple[str, ...]:
     return (f"{len(warnings)} exposures: {warnings[0]}",)
 
 
-def fates_of(named: NamedProfile) -> IntArray:
-    """(N,) `PointFate` of named stripe points, before they are triangulated."""
-    table = np.array([int(_FATES[fate]) for fate in sorted(NameFate)])
+def fates_of(named: LabelledProfile) -> IntArray:
+    """(N,) `PointStatus` of named stripe points, before they are triangulated."""
+    table = np.array([int(_FATES[fate]) for fate in sorted(LabelStatus)])
     return np.asarray(table[named.fate])

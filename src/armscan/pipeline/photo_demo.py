@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rendered photo set, and how far results measured from it are from its truth."""
+"""Photographs rendered for `demo photos`, and the errors of what was measured from them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from armscan.devices.registry import load_driver
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.truth_errors import SheetErrors, camera_errors, sheet_errors
+from armscan.pipeline.truth import SheetErrors, camera_errors, sheet_errors
 from armscan.records.cloud import PointCloud
 
 ON_OBJECT_MM = 2.0

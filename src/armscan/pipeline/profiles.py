@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-eye of a sensor that delivers profiles, carried by an arm that delivers poses."""
+"""Profiles that a sensor delivered, as what a hand-eye calibration observes."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import DEFAULT_OPTIONS, SphereOptions
+from armscan.calibration.hand_eye.sphere_sections import DEFAULT_OPTIONS, SphereOptions
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import fit_plane
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.records.point_profile import PointProfile
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.shapes import fit_plane
+from armscan.records.profile import PointProfile
 
 MAD_TO_SIGMA = 1.4826
 THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans joined by markers: views of a handheld scanner, and an arm that moved to a new place."""
+"""Scans joined by markers: views of a handheld scanner, an arm that moved, clouds carried."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -12,15 +13,20 @@ from scipy.stats import chi2
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Base
-from armscan.geometry.poses import Pose
-from armscan.geometry.registration import PointPairs, misfits, register_points
+from armscan.geometry.poses import Base, Pose
+from armscan.geometry.registration import (
+    PointPairs,
+    carried_covariance_mm2,
+    misfits,
+    register_points,
+)
+from armscan.markers.alignments import MarkerMatchOptions, Matched
 from armscan.markers.join_views import JoinedViews, join_views
 from armscan.markers.match_3d import match_markers
-from armscan.markers.match_result import Matched, MatchOptions
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import ASSUMED_SIGMA_MM, MarkerList
+from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.points import MarkerSet
+from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList
 
 MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
@@ -43,7 +49,7 @@ class RegisterOptions:
         Take markers with the same ``id`` in both lists as the same, instead of matching them.
     """
 
-    match: MatchOptions = field(default_factory=MatchOptions)
+    match: MarkerMatchOptions = field(default_factory=MarkerMatchOptions)
     sigma_mm: float = ASSUMED_SIGMA_MM
     is_by_id: bool = False
 
@@ -245,3 +251,40 @@ def _without_partner(
     only_old = tuple(int(n) for n in old.ids[lonely_old] if int(n) not in gone[0])
     only_new = tuple(int(n) for n in new.ids[lonely_new] if int(n) not in gone[1])
     return moved, only_old, only_new
+
+
+def carry_cloud(
+    cloud: PointCloud, a_from_b: Pose[Any, Any], covariance: FloatArray, frame: CloudFrame
+) -> PointCloud:
+    """Carry a cloud to the frame ``A``.
+
+    Parameters
+    ----------
+    cloud
+        Points in ``B``.
+    a_from_b
+        The registration.
+    covariance
+        (6, 6) of `armscan.geometry.registration.REGISTRATION_PARAMETERS`.
+    frame
+        Name of ``A``.
+
+    Returns
+    -------
+    PointCloud
+        Points' covariances are turned and get the registration's part, which is common to all
+        points; a cloud of another program, with none, keeps none. ``sigma_noise_mm``, the part
+        that is independent from point to point, stays.
+    """
+    points = cloud.points_mm @ a_from_b.rotation.T + a_from_b.translation_mm
+    own = cloud.covariance_mm2
+    is_known = bool(np.any(own))
+    return replace(
+        cloud,
+        frame=frame,
+        points_mm=points,
+        covariance_mm2=(
+            carried_covariance_mm2(cloud.points_mm, own, a_from_b, covariance) if is_known else own
+        ),
+        normals=None if cloud.normals is None else cloud.normals @ a_from_b.rotation.T,
+    )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a scan, exposures and the arm's samples, to points in Base."""
+"""A scan measured: every exposure placed in Base or counted with its reason."""
 
 from __future__ import annotations
 
@@ -7,48 +7,200 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.models.calibration import SensorCalibration
-from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.exposure_pairs import ExposurePair
-from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.pipeline.instants import PARTNER_MISSING, ExposurePair, Instant, ScanInstants
 from armscan.pipeline.measure import (
     LitProfile,
     MeasuredImage,
+    MeasureOptions,
     cameras_of,
     collected,
     see,
     stripes_for,
 )
-from armscan.pipeline.measure_options import MeasureOptions
-from armscan.pipeline.measurement_warnings import measurement_warnings
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import NOTHING_MEASURED_REMEDY, nothing_measured
-from armscan.pipeline.scan_doubts import doubt_scan
-from armscan.pipeline.scan_result import (
-    ScanExposure,
-    ScanExposureFate,
-    ScanReconstruction,
-    scan_exposure,
-    scan_warnings,
+from armscan.pipeline.reconstruct import (
+    NOTHING_MEASURED_REMEDY,
+    measurement_warnings,
+    measurer_for,
+    nothing_measured,
 )
-from armscan.pipeline.sheet_rules import measurer_for
-from armscan.reconstruction.equal_poses import stripes_at_equal_poses
-from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
-from armscan.reconstruction.merge import merge_clouds
-from armscan.reconstruction.normals import NormalOptions, choose_radius_mm, estimate_normals
-from armscan.reconstruction.place import Placing, place_stripe, prepare_placing
-from armscan.reconstruction.result import ReconstructedImage
-from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.reconstruction.volume import BaseBox, cut_cloud
+from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
+from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.place import (
+    BaseBox,
+    BaseTransform,
+    NormalOptions,
+    choose_radius_mm,
+    cut_cloud,
+    estimate_normals,
+    merge_clouds,
+    prepare_placing,
+    propagate_to_base,
+)
+from armscan.reconstruction.sync import (
+    ExposurePoses,
+    PoseStatus,
+    SyncOptions,
+    exposure_poses,
+    stripes_at_equal_poses,
+)
 from armscan.records.cloud import PointCloud
+from armscan.records.recording import ExposureRow
+
+LISTED = 4
+
+
+class ExposureStatus(Enum):
+    """What became of one exposure of a scan; the value is what a report shows."""
+
+    PLACED = "placed in Base"
+    NO_POSE = "without pose"
+    LASER_OFF = "laser off"
+    UNREADABLE = "image cannot be read"
+    NO_PARTNER = PARTNER_MISSING
+    EQUAL_POSE = "left out: the pose of another exposure, but another stripe"
+
+
+@dataclass(frozen=True, slots=True)
+class ScanExposure:
+    """One exposure of a scan.
+
+    Parameters
+    ----------
+    row
+        What the recording says of it.
+    fate
+        What became of it.
+    reason
+        Why it was not placed; empty if it was.
+    n_stripe_points
+        Points that looked like a stripe.
+    n_measured
+        Of these, measured.
+    n_outside_volume
+        Of the measured, outside the working volume in Base; the rest is in the cloud.
+    """
+
+    row: ExposureRow
+    fate: ExposureStatus
+    reason: str = ""
+    n_stripe_points: int = 0
+    n_measured: int = 0
+    n_outside_volume: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanReconstruction:
+    """Measured points in Base and the evidence of each exposure.
+
+    Parameters
+    ----------
+    cloud
+        Points in Base. ``normals`` are (0, 0, 0) where there is no tangent plane, None if not
+        asked for.
+    images
+        Stripe points of the exposures that were placed, in order of time; ``cloud.exposure``
+        points into it.
+    image_rows
+        Row of the recording that each of ``images`` is.
+    exposures
+        One entry a row of the recording.
+    poses
+        Of every row; how poses were found.
+    warnings
+        What is weak, in words.
+    doubt
+        How far the passes of the scan agree.
+    """
+
+    cloud: PointCloud
+    images: tuple[MeasuredProfile, ...]
+    image_rows: tuple[int, ...]
+    exposures: tuple[ScanExposure, ...]
+    poses: ExposurePoses
+    warnings: tuple[str, ...] = ()
+    doubt: ScanDoubt = field(default_factory=lambda: ScanDoubt(None))
+
+    @property
+    def contradictions(self) -> tuple[str, ...]:
+        """What shows that arm, clock, images and calibration do not belong together, in words."""
+        hung = self.count(ExposureStatus.EQUAL_POSE)
+        found = [fault.words for fault in self.poses.track_faults]
+        if hung:
+            found.append(f"{hung} exposures bear the pose of another one but show another stripe")
+        return (*found, *self.doubt.warnings)
+
+    @property
+    def without_pose(self) -> tuple[tuple[str, str], ...]:
+        """(source, reason) of the exposures with the laser on that have no pose."""
+        return tuple(
+            (exposure.row.source, exposure.reason)
+            for exposure in self.exposures
+            if exposure.fate in (ExposureStatus.NO_POSE, ExposureStatus.EQUAL_POSE)
+        )
+
+    @property
+    def unreadable(self) -> tuple[tuple[str, str], ...]:
+        """(source, reason) of the exposures whose image could not be read."""
+        return tuple(
+            (exposure.row.source, exposure.reason)
+            for exposure in self.exposures
+            if exposure.fate is ExposureStatus.UNREADABLE
+        )
+
+    def count(self, fate: ExposureStatus) -> int:
+        """Count of exposures of this fate."""
+        return sum(exposure.fate is fate for exposure in self.exposures)
+
+
+def scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tuple[str, ...]:
+    """What a person should know of the exposures that are not in the cloud."""
+    warnings = list(poses.warnings)
+    without = [e for e in exposures if e.fate is ExposureStatus.NO_POSE]
+    if without:
+        counts: dict[str, int] = {}
+        for exposure in without:
+            counts[exposure.reason] = counts.get(exposure.reason, 0) + 1
+        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
+        warnings.append(f"{len(without)} of {len(exposures)} exposures have no pose: {reasons}")
+    broken = [e for e in exposures if e.fate is ExposureStatus.UNREADABLE]
+    if broken:
+        named = "; ".join(exposure.reason.rstrip(".") for exposure in broken[:LISTED])
+        warnings.append(f"{len(broken)} of {len(exposures)} images cannot be read: {named}")
+    alone = [e.row.source for e in exposures if e.fate is ExposureStatus.NO_PARTNER]
+    if alone:
+        warnings.append(
+            f"{len(alone)} of {len(exposures)} images were not used, {PARTNER_MISSING}: "
+            f"{', '.join(alone[:LISTED])}"
+        )
+    hung = [e for e in exposures if e.fate is ExposureStatus.EQUAL_POSE]
+    if hung:
+        warnings.append(
+            f"{len(hung)} of {len(exposures)} exposures were left out: {hung[0].reason}: the arm's "
+            "pose hung or was repeated, or the object moved"
+        )
+    n_outside = sum(exposure.n_outside_volume for exposure in exposures)
+    if n_outside:
+        warnings.append(f"{n_outside} measured points lie outside the volume asked for")
+    if not any(exposure.row.lasers for exposure in exposures):
+        warnings.append("no exposure names its lasers: the laser was taken to be on in all")
+    return tuple(warnings)
+
+
+def scan_exposure(row: ExposureRow, image: MeasuredProfile, n_outside: int) -> ScanExposure:
+    """The record of an exposure that was placed."""
+    n_measured = image.count(PointStatus.MEASURED)
+    return ScanExposure(row, ExposureStatus.PLACED, "", len(image.profile), n_measured, n_outside)
+
 
 __all__ = ["PlacedImage", "ScanOptions", "ScanReconstruction", "measure_scan", "place_image"]
 
@@ -90,7 +242,7 @@ class ScanOptions:
 class PlacedImage:
     """What one exposure gave: its stripe, its points in Base, their depths, those cut away."""
 
-    image: ReconstructedImage
+    image: MeasuredProfile
     cloud: PointCloud
     depths_mm: tuple[FloatArray, ...]
     n_outside_volume: int
@@ -201,12 +353,12 @@ def measure_scan(
 def place_image(
     measured: MeasuredImage,
     base_from_tool: Pose[Base, Tool],
-    placing: Placing,
+    placing: BaseTransform,
     volume: BaseBox | None,
 ) -> PlacedImage:
     """Place the measured points of one exposure in Base and cut those outside a volume."""
     stripe, image = measured.points, measured.image
-    cloud = place_stripe(stripe, image.profile, base_from_tool, placing)
+    cloud = propagate_to_base(stripe, image.profile, base_from_tool, placing)
     n_sheets = len(placing.factors)
     depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
     inside = cloud if volume is None else cut_cloud(cloud, volume)
@@ -286,18 +438,18 @@ def _records(
         if k in placed:
             records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
         elif k in reasons:
-            records.append(ScanExposure(row, ScanExposureFate.UNREADABLE, reasons[k]))
+            records.append(ScanExposure(row, ExposureStatus.UNREADABLE, reasons[k]))
         elif k in hung:
             reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
-            records.append(ScanExposure(row, ScanExposureFate.EQUAL_POSE, reason))
+            records.append(ScanExposure(row, ExposureStatus.EQUAL_POSE, reason))
         elif not images.is_lit[k]:
-            records.append(ScanExposure(row, ScanExposureFate.LASER_OFF, "no laser was on"))
+            records.append(ScanExposure(row, ExposureStatus.LASER_OFF, "no laser was on"))
         elif k in alone:
-            records.append(ScanExposure(row, ScanExposureFate.NO_PARTNER, PARTNER_MISSING))
+            records.append(ScanExposure(row, ExposureStatus.NO_PARTNER, PARTNER_MISSING))
         else:
-            own = PoseFate(int(poses.fate[k]))
-            reason = "the other camera's image has none" if own is PoseFate.FOUND else own.label
-            records.append(ScanExposure(row, ScanExposureFate.NO_POSE, reason))
+            own = PoseStatus(int(poses.fate[k]))
+            reason = "the other camera's image has none" if own is PoseStatus.FOUND else own.label
+            records.append(ScanExposure(row, ExposureStatus.NO_POSE, reason))
     return tuple(records)
 
 
@@ -305,13 +457,13 @@ def _joined(
     placed: dict[int, PlacedImage],
     exposures: Sequence[ScanExposure],
     poses: ExposurePoses,
-    placing: Placing,
+    placing: BaseTransform,
     options: ScanOptions,
 ) -> ScanReconstruction:
     sensor = placing.scanner.sensor
     rows = list(placed)
     if sensor is None or not rows:
-        broken = "; ".join(e.reason for e in exposures if e.fate is ScanExposureFate.UNREADABLE)
+        broken = "; ".join(e.reason for e in exposures if e.fate is ExposureStatus.UNREADABLE)
         raise EstimationError(f"no exposure with a pose could be measured: {broken or 'no laser'}")
     images = tuple(placed[row].image for row in rows)
     cloud = merge_clouds([placed[row].cloud for row in rows])
@@ -340,7 +492,7 @@ def _with_normals(
     cloud: PointCloud,
     rows: Sequence[int],
     poses: ExposurePoses,
-    placing: Placing,
+    placing: BaseTransform,
     options: ScanOptions,
 ) -> tuple[PointCloud, tuple[str, ...]]:
     """The cloud with normals towards the camera of each point's exposure."""

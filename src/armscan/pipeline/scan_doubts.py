@@ -2,9 +2,9 @@
 """Whether a scan agrees with itself, and if not, which mistake would explain it.
 
 Where passes disagree far beyond what they claim, or beyond what another reading of the same
-recording would leave, the mistakes that people make are undone one after another: images off by
-one, a clock that is late, poses that are inverse or read in another convention, mirrored images, a
-head that is not where its document says, a jump between two passes.
+recording would leave, the mistakes that people make are undone one after another: images off
+by one, a clock that is late, poses that are inverse or read in another convention, mirrored
+images, a head that is not where its document says, a jump between two passes.
 """
 
 from __future__ import annotations
@@ -16,13 +16,17 @@ from typing import get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.models.scanner import ScannerCalibration
-from armscan.reconstruction.exposure_poses import ExposurePoses
+from armscan.geometry.rotations import (
+    EulerConvention,
+    euler_from_rotations,
+    rotation_from_vector,
+    rotations_from_euler,
+)
+from armscan.models.calibration import ScannerCalibration
+from armscan.reconstruction.labels import MeasuredProfile, PointStatus
 from armscan.reconstruction.pass_agreement import (
     PassAgreement,
     Stripes,
@@ -31,9 +35,8 @@ from armscan.reconstruction.pass_agreement import (
     passes_of,
     thinned_rows,
 )
-from armscan.reconstruction.result import PointFate, ReconstructedImage
-from armscan.reconstruction.sync import poses_by_time
-from armscan.reconstruction.triangulate import meet_sheets
+from armscan.reconstruction.sync import ExposurePoses, poses_by_time
+from armscan.reconstruction.triangulate import intersect_sheets
 from armscan.records.cloud import PointCloud
 
 WARNED_RATIO, WARNED_PAIR = 2.0, 3.0
@@ -122,7 +125,7 @@ def doubt_scan(
     poses: ExposurePoses,
     *,
     cloud: PointCloud,
-    images: tuple[ReconstructedImage, ...],
+    images: tuple[MeasuredProfile, ...],
     pose_rows: tuple[int, ...],
 ) -> ScanDoubt:
     """Compare the passes of a scan with each other, and look for the mistake if they disagree.
@@ -169,7 +172,7 @@ def _thinned(
     poses: ExposurePoses,
     *,
     cloud: PointCloud,
-    images: tuple[ReconstructedImage, ...],
+    images: tuple[MeasuredProfile, ...],
     pose_rows: tuple[int, ...],
 ) -> _Scan | None:
     if len(cloud) == 0 or scanner.sensor is None:
@@ -177,7 +180,7 @@ def _thinned(
     row_of = np.array(pose_rows)[cloud.exposure]
     kept = thinned_rows(cloud.points_mm, row_of)
     rows, exposure = np.unique(row_of[kept], return_inverse=True)
-    measured = [image.fate == int(PointFate.MEASURED) for image in images]
+    measured = [image.fate == int(PointStatus.MEASURED) for image in images]
     pixels = np.concatenate([i.profile.points_px[m] for i, m in zip(images, measured, strict=True)])
     if len(pixels) != len(cloud):
         # points outside the volume asked for are cut away: their pixels are not told apart
@@ -368,7 +371,7 @@ def _mirrored_images(scan: _Scan) -> Iterator[tuple[str, str, Stripes]]:
     for axis, words in enumerate(("right to left", "bottom up")):
         pixels = scan.pixels.copy()
         pixels[:, axis] = 2 * start[axis] + size[axis] - 1 - pixels[:, axis]
-        points, is_met = meet_sheets(pixels, scan.sheet, sensor)
+        points, is_met = intersect_sheets(pixels, scan.sheet, sensor)
         if not is_met.all():
             continue
         yield (
@@ -390,7 +393,7 @@ def _other_sheet(scan: _Scan) -> tuple[Stripes, float] | None:
             for one in sensor.sheets
             for shift in (shift_mm * one.sheet.axes[2],)
         )
-        points, is_met = meet_sheets(scan.pixels, scan.sheet, replace(sensor, sheets=sheets))
+        points, is_met = intersect_sheets(scan.pixels, scan.sheet, replace(sensor, sheets=sheets))
         return scan.stripes.with_points(points) if is_met.all() else None
 
     shift, stripes = 0.0, at(0.0)

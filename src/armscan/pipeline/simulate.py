@@ -1,19 +1,294 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scene of the twin as a folder recording, its truth beside it."""
+"""Recordings of the twin's scenes, rendered in parallel processes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from itertools import islice
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import get_args
+from typing import Any, TypeAlias, TypeVar, cast, get_args
 
-from armscan.devices.twin import Preset, TwinScene
-from armscan.errors import OptionError, OutputError
-from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.render_pool import TwinName
-from armscan.pipeline.twin_recordings import record_scenes, record_touches
-from armscan.storage.atomic import check_outputs
-from armscan.storage.atomic_folder import check_new_folder
+import cv2
+
+from armscan.devices.registry import load_driver
+from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
+from armscan.errors import EstimationError, OptionError, OutputError
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.scan_part import FewerViews
+from armscan.storage.arm import ProbeTip, write_probing
+from armscan.storage.atomic import check_new_folder, check_outputs
+from armscan.storage.recording import encoded_png
+from armscan.storage.recording_writer import write_recording, written_session
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def in_processes(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    processes: int,
+    prepare: Callable[..., None],
+    given: tuple[Any, ...],
+) -> Generator[Result]:
+    """Results of ``work`` on every item, in order.
+
+    When the generator is closed, or an interrupt ends it, the processes end too, without finishing
+    their items.
+
+    Parameters
+    ----------
+    work
+        A function of a module, so that other processes find it.
+    items
+        What it is called with, one after the other.
+    processes
+        How many share the work.
+    prepare, given
+        Called in every process first, with these arguments.
+
+    Raises
+    ------
+    EstimationError
+        If one of the processes came to an end.
+    """
+    spawn = get_context("spawn")
+    listener, held = spawn.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(
+        processes, spawn, initializer=_begin, initargs=(listener, prepare, given)
+    )
+    try:
+        with _deaf_children():
+            results = pool.map(work, items)
+        yield from results
+    except BaseException as error:
+        # the pool forgets what waits before its processes end: it cannot fail what is cancelled
+        pool.shutdown(wait=False, cancel_futures=True)
+        held.close()
+        if isinstance(error, BrokenProcessPool):
+            raise EstimationError(
+                "a process that rendered images came to an end",
+                remedy="free some memory, or let one process render",
+            ) from error
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        held.close()
+        listener.close()
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Processes that are started meanwhile never hear an interrupt; this one hears it afterwards.
+
+    It is for the process that waits, which ends the others.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _begin(listener: Connection, prepare: Callable[..., None], given: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(listener,), daemon=True).start()
+    # the processes share the cores already
+    cv2.setNumThreads(1)
+    prepare(*given)
+
+
+def _end_with(listener: Connection) -> None:
+    """End this process, in the middle of an item, as soon as the other end is closed or gone."""
+    try:
+        listener.recv_bytes()
+    except EOFError:
+        os._exit(1)
+
+
+IMAGES_A_PROCESS = 15
+"""Fewer do not pay: a process takes some seconds before its first image."""
+
+MostViews: TypeAlias = Mapping[TwinScene, int | None]
+"""Scenes in order, with the most views of each that are wanted; None for all."""
+
+_here: list[Scenes] = []
+"""The scenes of a rendering process; empty in any other process."""
+
+
+@dataclass(frozen=True, slots=True)
+class TwinName:
+    """What a twin is built from, in any process."""
+
+    head: str
+    preset: Preset
+    seed: int
+
+    def build(self) -> Twin:
+        """Build it; the simulator is found by its name.
+
+        Raises
+        ------
+        OptionError
+            If there is no such head or preset.
+        """
+        driver = load_driver("twin")
+        return cast(Twin, driver(head=self.head, preset=self.preset, seed=self.seed))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scenes:
+    """Scans of one twin's scenes, each planned when it is first asked for.
+
+    Parameters
+    ----------
+    twin
+        What is looked through.
+    most_views
+        The scenes.
+    """
+
+    twin: Twin
+    most_views: MostViews
+    _planned: dict[TwinScene, ScanSource] = field(default_factory=dict, init=False)
+
+    def scan(self, scene: TwinScene) -> ScanSource:
+        """The views of a scene that are wanted."""
+        if scene not in self._planned:
+            whole, most = self.twin.scan(scene), self.most_views[scene]
+            self._planned[scene] = whole if most is None else FewerViews(whole, most)
+        return self._planned[scene]
+
+    def png(self, scene: TwinScene, row: int) -> bytes:
+        """Render one exposure."""
+        source = self.scan(scene)
+        setup = written_session(source).cameras[source.rows[row].camera]
+        return encoded_png(source.exposure(row), setup)
+
+
+def rendered(name: TwinName, scenes: Scenes, processes: int) -> Generator[bytes]:
+    """PNG files of all rows of all scenes, in order.
+
+    Processes take image after image, whatever scene it is of, so that none waits for another's
+    scene. When the generator is closed, or an interrupt ends it, so do they, without finishing
+    their images.
+
+    Parameters
+    ----------
+    name, scenes
+        The twin, and what is wanted of it.
+    processes
+        Processes that render, if there are images enough; 1 renders in this one.
+
+    Raises
+    ------
+    EstimationError
+        If one of the processes came to an end.
+    """
+    rows = [(scene, k) for scene in scenes.most_views for k in range(len(scenes.scan(scene).rows))]
+    n_processes = min(processes, max(1, len(rows) // IMAGES_A_PROCESS))
+    if n_processes == 1:
+        for scene, row in rows:
+            yield scenes.png(scene, row)
+        return
+    given = (name, dict(scenes.most_views))
+    yield from in_processes(_render, rows, n_processes, _start_rendering, given)
+
+
+def _start_rendering(name: TwinName, most_views: MostViews) -> None:
+    _here.append(Scenes(name.build(), most_views))
+
+
+def _render(row: tuple[TwinScene, int]) -> bytes:
+    return _here[0].png(*row)
+
+
+STAGE = "render images"
+
+
+def record_scenes(
+    folders: Mapping[TwinScene, Path],
+    name: TwinName,
+    most_views: MostViews | None = None,
+    *,
+    processes: int = 2,
+    beside: Mapping[Path, bytes] | None = None,
+    progress: Progress = silent,
+) -> dict[TwinScene, ScanSource]:
+    """Render scenes of a twin and write each as a folder recording.
+
+    Each recording is there complete or not at all.
+
+    Parameters
+    ----------
+    folders
+        The scenes, with the folder of each, which must not exist or be empty.
+    name
+        The twin.
+    most_views
+        The most views that are wanted of some of them.
+    processes
+        Processes that render. A script that asks for more than 1 needs the usual
+        ``if __name__ == "__main__"``.
+    beside
+        Files that belong to the recordings; they appear with the first one.
+    progress
+        Told of every image.
+
+    Returns
+    -------
+    dict
+        What was recorded, as the twin has it.
+
+    Raises
+    ------
+    OutputError
+        If a folder holds something or cannot be written.
+    EstimationError
+        If a process that renders came to an end.
+    """
+    wanted = {scene: (most_views or {}).get(scene) for scene in folders}
+    scenes = Scenes(name.build(), wanted)
+    scans = {scene: scenes.scan(scene) for scene in folders}
+    total, before = sum(len(scan.rows) for scan in scans.values()), 0
+
+    def report(done: int, _total: int, item: str) -> None:
+        progress(ProgressEvent(STAGE, before + done, total, item))
+
+    with closing(rendered(name, scenes, processes)) as images:
+        for scene, scan in scans.items():
+            own = islice(images, len(scan.rows))
+            files = beside if before == 0 else None
+            write_recording(folders[scene], scan, report, encoded=own, beside=files)
+            before += len(scan.rows)
+    return scans
+
+
+def record_touches(folder: Path, twin: Twin, beside: Mapping[Path, bytes] | None = None) -> int:
+    """Write the twin's touches of the plate, and files that belong to them; returns their count.
+
+    Raises
+    ------
+    OutputError
+        If the folder holds something or cannot be written.
+    """
+    probing = twin.probe_plate()
+    tip = ProbeTip(probing.tool_from_probe_mm, probing.tip_diameter_mm)
+    write_probing(folder, probing.arm, tip, is_simulated=True, beside=beside)
+    return len(probing.arm)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The daily check: is a scanner still as its calibration says?"""
+"""Scans compared with what the simulator knows, or repeated scans with each other."""
 
 from __future__ import annotations
 
@@ -12,30 +12,26 @@ from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
-from armscan.inspection.cleaning import Region
-from armscan.inspection.consistency import StandardDistances, check_consistency
-from armscan.inspection.off_standard import check_exposures_off
-from armscan.inspection.options import InspectionOptions
-from armscan.inspection.plane import inspect_plane, linearised_plane
-from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
-from armscan.inspection.sphere import inspect_sphere, linearised_sphere
-from armscan.inspection.uncertainty import FitLinearised, influence_along
-from armscan.inspection.verdict import (
+from armscan.inspection.conformity import (
     COVERAGE,
     Check,
+    StandardDistances,
     Verdict,
+    check_consistency,
     check_contradictions,
+    check_exposures_off,
     check_size,
     check_spread,
     worst,
 )
-from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.distance_errors import (
-    distance_by_arm,
-    distance_by_calibration,
-    distance_by_plate,
-)
-from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.inspection.plane import inspect_plane, linearised_plane
+from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
+from armscan.inspection.selection import InspectionOptions, Region
+from armscan.inspection.sphere import inspect_sphere, linearised_sphere
+from armscan.inspection.uncertainty import FitLinearised, influence_along
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.scan import ScanReconstruction
+from armscan.pipeline.truth import distance_by_arm, distance_by_calibration, distance_by_plate
 from armscan.records.cloud import PointCloud
 
 NO_POSES = (

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each sheet's stripe was in the last image and how it moved: a prediction without an arm."""
+"""Where the last exposures of a pass showed each laser's stripe in the image."""
 
 from __future__ import annotations
 

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the passes of a scan show one surface: what a track or a clock cannot tell of itself.
 
-A pass is what was scanned without a pause, in one direction. Its own stripes lie side by side, so
-a wrong clock or pose bends it smoothly and nothing shows; where two passes cross, they then lie
-apart. So each pass makes local quadrics of its own stripes, and points of other passes that fall
-among those stripes are compared with them, in units of what both claim of themselves.
+A pass is what was scanned without a pause, in one direction. Its own stripes lie side by
+side, so a wrong clock or pose bends it smoothly and nothing shows; where two passes cross,
+they then lie apart. So each pass makes local quadrics of its own stripes, and points of
+other
+passes that fall among those stripes are compared with them, in units of what both claim of
+themselves.
 """
 
 from __future__ import annotations

@@ -1,20 +1,145 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pose the arm had at each exposure: by trigger id, or by time."""
+"""The arm's pose at each exposure, why some have none, and poses that stood still."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Literal
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from armscan.errors import EstimationError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.slerp import slerp
-from armscan.reconstruction.exposure_poses import ExposurePoses, PoseFate
-from armscan.reconstruction.track_faults import check_track
-from armscan.records.arm_track import NO_TRIGGER, ArmTrack
-from armscan.records.session import Clock, ExposureRow
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import slerp
+from armscan.reconstruction.track_faults import TrackFault, check_track
+from armscan.records.cloud import PointCloud
+from armscan.records.recording import NO_TRIGGER, ArmTrack, Clock, ExposureRow
+
+PoseSource = Literal["trigger", "time"]
+
+
+class PoseStatus(IntEnum):
+    """Whether an exposure has a pose, and if not, why."""
+
+    FOUND = 0
+    NO_TRIGGER = 1
+    """The exposure bears no trigger id, while poses are found by id."""
+    UNKNOWN_TRIGGER = 2
+    """No sample of the arm bears its trigger id."""
+    UNKNOWN_SAMPLE = 3
+    """The arm gave no pose for that trigger or time."""
+    BEFORE_TRACK = 4
+    """Earlier than the arm's first sample."""
+    AFTER_TRACK = 5
+    """Later than the arm's last sample."""
+    GAP = 6
+    """Between two samples too far apart, or next to one without pose."""
+    CONTRADICTED = 7
+    """At samples that the arm's own track shows to be wrong."""
+
+    @property
+    def label(self) -> str:
+        """The words that a report shows."""
+        return _LABELS[self]
+
+
+_LABELS = {
+    PoseStatus.FOUND: "pose found",
+    PoseStatus.NO_TRIGGER: "without trigger id",
+    PoseStatus.UNKNOWN_TRIGGER: "with a trigger id that the arm does not know",
+    PoseStatus.UNKNOWN_SAMPLE: "at samples for which the arm gave no pose",
+    PoseStatus.BEFORE_TRACK: "before the arm's first sample",
+    PoseStatus.AFTER_TRACK: "after the arm's last sample",
+    PoseStatus.GAP: "in a gap of the arm's samples",
+    PoseStatus.CONTRADICTED: "at samples that the arm's own track shows to be wrong",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExposurePoses:
+    """``base_from_tool`` for each of N exposures.
+
+    Parameters
+    ----------
+    rotations, translations_mm
+        (N, 3, 3) and (N, 3); unit and zero where there is no pose.
+    fate
+        (N,) `PoseStatus`.
+    sample
+        (N,) row of the arm's track that gave the pose, or the one before it; -1 for none.
+    source
+        Whether poses were found by trigger id or by time.
+    max_gap_ns
+        Widest step between samples that was bridged; 0 by trigger id.
+    warnings
+        What is weak, in words.
+    track_faults
+        What the arm's track says against itself.
+    """
+
+    rotations: FloatArray
+    translations_mm: FloatArray
+    fate: IntArray
+    sample: IntArray
+    source: PoseSource
+    max_gap_ns: int
+    warnings: tuple[str, ...] = ()
+    track_faults: tuple[TrackFault, ...] = ()
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(self.fate))
+        for name, shape in (("rotations", (n, 3, 3)), ("translations_mm", (n, 3))):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+        for name in ("fate", "sample"):
+            object.__setattr__(self, name, frozen_ints(getattr(self, name), (n,), name))
+
+    def __len__(self) -> int:
+        """Count of exposures, those without pose included."""
+        return len(self.fate)
+
+    @property
+    def has_pose(self) -> BoolArray:
+        """(N,) True where the pose is known."""
+        return np.asarray(self.fate == int(PoseStatus.FOUND))
+
+    def count(self, fate: PoseStatus) -> int:
+        """Count of exposures of this fate."""
+        return int((self.fate == int(fate)).sum())
+
+    @property
+    def missing(self) -> str:
+        """How many exposures have no pose, and why; empty if all have one."""
+        parts = [
+            f"{self.count(fate)} {fate.label}"
+            for fate in PoseStatus
+            if fate is not PoseStatus.FOUND and self.count(fate)
+        ]
+        return ", ".join(parts)
+
+    @property
+    def how(self) -> str:
+        """How poses were found, in words."""
+        if self.source == "trigger":
+            return "by trigger id"
+        return f"by time, between samples up to {self.max_gap_ns / 1e6:g} ms apart"
+
+    def pose(self, row: int) -> Pose[Base, Tool]:
+        """Pose of one exposure.
+
+        Raises
+        ------
+        InputError
+            If it has none.
+        """
+        fate = PoseStatus(int(self.fate[row]))
+        if fate is not PoseStatus.FOUND:
+            raise InputError(f"exposure {row} has no pose: {fate.label}")
+        return Pose(self.rotations[row], self.translations_mm[row])
+
 
 GAP_PERIODS = 3
 """Steps between samples up to this many median periods are bridged, unless the user says more."""
@@ -121,7 +246,7 @@ def _without_contradicted(
         is_between = times > arm.t_ns[sample]
         is_wrong |= is_between & (check.is_faulty[after] | check.is_broken_step[sample])
     is_wrong &= poses.has_pose
-    fate = np.where(is_wrong, int(PoseFate.CONTRADICTED), poses.fate)
+    fate = np.where(is_wrong, int(PoseStatus.CONTRADICTED), poses.fate)
     rotations = np.where(is_wrong[:, None, None], np.eye(3), poses.rotations)
     translations = np.where(is_wrong[:, None], 0.0, poses.translations_mm)
     named = [fault.words for fault in check.faults[:LISTED_FAULTS]]
@@ -166,16 +291,16 @@ def _by_trigger(
                 remedy="each trigger must have one sample",
             )
         sample_of[int(ids[sample])] = int(sample)
-    fate = np.full(len(rows), int(PoseFate.NO_TRIGGER))
+    fate = np.full(len(rows), int(PoseStatus.NO_TRIGGER))
     found = np.full(len(rows), -1)
     for k, row in enumerate(rows):
         if row.trigger_id is None or row.trigger_id == NO_TRIGGER:
             continue
         found[k] = sample_of.get(row.trigger_id, -1)
-        fate[k] = int(PoseFate.UNKNOWN_TRIGGER)
+        fate[k] = int(PoseStatus.UNKNOWN_TRIGGER)
         if found[k] >= 0:
             is_known = arm.is_known[found[k]]
-            fate[k] = int(PoseFate.FOUND if is_known else PoseFate.UNKNOWN_SAMPLE)
+            fate[k] = int(PoseStatus.FOUND if is_known else PoseStatus.UNKNOWN_SAMPLE)
     rotations, translations = _at_samples(arm, found, fate)
     warnings = _times_apart(rows, arm, found, latency_ns) if clock == "shared" else ()
     return ExposurePoses(rotations, translations, fate, found, "trigger", 0, warnings)
@@ -199,7 +324,7 @@ def _times_apart(
 
 def _at_samples(arm: ArmTrack, found: IntArray, fate: IntArray) -> tuple[FloatArray, FloatArray]:
     rotations, translations = np.tile(np.eye(3), (len(found), 1, 1)), np.zeros((len(found), 3))
-    own = fate == int(PoseFate.FOUND)
+    own = fate == int(PoseStatus.FOUND)
     rotations[own] = arm.rotations[found[own]]
     translations[own] = arm.translations_mm[found[own]]
     return rotations, translations
@@ -221,19 +346,19 @@ def poses_by_time(
     is_exact = (before >= 0) & (arm.t_ns[start] == times)
     step = arm.t_ns[after] - arm.t_ns[start]
     is_bridged = arm.is_known[start] & arm.is_known[after] & (step > 0) & (step <= max_gap)
-    fate = np.where(is_bridged, int(PoseFate.FOUND), int(PoseFate.GAP))
-    fate[before < 0] = int(PoseFate.BEFORE_TRACK)
-    fate[times > arm.t_ns[-1]] = int(PoseFate.AFTER_TRACK)
-    at_sample = np.where(arm.is_known[start], PoseFate.FOUND, PoseFate.UNKNOWN_SAMPLE)
+    fate = np.where(is_bridged, int(PoseStatus.FOUND), int(PoseStatus.GAP))
+    fate[before < 0] = int(PoseStatus.BEFORE_TRACK)
+    fate[times > arm.t_ns[-1]] = int(PoseStatus.AFTER_TRACK)
+    at_sample = np.where(arm.is_known[start], PoseStatus.FOUND, PoseStatus.UNKNOWN_SAMPLE)
     fate[is_exact] = at_sample[is_exact]
     rotations, translations = _at_samples(arm, start, fate)
-    between = np.flatnonzero((fate == int(PoseFate.FOUND)) & ~is_exact)
+    between = np.flatnonzero((fate == int(PoseStatus.FOUND)) & ~is_exact)
     low, high = start[between], after[between]
     fraction = (times[between] - arm.t_ns[low]) / step[between]
     rotations[between] = slerp(arm.rotations[low], arm.rotations[high], fraction)
     way = arm.translations_mm[high] - arm.translations_mm[low]
     translations[between] = arm.translations_mm[low] + fraction[:, None] * way
-    sample = np.where(fate == int(PoseFate.FOUND), start, -1)
+    sample = np.where(fate == int(PoseStatus.FOUND), start, -1)
     warnings = _bend_warning(arm, low, fraction)
     return ExposurePoses(rotations, translations, fate, sample, "time", max_gap, warnings)
 
@@ -298,3 +423,59 @@ def _spans(rows: Sequence[ExposureRow], arm: ArmTrack) -> str:
         f"; exposures span {min(times) / 1e9:.6f} to {max(times) / 1e9:.6f} s, the arm's samples "
         f"{arm.t_ns[0] / 1e9:.6f} to {arm.t_ns[-1] / 1e9:.6f} s"
     )
+
+
+SAME_MM, SAME = 1e-6, 1e-9
+FEWEST_POINTS = 30
+MOVED_MM = 0.3
+"""Stripes further apart were not taken from one place: poses that are written with one decimal of
+a millimetre or a degree stay equal over less than that."""
+
+
+def stripes_at_equal_poses(
+    clouds: Mapping[int, PointCloud], poses: ExposurePoses
+) -> dict[int, float]:
+    """Exposures that bear the pose of an earlier one but show another stripe.
+
+    An arm at rest may well say the very same pose again, and a robot comes back to it; the object
+    then shows the same stripe. A pose that hung, or was repeated, does not.
+
+    Parameters
+    ----------
+    clouds
+        Points in Base of each instant, of all its cameras, by the row whose pose it has.
+    poses
+        Of all rows.
+
+    Returns
+    -------
+    dict[int, float]
+        Distance in mm from the earlier stripe, by row; only where the same sheet shows in both.
+    """
+    found: dict[int, float] = {}
+    first: dict[bytes, int] = {}
+    for row in sorted(clouds):
+        key = _key(poses, row)
+        if key not in first:
+            first[key] = row
+            continue
+        apart = _apart_mm(clouds[first[key]], clouds[row])
+        if apart > MOVED_MM:
+            found[row] = apart
+    return found
+
+
+def _key(poses: ExposurePoses, row: int) -> bytes:
+    place = np.rint(poses.translations_mm[row] / SAME_MM).astype(np.int64)
+    turn = np.rint(poses.rotations[row] / SAME).astype(np.int64)
+    return bytes(place.tobytes() + turn.tobytes())
+
+
+def _apart_mm(one: PointCloud, other: PointCloud) -> float:
+    """Median distance between two stripes of one sheet; 0 where they cannot be compared."""
+    distances: list[FloatArray] = []
+    for sheet in np.intersect1d(one.sheet, other.sheet):
+        a, b = (cloud.points_mm[cloud.sheet == sheet] for cloud in (one, other))
+        if min(len(a), len(b)) >= FEWEST_POINTS:
+            distances.append(np.asarray(cKDTree(a).query(b)[0]))
+    return float(np.median(np.concatenate(distances))) if distances else 0.0

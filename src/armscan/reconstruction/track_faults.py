@@ -1,11 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an arm's track says against itself: places no hand or robot can have gone between.
-
-Nothing here knows the images. A tool is a body: within one step between samples it goes about as
-far as its speed around that step says, and its acceleration is bounded. A sample or a stretch of
-samples that breaks this is told from the track alone where both sides of it fit together; a single
-jump after which all the rest is shifted says only that one of the halves is wrong.
-"""
+"""Jumps, standstills and other faults that an arm's track shows of itself."""
 
 from __future__ import annotations
 
@@ -17,7 +11,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.records.arm_track import ArmTrack
+from armscan.records.recording import ArmTrack
 
 FaultKind = Literal["jump", "off the track", "stands still", "repeated"]
 

@@ -16,7 +16,7 @@ from armscan.records.profile import Profile
 N_CAMERA, N_SHEET = 9, len(SHEET_PARAMETER_NAMES)
 
 
-def meet_sheets(
+def intersect_sheets(
     points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
 ) -> tuple[FloatArray, BoolArray]:
     """Intersect the rays of pixels with their sheets, without covariance.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures that travel inside a page: charts by matplotlib, photographs with marks on them."""
+"""Charts and marked photographs as markup inside a page."""
 
 from __future__ import annotations
 

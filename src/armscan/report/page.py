@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A report as one self-contained HTML page: what it is made of, and how it is rendered."""
+"""One HTML page: cards, figures, tables, text, and where its content came from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TypeAlias
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from armscan.report.summary import Table
+from armscan.models.calibration import Provenance
+from armscan.report.quantity import SIGMA_NOTE, Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,3 +144,31 @@ def _environment() -> Environment:
     for name, kind in kinds.items():
         environment.tests[name] = lambda block, kind=kind: isinstance(block, kind)
     return environment
+
+
+def origin_section(provenance: Provenance) -> Section:
+    """Inputs with hashes, options, parents, command."""
+    facts = Facts(
+        (
+            ("Document", provenance.document_id),
+            ("Written", f"{provenance.created_utc} by armscan {provenance.armscan_version}"),
+            ("Command", " ".join(provenance.command)),
+            ("Rests on", ", ".join(provenance.parent_ids) or "no other document"),
+        )
+    )
+    options = Table(("option", "value"), provenance.options, "Options in force", (1,))
+    inputs = Table(
+        ("file", "SHA-256"),
+        tuple((item.path, item.sha256[:16] + "…") for item in provenance.inputs),
+        "Files that went in",
+        (1,),
+    )
+    return Section("Origin", (facts, inputs, options), is_folded=True)
+
+
+def footer(provenance: Provenance) -> str:
+    """One line for the foot of a page."""
+    return (
+        f"Written {provenance.created_utc} by armscan {provenance.armscan_version}. "
+        f"{SIGMA_NOTE} This page holds all its pictures and asks no other host for anything."
+    )

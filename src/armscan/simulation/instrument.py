@@ -1,20 +1,172 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mechanical half of the presets, and all that one twin is made of."""
+"""The whole simulated instrument: head, arm, probe and fixtures of one seed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from armscan.devices.twin import Preset
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.hand_path import Unsteadiness
+from armscan.devices.sources import Preset
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.records.recording import NO_TRIGGER, ArmTrack
+from armscan.simulation.arm.arm import COMFORTABLE_RAD, ArmErrors, MeasuringArm, reach
+from armscan.simulation.arm.hand import FACE_DOWN, HandTremor, Trajectory
 from armscan.simulation.head import Head, build_head
-from armscan.simulation.held_target import made_target
-from armscan.simulation.measuring_arm import ArmErrors, MeasuringArm
-from armscan.simulation.plate_probing import ProbeErrors
-from armscan.simulation.stations import Bench
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.fixtures import Bench
+from armscan.simulation.targets import made_target
+
+SAMPLE_NS = 4_000_000
+"""250 samples a second."""
+_EDGE_NS = 60_000_000
+
+
+def track_of_readings(
+    arm: MeasuringArm,
+    t_ns: IntArray,
+    trigger_ids: IntArray,
+    joints_rad: FloatArray,
+    rng: np.random.Generator,
+) -> ArmTrack:
+    """Track of true joint angles (N, 7) at increasing times (N,), as the controller sees them."""
+    readings = arm.readings(joints_rad, rng)
+    rotations, translations = arm.nominal.transforms(readings)
+    known = np.ones(len(t_ns), dtype=np.bool_)
+    return ArmTrack(t_ns, rotations, translations, known, trigger_ids, readings)
+
+
+def track_of_sweeps(
+    arm: MeasuringArm,
+    sweeps: Sequence[Trajectory],
+    starts_ns: Sequence[int],
+    rng: np.random.Generator,
+) -> ArmTrack:
+    """Track of strokes that start at the given times; between them the arm sends nothing.
+
+    Triggers are numbered from 1 through all strokes, in order of time.
+    """
+    times, triggers, joints = [], [], []
+    first_trigger = 1
+    for one, start in zip(sweeps, starts_ns, strict=True):
+        phase = int(rng.integers(SAMPLE_NS))
+        last = int(one.exposure_t_ns[-1]) + _EDGE_NS
+        own = np.arange(phase - _EDGE_NS, last, SAMPLE_NS, dtype=np.int64)
+        own = own[~np.isin(own, one.exposure_t_ns)]
+        both = np.concatenate([own, one.exposure_t_ns])
+        ids = np.full(len(both), NO_TRIGGER, dtype=np.int64)
+        ids[len(own) :] = first_trigger + np.arange(len(one.exposure_t_ns))
+        first_trigger += len(one.exposure_t_ns)
+        order = np.argsort(both)
+        times.append(start + both[order])
+        triggers.append(ids[order])
+        joints.append(one.path.joints(both[order] * 1e-9))
+    return track_of_readings(
+        arm, np.concatenate(times), np.concatenate(triggers), np.concatenate(joints), rng
+    )
+
+
+TIP_DIAMETER_MM = 6.0
+TRUE_PROBE_MM = np.array([0.4, -0.3, 61.2])
+"""Centre of the tip in Tool: on the last axis, but for the mounting."""
+
+_RINGS = ((14, 78.0), (7, 42.0), (3, 14.0))
+"""Touches and radius in mm of each ring around the plate's middle."""
+_STRAY_MM = 5.0
+_LEAN_RAD = 0.35
+_TOUCH_NS = 3_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeErrors:
+    """Errors of probing; each a standard deviation in mm.
+
+    Parameters
+    ----------
+    touch_mm
+        Of one touch, along the normal: the tip's form and the finger's force.
+    calibration_mm
+        Of each coordinate of the tip's calibrated centre in Tool.
+    diameter_mm
+        Of the tip's calibrated diameter.
+    """
+
+    touch_mm: float
+    calibration_mm: float
+    diameter_mm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlateProbing:
+    """What a program gets; see `armscan.devices.sources.Probing`.
+
+    Parameters
+    ----------
+    arm
+        One sample a touch.
+    tool_from_probe_mm
+        (3,) calibrated centre of the tip in Tool.
+    tip_diameter_mm
+        Calibrated diameter of the tip.
+    """
+
+    arm: ArmTrack
+    tool_from_probe_mm: FloatArray
+    tip_diameter_mm: float
+
+    def __post_init__(self) -> None:
+        centre = frozen_floats(self.tool_from_probe_mm, (3,), "tool_from_probe_mm")
+        object.__setattr__(self, "tool_from_probe_mm", centre)
+
+
+def probe_plate(
+    arm: MeasuringArm, bench: Bench, errors: ProbeErrors, rng: np.random.Generator
+) -> PlateProbing:
+    """Touch the plate all around with a tip that leans this way and that."""
+    joints = []
+    last = COMFORTABLE_RAD
+    for x, y in _places_mm(rng):
+        centre = _tip_centre_mm(bench, x, y, errors.touch_mm * rng.standard_normal())
+        last = reach(arm.true, _tool_at(centre, rng), last)
+        joints.append(last)
+    n = len(joints)
+    times = _TOUCH_NS * np.arange(1, n + 1, dtype=np.int64)
+    track = track_of_readings(arm, times, np.full(n, NO_TRIGGER), np.array(joints), rng)
+    return PlateProbing(
+        arm=track,
+        tool_from_probe_mm=TRUE_PROBE_MM + errors.calibration_mm * rng.standard_normal(3),
+        tip_diameter_mm=TIP_DIAMETER_MM + errors.diameter_mm * float(rng.standard_normal()),
+    )
+
+
+def _places_mm(rng: np.random.Generator) -> FloatArray:
+    """(N, 2) places on the plate, on rings, each a little off."""
+    rings = []
+    for count, radius in _RINGS:
+        turn = 2.0 * np.pi * (np.arange(count) + rng.uniform()) / count
+        rings.append(radius * np.stack([np.cos(turn), np.sin(turn)], axis=1))
+    places = np.concatenate(rings)
+    return np.asarray(places + _STRAY_MM * rng.uniform(-1.0, 1.0, places.shape))
+
+
+def _tip_centre_mm(bench: Bench, x_mm: float, y_mm: float, touch_mm: float) -> FloatArray:
+    """(3,) centre, in Base, of a tip that rests on the true face at x, y of the plate's frame."""
+    x, y = np.array([x_mm]), np.array([y_mm])
+    foot = np.array([[x_mm, y_mm, bench.plate.height_mm(x, y)[0]]])
+    centre = foot[0] + (0.5 * TIP_DIAMETER_MM + touch_mm) * bench.plate.normals(foot)[0]
+    pose = bench.base_from_plate
+    return np.asarray(pose.rotation @ centre + pose.translation_mm)
+
+
+def _tool_at(centre_mm: FloatArray, rng: np.random.Generator) -> Pose[Base, Tool]:
+    """Pose of a tool that holds the tip's centre at a place, leaning by chance."""
+    lean = rotation_from_vector(np.array([*(_LEAN_RAD * rng.uniform(-1.0, 1.0, 2)), 0.0]))
+    roll = rotation_from_vector(np.array([0.0, 0.0, rng.uniform(-1.0, 1.0)]))
+    rotation = lean @ roll @ FACE_DOWN
+    return Pose(rotation, centre_mm - rotation @ TRUE_PROBE_MM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +185,7 @@ class Mechanics:
 
     arm: ArmErrors
     probe: ProbeErrors
-    hand: Unsteadiness = field(default_factory=Unsteadiness)
+    hand: HandTremor = field(default_factory=HandTremor)
     exposure_s: float = 1e-3
     target_mm: float = 0.0003
     """The thesis's target is true to 0.001 mm (5.2.1): three of these."""
@@ -47,7 +199,7 @@ MECHANICS: dict[Preset, Mechanics] = {
     "harsh": Mechanics(
         ArmErrors(2.7, 2.7, 1.3, 0.7, 0.0025),
         ProbeErrors(0.003, 0.004, 0.001),
-        Unsteadiness(tilt_deg=2.5, depth_mm=1.5, aside_mm=2.0, speed=0.4),
+        HandTremor(tilt_deg=2.5, depth_mm=1.5, aside_mm=2.0, speed=0.4),
         exposure_s=2e-3,
         target_mm=0.001,
     ),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scanner head at any pose sees of a scene in Base: exposures and the truth of stripes."""
+"""What stands before the head at one moment, and the image that a camera takes of it."""
 
 from __future__ import annotations
 
@@ -12,30 +12,20 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, ImageArray, frozen_floats
-from armscan.geometry.frames import Base, Board, Sensor
-from armscan.geometry.poses import Points, Pose
-from armscan.simulation.band_light import band_light
-from armscan.simulation.board import PrintedBoard
-from armscan.simulation.board_photo import render_board
-from armscan.simulation.flat_pattern import FlatPattern
+from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
 from armscan.simulation.head import Head, MountedCamera, Window
-from armscan.simulation.imaging import Imaging
-from armscan.simulation.laser_source import in_sources
-from armscan.simulation.light import LineLaser
-from armscan.simulation.region import Region, to_pixels
-from armscan.simulation.render import laser_bands
-from armscan.simulation.ring_image import draw_markers
-from armscan.simulation.ring_markers import Marked, RingMarker
-from armscan.simulation.scene import Lamp, Scene
-from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
-from armscan.simulation.shapes import Placed
-from armscan.simulation.sheet_light import PosedView, look
-from armscan.simulation.stray_light import stray_lights
-from armscan.simulation.stripe_truth import find_stripe
-from armscan.simulation.surfaces import Surface
-from armscan.simulation.thing import Finish, Thing
+from armscan.simulation.objects.board_image import render_board
+from armscan.simulation.objects.boards import FlatPattern, PrintedBoard
+from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
+from armscan.simulation.objects.shapes import Placed
+from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
+from armscan.simulation.optics.lasers import LineLaser, in_sources
+from armscan.simulation.optics.render import Imaging, Region, find_stripe, laser_bands, to_pixels
+from armscan.simulation.optics.scene import Material, RoomLight, Scene, SceneObject, Surface
+from armscan.simulation.optics.stray_light import stray_lights
+from armscan.simulation.optics.stripe_light import PosedView, band_light, look
 
-ROOM = Lamp(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0.0, 0.0, 1.0))
+ROOM = RoomLight(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0.0, 0.0, 1.0))
 """Light of the room around the arm: white that faces up sees about full scale; scaled later."""
 
 
@@ -75,9 +65,9 @@ class Station:
         Ring markers on flat faces of the things, drawn sharply in images under room light.
     """
 
-    things: tuple[Thing, ...]
+    things: tuple[SceneObject, ...]
     target: Target | None = None
-    room: Lamp = ROOM
+    room: RoomLight = ROOM
     markers: tuple[RingMarker, ...] = ()
 
     def under(self, imaging: Imaging) -> Station:
@@ -272,7 +262,7 @@ def _seen_lasers(head: Head, eye: MountedCamera, sources: tuple[str, ...]) -> li
 
 def _view(eye: MountedCamera, station: Station, pose: Pose[Base, Any], region: Region) -> PosedView:
     finishes = tuple(thing.finish for thing in station.things)
-    return look(seen_from(station, pose), (*finishes, Finish()), eye.camera, region)
+    return look(seen_from(station, pose), (*finishes, Material()), eye.camera, region)
 
 
 def _room(
@@ -307,7 +297,7 @@ def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:
     return Scene(tuple(surfaces), lamp=_lamp_seen_from(station.room, sensor_from_base))
 
 
-def _lamp_seen_from(room: Lamp, sensor_from_base: Pose[Any, Base]) -> Lamp:
+def _lamp_seen_from(room: RoomLight, sensor_from_base: Pose[Any, Base]) -> RoomLight:
     position: Points[Base] = Points(np.array([room.position_mm]))
     x, y, z = (sensor_from_base @ position).xyz_mm[0]
     up = sensor_from_base.rotation @ np.asarray(room.up)

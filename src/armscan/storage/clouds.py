@@ -1,20 +1,162 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds on disk: PLY, which loses nothing, and XYZ, which says what it loses."""
+"""Point clouds as PLY and XYZ, armscan's own and other programs', and conversion from one
+format to another.
+"""
 
 from __future__ import annotations
 
 import io
 import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from armscan.errors import FileFormatError, InputError
+from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.models.calibration import SensorCalibration
+from armscan.models.camera import CameraModel
 from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.documents import read_calibration, read_camera_calibration
+from armscan.storage.foreign import camera_info_yaml
 from armscan.storage.images import read_bytes
-from armscan.storage.ply_format import PlyVertices, parse_ply, ply_header
+from armscan.storage.json_text import parse_json
+
+TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+WRITTEN_TYPES = {"f8": "double", "i4": "int"}
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+HEADER = re.compile(rb"ply\s*\n(.*?)end_header\r?\n", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlyVertices:
+    """Vertices of a PLY file.
+
+    Parameters
+    ----------
+    table
+        (N,) structured array, one field a property.
+    comments
+        Comment lines of the header, without the word ``comment``.
+    """
+
+    table: NDArray[Any]
+    comments: tuple[str, ...]
+
+
+def ply_header(kind: np.dtype[Any], count: int, comments: Iterable[str]) -> bytes:
+    """Header of a binary little-endian file with ``count`` vertices of a structured type."""
+    properties = [
+        f"property {WRITTEN_TYPES[kind[name].str[1:]]} {name}" for name in kind.names or ()
+    ]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {text}" for text in comments),
+        f"element vertex {count}",
+        *properties,
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def parse_ply(data: bytes, where: str) -> PlyVertices:
+    """Read the vertices of any PLY file whose first element they are.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no PLY file, its vertices are lists or not first, or it is cut short.
+    """
+    header = HEADER.match(data)
+    if header is None:
+        raise FileFormatError(
+            "this is not a PLY file with a complete header",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
+        )
+    body = data[header.end() :]
+    try:
+        order, count, fields, comments = _header(header[1].decode("latin-1"))
+    except (ValueError, KeyError, IndexError) as error:
+        raise FileFormatError(
+            "the PLY header is not understood",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
+        ) from error
+    if order == "=":
+        table = _ascii_table(body, fields, count, where)
+    else:
+        kind = np.dtype([(name, order + code) for name, code in fields])
+        table = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)[:count]
+    if len(table) < count:
+        raise FileFormatError(
+            f"the PLY file holds {len(table)} of {count} points",
+            where=where,
+            remedy="copy the file again",
+        )
+    return PlyVertices(table, comments)
+
+
+def _header(text: str) -> tuple[str, int, list[tuple[str, str]], tuple[str, ...]]:
+    order, count = "", -1
+    element = ""
+    fields: list[tuple[str, str]] = []
+    comments: list[str] = []
+    for line in text.splitlines():
+        words = line.split()
+        if line.startswith("comment "):
+            comments.append(line[8:])
+        elif words[:1] == ["format"]:
+            order = BYTE_ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            element = words[1]
+            if element == "vertex":
+                count = int(words[2])
+            elif count < 0:
+                raise ValueError("vertices are not the first element")
+        elif words[:1] == ["property"] and element == "vertex":
+            fields.append((words[2], TYPES[words[1]]))
+    if not order or count < 0 or not fields:
+        raise ValueError("the header names no vertices")
+    return order, count, fields, tuple(comments)
+
+
+def _ascii_table(
+    body: bytes, fields: list[tuple[str, str]], count: int, where: str
+) -> NDArray[Any]:
+    rows = [line.split() for line in body.split(b"\n", count)[:count] if line.strip()]
+    try:
+        return np.array([tuple(float(word) for word in row) for row in rows], dtype=fields)
+    except ValueError as error:
+        raise FileFormatError(
+            "the points of the PLY file are not understood",
+            where=where,
+            remedy="copy the file again; it may be cut or damaged",
+        ) from error
+
 
 POINT = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
@@ -143,3 +285,216 @@ def _names(vertices: PlyVertices, word: str) -> tuple[str, ...]:
             except (IndexError, ValueError) as error:
                 raise InputError(f"the PLY header's comment {text!r} is damaged") from error
     return tuple(names)
+
+
+FOREIGN_FRAME: CloudFrame = "Part"
+"""Frame of points about which a file says nothing."""
+
+
+LOOKED_AT = 1000
+"""Lines in which decimal commas are sought: a table that has them has them everywhere."""
+
+
+def read_cloud(path: Path) -> PointCloud:
+    """Read a cloud that armscan wrote, or the points of another program's PLY, XYZ or CSV file.
+
+    Points of other programs come with covariances of zero, which stands for "not known", and as
+    one exposure.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is cut short, or holds no points in x, y, z.
+    """
+    data = read_bytes(path)
+    if data.startswith(b"ply"):
+        table = parse_ply(data, str(path)).table
+        names = set(table.dtype.names or ())
+        if names.issuperset(COVARIANCE):
+            return read_ply(path)
+        if missing := sorted(set(POINT) - names):
+            raise FileFormatError(
+                f"the PLY file's points have no {missing[0]}",
+                where=str(path),
+                remedy="give a cloud with x, y and z in mm",
+            )
+        points = np.stack([table[name].astype(np.float64) for name in POINT], axis=1)
+        return _bare_cloud(points, FOREIGN_FRAME, path)
+    if path.suffix.lower() not in (".xyz", ".txt", ".csv", ".asc"):
+        raise FileFormatError(
+            "this is no point cloud that armscan knows",
+            where=str(path),
+            remedy="give a .ply file, or a text file .xyz, .txt, .asc or .csv with x y z in mm",
+        )
+    return _text_cloud(data, path)
+
+
+def _text_cloud(data: bytes, path: Path) -> PointCloud:
+    text = data.decode("utf-8-sig", errors="replace")
+    named = re.match(r"#.*\bframe (\w+)", text)
+    frame = named[1] if named is not None else ""
+    lines = text.splitlines()
+    start = 1 if _is_heading(lines, path) else 0
+    body = [line.partition("#")[0] for line in lines[start:]]
+    filled = [line for line in body[:LOOKED_AT] if line.strip()]
+    if not filled:
+        raise FileFormatError(
+            "the file holds no points", where=str(path), remedy="write lines of x y z in mm"
+        )
+    for line in filled:
+        _refuse_decimal_commas(line, path)
+    if start and len(_words(lines[0])) > 1 and len(_words(filled[0])) == 2 * len(_words(lines[0])):
+        raise FileFormatError(
+            f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
+            where=str(path),
+            remedy="write numbers with points: 1.5,2.5,3.5",
+        )
+    joined = "\n".join(body).replace(",", " ").replace(";", " ")
+    try:
+        points = np.loadtxt(io.StringIO(joined), usecols=(0, 1, 2), ndmin=2)
+    except (ValueError, IndexError) as error:
+        raise FileFormatError(
+            f"the points are not understood ({error})",
+            where=str(path),
+            remedy="give one point a line: x y z in mm, with a point as decimal sign",
+        ) from error
+    known = cast(CloudFrame, frame) if frame in get_args(CloudFrame) else FOREIGN_FRAME
+    is_simulated = named is not None and f"; {SIMULATED};" in text.partition("\n")[0]
+    mark = f"# {FORCED}: "
+    forced = tuple(line.removeprefix(mark) for line in lines if line.startswith(mark))
+    return replace(_bare_cloud(points, known, path), is_simulated=is_simulated, forced=forced)
+
+
+def _is_heading(lines: list[str], path: Path) -> bool:
+    """Whether the first line is no point but a count of points, or names of columns.
+
+    Raises
+    ------
+    FileFormatError
+        If it is none of these: a damaged point is not to be dropped in silence.
+    """
+    words = _words(lines[0]) if lines else []
+    if not words or lines[0].startswith("#"):
+        return False
+    if len(words) == 1 and words[0].isdecimal():
+        return True
+    if all(_is_number(word) for word in words):
+        return False
+    if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
+        raise FileFormatError(
+            f"the first line is neither a point nor a heading: '{lines[0][:60]}'",
+            where=str(path),
+            remedy="correct the line, or put # before it",
+        )
+    return True
+
+
+def _refuse_decimal_commas(line: str, path: Path) -> None:
+    """Raise for a line whose commas can only be decimal signs, or may be.
+
+    ``1,5;2,5;3,5`` and ``1,5 2,5 3,5`` hold commas and another separator between numbers; so do
+    six whole numbers ``1,5,2,5,3,5`` from a table of three columns, which is not told from one of
+    six: only what is certain is refused.
+    """
+    fields = [word for word in re.split(r"[;\s]+", line.strip().strip(",;")) if word]
+    with_comma = [word for word in fields if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word)]
+    if len(fields) >= 2 and with_comma:
+        raise FileFormatError(
+            f"the numbers have commas as decimal signs: '{line.strip()[:60]}'",
+            where=str(path),
+            remedy="write them with points: 1.5 2.5 3.5",
+        )
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCloud:
+    n = len(points_mm)
+    zeros = np.zeros(n, dtype=np.int64)
+    try:
+        return PointCloud(
+            frame=frame,
+            points_mm=points_mm,
+            covariance_mm2=np.zeros((n, 3, 3)),
+            sigma_noise_mm=np.zeros(n),
+            sheet=zeros,
+            sheet_names=("",),
+            exposure=zeros,
+            exposure_sources=(path.name,),
+            segment=zeros,
+            intensity=np.zeros(n),
+        )
+    except InputError as error:
+        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+
+
+YAML_LOSES = ("covariance", "evidence and provenance")
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """What was converted, in words, what the new file does not hold, and marks of the old one."""
+
+    what: str
+    losses: tuple[str, ...]
+    forced: tuple[str, ...] = ()
+
+
+def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) -> Conversion:
+    """Write a calibration's camera as ROS ``camera_info``, or a cloud as XYZ.
+
+    Parameters
+    ----------
+    source
+        ``.ply`` of armscan, or any calibration that armscan reads: its own camera or sensor
+        document, OpenCV's YAML, XML or JSON, ROS.
+    output
+        ``.yaml`` for a camera, ``.xyz`` for a cloud.
+    is_overwriting
+        Replace a file that exists.
+
+    Raises
+    ------
+    OptionError
+        If there is no way from the one kind of file to the other.
+    FileFormatError
+        If the source cannot be read.
+    OutputError
+        If the output exists or cannot be written.
+    """
+    kinds = source.suffix.lower() == ".ply", output.suffix.lower()
+    if kinds not in ((True, ".xyz"), (False, ".yaml"), (False, ".yml")):
+        raise OptionError(
+            f"there is no conversion from {source.name} to {output.name}",
+            remedy="convert a calibration to .yaml, or a cloud .ply to .xyz",
+        )
+    check_outputs((output,), is_overwriting=is_overwriting)
+    if kinds[0]:
+        cloud = read_ply(source)
+        content = xyz_bytes(cloud)
+        conversion = Conversion("cloud to XYZ", XYZ_LOSES, cloud.forced)
+    else:
+        camera, forced = _camera(source)
+        content = camera_info_yaml(camera, comments=forced).encode()
+        conversion = Conversion("camera to ROS camera_info", YAML_LOSES, forced)
+    write_files({output: content}, is_overwriting=is_overwriting)
+    return conversion
+
+
+def _camera(path: Path) -> tuple[CameraModel, tuple[str, ...]]:
+    data = read_bytes(path)
+    is_own = data.lstrip().startswith(b"{") and "schema" in parse_json(data, str(path))
+    calibration = read_calibration(path) if is_own else read_camera_calibration(path)
+    if isinstance(calibration, SensorCalibration):
+        return calibration.camera.camera, calibration.camera.provenance.forced
+    return calibration.camera, calibration.provenance.forced

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """What was found in images, kept in a folder so that the next run need not look again.
 
-An entry's name is the hash of all that it follows from: the image's pixels and how they are read,
-the options, and the code that looks. Nothing is ever updated: another image, option or version of
-the code is another name. An entry states its own hash and name; one that is cut, changed, renamed
-or not understood counts as absent. The folder may be deleted at any time.
+An entry's name is the hash of all that it follows from: the image's pixels and how they are
+read, the options, and the code that looks. Nothing is ever updated: another image, option or
+version of the code is another name. An entry states its own hash and name; one that is cut,
+changed, renamed or not understood counts as absent. The folder may be deleted at any time.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.vision.targets.view import CircleEdges, OtherCountSeen, TargetView
+from armscan.vision.targets.target import CircleEdges, OtherCountSeen, TargetView
 
 FOLDER_NAME = "armscan-cache"
 SUFFIX = ".found"

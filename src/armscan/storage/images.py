@@ -1,23 +1,398 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Image files to exposures: raw pixels, never turned, never rescaled."""
+"""Image files to exposures: raw pixels, never turned, never rescaled.
+
+Decoders return a picture whose lower part is grey when a file was cut, without an error; so
+the structure of a file is walked before it is decoded.
+"""
 
 from __future__ import annotations
 
+import re
+import struct
+import zlib
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError, InputError, OptionError
-from armscan.geometry.arrays import ImageArray
+from armscan.geometry.arrays import ImageArray, IntArray
+from armscan.kernels.jpeg_entropy import WHOLE, walk_scan
 from armscan.records.exposure import Exposure
-from armscan.storage.image_format import check_complete, image_format
-from armscan.storage.image_options import ImageOptions
-from armscan.storage.netpbm import decode_netpbm
+
+Alignment = Literal["low", "high"]
+
+
+@dataclass(frozen=True, slots=True)
+class ImageOptions:
+    """What a file does not say about its pixels.
+
+    Parameters
+    ----------
+    bits_used
+        Significant bits of a pixel; None takes what the file says (PGM), else all of its bits.
+    align
+        Where the significant bits lie in a 16-bit pixel; high-aligned pixels are shifted down.
+    """
+
+    bits_used: int | None = None
+    align: Alignment = "low"
+
+    def __post_init__(self) -> None:
+        if self.bits_used is not None and not 1 <= self.bits_used <= 16:
+            raise OptionError(f"bits used is {self.bits_used}", remedy="give 1 to 16")
+        if self.align not in ("low", "high"):
+            raise OptionError(f"align is {self.align!r}", remedy="choose low or high")
+        if self.align == "high" and self.bits_used is None:
+            raise OptionError(
+                "high-aligned pixels need the count of bits used", remedy="give 10, 12 or 14"
+            )
+
+    def check_unused(self) -> None:
+        """Raise `OptionError` if anything is said of pixels: a recording describes its own."""
+        if self != ImageOptions():
+            raise OptionError(
+                "a recording says itself how its pixels are stored",
+                where="--bits-used and --bits-align",
+                remedy="leave them out, or correct bits_used and align under [[camera]] in "
+                "session.toml",
+            )
+
+
+NO_LENGTH = frozenset({0x01, *range(0xD0, 0xD8)})
+END, SCAN, HUFFMAN, RESTART_INTERVAL = 0xD9, 0xDA, 0xC4, 0xDD
+SEQUENTIAL = (0xC0, 0xC1)
+FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
+FILL_BYTES = 2
+"""Bytes that some writers leave between the last code and the end."""
+MOST_PIXELS_A_BYTE = 1600
+"""A block of 64 pixels takes two codes of at least two bits in all: 0.04 bytes with its share of
+the chroma. A header that claims more than this is not that of the data."""
+STANDARD_TABLES = bytes.fromhex(
+    "0000010501010101010100000000000000000102030405060708090a0b100002010303020403050504040000"
+    "017d01020300041105122131410613516107227114328191a1082342b1c11552d1f02433627282090a161718"
+    "191a25262728292a3435363738393a434445464748494a535455565758595a636465666768696a7374757677"
+    "78797a838485868788898a92939495969798999aa2a3a4a5a6a7a8a9aab2b3b4b5b6b7b8b9bac2c3c4c5c6c7"
+    "c8c9cad2d3d4d5d6d7d8d9dae1e2e3e4e5e6e7e8e9eaf1f2f3f4f5f6f7f8f9fa010003010101010101010101"
+    "0000000000000102030405060708090a0b110002010204040304070504040001027700010203110405213106"
+    "1241510761711322328108144291a1b1c109233352f0156272d10a162434e125f11718191a262728292a3536"
+    "3738393a434445464748494a535455565758595a636465666768696a737475767778797a8283848586878889"
+    "8a92939495969798999aa2a3a4a5a6a7a8a9aab2b3b4b5b6b7b8b9bac2c3c4c5c6c7c8c9cad2d3d4d5d6d7d8"
+    "d9dae2e3e4e5e6e7e8e9eaf2f3f4f5f6f7f8f9fa"
+)
+"""Codes of T.81, annex K: single pictures of a camera's MJPEG stream hold none, and mean these."""
+
+
+@dataclass
+class _Picture:
+    """What the markers have said so far."""
+
+    is_sequential: bool = False
+    size_px: tuple[int, int] = (0, 0)
+    components: dict[int, tuple[int, int]] = field(default_factory=dict)
+    tables: dict[int, IntArray] = field(default_factory=dict)
+    restart: int = 0
+
+
+def jpeg_defect(data: bytes) -> str:
+    """What is wrong with a JPEG file, as the end of a sentence; empty if nothing was found.
+
+    Raises
+    ------
+    struct.error, IndexError
+        If it ends within a marker.
+    """
+    picture, position = _Picture(), 2
+    while True:
+        position = data.find(b"\xff", position)
+        if position < 0 or position + 1 >= len(data):
+            return "is cut short"
+        marker = data[position + 1]
+        if marker == END:
+            return ""
+        if marker in NO_LENGTH or marker in (0x00, 0xFF):
+            position += 1 if marker == 0xFF else 2
+            continue
+        (length,) = struct.unpack_from(">H", data, position + 2)
+        body = data[position + 4 : position + 2 + length]
+        position += 2 + length
+        if marker == SCAN:
+            if not picture.tables:
+                _read_tables(STANDARD_TABLES, picture.tables)
+            end = _end_of_scan(data, position)
+            defect = "is cut short" if end < 0 else _scan_defect(data[position:end], body, picture)
+            position = end
+        else:
+            defect = _heading_defect(marker, body, picture, len(data))
+        if defect:
+            return defect
+
+
+def _heading_defect(marker: int, body: bytes, picture: _Picture, n_bytes: int) -> str:
+    """Take in what a marker says of the picture."""
+    if marker in FRAMES:
+        picture.is_sequential = marker in SEQUENTIAL
+        height, width, n = struct.unpack_from(">HHB", body, 1)
+        picture.size_px = (width, height)
+        picture.components = {
+            body[6 + 3 * k]: (body[7 + 3 * k] >> 4, body[7 + 3 * k] & 15) for k in range(n)
+        }
+        if width * height > MOST_PIXELS_A_BYTE * n_bytes:
+            return f"claims {width} x {height} px, more than its {n_bytes} bytes can hold"
+    elif marker == HUFFMAN:
+        _read_tables(body, picture.tables)
+    elif marker == RESTART_INTERVAL:
+        (picture.restart,) = struct.unpack_from(">H", body)
+    return ""
+
+
+def _read_tables(body: bytes, tables: dict[int, IntArray]) -> None:
+    """Spread each code over all 16-bit words that begin with it (T.81, annex C)."""
+    position = 0
+    while position + 17 <= len(body):
+        kind, counts = body[position], body[position + 1 : position + 17]
+        values = body[position + 17 : position + 17 + sum(counts)]
+        position += 17 + sum(counts)
+        table = np.zeros(1 << 16, dtype=np.int64)
+        start, used = 0, 0
+        for length, count in enumerate(counts, start=1):
+            width = 1 << (16 - length)
+            for value in values[used : used + count]:
+                table[start : start + width] = 256 * length + value
+                start += width
+            used += count
+        tables[kind] = table
+
+
+def _end_of_scan(data: bytes, position: int) -> int:
+    """Where the next marker that does not belong to a scan begins; -1 if there is none."""
+    while True:
+        position = data.find(b"\xff", position)
+        if position < 0 or position + 1 >= len(data):
+            return -1
+        marker = data[position + 1]
+        if marker == 0x00 or 0xD0 <= marker <= 0xD7:
+            position += 2
+        elif marker == 0xFF:
+            position += 1
+        else:
+            return position
+
+
+def _scan_defect(codes: bytes, header: bytes, picture: _Picture) -> str:
+    if not picture.is_sequential:
+        return ""
+    n = header[0]
+    chosen = [(header[1 + 2 * k], header[2 + 2 * k]) for k in range(n)]
+    kinds = sorted(picture.tables)
+    places: list[tuple[int, int]] = []
+    across, down = (max(sizes) for sizes in zip(*picture.components.values(), strict=True))
+    width, height = picture.size_px
+    for component, codes_of in chosen:
+        if component not in picture.components:
+            return f"has a scan of a colour {component} that it has not"
+        pair = (codes_of >> 4, 0x10 | (codes_of & 15))
+        if not set(pair) <= set(kinds):
+            return "lacks a table of codes"
+        h, v = picture.components[component]
+        # a scan of one colour has one block a unit
+        n_blocks = h * v if n > 1 else 1
+        places += [(kinds.index(pair[0]), kinds.index(pair[1]))] * n_blocks
+    if n > 1:
+        n_units = ceil(width / (8 * across)) * ceil(height / (8 * down))
+    else:
+        h, v = picture.components[chosen[0][0]]
+        n_units = ceil(ceil(width * h / across) / 8) * ceil(ceil(height * v / down) / 8)
+    tables = np.stack([picture.tables[kind] for kind in kinds])
+    defect, left = walk_scan(
+        np.frombuffer(codes, np.uint8), tables, np.array(places), n_units, picture.restart
+    )
+    if defect != WHOLE:
+        return f"is damaged: {left} of {n_units} blocks of its picture are missing or unreadable"
+    return f"is damaged: {left} bytes too many in its picture" if left > FILL_BYTES else ""
+
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+TIFF_TYPE_BYTES = {1: 1, 3: 2, 4: 4}
+TIFF_DATA_TAGS = {273: 279, 324: 325}
+"""Tags of the offsets of strips and tiles, with the tags of their byte counts."""
+
+CUT = "copy the file again or leave it out"
+
+
+def image_format(data: bytes) -> str | None:
+    """Name of the image format by its first bytes, or None if it is none that can be read."""
+    if data.startswith(PNG_SIGNATURE):
+        return "PNG"
+    if data.startswith(b"\xff\xd8\xff"):
+        return "JPEG"
+    if data.startswith(b"BM"):
+        return "BMP"
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return "TIFF"
+    if data[:2] in (b"P2", b"P3", b"P5", b"P6") and data[2:3].isspace():
+        return "PGM"
+    return None
+
+
+def check_complete(data: bytes, where: str) -> None:
+    """Raise if an image file ends before its picture does, or a PNG's checksums fail.
+
+    Parameters
+    ----------
+    data
+        The whole file.
+    where
+        Its name, for the message.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is cut short or damaged.
+    """
+    checks = {"PNG": _png_defect, "JPEG": jpeg_defect, "BMP": _bmp_defect, "TIFF": _tiff_defect}
+    name = image_format(data)
+    if name not in checks:
+        return
+    try:
+        defect = checks[name](data)
+    except (struct.error, IndexError):
+        defect = "is cut short"
+    if defect:
+        raise FileFormatError(f"the {name} file {defect}", where=where, remedy=CUT)
+
+
+def _png_defect(data: bytes) -> str:
+    position = len(PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, position)
+        end = position + 12 + length
+        if end > len(data):
+            break
+        (checksum,) = struct.unpack_from(">I", data, end - 4)
+        if zlib.crc32(data[position + 4 : end - 4]) != checksum:
+            return f"is damaged near byte {position}"
+        if data[position + 4 : position + 8] == b"IEND":
+            return ""
+        position = end
+    return "is cut short"
+
+
+def _bmp_defect(data: bytes) -> str:
+    (pixel_offset,) = struct.unpack_from("<I", data, 10)
+    width, height = struct.unpack_from("<ii", data, 18)
+    bits, compression = struct.unpack_from("<HI", data, 28)
+    row_bytes = (abs(width) * bits + 31) // 32 * 4
+    is_plain = compression in (0, 3)
+    return "is cut short" if is_plain and pixel_offset + row_bytes * abs(height) > len(data) else ""
+
+
+def _tiff_defect(data: bytes) -> str:
+    order = "<" if data[:2] == b"II" else ">"
+    (directory,) = struct.unpack_from(f"{order}I", data, 4)
+    (n_entries,) = struct.unpack_from(f"{order}H", data, directory)
+    tags: dict[int, tuple[int, ...]] = {}
+    for k in range(n_entries):
+        entry = directory + 2 + 12 * k
+        tag, kind, count = struct.unpack_from(f"{order}HHI", data, entry)
+        size = TIFF_TYPE_BYTES.get(kind)
+        if size is None or tag not in (*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values()):
+            continue
+        if size * count > 4:
+            (place,) = struct.unpack_from(f"{order}I", data, entry + 8)
+        else:
+            place = entry + 8
+        code = {1: "B", 2: "H", 4: "I"}[size]
+        tags[tag] = struct.unpack_from(f"{order}{count}{code}", data, place)
+    for offset_tag, count_tag in TIFF_DATA_TAGS.items():
+        pairs = zip(tags.get(offset_tag, ()), tags.get(count_tag, ()), strict=False)
+        if any(offset + count > len(data) for offset, count in pairs):
+            return "is cut short"
+    return ""
+
+
+HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d+)" + rb"\s")
+
+
+def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
+    """Decode a PGM (P2, P5) or PPM (P3, P6) file.
+
+    Parameters
+    ----------
+    data
+        The whole file.
+    where
+        Its name, for messages.
+
+    Returns
+    -------
+    image
+        (H, W) or (H, W, 3) in the order red, green, blue; uint8 or uint16, values as stored.
+    bits_used
+        Bits that the header's greatest value needs.
+
+    Raises
+    ------
+    FileFormatError
+        If the header is not understood or values are missing.
+    """
+    header = HEADER.match(data)
+    if header is None:
+        raise FileFormatError(
+            "the PGM header is not understood", where=where, remedy="save the image as PNG"
+        )
+    kind = int(header[1])
+    width, height, greatest = (int(header[k]) for k in (2, 3, 4))
+    if not 1 <= greatest <= 65535 or width < 1 or height < 1:
+        raise FileFormatError(
+            f"the PGM header gives {width} x {height} px and a greatest value of {greatest}",
+            where=where,
+            remedy="save the image as PNG",
+        )
+    shape = (height, width, 3) if kind in (3, 6) else (height, width)
+    body = data[header.end() :]
+    stored = np.dtype(">u2" if greatest > 255 else "u1")
+    count = int(np.prod(shape))
+    values: NDArray[Any]
+    if kind in (2, 3):
+        values = _ascii_values(body, where)
+    else:
+        values = np.frombuffer(body[: len(body) // stored.itemsize * stored.itemsize], stored)
+    if len(values) < count:
+        raise FileFormatError(
+            f"the PGM file holds {len(values)} of {count} values",
+            where=where,
+            remedy="copy the file again or leave it out",
+        )
+    values = values[:count].reshape(shape)
+    image = values.astype(np.uint16) if greatest > 255 else values.astype(np.uint8)
+    return image, greatest.bit_length()
+
+
+def _ascii_values(body: bytes, where: str) -> IntArray:
+    words = re.sub(rb"#[^\n]*", b"", body).split()
+    try:
+        values = np.array([int(word) for word in words], dtype=np.int64)
+    except ValueError as error:
+        raise FileFormatError(
+            "the PGM file holds words that are no numbers",
+            where=where,
+            remedy="save the image as PNG",
+        ) from error
+    if len(values) and not 0 <= values.min() <= values.max() <= 65535:
+        raise FileFormatError(
+            "the PGM file holds values outside 0 to 65535",
+            where=where,
+            remedy="save the image as PNG",
+        )
+    return values
+
 
 FORMATS = "PNG, BMP, JPEG, TIFF or PGM"
 PNG_GREY_WITH_ALPHA = 4

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from armscan.errors import FileFormatError
 from armscan.records.profile import Profile
 from armscan.storage.images import read_bytes
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import TargetView
 
 VIEW_ARRAYS = ("point_index", "points_px", "covariance_px2", "points_board_mm")
 VIEW_SCALARS = ("source", "width_px", "height_px", "is_ambiguous")

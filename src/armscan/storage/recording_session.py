@@ -1,24 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``session.toml``: what holds for a whole folder recording."""
+"""What holds for a folder recording (``session.toml``) and its list of exposures
+(``exposures.csv``).
+"""
 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from armscan.errors import FileFormatError
-from armscan.geometry.euler import EulerConvention
-from armscan.records.sensor_window import SensorWindow
-from armscan.records.session import (
+from armscan.geometry.arrays import IntArray
+from armscan.geometry.rotations import EulerConvention
+from armscan.records.exposure import SensorWindow
+from armscan.records.recording import (
+    NO_TRIGGER,
     CameraSetup,
     Clock,
+    ExposureRow,
     PixelAlignment,
     PixelColour,
     PoseForm,
@@ -26,6 +33,7 @@ from armscan.records.session import (
     SessionKind,
 )
 from armscan.storage.images import read_bytes
+from armscan.storage.tables import CsvTable
 
 SESSION_FILE = "session.toml"
 
@@ -211,3 +219,163 @@ def _unknown(keys: Keys, file: str, prefix: str = "") -> Iterator[str]:
 
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+EXPOSURES_FILE = "exposures.csv"
+REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
+OPTIONAL = ("trigger_id", "view")
+DRIVE = re.compile(r"[A-Za-z]:")
+
+Columns = Mapping[str, tuple[str, ...]]
+
+
+def exposure_rows(table: CsvTable) -> tuple[tuple[ExposureRow, ...], Columns]:
+    """Rows of ``exposures.csv`` in order of time, and its unknown columns in the same order.
+
+    Raises
+    ------
+    FileFormatError
+        If a column is missing, a cell is wrong, an index or trigger id appears twice, a camera's
+        times do not increase, or a path leaves the recording.
+    """
+    table.require(REQUIRED)
+    if not len(table):
+        raise FileFormatError(
+            "the table lists no exposure", where=table.where, remedy="write one line an image"
+        )
+    n = len(table)
+    index, times = table.ints("index"), table.ints("t_ns")
+    camera = table.ints("camera")
+    triggers = table.ints("trigger_id", NO_TRIGGER) if "trigger_id" in table else None
+    views = table.columns.get("view", ("",) * n)
+    rows = [
+        ExposureRow(
+            index=int(index[k]),
+            t_ns=int(times[k]),
+            camera=int(camera[k]),
+            source=_relative(table.columns["file"][k], table.place(k)),
+            lasers=_lasers(table.columns["lasers"][k], table.place(k)),
+            trigger_id=_trigger(table, triggers, k),
+            view=views[k] or None,
+        )
+        for k in range(n)
+    ]
+    _check(rows, table)
+    order = sorted(range(n), key=lambda k: (rows[k].t_ns, rows[k].camera))
+    extra = {
+        name: tuple(cells[k] for k in order)
+        for name, cells in table.columns.items()
+        if name not in REQUIRED + OPTIONAL
+    }
+    return tuple(rows[k] for k in order), extra
+
+
+def exposure_columns(rows: Sequence[ExposureRow], extra: Columns) -> dict[str, tuple[str, ...]]:
+    """Columns of ``exposures.csv``; optional ones only where a row has something to say."""
+    columns = {
+        "index": tuple(str(row.index) for row in rows),
+        "t_ns": tuple(str(row.t_ns) for row in rows),
+        "camera": tuple(str(row.camera) for row in rows),
+        "file": tuple(row.source for row in rows),
+        "lasers": tuple("+".join(row.lasers) for row in rows),
+    }
+    if any(row.trigger_id is not None for row in rows):
+        ids = (row.trigger_id for row in rows)
+        columns["trigger_id"] = tuple("" if number is None else str(number) for number in ids)
+    if any(row.view is not None for row in rows):
+        columns["view"] = tuple(row.view or "" for row in rows)
+    return {**columns, **extra}
+
+
+def check_files(folder: Path, rows: Sequence[ExposureRow]) -> None:
+    """Raise if an image that is listed does not exist.
+
+    Raises
+    ------
+    FileFormatError
+        Naming the first one and the count.
+    """
+    missing = [row.source for row in rows if not (folder / row.source).is_file()]
+    if missing:
+        raise FileFormatError(
+            f"{len(missing)} of {len(rows)} images that are listed do not exist, the first is "
+            f"{missing[0]}",
+            where=str(folder / EXPOSURES_FILE),
+            remedy="copy the images into the recording, or remove their lines",
+        )
+
+
+def _check(rows: Sequence[ExposureRow], table: CsvTable) -> None:
+    latest: dict[int, int] = {}
+    seen: dict[tuple[str, int, int], int] = {}
+    for k, row in enumerate(rows):
+        where = table.place(k)
+        if row.camera < 0:
+            raise FileFormatError(
+                f"camera {row.camera}", where=where, remedy="count cameras from 0"
+            )
+        if (row.trigger_id or 0) < 0 or row.index < 0:
+            raise FileFormatError(
+                "index and trigger_id are not negative", where=where, remedy="count from 0"
+            )
+        keys = [("index", row.index, 0)]
+        if row.trigger_id is not None:
+            keys.append(("trigger_id", row.trigger_id, row.camera))
+        for key in keys:
+            if key in seen:
+                raise FileFormatError(
+                    f"{key[0]} {key[1]} appears again (first in line {table.lines[seen[key]]})",
+                    where=where,
+                    remedy="give each exposure of a camera its own",
+                )
+            seen[key] = k
+        if row.t_ns <= latest.get(row.camera, row.t_ns - 1):
+            fact = "repeats" if row.t_ns == latest[row.camera] else "goes back from"
+            raise FileFormatError(
+                f"t_ns of camera {row.camera} {fact} {latest[row.camera]}",
+                where=where,
+                remedy="sort the lines by time and give each exposure its own",
+            )
+        latest[row.camera] = row.t_ns
+
+
+def repeated_files(rows: Sequence[ExposureRow]) -> list[str]:
+    """Images that are listed more than once."""
+    counts = Counter(row.source for row in rows)
+    return [name for name, count in counts.items() if count > 1]
+
+
+def is_inside(name: str) -> bool:
+    """True for a relative path with ``/`` that does not leave the recording."""
+    path = PurePosixPath(name)
+    has_other_marks = "\\" in name or DRIVE.match(name) is not None
+    return bool(name) and not (path.is_absolute() or ".." in path.parts or has_other_marks)
+
+
+def _relative(name: str, where: str) -> str:
+    if not is_inside(name):
+        raise FileFormatError(
+            f"'{name}' is no path inside the recording",
+            where=where,
+            remedy="write it relative to the recording, with / and without ..",
+        )
+    return name
+
+
+def _lasers(cell: str, where: str) -> tuple[str, ...]:
+    if not cell:
+        return ()
+    names = tuple(name.strip() for name in cell.split("+"))
+    if "" in names or len(set(names)) < len(names):
+        raise FileFormatError(
+            f"lasers '{cell}' name a source twice or not at all",
+            where=where,
+            remedy="join the names of the sources by +, as A+B",
+        )
+    return names
+
+
+def _trigger(table: CsvTable, triggers: IntArray | None, row: int) -> int | None:
+    if triggers is None or not table.columns["trigger_id"][row]:
+        return None
+    return int(triggers[row])

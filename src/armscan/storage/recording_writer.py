@@ -8,23 +8,22 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TypeAlias
 
-from armscan.devices.scan_source import ScanSource
+from armscan.devices.sources import ScanSource
 from armscan.errors import InputError
 from armscan.models.arm import ArmModel
-from armscan.records.session import CameraSetup, ExposureRow, PixelColour, Session
-from armscan.storage.arm_files import ARM_MODEL_FILE, arm_model_toml
-from armscan.storage.atomic_folder import new_folder
-from armscan.storage.csv_table import csv_bytes
+from armscan.records.recording import CameraSetup, ExposureRow, PixelColour, Session
+from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, arm_columns, arm_model_toml
+from armscan.storage.atomic import new_folder
 from armscan.storage.images import read_bytes
-from armscan.storage.recording_arm import ARM_FILE, arm_columns
-from armscan.storage.recording_exposures import (
+from armscan.storage.recording import FolderRecording, encoded_png
+from armscan.storage.recording_session import (
     EXPOSURES_FILE,
+    SESSION_FILE,
     exposure_columns,
     is_inside,
+    session_toml,
 )
-from armscan.storage.recording_images import encoded_png
-from armscan.storage.recording_reader import FolderRecording
-from armscan.storage.recording_session import SESSION_FILE, session_toml
+from armscan.storage.tables import csv_bytes
 
 Report: TypeAlias = Callable[[int, int, str], None]
 

@@ -1,27 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from armscan.calibration.camera.adjustment import (
+from armscan.calibration.cameras.adjustment import (
+    SHARED_NAMES,
+    Observations,
+    State,
     adjust,
     damped_step,
+    free_basis,
+    gather,
+    joint_covariance,
     linearise,
     moved,
     predict,
 )
-from armscan.calibration.camera.covariance import joint_covariance
-from armscan.calibration.camera.observations import (
-    SHARED_NAMES,
-    Observations,
-    State,
-    free_basis,
-    gather,
-)
-from armscan.calibration.camera.options import CameraOptions
+from armscan.calibration.cameras.result import CameraOptions
 from armscan.geometry.estimate import FitFailure
 from camera_scene import CAMERA, Scene, make_views
 
 SCENE = Scene(n_views=4, bow_mm=(0.3, -0.2))
-BASIS, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_warp=True)
+BASIS, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=True)
 
 
 def problem(seed: int = 1) -> tuple[Observations, State]:
@@ -105,7 +103,7 @@ def test_weights_leave_points_out_exactly() -> None:
         spoiled,
         observations.whitening,
         observations.board_mm,
-        observations.bow_shape,
+        observations.board_warp_shape,
         observations.starts,
         observations.width_px,
         observations.height_px,
@@ -121,7 +119,7 @@ def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
     views, poses = make_views(scene, 4)
     observations = gather(views)
     poor = np.append(CAMERA.parameters * [1.05, 0.96, 1.02, 0.98, 0.5, 0, 0, 0, 0], np.zeros(2))
-    basis, names = free_basis("k1k2p1p2k3", CameraOptions(), with_warp=False)
+    basis, names = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=False)
     result = adjust(observations, State.from_poses(poor, poses), basis)
     assert not isinstance(result, FitFailure)
     assert names == SHARED_NAMES[:9]
@@ -133,7 +131,7 @@ def test_noise_free_views_give_the_truth_back_from_a_poor_start() -> None:
 
 def test_fixed_aspect_and_centre_stay_fixed() -> None:
     options = CameraOptions(is_aspect_fixed=True, is_principal_point_fixed=True)
-    basis, names = free_basis("k1k2", options, with_warp=False)
+    basis, names = free_basis("k1k2", options, with_board_warp=False)
     assert names == ("fx_px", "k1", "k2")
     step = basis @ np.array([2.0, 0.1, 0.2])
     assert step.tolist() == [2.0, 2.0, 0.0, 0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 0.0, 0.0]

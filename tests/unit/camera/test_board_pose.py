@@ -4,22 +4,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.board_pose import (
+from armscan.calibration.cameras.board_pose import (
     AMBIGUOUS_CHI2,
     board_pose_candidates,
     estimate_board_pose,
     mirrored_pose,
 )
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.errors import InputError
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.models.camera import CameraModel
-from armscan.vision.targets.definition import Chessboard
+from armscan.vision.targets.target import Chessboard
 from camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
 
 TELE = CameraModel(9000.0, 9000.0, 1023.5, 767.5, np.zeros(5), 2048, 1536)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline.camera import CameraRun, calibrate_camera_from_exposures
+from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.progress import ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.storage.images import read_exposure
-from armscan.vision.targets.definition import Chessboard, CircleGrid
+from armscan.vision.targets.target import Chessboard, CircleGrid
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
 

@@ -3,17 +3,17 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.homography import estimate_homography, map_points
-from armscan.calibration.camera.zhang import (
+from armscan.calibration.cameras.start import (
     constraint_rows,
+    estimate_homography,
     intrinsics_from_homographies,
     linear_distortion,
+    map_points,
     pose_from_homography,
 )
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from camera_scene import CAMERA, Scene, make_views
 

@@ -6,12 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.adjustment import adjust
-from armscan.calibration.camera.advice import advise
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.observations import State, free_basis, gather
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.cameras.adjustment import State, adjust, free_basis, gather
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions, advise
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
 from camera_scene import CAMERA, Scene, make_views
@@ -31,7 +28,7 @@ def test_adjustment_tells_whether_it_reached_the_minimum(noise_px: float) -> Non
     views, poses = make_views(Scene(noise_px=noise_px), 4)
     poor = np.append(CAMERA.parameters * [1.05, 0.96, 1.02, 0.98, 0.5, 0, 0, 0, 0], np.zeros(2))
     start = State.from_poses(poor, poses)
-    basis, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_warp=False)
+    basis, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=False)
     stopped, ended = (adjust(gather(views), start, basis, max_steps=n) for n in (2, 100))
     assert not isinstance(stopped, FitFailure)
     assert not isinstance(ended, FitFailure)

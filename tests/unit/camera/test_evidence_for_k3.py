@@ -3,15 +3,12 @@
 
 import numpy as np
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
-from armscan.vision.targets.definition import Chessboard
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import Chessboard, TargetView
 from camera_scene import Scene, view_of
 
 LENS = CameraModel(

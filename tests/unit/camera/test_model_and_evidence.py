@@ -4,15 +4,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.coverage import largest_angle_deg, measure_coverage
-from armscan.calibration.camera.noise import excess_variance_px2
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import (
+    CameraFit,
+    CameraOptions,
+    largest_angle_deg,
+    measure_coverage,
+)
+from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.geometry.estimate import Estimate
 from armscan.models.camera import CameraModel
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import TargetView
 from camera_scene import CAMERA, Scene, make_views
 
 ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)

@@ -7,10 +7,9 @@ from typing import cast
 
 import pytest
 
-from armscan.calibration.camera.model_choice import MODELS, ChosenModel, choose_model
-from armscan.calibration.camera.options import DistortionModel
-from armscan.calibration.camera.result import CrossValidation
-from armscan.calibration.camera.robust import Solution
+from armscan.calibration.cameras.model_choice import MODELS, ChosenModel, choose_model
+from armscan.calibration.cameras.result import CrossValidation, DistortionModel
+from armscan.calibration.cameras.robust import Solution
 from armscan.geometry.estimate import FitFailure
 
 

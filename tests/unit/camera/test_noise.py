@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.noise import excess_variance_px2
+from armscan.calibration.cameras.robust import excess_variance_px2
 
 RESIDUALS = np.tile([[0.3, 0.0], [0.0, -0.5]], (50, 1))
 """Sum of squares 50 * (0.09 + 0.25) = 17 px^2 over 100 points."""

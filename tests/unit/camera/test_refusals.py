@@ -7,11 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.refusals import LARGEST_FOCAL_SIGMA, reasons_to_refuse
-from armscan.calibration.camera.result import CameraFit
-from armscan.vision.targets.view import TargetView
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import (
+    LARGEST_FOCAL_SIGMA,
+    CameraFit,
+    CameraOptions,
+    reasons_to_refuse,
+)
+from armscan.vision.targets.target import TargetView
 from camera_scene import Scene, make_views
 
 OPTIONS = CameraOptions(distortion="k1k2", n_folds=4)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from camera_scene import Scene, make_views, normalised_error
 
 OPTIONS = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)

@@ -4,15 +4,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.vision.targets.view import TargetView
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.vision.targets.target import TargetView
 from camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
 
 ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import OptionError
-from armscan.geometry.box import box_corners_mm
-from armscan.reconstruction.volume import parse_volume
+from armscan.geometry.arrays import box_corners_mm
+from armscan.reconstruction.place import parse_volume
 
 
 def test_corners_are_every_second_number() -> None:

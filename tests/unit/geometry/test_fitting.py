@@ -4,7 +4,7 @@
 import numpy as np
 
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.fitting import Line, fit_line, fit_plane
+from armscan.geometry.shapes import Line, fit_line, fit_plane
 
 SEED = 3
 

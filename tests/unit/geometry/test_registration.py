@@ -12,8 +12,7 @@ from scipy.stats import chi2
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import (
     PointPairs,
     carried_covariance_mm2,
@@ -22,7 +21,7 @@ from armscan.geometry.registration import (
     register_points,
     spread_mm,
 )
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 
 SIZE = np.array([120.0, 90.0, 40.0])
 

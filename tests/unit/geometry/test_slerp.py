@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
-from armscan.geometry.slerp import slerp
+from armscan.geometry.rotations import rotation_from_vector, slerp, vector_from_rotation
 
 N = 50
 RNG = np.random.default_rng(0)

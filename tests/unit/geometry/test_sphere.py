@@ -7,9 +7,8 @@ from scipy.optimize import least_squares
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.circle import fit_circle, fit_space_circle
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.sphere import fit_sphere
+from armscan.geometry.shapes import fit_circle, fit_space_circle, fit_sphere
 
 SEED = 7
 CENTRE = np.array([310.0, -120.0, 45.0])

@@ -9,20 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.many_starts import distinct, rotations_all_over
-from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
-from armscan.calibration.hand_eye.plate_search import minima_from_everywhere
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PosedStripe,
+    condense,
+    straight_stripes,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_sections import find_sections
-from armscan.calibration.hand_eye.sphere_start import start_candidates
+from armscan.calibration.hand_eye.search import distinct, minima_from_everywhere, rotations_all_over
+from armscan.calibration.hand_eye.sphere_estimate import start_candidates
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Sensor, Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Pose, Sensor, Tool
 from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
 from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 

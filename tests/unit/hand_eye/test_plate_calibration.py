@@ -10,19 +10,21 @@ import pytest
 from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_fit import fit_plate
-from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
-from armscan.calibration.hand_eye.plate_residuals import (
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.estimate import fit_plate
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateReference,
     PlateState,
+    PosedStripe,
+    condense,
     hand_eye_difference,
     place_nodes,
     step_hand_eye,
+    straight_stripes,
 )
-from armscan.calibration.hand_eye.plate_start import linear_hand_eye
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.search import linear_hand_eye
 from armscan.geometry.arrays import FloatArray
 from plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 

@@ -6,24 +6,25 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate_equations import (
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateNodes,
+    PlateState,
+    condense,
+    place_nodes,
+    shifted_plane,
+    step_hand_eye,
+    straight_stripes,
+)
+from armscan.calibration.hand_eye.thesis import (
     design_rows,
     hand_eye_unknowns,
     objective,
     plane_in_tool,
     rotation_from_angles,
 )
-from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
-from armscan.calibration.hand_eye.plate_residuals import (
-    PlateState,
-    place_nodes,
-    shifted_plane,
-    step_hand_eye,
-)
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Points, Pose
+from armscan.geometry.poses import Base, Points, Pose, Tool
 from plate_rig import PLATE_CENTRE, PLATE_NORMAL, SILENT, TOOL_FROM_SENSOR, PlateRig, good_postures
 
 POSE: Pose[Base, Tool] = Pose.from_vectors([0.4, -0.2, 1.1], [300.0, -120.0, 80.0])

@@ -9,21 +9,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.left_out import LeftOut
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_checks import influence_warnings
-from armscan.calibration.hand_eye.plate_nodes import condense, straight_stripes
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.checks import influence_warnings
+from armscan.calibration.hand_eye.estimate import LeftOut
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateReference,
+    PosedStripe,
+    condense,
+    hand_eye_difference,
+    straight_stripes,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.euler import EulerConvention, euler_from_rotations, rotations_from_euler
-from armscan.geometry.fitting import Plane
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import (
+    EulerConvention,
+    euler_from_rotations,
+    rotation_from_vector,
+    rotations_from_euler,
+)
+from armscan.geometry.shapes import Plane
 from plate_rig import (
     PLATE_NORMAL,
     SILENT,

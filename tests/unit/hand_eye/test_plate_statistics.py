@@ -8,13 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.least_squares import solve_linear
-from armscan.calibration.hand_eye.noise_model import NoiseComponent
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.estimate import estimate_noise
+from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_difference
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.variance_components import estimate_noise
+from armscan.calibration.hand_eye.solve import NoiseComponent, solve_linear
 from armscan.geometry.arrays import FloatArray
 from plate_bound import cramer_rao, plain_least_squares
 from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures

@@ -8,14 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.posture_names import check_postures
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStripe, check_postures
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import InputError
-from armscan.geometry.frames import Tool
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Pose, Tool
 from plate_rig import PlateRig, good_postures
 
 STANDING_MM, STANDING_RAD = 0.02, np.radians(0.002)

@@ -15,10 +15,9 @@ from armscan.calibration.hand_eye.repeat_study import (
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import nearest_rotation, rotation_from_vector
-from armscan.models.scanner import ArmNoise, HandEyeCalibration
+from armscan.geometry.poses import Pose, Sensor, Tool
+from armscan.geometry.rotations import nearest_rotation, rotation_from_vector
+from armscan.models.calibration import ArmNoise, HandEyeCalibration
 from thesis_instrument import MEAN_ROTATION, TABLE_4, TABLE_4_MEAN, TABLE_4_STD
 
 SEED = 3

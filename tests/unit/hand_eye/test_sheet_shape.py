@@ -8,18 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.noise_model import noise_components
-from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate_fit import PlateFit, fit_plate
-from armscan.calibration.hand_eye.plate_nodes import PlateNodes, condense, straight_stripes
-from armscan.calibration.hand_eye.plate_residuals import (
+from armscan.calibration.hand_eye.estimate import PlateFit, fit_plate
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateNodes,
+    PlateReference,
     PlateState,
+    PosedStripe,
+    condense,
     hand_eye_difference,
     place_nodes,
     residual_by_sensor,
+    straight_stripes,
 )
-from armscan.calibration.hand_eye.plate_result import sigma_of
+from armscan.calibration.hand_eye.result import sigma_of
+from armscan.calibration.hand_eye.solve import noise_components
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SHEET_PARAMETER_NAMES
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES

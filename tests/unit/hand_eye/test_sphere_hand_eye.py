@@ -7,29 +7,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_residuals import (
+from armscan.calibration.hand_eye.sphere_estimate import (
     N_COLUMNS,
     SphereState,
     place_on_sphere,
     sphere_nodes,
 )
-from armscan.calibration.hand_eye.sphere_sections import find_sections
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
-from sphere_rig import (
-    DIAMETER_MM,
-    HAND_EYE,
-    POINT_NOISE_MM,
-    SHEET_NORMAL,
-    SphereRig,
-    turned_poses,
-)
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+from sphere_rig import DIAMETER_MM, HAND_EYE, POINT_NOISE_MM, SHEET_NORMAL, SphereRig, turned_poses
 
 SEED = 5
 POSE_NOISE_MM = 0.02

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
-from armscan.calibration.hand_eye.sphere_two_step import (
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions
+from armscan.calibration.hand_eye.thesis import (
     TwoStepHandEye,
     calibrate_in_two_steps,
     group_by_rotation,
@@ -14,7 +14,7 @@ from armscan.calibration.hand_eye.sphere_two_step import (
 )
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
 from sphere_rig import DIAMETER_MM, HAND_EYE, SHEET_NORMAL, SphereRig, shifted_poses
 
 SEED = 9

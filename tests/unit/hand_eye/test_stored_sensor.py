@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.options import HandEyeOptions
-from armscan.calibration.hand_eye.plate import calibrate_on_plate
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PosedStripe,
+    hand_eye_difference,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere import calibrate_on_sphere
-from armscan.calibration.hand_eye.sphere_options import SphereOptions
+from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.geometry.arrays import FloatArray
 from calibrated_head import CalibratedHead
 from plate_rig import PLATE_NORMAL, RigNoise

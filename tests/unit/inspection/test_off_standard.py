@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.inspection.off_standard import check_exposures_off
-from armscan.inspection.options import InspectionOptions
+from armscan.inspection.conformity import Check, check_exposures_off
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection, SphereInspection
+from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere
-from armscan.inspection.verdict import Check
 from armscan.records.cloud import PointCloud
 from inspection_clouds import cloud_of
 

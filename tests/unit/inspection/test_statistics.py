@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from armscan.errors import InputError
-from armscan.inspection.histogram import (
+from armscan.inspection.results import (
     WITHIN_MM,
     describe_deviations,
     histogram,

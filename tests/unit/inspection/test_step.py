@@ -9,8 +9,8 @@ import pytest
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.inspection.options import StepOptions
 from armscan.inspection.results import StepInspection
+from armscan.inspection.selection import StepOptions
 from armscan.inspection.step import inspect_step
 from inspection_clouds import block_stripes, cloud_of, random_motion
 

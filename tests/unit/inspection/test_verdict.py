@@ -11,8 +11,15 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.inspection.consistency import StandardDistances, check_consistency
-from armscan.inspection.verdict import Verdict, check_size, check_spread, judge, worst
+from armscan.inspection.conformity import (
+    StandardDistances,
+    Verdict,
+    check_consistency,
+    check_size,
+    check_spread,
+    judge,
+    worst,
+)
 
 
 @pytest.mark.parametrize(

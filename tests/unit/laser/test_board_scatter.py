@@ -6,16 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.board_scatter import board_scatter
-from armscan.calibration.laser.calibrate import calibrate_sheets, sight_on_boards
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.lack_of_fit import stripe_noise
-from armscan.calibration.laser.naming import NamedStripes, name_stripes
-from armscan.calibration.laser.observations import collect_observations, placement_covariances
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes, LaserFit
-from armscan.calibration.laser.sheet_model import start_sheet
-from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets
+from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.calibrate import calibrate_sheets, observe_boards
+from armscan.calibration.sheets.labels import SheetAssignment, name_stripes
+from armscan.calibration.sheets.lack_of_fit import board_scatter, stripe_noise
+from armscan.calibration.sheets.model import start_sheet
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetOptions
+from armscan.calibration.sheets.solve import (
+    CommonErrors,
+    SheetSolution,
+    collect_observations,
+    placement_covariances,
+    solve_sheets,
+)
 from armscan.models.light_sheet import LightSheet
 from sheet_rig import SheetRig, placed, thesis_rig
 
@@ -93,9 +96,9 @@ def test_a_stripe_of_which_nothing_is_left_has_no_say() -> None:
     rig = rig_of_many()
     cameras = HeadCameras.of(rig.calibration(rig.camera))
     boards = rig.boards(rig.camera, np.random.default_rng(1))
-    images = sight_on_boards(boards, cameras, SheetOptions()).images
+    images = observe_boards(boards, cameras, SheetOptions()).images
     named = name_stripes(images, cameras.covariance, SheetOptions())
-    assert isinstance(named, NamedStripes)
+    assert isinstance(named, SheetAssignment)
     every = collect_observations(images, named)
     few = every.select((every.stripe != 0) | (np.arange(len(every)) < 2))
     start = start_sheet("A", few, images)

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes, LaserFit, PointUse
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
 from armscan.errors import OptionError
 from armscan.geometry.poses import Pose
 from armscan.models.light_sheet import LightSheet

@@ -6,18 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.conditioning import (
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.coplanarity import (
     MAX_PARALLEL_TILT_SIGMA_DEG,
     MAX_TILT_SIGMA_DEG,
     MIN_SPREAD_SIGMAS,
     WEAK_TILT_SIGMA_DEG,
     SheetGeometry,
     geometry_warnings,
-    refuse_loose_tilt,
     refuse_lost_spread,
+    refuse_underdetermined_tilt,
 )
-from armscan.calibration.laser.result import LaserFit
+from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from sheet_rig import thesis_rig
@@ -26,15 +26,15 @@ GEOMETRY = SheetGeometry(3, 20.0, (120.0, 150.0), np.array([10.0, 8.0]))
 
 
 def test_a_direction_that_the_boards_leave_open_is_refused_with_the_facts() -> None:
-    assert refuse_loose_tilt("A", GEOMETRY, MAX_TILT_SIGMA_DEG) is None
-    failure = refuse_loose_tilt("A", GEOMETRY, MAX_TILT_SIGMA_DEG + 0.1)
+    assert refuse_underdetermined_tilt("A", GEOMETRY, MAX_TILT_SIGMA_DEG) is None
+    failure = refuse_underdetermined_tilt("A", GEOMETRY, MAX_TILT_SIGMA_DEG + 0.1)
     assert failure is not None
     assert "known to 2.10 deg only" in failure.reason
     assert "depth 120.0 to 150.0 mm" in failure.reason
     assert "further in depth" in failure.remedy
     parallel = replace(GEOMETRY, board_angle_deg=0.1)
-    assert refuse_loose_tilt("A", parallel, MAX_PARALLEL_TILT_SIGMA_DEG) is None
-    assert refuse_loose_tilt("A", parallel, MAX_PARALLEL_TILT_SIGMA_DEG + 0.1) is not None
+    assert refuse_underdetermined_tilt("A", parallel, MAX_PARALLEL_TILT_SIGMA_DEG) is None
+    assert refuse_underdetermined_tilt("A", parallel, MAX_PARALLEL_TILT_SIGMA_DEG + 0.1) is not None
 
 
 def test_a_weak_direction_is_warned_of() -> None:

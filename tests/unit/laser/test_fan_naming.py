@@ -8,19 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.coplanarity import PosedSighting
-from armscan.calibration.laser.fan_naming import FanNames, name_fan
-from armscan.calibration.laser.naming import board_numbers, name_stripes
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes
-from armscan.calibration.laser.sightings import BoardImage, sight_stripes
+from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.coplanarity import PosedObservation
+from armscan.calibration.sheets.fan import FanAssignment, number_fan
+from armscan.calibration.sheets.labels import board_numbers, name_stripes
+from armscan.calibration.sheets.result import BoardStripes, SheetOptions
+from armscan.calibration.sheets.stripes_on_board import BoardImage, observe_board_stripes
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Board, Pose, Sensor
 from fan_rig import MIDDLE_MM, FanRig, fan_rig
 
-Named = FanNames | FitFailure
+Named = FanAssignment | FitFailure
 
 
 def images_of(rig: FanRig, seed: int, *, dropped: float = 0.0, n_strays: int = 0,
@@ -31,7 +29,7 @@ def images_of(rig: FanRig, seed: int, *, dropped: float = 0.0, n_strays: int = 0
     calibration = stereo if has_right else stereo.left
     boards, truth = rig.boards(calibration, rng, dropped=dropped, n_strays=n_strays)
     cameras = HeadCameras.of(calibration)
-    images = [sight_stripes(board, cameras, SheetOptions()) for board in boards]
+    images = [observe_board_stripes(board, cameras, SheetOptions()) for board in boards]
     return images, [true_sheets(image, names) for image, names in zip(images, truth, strict=True)]
 
 
@@ -44,12 +42,12 @@ def named(images: list[BoardImage], n_sheets: int = 0) -> Named:
     cameras = HeadCameras.of(fan_rig(0, 1).stereo().left)
     n = images[0].by_camera.shape[2]
     camera = np.zeros((n, n)) if n != len(cameras.covariance) else cameras.covariance
-    posed = [[PosedSighting(s, image.placed.covariance, camera) for s in image.sightings]
+    posed = [[PosedObservation(s, image.placed.covariance, camera) for s in image.sightings]
              for image in images]  # fmt: skip
-    return name_fan(posed, board_numbers(images), n_sheets)
+    return number_fan(posed, board_numbers(images), n_sheets)
 
 
-def offsets(names: FanNames, truth: list[list[int]]) -> set[int]:
+def offsets(names: FanAssignment, truth: list[list[int]]) -> set[int]:
     """True number less given number of every named stripe: one value if all are right."""
     return {
         true - names.numbers[k] if true >= 0 else -100
@@ -64,7 +62,7 @@ def test_few_lines_an_image_are_named_over_all(seed: int) -> None:
     """Eleven bowed lines, 3 to 6 of them on each board; the numbers run along the head in order."""
     images, truth = images_of(fan_rig(seed, 7), seed)
     names = named(images)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     assert len(offsets(names, truth)) == 1
     assert max(len(row) for row in truth) <= 6
     assert sum(k >= 0 for row in names.sheets for k in row) >= 0.85 * sum(map(len, truth))
@@ -75,7 +73,7 @@ def test_lost_lines_and_stray_stripes_mislead_no_one(seed: int) -> None:
     """A sixth of the stripes is not found, and each image has a straight stripe of no sheet."""
     images, truth = images_of(fan_rig(40 + seed, 8), seed, dropped=0.16, n_strays=1)
     names = named(images)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     assert len(offsets(names, truth) - {-100}) == 1
     # A stray stripe that happens to lie in a sheet is not to be told from its line.
     assert sum(true < 0 for row, sheets in zip(truth, names.sheets, strict=True)
@@ -86,7 +84,7 @@ def test_both_cameras_name_together() -> None:
     images, truth = images_of(fan_rig(3, 6), 3, has_right=True)
     assert {image.data.camera for image in images} == {0, 1}
     names = named(images)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     assert len(offsets(names, truth)) == 1
 
 
@@ -95,7 +93,7 @@ def test_a_line_that_is_never_seen_keeps_its_number() -> None:
     lost = replace(rig, sheets=rig.sheets[:4] + rig.sheets[5:])
     images, truth = images_of(lost, 1)
     names = named(images)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     was = [[k + (k >= 4) for k in row] for row in truth]
     assert len(offsets(names, was)) == 1
     number = 4 - offsets(names, was).pop()
@@ -112,7 +110,7 @@ def test_a_line_seen_on_one_board_counts_in_the_numbering() -> None:
         for i, (image, row) in enumerate(zip(images, truth, strict=True))
     ]
     names = named(cut)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     assert names.numbers == (2, 3, 4, 5)
     assert any("line 1:" in warning for warning in names.warnings)
 
@@ -144,7 +142,7 @@ def test_boards_that_share_no_line_are_placed_by_the_fan_or_refused() -> None:
     ]
     assert not set(parts[0][1]) & set(parts[1][1])
     names = named([image for image, _ in parts])
-    if isinstance(names, FanNames):
+    if isinstance(names, FanAssignment):
         assert len(offsets(names, [row for _, row in parts])) == 1
     else:
         assert "share too few lines" in names.reason
@@ -177,7 +175,7 @@ def test_one_line_and_a_reflection_are_one_sheet() -> None:
 def test_numbers_run_from_left_to_right() -> None:
     images, _ = images_of(fan_rig(7, 7), 7)
     names = named(images)
-    assert isinstance(names, FanNames), names
+    assert isinstance(names, FanAssignment), names
     for image, sheets in zip(images, names.sheets, strict=True):
         where = [float(sighting.middle_px.sum()) for sighting in image.sightings]
         ordered = [at for k, at in sorted(zip(sheets, where, strict=True)) if k >= 0]
@@ -189,5 +187,7 @@ def test_two_images_of_one_placement_are_one_board() -> None:
                            placement=i.data.placement)
               for i in images_of(fan_rig(8, 2), 8)[0]]  # fmt: skip
     cameras = HeadCameras.of(fan_rig(8, 1).stereo().left)
-    twice = [sight_stripes(board, cameras, SheetOptions()) for board in (boards[0], *boards)]
+    twice = [
+        observe_board_stripes(board, cameras, SheetOptions()) for board in (boards[0], *boards)
+    ]
     assert board_numbers(twice) == [0, 0, 1]

@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.laser.lack_of_fit import StripeNoise, lack_of_fit
-from armscan.calibration.laser.normal_equations import NormalSolution, StripeSystem
-from armscan.calibration.laser.observations import SheetObservations
-from armscan.calibration.laser.solve import LinearSolution, SheetSolution
+from armscan.calibration.sheets.lack_of_fit import StripeNoise, lack_of_fit
+from armscan.calibration.sheets.solve import (
+    LinearSolution,
+    NormalSolution,
+    SheetObservations,
+    SheetSolution,
+    StripeSystem,
+)
 from armscan.geometry.arrays import FloatArray
 
 NOISE = StripeNoise(1.2, 4.0, 500.0)

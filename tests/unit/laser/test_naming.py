@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray
 from sheet_rig import SheetRig, SheetTruth, placed, thesis_rig
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes, LaserFit, PointUse
-from armscan.calibration.laser.sightings import PULL_WIDTHS
-from armscan.calibration.laser.target_edges import TargetEdges
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
+from armscan.calibration.sheets.stripes_on_board import PULL_WIDTHS
+from armscan.calibration.sheets.target_edges import TargetEdges
 from sheet_rig import SheetRig, thesis_rig
 
 PULL_PX = 0.25

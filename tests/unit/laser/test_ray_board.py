@@ -3,11 +3,11 @@
 
 import numpy as np
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.laser.ray_board import meet_board, pose_by_camera
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.sheets.board_points import intersect_board, pose_by_camera
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from sheet_rig import exact, placed, project, thesis_rig
 
@@ -26,7 +26,7 @@ def moved(camera: CameraModel, step: FloatArray) -> CameraModel:
 
 
 def test_points_come_back_from_their_opencv_projection() -> None:
-    found = meet_board(project(RIG.camera, POSE, BOARD_MM), POSE, RIG.camera)
+    found = intersect_board(project(RIG.camera, POSE, BOARD_MM), POSE, RIG.camera)
     assert found.is_valid.all()
     np.testing.assert_allclose(
         found.points_mm, BOARD_MM @ POSE.rotation.T + POSE.translation_mm, atol=1e-9
@@ -35,20 +35,20 @@ def test_points_come_back_from_their_opencv_projection() -> None:
 
 def test_derivatives_by_differences() -> None:
     q = project(RIG.camera, POSE, BOARD_MM)
-    found = meet_board(q, POSE, RIG.camera)
+    found = intersect_board(q, POSE, RIG.camera)
     for k in range(2):
         d = 1e-4 * np.eye(2)[k]
-        up, down = (meet_board(q + s * d, POSE, RIG.camera).points_mm for s in (1, -1))
+        up, down = (intersect_board(q + s * d, POSE, RIG.camera).points_mm for s in (1, -1))
         np.testing.assert_allclose(found.dpoint_dq[:, :, k], (up - down) / 2e-4, atol=1e-7)
     for k in range(6):
         d = 1e-6 * np.eye(6)[k]
-        up, down = (meet_board(q, shifted(POSE, s * d), RIG.camera).points_mm for s in (1, -1))
+        up, down = (intersect_board(q, shifted(POSE, s * d), RIG.camera).points_mm for s in (1, -1))
         np.testing.assert_allclose(
             found.dpoint_dpose[:, :, k], (up - down) / 2e-6, rtol=1e-6, atol=1e-6
         )
     for k in range(9):
         d = STEPS[k] * np.eye(9)[k]
-        up, down = (meet_board(q, POSE, moved(RIG.camera, s * d)).points_mm for s in (1, -1))
+        up, down = (intersect_board(q, POSE, moved(RIG.camera, s * d)).points_mm for s in (1, -1))
         np.testing.assert_allclose(
             found.dpoint_dcamera[:, :, k], (up - down) / (2 * STEPS[k]), rtol=1e-5, atol=1e-5
         )
@@ -79,6 +79,6 @@ def test_a_ray_along_the_board_and_a_board_behind_are_no_points() -> None:
     edge_on = placed(90.0, 0.0, 140.0, (16.0, 12.0))
     behind = Pose(np.eye(3), np.array([0.0, 0.0, -100.0]))
     for pose in (Pose(edge_on.rotation, edge_on.translation_mm + np.array([0, 5.0, 0])), behind):
-        found = meet_board(middle, pose, RIG.camera)
+        found = intersect_board(middle, pose, RIG.camera)
         assert not found.is_valid.any()
         assert np.isnan(found.points_mm).all()

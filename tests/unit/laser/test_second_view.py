@@ -6,17 +6,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.result import PlacedBoard
-from armscan.calibration.laser.second_view import meet_board_of, place_board, poses_chi2
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.sheets.board_points import (
+    HeadCameras,
+    intersect_board_of,
+    place_board,
+    poses_chi2,
+)
+from armscan.calibration.sheets.result import PlacedBoard
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector, vector_from_rotation
-from armscan.vision.targets.view import TargetView
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+from armscan.vision.targets.target import TargetView
 from fan_rig import STEREO_SIGMA, FanRig, fan_rig
 from sheet_rig import placed, project
 
@@ -41,19 +44,19 @@ def right_pixels() -> tuple[FloatArray, FloatArray]:
 
 def test_right_pixels_meet_the_board_in_the_sensors_frame() -> None:
     q, points = right_pixels()
-    met = meet_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo()))
+    met = intersect_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo()))
     assert met.is_valid.all()
     np.testing.assert_allclose(met.points_mm, points, atol=1e-9)
 
 
 def test_derivatives_by_all_parameters_are_those_of_differences() -> None:
     q, _ = right_pixels()
-    met = meet_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo()))
+    met = intersect_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo()))
     for j in range(24):
         error = np.zeros(24)
         error[j] = STEP[j]
         ahead, behind = (
-            meet_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo(s * error))).points_mm
+            intersect_board_of(q, 1, POSE, HeadCameras.of(RIG.stereo(s * error))).points_mm
             for s in (1.0, -1.0)
         )
         slope = (ahead - behind) / (2.0 * STEP[j])
@@ -65,7 +68,7 @@ def test_derivatives_by_all_parameters_are_those_of_differences() -> None:
         step = np.zeros(6)
         step[j] = 1e-5
         ahead, behind = (
-            meet_board_of(q, 1, moved(POSE, s * step), HeadCameras.of(RIG.stereo())).points_mm
+            intersect_board_of(q, 1, moved(POSE, s * step), HeadCameras.of(RIG.stereo())).points_mm
             for s in (1.0, -1.0)
         )
         np.testing.assert_allclose(

@@ -6,9 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser import solve
-from armscan.calibration.laser.observations import SheetObservations
-from armscan.calibration.laser.solve import CommonErrors, SheetSolution, solve_sheets, square_root
+from armscan.calibration.sheets import solve
+from armscan.calibration.sheets.solve import (
+    CommonErrors,
+    SheetObservations,
+    SheetSolution,
+    solve_sheets,
+    square_root,
+)
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.models.light_sheet import LightSheet

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armscan.calibration.laser import assembly
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import BoardStripes, LaserFit, PointUse, SheetPointCheck
-from armscan.calibration.laser.solve import solve_sheets
+from armscan.calibration.sheets import calibrate
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetPointCheck
+from armscan.calibration.sheets.solve import solve_sheets
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.triangulate import triangulate
@@ -80,7 +80,7 @@ def test_with_a_poor_camera_the_stored_points_lie_on_their_boards(
     by far more.
     """
     if is_moved:
-        monkeypatch.setattr(assembly, "solve_sheets", free_instead)
+        monkeypatch.setattr(calibrate, "solve_sheets", free_instead)
     rig = poor_rig()
     checks = [raw_check(rig, seed) for seed in range(12)]
     rms = np.sqrt(np.mean([rms**2 for rms, _ in checks]))
@@ -95,7 +95,7 @@ def raw_check(rig: SheetRig, seed: int) -> tuple[float, float]:
     assert isinstance(fit, LaserFit), fit
     every = np.concatenate([distances(fit, boards, i) for i in range(len(boards))])
     with pytest.MonkeyPatch.context() as restored:
-        restored.setattr(assembly, "solve_sheets", solve_sheets)
+        restored.setattr(calibrate, "solve_sheets", solve_sheets)
         right = calibrate_sheets(boards, rig.calibration(camera))
     assert isinstance(right, LaserFit), right
     return float(np.sqrt((every**2).mean())), right.sheets[0].points.fitted.claimed_rms_mm

@@ -3,8 +3,8 @@
 
 import numpy as np
 
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.straight_stripes import find_straight_stripes
+from armscan.calibration.sheets.result import SheetOptions
+from armscan.calibration.sheets.stripes_on_board import find_straight_stripes
 from armscan.geometry.arrays import FloatArray
 
 SIGMA_MM = 0.02

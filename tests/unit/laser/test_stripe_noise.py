@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armscan.calibration.laser.lack_of_fit import scatter_by_stripe, stripe_noise
-from armscan.calibration.laser.observations import SheetObservations
+from armscan.calibration.sheets.lack_of_fit import scatter_by_stripe, stripe_noise
+from armscan.calibration.sheets.solve import SheetObservations
 from armscan.geometry.arrays import FloatArray
 
 N_STRIPES, N_POINTS = 8, 300

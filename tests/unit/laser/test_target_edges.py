@@ -4,18 +4,19 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.target_edges import (
-    TargetEdges,
-    find_target_edges,
-    runs_along_edge,
-)
+from armscan.calibration.sheets.target_edges import TargetEdges, find_target_edges, runs_along_edge
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Board, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile
-from armscan.vision.targets.definition import Charuco, Chessboard, CircleGrid, Target
-from armscan.vision.targets.view import CircleEdges, TargetView
+from armscan.vision.targets.target import (
+    Charuco,
+    Chessboard,
+    CircleEdges,
+    CircleGrid,
+    Target,
+    TargetView,
+)
 
 CAMERA = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
 HERE: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-50.0, -40.0, 500.0]))

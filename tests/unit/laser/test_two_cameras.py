@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import LaserFit, PointUse
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.rotation import vector_from_rotation
-from armscan.models.stereo import StereoCalibration
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.models.two_views import StereoCalibration
 from fan_rig import FanRig, LaserTruth, fan_rig
 from sheet_rig import PROVENANCE
 

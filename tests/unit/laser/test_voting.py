@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.board_pose import estimate_board_pose
-from armscan.calibration.laser.calibrate import calibrate_sheets, sight_on_boards
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes, LaserFit, PointUse
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.calibrate import calibrate_sheets, observe_boards
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
 from sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
@@ -118,7 +117,7 @@ def test_honest_boards_are_not_outvoted(bow_mm: float) -> None:
         rng = np.random.default_rng(100 + seed)
         camera = rig.noisy_camera(rng)
         boards = rig.boards(camera, rng)
-        vote = sight_on_boards(boards, HeadCameras.of(rig.calibration(camera)), SheetOptions())
+        vote = observe_boards(boards, HeadCameras.of(rig.calibration(camera)), SheetOptions())
         assert vote.outlying == (), seed
         assert all(len(image.sightings) == 1 for image in vote.images)
 
@@ -135,5 +134,5 @@ def test_two_sheets_are_both_kept() -> None:
 def test_two_boards_do_not_vote() -> None:
     rig = replace(thesis_rig(), poses=thesis_rig().poses[:2])
     boards = rig.boards(rig.camera, np.random.default_rng(6))
-    vote = sight_on_boards(boards, HeadCameras.of(rig.calibration(rig.camera)), SheetOptions())
+    vote = observe_boards(boards, HeadCameras.of(rig.calibration(rig.camera)), SheetOptions())
     assert vote.outlying == ()

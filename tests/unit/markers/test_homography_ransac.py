@@ -9,7 +9,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.markers.homography_ransac import (
+from armscan.markers.surface_support import (
     HomographyConsensus,
     find_homography,
     fit_homography,

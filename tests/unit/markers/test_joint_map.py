@@ -12,13 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import vector_from_rotation
-from armscan.markers.join_views import JoinedViews, join_views
+from armscan.geometry.poses import Frame, Pose
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.markers.join_views import JoinedViews, Link, chain_markers, join_views
 from armscan.markers.joint_map import adjust_jointly
-from armscan.markers.view_links import Link, chain_markers
-from armscan.records.markers import MarkerSet
+from armscan.records.points import MarkerSet
 from marker_scenes import NOISE_MM, Walk, marker_set, scattered, walk
 
 

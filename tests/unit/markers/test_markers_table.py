@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
-from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import markers_csv, read_marker_list
+from armscan.records.points import MarkerSet
+from armscan.storage.points import markers_csv, read_marker_list
 
 
 def some_markers(n: int = 4) -> MarkerSet:

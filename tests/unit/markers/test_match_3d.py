@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import OptionError
-from armscan.geometry.frames import Frame
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import vector_from_rotation
+from armscan.geometry.poses import Frame, Pose
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.markers.alignments import MarkerMatchOptions, Matched, NoMatch, NotUnique
 from armscan.markers.match_3d import match_markers
-from armscan.markers.match_result import Matched, MatchOptions, NoMatch, NotUnique
-from armscan.markers.thesis_matching import match_after_thesis
-from armscan.records.markers import MarkerSet
+from armscan.markers.thesis import match_after_thesis
+from armscan.records.points import MarkerSet
 from marker_scenes import NOISE_MM, marker_set, random_pose, scattered, two_views
 
 SOLID = np.array([200.0, 150.0, 80.0])
@@ -183,11 +182,11 @@ def test_a_pattern_that_repeats_in_part_is_matched_by_the_rest() -> None:
 def test_more_common_markers_can_be_asked_for() -> None:
     scene = two_views(np.random.default_rng(0), 6, SOLID)
     assert isinstance(match_markers(scene.a, scene.b), Matched)
-    found = match_markers(scene.a, scene.b, MatchOptions(least_common=7))
+    found = match_markers(scene.a, scene.b, MarkerMatchOptions(least_common=7))
     assert isinstance(found, NoMatch)
     assert "7 are asked for" in found.reason
     with pytest.raises(OptionError, match="no check"):
-        MatchOptions(least_common=3)
+        MarkerMatchOptions(least_common=3)
 
 
 def test_the_eight_steps_confuse_markers_at_equal_distances() -> None:

@@ -11,11 +11,10 @@ import pytest
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.markers.match_result import MatchOptions
-from armscan.pipeline.carry_cloud import carry_cloud
-from armscan.pipeline.register import RegisterOptions, register_place
-from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import MarkerList
+from armscan.markers.alignments import MarkerMatchOptions
+from armscan.pipeline.register import RegisterOptions, carry_cloud, register_place
+from armscan.records.points import MarkerSet
+from armscan.storage.points import MarkerList
 from inspection_clouds import cloud_of
 from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
@@ -116,7 +115,7 @@ def test_too_few_common_markers_are_refused_with_the_lists_named() -> None:
     with pytest.raises(EstimationError, match=r"old\.csv and new\.csv"):
         register_place(listed(scene.a, "old.csv"), listed(scene.b, "new.csv"))
     scene = two_views(np.random.default_rng(1), 6, SIZE)
-    options = RegisterOptions(MatchOptions(least_common=7))
+    options = RegisterOptions(MarkerMatchOptions(least_common=7))
     with pytest.raises(EstimationError, match="7 are asked for"):
         register_place(listed(scene.a, "old.csv"), listed(scene.b, "new.csv"), options)
     with pytest.raises(OptionError, match="standard deviation of 0"):

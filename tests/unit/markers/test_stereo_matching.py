@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from armscan.errors import OptionError
-from armscan.markers.epipolar_candidates import find_candidates
-from armscan.markers.matching_options import MatchingOptions
-from armscan.markers.stereo_matching import RingFate, StereoMatches, match_rings
-from armscan.records.markers import RingImages
+from armscan.markers.candidates import RingMatchOptions, find_candidates
+from armscan.markers.stereo_matching import RingStatus, StereoMatches, match_rings
+from armscan.records.points import RingImages
 from ring_pair_scenes import (
     CALIBRATION_COVARIANCE,
     RADIUS_MM,
@@ -24,7 +23,7 @@ from ring_pair_scenes import (
 N_SCENES = 45
 
 
-def matched(scene: MarkerScene, options: MatchingOptions | None = None) -> StereoMatches:
+def matched(scene: MarkerScene, options: RingMatchOptions | None = None) -> StereoMatches:
     return match_rings(scene.left, scene.right, scene.views, CALIBRATION_COVARIANCE, options)
 
 
@@ -62,8 +61,8 @@ def test_no_wrong_pair_and_most_are_matched(
 def test_every_ring_has_its_fate(results: list[tuple[MarkerScene, StereoMatches]]) -> None:
     for scene, matches in results:
         assert sum(matches.counts.values()) == len(scene.left)
-        assert matches.counts[RingFate.MATCHED] == len(matches.left)
-        rows = [k for k, fate in enumerate(matches.fates) if fate is RingFate.MATCHED]
+        assert matches.counts[RingStatus.MATCHED] == len(matches.left)
+        rows = [k for k, fate in enumerate(matches.fates) if fate is RingStatus.MATCHED]
         np.testing.assert_array_equal(np.sort(matches.left), rows)
         np.testing.assert_array_equal(matches.markers.ids, matches.left)
 
@@ -97,13 +96,13 @@ def test_a_partner_that_was_not_seen_is_not_replaced() -> None:
     for seed in range(40):
         scene = random_scene(seed)
         pairs = find_candidates(
-            scene.left, scene.right, scene.views, CALIBRATION_COVARIANCE, MatchingOptions()
+            scene.left, scene.right, scene.views, CALIBRATION_COVARIANCE, RingMatchOptions()
         )
         is_alone = ~np.isin(scene.left_marker, scene.right_marker)
         tempted = np.unique(pairs.left[is_alone[pairs.left]])
         n_tried += len(tempted)
         fates = matched(scene).fates
-        assert all(fates[row] is not RingFate.MATCHED for row in tempted)
+        assert all(fates[row] is not RingStatus.MATCHED for row in tempted)
     assert n_tried >= 5
 
 
@@ -118,7 +117,7 @@ def test_rows_along_the_epipolar_lines_are_not_guessed() -> None:
         shown = some_of(scene.left, np.zeros(n, np.int64))
         return replace(shown, centres_px=centres)
 
-    wide = MatchingOptions(size_tolerance=1.0)
+    wide = RingMatchOptions(size_tolerance=1.0)
     matches = match_rings(rings(left_px), rings(right_px), views, CALIBRATION_COVARIANCE, wide)
     assert len(matches.left) == 0
     assert matches.n_candidates > 2 * n
@@ -127,7 +126,7 @@ def test_rows_along_the_epipolar_lines_are_not_guessed() -> None:
 def test_known_size_and_depth_leave_fewer_candidates() -> None:
     scene = random_scene(5)
     plain, sized, near, other = (
-        matched(scene, MatchingOptions(**options))
+        matched(scene, RingMatchOptions(**options))
         for options in (
             {"size_tolerance": 1.0},
             {"diameter_mm": 2.0 * RADIUS_MM},
@@ -154,15 +153,15 @@ def test_three_rings_are_matched_only_if_their_size_is_known() -> None:
         )
     )
     matches = match_rings(left, right, scene.views, CALIBRATION_COVARIANCE)
-    assert set(matches.fates) == {RingFate.UNSUPPORTED}
+    assert set(matches.fates) == {RingStatus.UNSUPPORTED}
     sized = match_rings(
         left,
         right,
         scene.views,
         CALIBRATION_COVARIANCE,
-        MatchingOptions(diameter_mm=2.0 * RADIUS_MM),
+        RingMatchOptions(diameter_mm=2.0 * RADIUS_MM),
     )
-    assert set(sized.fates) == {RingFate.MATCHED}
+    assert set(sized.fates) == {RingStatus.MATCHED}
     none = match_rings(some_of(left, []), right, scene.views, CALIBRATION_COVARIANCE)
     assert len(none.left) == 0
     assert none.fates == ()
@@ -192,7 +191,7 @@ def test_diameters_are_those_of_the_markers() -> None:
     """Half axes carry 0.1 px of 90; the circle's own size on the sphere 0.0003."""
     scene = random_scene(4)
     pairs = find_candidates(
-        scene.left, scene.right, true_views(), CALIBRATION_COVARIANCE, MatchingOptions()
+        scene.left, scene.right, true_views(), CALIBRATION_COVARIANCE, RingMatchOptions()
     )
     is_true = scene.left_marker[pairs.left] == scene.right_marker[pairs.right]
     error = pairs.diameter_mm[is_true] / (2.0 * RADIUS_MM) - 1.0
@@ -224,4 +223,4 @@ def test_markers_of_several_sizes_are_matched_by_their_neighbours() -> None:
 )
 def test_options_are_checked(change: dict[str, object]) -> None:
     with pytest.raises(OptionError):
-        MatchingOptions(**change)  # type: ignore[arg-type]
+        RingMatchOptions(**change)  # type: ignore[arg-type]

@@ -8,13 +8,15 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.poses import Pose
-from armscan.models.arm import ArmModel, quarter_turn_flange, thesis_arm
-from armscan.models.arm_forward import (
+from armscan.models.arm import (
+    ArmModel,
     axis_frames,
     forward,
     joint_jacobian,
     link_matrices,
     parameter_jacobian,
+    quarter_turn_flange,
+    thesis_arm,
 )
 
 D_MM, L_MM = (300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0)

@@ -11,11 +11,16 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.models.arm import ArmModel, quarter_turn_flange, thesis_arm
-from armscan.models.arm_forward import forward
-from armscan.models.arm_inverse import JointSolution, inverse
-from armscan.models.probe_tip import compensate_tip, tip_centres, tool_from_probe
-from armscan.records.arm_track import ArmTrack
+from armscan.models.arm import (
+    ArmModel,
+    JointSolution,
+    forward,
+    inverse,
+    quarter_turn_flange,
+    thesis_arm,
+)
+from armscan.models.probe import compensate_tip, tip_centres, tool_from_probe
+from armscan.records.recording import ArmTrack
 
 ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0), flange=quarter_turn_flange())
 BENT = np.array([0.2, 0.7, -0.3, 1.1, 0.4, -0.8, 0.3])

@@ -3,7 +3,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.models.distortion import distort, distorted_xy, fold_radius, undistort
+from armscan.models.camera import distort, distorted_xy, fold_radius, undistort
 
 LENSES = {
     "none": [0.0, 0.0, 0.0, 0.0, 0.0],

@@ -8,7 +8,7 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.light_sheet import LightSheet
 
 THESIS_PLANE = np.array([-0.0042275, 0.73558, -0.67742, 91.78])

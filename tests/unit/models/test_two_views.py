@@ -9,16 +9,16 @@ import pytest
 from scipy.optimize import least_squares
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import CameraRight, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import CameraRight, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
-from armscan.models.stereo_points import triangulate_directly, triangulate_points
 from armscan.models.two_views import (
     N_CAMERA,
     TwoViews,
     epipolar_distances_px,
     sampson_distances_px,
+    triangulate_directly,
+    triangulate_points,
 )
 from stereo_rig import CONVERGING, LEFT, RIGHT
 

@@ -9,23 +9,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from armscan.devices.twin import TrueStripe
+from armscan.devices.sources import TrueStripe
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.pipeline.adaptive_scan import (
     ChosenLasers,
-    TakenStroke,
+    TakenPass,
     scan_adaptively,
     strokes,
     take_stroke,
 )
-from armscan.reconstruction.named_profile import NamedProfile, NameFate
-from armscan.reconstruction.stripe_namer import STROKE_GAP_NS
-from armscan.records.arm_track import ArmTrack
+from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, LabelStatus
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from placing_rig import BASE_FROM_TOOL, TOOL_FROM_SENSOR, scanner
 
 TICK_NS = 12_500_000
@@ -84,14 +81,14 @@ class Counting:
         lasers: tuple[str, ...],
         base_from_sensor: Pose[Base, Sensor] | None,
         t_ns: int,
-    ) -> NamedProfile:
+    ) -> LabelledProfile:
         self.n_since_reset += 1
         self.told.append((lasers, base_from_sensor is not None, t_ns))
         if base_from_sensor is not None:
             expected = BASE_FROM_TOOL @ TOOL_FROM_SENSOR
             assert np.allclose(base_from_sensor.matrix, expected.matrix)
         n = len(profile)
-        return NamedProfile(profile, np.full(n, -1), np.full(n, int(NameFate.AMBIGUOUS)), "")
+        return LabelledProfile(profile, np.full(n, -1), np.full(n, int(LabelStatus.AMBIGUOUS)), "")
 
     def next_lasers(self) -> tuple[str, ...]:
         return ("A",) if self.n_since_reset == 0 else BOTH
@@ -150,6 +147,6 @@ def test_missing_strokes_and_rows_are_refused() -> None:
     scan = DarkScan()
     with pytest.raises(InputError, match="lasers of 1 exposures for 7 rows"):
         ChosenLasers(scan, (BOTH,))
-    part = TakenStroke((0, 1), (BOTH, BOTH), ())
+    part = TakenPass((0, 1), (BOTH, BOTH), ())
     with pytest.raises(InputError, match="2 of 7"):
         ChosenLasers.of_strokes(scan, [part])

@@ -6,20 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.cameras import HeadCameras
+from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline import cached_detection
-from armscan.pipeline.board_placements import find_placements
+from armscan.pipeline import targets
+from armscan.pipeline.laser import find_placements
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.definition import Chessboard
-from armscan.vision.targets.options import TargetOptions
+from armscan.vision.targets.target import Chessboard, TargetOptions
 from sheet_rig import thesis_rig
 
 
 def test_the_first_images_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without laser it is looked for first; that reason was lost, being no true value."""
     monkeypatch.setattr(
-        cached_detection,
+        targets,
         "detect_target",
         lambda image, *_: FitFailure(f"nothing in {image.source}"),
     )

@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline import cached_detection
-from armscan.pipeline.cached_detection import cached_profile, cached_target
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
+from armscan.pipeline import targets
+from armscan.pipeline.targets import cached_profile, cached_target
+from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
 from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
-from armscan.vision.stripe.options import StripeOptions
-from armscan.vision.targets.definition import Chessboard, CircleGrid, Target
-from armscan.vision.targets.options import TargetOptions
-from armscan.vision.targets.view import TargetView
+from armscan.vision.stripe.image import StripeOptions
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetOptions, TargetView
 
 GRID = CircleGrid(5, 4, 10.0)
 BOARD = Chessboard(5, 4, 10.0)
@@ -67,13 +64,13 @@ def looked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the images that were looked at."""
     names: list[str] = []
     for function in ("detect_target", "extract_stripes"):
-        real = getattr(cached_detection, function)
+        real = getattr(targets, function)
 
         def spy(exposure: Exposure, *rest: Any, real: Any = real) -> Any:
             names.append(exposure.source)
             return real(exposure, *rest)
 
-        monkeypatch.setattr(cached_detection, function, spy)
+        monkeypatch.setattr(targets, function, spy)
     return names
 
 

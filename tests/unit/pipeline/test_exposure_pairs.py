@@ -6,9 +6,8 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.models.camera import CameraModel
-from armscan.pipeline.exposure_pairs import check_sizes, pair_exposures
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
+from armscan.pipeline.instants import check_sizes, pair_exposures
+from armscan.records.exposure import Exposure, SensorWindow
 
 CAMERA = CameraModel(100.0, 100.0, 20.0, 15.0, np.zeros(5), 40, 30)
 

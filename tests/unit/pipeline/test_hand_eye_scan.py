@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.plate_residuals import hand_eye_difference
-from armscan.devices.scan_source import ScanSource
+from armscan.calibration.hand_eye.observations import hand_eye_difference
+from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import (
@@ -26,9 +26,8 @@ from armscan.pipeline.hand_eye import (
     _left_out,
     calibrate_hand_eye_from_scan,
 )
-from armscan.records.arm_track import ArmTrack
 from armscan.records.exposure import Exposure
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 1000.0

@@ -6,19 +6,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.result import LaserFit
+from armscan.calibration.sheets.result import LaserFit
 from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_exposures
-from armscan.pipeline.measure_options import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.reconstruct import reconstruct
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.result import PointFate
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.labels import PointStatus
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.definition import Chessboard
+from armscan.vision.targets.target import Chessboard
 from sheet_rig import PROVENANCE
 
 WIDTH, HEIGHT = 320, 240
@@ -94,7 +94,7 @@ def test_a_line_becomes_points_at_the_depth_by_hand() -> None:
     error = result.cloud.points_mm[:, 2] - depth
     np.testing.assert_allclose(error, 0.0, atol=0.1 * mm_per_px)
     assert abs(error.mean()) < 0.02 * mm_per_px
-    assert result.images[0].count(PointFate.MEASURED) == len(result.cloud)
+    assert result.images[0].count(PointStatus.MEASURED) == len(result.cloud)
     assert result.warnings == ()
 
 

@@ -9,14 +9,13 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import InputError
-from armscan.models.scanner import ScannerCalibration
+from armscan.jobs.reconstruct import StillPaths, read_stills
+from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.hand_eye import HandEyeScanOptions, observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
-from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.pipeline.scan_result import ScanExposureFate
-from armscan.records.session import ExposureRow
-from armscan.report.still_images import StillPaths, read_stills
-from armscan.storage.image_options import ImageOptions
+from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
+from armscan.records.recording import ExposureRow
+from armscan.storage.images import ImageOptions
 from armscan.storage.recording_writer import write_recording
 from two_camera_scan import (
     PERIOD_NS,
@@ -90,7 +89,7 @@ def test_a_scan_goes_on_without_a_lost_frame(
     result = measure_scan(
         two_camera_scan(3, lost=LOST, late_ns=1), device, ScanOptions(normals=None)
     )
-    placed, alone = ScanExposureFate.PLACED, ScanExposureFate.NO_PARTNER
+    placed, alone = ExposureStatus.PLACED, ExposureStatus.NO_PARTNER
     assert [e.fate for e in result.exposures] == [placed, placed, alone, placed, placed]
     assert result.exposures[2].reason == PARTNER_MISSING
     assert result.image_rows == (0, 1, 3, 4)

@@ -8,13 +8,9 @@ from scipy.spatial.transform import Rotation
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.pipeline.profiles import (
-    calibrate_hand_eye_from_profiles,
-    posed_stripes_from_profiles,
-)
-from armscan.records.point_profile import PointProfile
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
+from armscan.records.profile import PointProfile
 
 SEED = 2
 NOISE_MM = 0.01

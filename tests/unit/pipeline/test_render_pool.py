@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 
 import fake_twin
-from armscan.devices.twin import TwinScene
+from armscan.devices.sources import TwinScene
 from armscan.errors import EstimationError
-from armscan.pipeline import render_pool
+from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.render_pool import TwinName
-from armscan.pipeline.twin_recordings import record_scenes
-from armscan.storage.recording_reader import read_recording
+from armscan.pipeline.simulate import TwinName, record_scenes
+from armscan.storage.recording import read_recording
 from recording_folders import pixels
 
 SCENES: tuple[TwinScene, ...] = ("camera", "ball", "plate")
@@ -31,7 +30,7 @@ SCENES: tuple[TwinScene, ...] = ("camera", "ball", "plate")
 @pytest.fixture(autouse=True)
 def _fake(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     fake_twin.register(tmp_path_factory.mktemp("site"), monkeypatch)
-    monkeypatch.setattr(render_pool, "IMAGES_A_PROCESS", 3)
+    monkeypatch.setattr(simulate, "IMAGES_A_PROCESS", 3)
 
 
 def record(folder: Path, head: str, events: list[ProgressEvent] | None = None) -> None:

@@ -9,13 +9,11 @@ import numpy as np
 import pytest
 
 from armscan.errors import EstimationError, InputError, OptionError
-from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.measure_options import MeasureOptions
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.pipeline.scan_result import ScanExposureFate
-from armscan.reconstruction.normals import NormalOptions
-from armscan.reconstruction.volume import BaseBox
+from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
+from armscan.reconstruction.place import BaseBox, NormalOptions
 from scan_fake import PERIOD_NS, FakeScan, as_source, fake_scan, looking_down, scanner, with_rows
 
 
@@ -77,9 +75,9 @@ def test_what_is_missing_is_counted_and_named(device: ScannerCalibration) -> Non
     )
     fates = [exposure.fate for exposure in result.exposures]
     placed, unreadable, no_pose = (
-        ScanExposureFate.PLACED,
-        ScanExposureFate.UNREADABLE,
-        ScanExposureFate.NO_POSE,
+        ExposureStatus.PLACED,
+        ExposureStatus.UNREADABLE,
+        ExposureStatus.NO_POSE,
     )
     assert fates == [placed] * 2 + [unreadable] + [placed] * 2 + [no_pose] * 3
     assert result.image_rows == (0, 1, 3, 4)
@@ -106,7 +104,7 @@ def test_exposures_are_not_read_for_nothing(device: ScannerCalibration) -> None:
     shown = with_rows(scan, changes)
     result = measure_scan(as_source(shown), device, ScanOptions(normals=None))
     assert sorted(shown.reads) == [0, 1, 2, 4]
-    assert [e.fate for e in result.exposures].count(ScanExposureFate.LASER_OFF) == 2
+    assert [e.fate for e in result.exposures].count(ExposureStatus.LASER_OFF) == 2
     assert result.image_rows == (1, 2, 4)
 
 

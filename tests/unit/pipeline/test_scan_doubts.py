@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.models.scanner import ScannerCalibration
+from armscan.models.calibration import ScannerCalibration
 from armscan.reconstruction.sync import poses_by_time
 from armscan.reconstruction.track_faults import TrackFault
 from passes_over_a_ball import N_PASSES, N_STEPS, BallScan, ball_scan, doubt, poses_of, read_as

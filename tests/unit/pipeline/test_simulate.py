@@ -16,23 +16,18 @@ import pytest
 
 import fake_twin
 from armscan.cli.simulate import PresetName, Scene
-from armscan.devices.twin import Preset, TwinScene
+from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
-from armscan.pipeline import render_pool
-from armscan.pipeline.fewer_views import FewerViews
+from armscan.jobs import simulate as simulate_job_simulate
+from armscan.jobs.simulate import SimulateRequest, run_simulation
+from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.simulate import (
-    SimulatedScene,
-    SimulateOptions,
-    simulate_scene,
-    truth_path,
-)
-from armscan.report import simulate_job
-from armscan.report.simulate_job import SimulateRequest, run_simulation
-from armscan.storage import atomic_folder
-from armscan.storage.probe_files import read_probe_tip
-from armscan.storage.recording_reader import read_arm_track, read_recording
-from armscan.storage.simulated import are_simulated
+from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene, truth_path
+from armscan.storage import atomic
+from armscan.storage.arm import read_probe_tip
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.recording import read_arm_track, read_recording
 from recording_folders import memory_scan, pixels
 
 HEAD = "thesis-single"
@@ -64,7 +59,7 @@ def test_a_scene_is_a_recording_and_its_truth_lies_beside_it(tmp_path: Path) -> 
 
 
 def test_several_processes_write_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(render_pool, "IMAGES_A_PROCESS", 3)
+    monkeypatch.setattr(simulate, "IMAGES_A_PROCESS", 3)
     simulate_scene(tmp_path / "two", HEAD, "ball", SimulateOptions(processes=2))
     simulate_scene(tmp_path / "one", HEAD, "ball", SimulateOptions(processes=1))
     names = [p.relative_to(tmp_path / "one") for p in (tmp_path / "one").rglob("*") if p.is_file()]
@@ -76,7 +71,7 @@ def test_several_processes_write_the_same(tmp_path: Path, monkeypatch: pytest.Mo
 def test_an_interrupt_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images_a_process: int
 ) -> None:
-    monkeypatch.setattr(render_pool, "IMAGES_A_PROCESS", images_a_process)
+    monkeypatch.setattr(simulate, "IMAGES_A_PROCESS", images_a_process)
 
     def stop(event: ProgressEvent) -> None:
         raise KeyboardInterrupt
@@ -95,7 +90,7 @@ def test_no_recording_is_seen_without_its_truth(
     def full(contents: object, **_: object) -> None:
         raise OutputError("no space")
 
-    monkeypatch.setattr(atomic_folder, "write_files", full)
+    monkeypatch.setattr(atomic, "write_files", full)
     with pytest.raises(OutputError, match="no space"):
         simulate_scene(tmp_path / "scan", HEAD, scene, SimulateOptions(processes=1))
     assert list(tmp_path.iterdir()) == []
@@ -171,7 +166,7 @@ def test_two_cameras_are_calibrated_as_a_pair(
     monkeypatch: pytest.MonkeyPatch, scene: TwinScene, step: str
 ) -> None:
     found = SimulatedScene(Path("board"), Path("t.json"), 4, 0, "circle-grid:11x9:3.75", 2, ("A",))
-    monkeypatch.setattr(simulate_job, "simulate_scene", lambda *_: found)
+    monkeypatch.setattr(simulate_job_simulate, "simulate_scene", lambda *_: found)
     summary = run_simulation(SimulateRequest("thesis-multi", scene, Path("board")))
     assert step in summary.next_step.replace("\\", "/")
 

@@ -10,20 +10,17 @@ import pytest
 
 from armscan.errors import OptionError
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.measure import LitProfile
-from armscan.pipeline.measure_options import MeasureOptions
-from armscan.pipeline.sheet_rules import ByTwoCameras, measurer_for
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.named_profile import NameFate
-from armscan.reconstruction.result import PointFate
-from armscan.reconstruction.stereo_fate import StereoFate
-from armscan.reconstruction.stereo_measure import StereoMeasurement, measure_stereo
-from armscan.reconstruction.stereo_options import StereoNamingOptions
+from armscan.pipeline.measure import LitProfile, MeasureOptions
+from armscan.pipeline.reconstruct import ByTwoCameras, measurer_for
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.label_stereo import StereoLabelOptions
+from armscan.reconstruction.labels import LabelStatus, PointStatus, StereoStatus
+from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
 from armscan.records.profile import Profile
 from stereo_scenes import Noise, draw_surfaces, expose
 from two_camera_scan import small_head
 
-STRICT = StereoNamingOptions(consistency_sigmas=1.0)
+STRICT = StereoLabelOptions(consistency_sigmas=1.0)
 """Drops many a pair that noise alone explains."""
 
 
@@ -47,7 +44,7 @@ def shallow(sensor: SensorCalibration, found: StereoMeasurement) -> SensorCalibr
     return replace(sensor, sheets=sheets)
 
 
-def n_of(fate: np.ndarray, wanted: StereoFate) -> int:
+def n_of(fate: np.ndarray, wanted: StereoStatus) -> int:
     return int((fate == int(wanted)).sum())
 
 
@@ -58,14 +55,14 @@ def check(found: StereoMeasurement) -> None:
         (left, found.left_points, found.left),
         (right, found.right_points, found.right),
     ):
-        measured = np.isin(fate, (int(StereoFate.FUSED), int(StereoFate.ALONE)))
+        measured = np.isin(fate, (int(StereoStatus.FUSED), int(StereoStatus.ALONE)))
         np.testing.assert_array_equal(np.flatnonzero(measured), points.row)
-        np.testing.assert_array_equal(fate == int(StereoFate.UNNAMED), named.sheet == -1)
-    assert n_of(left, StereoFate.FUSED) == counts.n_fused
-    assert n_of(left, StereoFate.ALONE) == counts.n_left_alone
-    assert n_of(right, StereoFate.ALONE) == counts.n_right_alone
-    assert n_of(left, StereoFate.INCONSISTENT) == counts.n_inconsistent
-    assert counts.n_out_of_depth == sum(n_of(f, StereoFate.OUT_OF_DEPTH) for f in (left, right))
+        np.testing.assert_array_equal(fate == int(StereoStatus.UNNAMED), named.sheet == -1)
+    assert n_of(left, StereoStatus.FUSED) == counts.n_fused
+    assert n_of(left, StereoStatus.ALONE) == counts.n_left_alone
+    assert n_of(right, StereoStatus.ALONE) == counts.n_right_alone
+    assert n_of(left, StereoStatus.INCONSISTENT) == counts.n_inconsistent
+    assert counts.n_out_of_depth == sum(n_of(f, StereoStatus.OUT_OF_DEPTH) for f in (left, right))
 
 
 def test_dropped_pairs_are_inconsistent_in_both_images(
@@ -76,17 +73,17 @@ def test_dropped_pairs_are_inconsistent_in_both_images(
     for found in (kind, strict):
         check(found)
     assert strict.counts.n_inconsistent > 100
-    gone = n_of(strict.right_fate, StereoFate.INCONSISTENT)
+    gone = n_of(strict.right_fate, StereoStatus.INCONSISTENT)
     assert gone > 0
     # a right point is taken, or falls with its left one: never both, never neither
-    assert gone + n_of(strict.right_fate, StereoFate.TAKEN) == n_of(
-        kind.right_fate, StereoFate.TAKEN
-    ) + n_of(kind.right_fate, StereoFate.INCONSISTENT)
+    assert gone + n_of(strict.right_fate, StereoStatus.TAKEN) == n_of(
+        kind.right_fate, StereoStatus.TAKEN
+    ) + n_of(kind.right_fate, StereoStatus.INCONSISTENT)
     left, right = ByTwoCameras(sensor, STRICT).measure([LitProfile(p) for p in profiles])
-    assert left.image.count(PointFate.INCONSISTENT) == strict.counts.n_inconsistent
-    assert right.image.count(PointFate.INCONSISTENT) == gone
-    assert right.image.count(PointFate.SHARED) == n_of(strict.right_fate, StereoFate.TAKEN)
-    assert left.image.count(PointFate.AMBIGUOUS) == strict.left.count(NameFate.AMBIGUOUS)
+    assert left.image.count(PointStatus.INCONSISTENT) == strict.counts.n_inconsistent
+    assert right.image.count(PointStatus.INCONSISTENT) == gone
+    assert right.image.count(PointStatus.SHARED) == n_of(strict.right_fate, StereoStatus.TAKEN)
+    assert left.image.count(PointStatus.AMBIGUOUS) == strict.left.count(LabelStatus.AMBIGUOUS)
 
 
 def test_a_margin_that_was_given_counts_and_what_lies_beyond_is_out_of_depth(
@@ -96,9 +93,9 @@ def test_a_margin_that_was_given_counts_and_what_lies_beyond_is_out_of_depth(
     seen = [LitProfile(profile) for profile in profiles]
     given = MeasureOptions(depths=DepthRange(0.0))
     left, right = measurer_for(narrow, given).measure(seen)
-    found = measure_stereo(*profiles, narrow, StereoNamingOptions(depths=DepthRange(0.0)))
+    found = measure_stereo(*profiles, narrow, StereoLabelOptions(depths=DepthRange(0.0)))
     check(found)
-    n_out = [one.image.count(PointFate.OUT_OF_DEPTH) for one in (left, right)]
+    n_out = [one.image.count(PointStatus.OUT_OF_DEPTH) for one in (left, right)]
     assert sum(n_out) == found.counts.n_out_of_depth > 0
     np.testing.assert_array_equal(left.points.points_mm, found.left_points.points_mm)
     usual = measurer_for(narrow, MeasureOptions()).measure(seen)

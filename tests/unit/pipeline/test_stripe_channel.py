@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.laser.cameras import HeadCameras
-from armscan.calibration.laser.options import SheetOptions
-from armscan.calibration.laser.result import BoardStripes
+from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.result import BoardStripes, SheetOptions
 from armscan.geometry.arrays import FloatArray
-from armscan.pipeline.stripe_channel import choose_channel
+from armscan.pipeline.laser import choose_channel
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import LaserColour, StripeOptions
+from armscan.vision.stripe.image import LaserColour, StripeOptions
 from sheet_rig import SheetRig, thesis_rig
 
 WIDTH_PX = 2.0

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from armscan.geometry.estimate import FitFailure
-from armscan.pipeline.camera import calibrate_camera_from_exposures
-from armscan.pipeline.target_count import ENOUGH_IMAGES, wrong_count
-from armscan.simulation.flat_pattern import ChessboardPattern, CirclePattern
-from armscan.vision.targets.definition import Chessboard, CircleGrid
-from armscan.vision.targets.view import OtherCountSeen, TargetView
+from armscan.pipeline.cameras import calibrate_camera_from_exposures
+from armscan.pipeline.targets import ENOUGH_IMAGES, wrong_count
+from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.vision.targets.target import Chessboard, CircleGrid, OtherCountSeen, TargetView
 from target_scenes import exposure, render
 
 ASKED = Chessboard(9, 7, 3.0)

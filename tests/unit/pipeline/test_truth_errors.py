@@ -10,13 +10,12 @@ import pytest
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.fewer_views import FewerViews
-from armscan.pipeline.truth_errors import hand_eye_errors, true_names
-from armscan.records.arm_track import ArmTrack
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.truth import hand_eye_errors, true_names
 from armscan.records.exposure import Exposure
-from armscan.records.session import ExposureRow, Session
+from armscan.records.recording import ArmTrack, ExposureRow, Session
 from hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
 from scan_fake import scanner as one_sheet_scanner
 from sheet_rig import PROVENANCE

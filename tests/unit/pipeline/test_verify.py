@@ -13,19 +13,17 @@ import scan_fake
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.fitting import Plane
 from armscan.geometry.poses import Points, Pose
+from armscan.geometry.shapes import Plane
+from armscan.models.calibration import ScannerCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.scanner import ScannerCalibration
-from armscan.pipeline.distance_errors import distance_by_calibration
-from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.pipeline.scan_result import ScanReconstruction
+from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
+from armscan.pipeline.truth import distance_by_calibration
 from armscan.pipeline.verify import Measured, VerifyOptions, verify_on_plate
-from armscan.reconstruction.exposure_poses import ExposurePoses
-from armscan.reconstruction.merge import merge_clouds
-from armscan.reconstruction.place import place_stripe, prepare_placing
-from armscan.reconstruction.result import ReconstructedImage
-from armscan.reconstruction.triangulate import meet_sheets, triangulate_stripe
+from armscan.reconstruction.labels import MeasuredProfile
+from armscan.reconstruction.place import merge_clouds, prepare_placing, propagate_to_base
+from armscan.reconstruction.sync import ExposurePoses
+from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
 from sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
@@ -38,8 +36,8 @@ def two_exposures(scanner: ScannerCalibration) -> ScanReconstruction:
     placing, profile = prepare_placing(scanner), rig.profile_at(PLACES_PX)
     assert scanner.sensor is not None
     stripe = triangulate_stripe(profile, SHEET_OF, scanner.sensor)
-    cloud = merge_clouds([place_stripe(stripe, profile, pose, placing) for pose in POSES])
-    image = ReconstructedImage(profile, np.zeros(3, dtype=np.int64), SHEET_OF, "")
+    cloud = merge_clouds([propagate_to_base(stripe, profile, pose, placing) for pose in POSES])
+    image = MeasuredProfile(profile, np.zeros(3, dtype=np.int64), SHEET_OF, "")
     poses = ExposurePoses(
         np.stack([pose.rotation for pose in POSES]),
         np.stack([pose.translation_mm for pose in POSES]),
@@ -58,7 +56,7 @@ def points_base_mm(sensor_step: FloatArray, hand_eye_step: FloatArray) -> FloatA
     )
     pair = rig.sheets()
     moved = (pair[0].updated(sensor_step[9:17]), pair[1].updated(sensor_step[17:]))
-    points, _ = meet_sheets(PLACES_PX, SHEET_OF, rig.sensor_of(camera, moved))
+    points, _ = intersect_sheets(PLACES_PX, SHEET_OF, rig.sensor_of(camera, moved))
     hand_eye = rig.stepped(rig.TOOL_FROM_SENSOR, hand_eye_step)
     return np.concatenate([(pose @ (hand_eye @ Points(points))).xyz_mm for pose in POSES])
 

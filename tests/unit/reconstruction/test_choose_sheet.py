@@ -8,7 +8,7 @@ from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.choose_sheet import DepthRange, choose_sheets
+from armscan.reconstruction.label_single import DepthRange, choose_sheets
 from armscan.records.profile import Profile, StripeFlag
 from sheet_rig import PROVENANCE, make_profile
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.choose_sheet import DepthRange
-from armscan.reconstruction.cross_evidence import (
+from armscan.reconstruction.label_cross import (
     ALIKE_PIECES,
     OUTSIDE,
     TAKEN,
@@ -18,6 +17,7 @@ from armscan.reconstruction.cross_evidence import (
     still_evidence,
     taken_evidence,
 )
+from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.stretches import Pieces, cut_pieces
 from cross_rig import PLANES, camera, light_sheet, sensor
 from sheet_rig import make_profile

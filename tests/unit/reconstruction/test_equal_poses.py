@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.equal_poses import MOVED_MM, stripes_at_equal_poses
-from armscan.reconstruction.exposure_poses import ExposurePoses
+from armscan.reconstruction.sync import MOVED_MM, ExposurePoses, stripes_at_equal_poses
 from armscan.records.cloud import PointCloud
 
 N, NOISE_MM = 200, 0.01

@@ -4,7 +4,7 @@
 import numpy as np
 
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.free_rays import is_without_ray
+from armscan.reconstruction.label_single import is_without_ray
 
 SHEET = LightSheet(np.array([0.0, 0.0, 300.0]), np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
                    50.0, np.zeros(5))  # fmt: skip

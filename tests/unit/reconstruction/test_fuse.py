@@ -12,12 +12,12 @@ import pytest
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
-from armscan.reconstruction.fuse import FusedPoints, fuse_points, misfit_mm
-from armscan.reconstruction.right_sheet import triangulate_right
-from armscan.reconstruction.stereo_residuals import (
-    RightStripes,
-    find_crossings,
-    project_on_sheets,
+from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
+from armscan.reconstruction.stereo_points import (
+    FusedPoints,
+    fuse_points,
+    misfit_mm,
+    triangulate_right,
 )
 from armscan.reconstruction.triangulate import sensor_columns, sensor_covariance
 from sheet_rig import make_profile

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError, OptionError
-from armscan.reconstruction.identify_cross import CrossNamer, CrossOptions
-from armscan.reconstruction.identify_rows import RowNamer
-from armscan.reconstruction.named_profile import NamedProfile, NameFate
-from armscan.reconstruction.stripe_namer import STROKE_GAP_NS, StripeNamer
+from armscan.reconstruction.label_cross import CrossLabeller, CrossOptions
+from armscan.reconstruction.labels import (
+    STROKE_GAP_NS,
+    LabelledProfile,
+    LabelStatus,
+    StripeLabeller,
+)
+from armscan.reconstruction.row_rule import RowLabeller
 from cross_rig import HARSH, NAMES, SCENES, THESIS, TICK_NS, CrossExposure, CrossStroke
 
 BOTH = ("A", "B")
@@ -24,7 +28,7 @@ class Outcome:
     """Exposures of a stroke as they were taken, and their names."""
 
     taken: list[CrossExposure]
-    named: list[NamedProfile]
+    named: list[LabelledProfile]
 
     @property
     def wrong_share(self) -> float:
@@ -32,19 +36,19 @@ class Outcome:
             int(((n.sheet >= 0) & (e.true_sheet >= 0) & (n.sheet != e.true_sheet)).sum())
             for e, n in zip(self.taken, self.named, strict=True)
         )
-        return wrong / max(sum(n.count(NameFate.NAMED) for n in self.named), 1)
+        return wrong / max(sum(n.count(LabelStatus.NAMED) for n in self.named), 1)
 
     @property
     def named_share(self) -> float:
         asked = sum(int(e.profile.is_accepted.sum()) for e in self.taken)
-        return sum(n.count(NameFate.NAMED) for n in self.named) / asked
+        return sum(n.count(LabelStatus.NAMED) for n in self.named) / asked
 
     @property
     def singles(self) -> int:
         return sum(len(e.lasers) == 1 for e in self.taken)
 
 
-def take(stroke: CrossStroke, namer: StripeNamer, has_arm: bool = True) -> Outcome:
+def take(stroke: CrossStroke, namer: StripeLabeller, has_arm: bool = True) -> Outcome:
     taken, named = [], []
     for k in range(stroke.n_exposures):
         exposure = stroke.expose(k, namer.next_lasers())
@@ -65,7 +69,7 @@ def test_both_lasers_stay_on_and_no_name_is_wrong(
     scene: str, strokes: dict[str, CrossStroke]
 ) -> None:
     stroke = strokes[scene]
-    found = take(stroke, CrossNamer(stroke.sensor))
+    found = take(stroke, CrossLabeller(stroke.sensor))
     assert found.wrong_share < 0.001
     assert found.named_share > 0.97
     assert found.taken[0].lasers == ("A",)
@@ -75,11 +79,11 @@ def test_both_lasers_stay_on_and_no_name_is_wrong(
 def test_where_surfaces_bend_the_thesis_rule_names_less(strokes: dict[str, CrossStroke]) -> None:
     """Both see the same stripes; T of 10 px against a hand's motion (FINDINGS: 19-38 %)."""
     stroke = strokes["waves"]
-    ours = take(stroke, CrossNamer(stroke.sensor))
-    thesis = take(stroke, RowNamer(stroke.sensor))
+    ours = take(stroke, CrossLabeller(stroke.sensor))
+    thesis = take(stroke, RowLabeller(stroke.sensor))
     both = [n for e, n in zip(thesis.taken, thesis.named, strict=True) if e.lasers == BOTH]
-    asked = sum(int((n.fate != int(NameFate.NOT_ASKED)).sum()) for n in both)
-    assert sum(n.count(NameFate.UNEXPLAINED) for n in both) > 0.1 * asked
+    asked = sum(int((n.fate != int(LabelStatus.NOT_ASKED)).sum()) for n in both)
+    assert sum(n.count(LabelStatus.UNEXPLAINED) for n in both) > 0.1 * asked
     per_exposure = [
         np.mean([len(set(n.sheet[n.sheet >= 0].tolist())) for n in found.named])
         for found in (ours, thesis)
@@ -92,7 +96,7 @@ def test_chains_that_follow_the_other_line_past_the_crossing_get_both_names(
     strokes: dict[str, CrossStroke],
 ) -> None:
     stroke = strokes["plate"]
-    found = take(stroke, CrossNamer(stroke.sensor))
+    found = take(stroke, CrossLabeller(stroke.sensor))
     n_swapped = 0
     for exposure, named in zip(found.taken, found.named, strict=True):
         for segment in np.unique(exposure.profile.segment):
@@ -106,19 +110,19 @@ def test_chains_that_follow_the_other_line_past_the_crossing_get_both_names(
 
 def test_rejected_points_are_not_asked(strokes: dict[str, CrossStroke]) -> None:
     stroke = strokes["plate"]
-    for exposure, named in zip(*_columns(take(stroke, CrossNamer(stroke.sensor))), strict=True):
+    for exposure, named in zip(*_columns(take(stroke, CrossLabeller(stroke.sensor))), strict=True):
         rejected = ~exposure.profile.is_accepted
-        assert (named.fate[rejected] == int(NameFate.NOT_ASKED)).all()
-        assert ((named.sheet >= 0) == (named.fate == int(NameFate.NAMED))).all()
+        assert (named.fate[rejected] == int(LabelStatus.NOT_ASKED)).all()
+        assert ((named.sheet >= 0) == (named.fate == int(LabelStatus.NAMED))).all()
 
 
-def _columns(found: Outcome) -> tuple[list[CrossExposure], list[NamedProfile]]:
+def _columns(found: Outcome) -> tuple[list[CrossExposure], list[LabelledProfile]]:
     return found.taken, found.named
 
 
 def test_a_recorded_stroke_is_named_again_as_it_was(strokes: dict[str, CrossStroke]) -> None:
     stroke = strokes["steps"]
-    namer = CrossNamer(stroke.sensor)
+    namer = CrossLabeller(stroke.sensor)
     first = take(stroke, namer)
     later = [
         namer.name(e.profile, e.lasers, e.base_from_sensor, e.t_ns + 10 * STROKE_GAP_NS)
@@ -133,25 +137,25 @@ def test_after_a_pause_nothing_is_known_and_both_stripes_are_in_doubt(
     strokes: dict[str, CrossStroke],
 ) -> None:
     stroke = strokes["part"]
-    namer = CrossNamer(stroke.sensor)
+    namer = CrossLabeller(stroke.sensor)
     take(stroke, namer)
     again = stroke.expose(8, BOTH)
     at_once = stroke.t_ns(N_EXPOSURES - 1) + TICK_NS
     known = namer.name(again.profile, BOTH, again.base_from_sensor, at_once)
     late = at_once + STROKE_GAP_NS + 1
     forgotten = namer.name(again.profile, BOTH, again.base_from_sensor, late)
-    assert known.count(NameFate.NAMED) > forgotten.count(NameFate.NAMED)
-    assert known.count(NameFate.AMBIGUOUS) == 0
+    assert known.count(LabelStatus.NAMED) > forgotten.count(LabelStatus.NAMED)
+    assert known.count(LabelStatus.AMBIGUOUS) == 0
 
 
 def test_a_stroke_that_begins_with_both_asks_for_one_laser_and_then_knows(
     strokes: dict[str, CrossStroke],
 ) -> None:
     stroke = strokes["waves"]
-    namer = CrossNamer(stroke.sensor, CrossOptions(margin=50.0, remember_margin=50.0))
+    namer = CrossLabeller(stroke.sensor, CrossOptions(margin=50.0, remember_margin=50.0))
     first = stroke.expose(4, BOTH)
     named = namer.name(first.profile, BOTH, first.base_from_sensor, first.t_ns)
-    assert named.count(NameFate.NAMED) == 0
+    assert named.count(LabelStatus.NAMED) == 0
     asked = namer.next_lasers()
     assert len(asked) == 1
     n_true = [int((first.true_sheet == k).sum()) for k in (0, 1)]
@@ -163,11 +167,11 @@ def test_without_the_arm_stripes_are_predicted_in_the_image(
     strokes: dict[str, CrossStroke],
 ) -> None:
     stroke = strokes["plate"]
-    found = take(stroke, CrossNamer(stroke.sensor), has_arm=False)
+    found = take(stroke, CrossLabeller(stroke.sensor), has_arm=False)
     assert found.wrong_share < 0.001
     assert found.named_share > 0.95
     assert "without the arm's pose" in found.named[-1].how
-    with_arm = take(stroke, CrossNamer(stroke.sensor))
+    with_arm = take(stroke, CrossLabeller(stroke.sensor))
     assert "continues the surface" in with_arm.named[-1].how
 
 
@@ -176,7 +180,7 @@ def test_a_stripe_that_vanishes_for_a_while_is_found_again(
 ) -> None:
     """B is hidden in four exposures; meanwhile nothing is taken for it, then it has its name."""
     stroke = strokes["waves"]
-    namer = CrossNamer(stroke.sensor)
+    namer = CrossLabeller(stroke.sensor)
     for k in range(N_EXPOSURES):
         lasers = namer.next_lasers()
         exposure = stroke.expose(k, lasers)
@@ -193,14 +197,14 @@ def test_a_stripe_that_vanishes_for_a_while_is_found_again(
 
 def test_harsh_stripes_with_strays_and_holes() -> None:
     stroke = CrossStroke("steps", 5, HARSH, N_EXPOSURES)
-    found = take(stroke, CrossNamer(stroke.sensor))
+    found = take(stroke, CrossLabeller(stroke.sensor))
     assert found.wrong_share < 0.005
     assert found.named_share > 0.9
 
 
 def test_a_dark_exposure_and_one_without_stripes_are_survived() -> None:
     stroke = CrossStroke("plate", 1, THESIS, N_EXPOSURES)
-    namer = CrossNamer(stroke.sensor)
+    namer = CrossLabeller(stroke.sensor)
     empty = stroke.expose(0, ())
     named = namer.name(empty.profile, BOTH, empty.base_from_sensor, empty.t_ns)
     assert len(named.sheet) == 0
@@ -213,7 +217,7 @@ def test_a_laser_of_another_head_is_refused() -> None:
     stroke = CrossStroke("plate", 1, THESIS, 1)
     profile = stroke.expose(0, BOTH).profile
     with pytest.raises(InputError, match="laser that was on is C, the calibration has A, B"):
-        CrossNamer(stroke.sensor).name(profile, ("C",), None, 0)
+        CrossLabeller(stroke.sensor).name(profile, ("C",), None, 0)
 
 
 def test_wrong_options_are_refused() -> None:

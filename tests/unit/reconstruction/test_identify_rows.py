@@ -8,10 +8,10 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.identify_rows import RowNamer, RowOptions, row_differences
-from armscan.reconstruction.named_profile import NameFate
-from armscan.records.laser_schedule import LaserSchedule
+from armscan.reconstruction.labels import LabelStatus
+from armscan.reconstruction.row_rule import RowLabeller, RowOptions, row_differences
 from armscan.records.profile import Profile
+from armscan.records.recording import LaserSchedule
 from cross_rig import sensor
 from sheet_rig import make_profile
 
@@ -23,9 +23,9 @@ def rows(points: list[tuple[float, float]]) -> Profile:
     return make_profile("by hand", [(places, np.tile([0.0, 1.0], (len(places), 1)))], 0.1)
 
 
-def taught() -> RowNamer:
+def taught() -> RowLabeller:
     """After exposure N with A at row 100 and N + 1 with B at row 125, in columns 10 to 13."""
-    namer = RowNamer(sensor())
+    namer = RowLabeller(sensor())
     namer.name(rows([(x, 100.0) for x in range(10, 14)]), ("A",), None, 0)
     namer.name(rows([(x, 125.0) for x in range(10, 14)]), ("B",), None, 1)
     return namer
@@ -38,12 +38,12 @@ def taught() -> RowNamer:
 def test_threshold_of_equations_3_6_and_3_7(row: float, sheet: int) -> None:
     named = taught().name(rows([(10.0, row), (11.0, row)]), ("A", "B"), None, 2)
     assert named.sheet.tolist() == [sheet, sheet]
-    expected = NameFate.NAMED if sheet >= 0 else NameFate.UNEXPLAINED
+    expected = LabelStatus.NAMED if sheet >= 0 else LabelStatus.UNEXPLAINED
     assert (named.fate == int(expected)).all()
 
 
 def test_where_both_hold_the_smallest_difference_wins() -> None:
-    namer = RowNamer(sensor(), RowOptions(threshold_px=20.0))
+    namer = RowLabeller(sensor(), RowOptions(threshold_px=20.0))
     namer.name(rows([(10.0, 100.0), (11.0, 100.0)]), ("A",), None, 0)
     namer.name(rows([(10.0, 125.0), (11.0, 125.0)]), ("B",), None, 1)
     named = namer.name(rows([(10.0, 112.0), (11.0, 113.0)]), ("A", "B"), None, 2)
@@ -63,7 +63,7 @@ def test_of_several_rows_in_a_column_the_nearest_counts() -> None:
 
 
 def test_schedule_of_figure_3_2() -> None:
-    namer = RowNamer(sensor())
+    namer = RowLabeller(sensor())
     asked = []
     for k in range(6):
         asked.append(namer.next_lasers())
@@ -84,11 +84,11 @@ def test_without_earlier_exposures_nothing_is_named() -> None:
     namer = taught()
     namer.reset()
     named = namer.name(rows([(10.0, 100.0), (11.0, 100.0)]), ("A", "B"), None, 2)
-    assert named.count(NameFate.UNEXPLAINED) == 2
+    assert named.count(LabelStatus.UNEXPLAINED) == 2
 
 
 def test_wrong_options_are_refused() -> None:
     with pytest.raises(OptionError, match="threshold"):
         RowOptions(threshold_px=0.0)
     with pytest.raises(InputError, match="laser C"):
-        RowNamer(sensor(), RowOptions(schedule=LaserSchedule((("C",),))))
+        RowLabeller(sensor(), RowOptions(schedule=LaserSchedule((("C",),))))

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.reconstruction.near_surface import depths_off, fit_planes
+from armscan.reconstruction.label_stereo import depths_off, fit_planes
 
 FLOOR_MM = 150.0
 SLOPE = 0.004

@@ -8,7 +8,7 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.normals import (
+from armscan.reconstruction.place import (
     LARGEST_RADIUS_MM,
     SMALLEST_RADIUS_MM,
     NormalOptions,

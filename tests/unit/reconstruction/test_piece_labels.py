@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.piece_labels import SWITCH, smoothed_posterior
+from armscan.reconstruction.label_cross import SWITCH, smoothed_posterior
 
 
 def by_enumeration(log_likelihood: FloatArray) -> FloatArray:

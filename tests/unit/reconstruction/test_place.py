@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Placing in Base: differences of every parameter, repeats with all errors, limits of space."""
+"""Points carried to Base: differences of every parameter, repeats with all errors, limits."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ import placing_rig as rig
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Points, Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
-from armscan.models.scanner import ArmNoise
 from armscan.reconstruction.place import (
+    BaseBox,
     arm_covariance,
+    parse_volume,
     place_delivered_points,
-    place_stripe,
     place_with_jacobian,
     prepare_placing,
+    propagate_to_base,
     scan_point_mm,
 )
-from armscan.reconstruction.triangulate import meet_sheets, triangulate_stripe
-from armscan.reconstruction.volume import BaseBox, parse_volume
+from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
 from sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
@@ -69,7 +70,7 @@ def covariance_by_differences() -> FloatArray:
     def at(sensor_step: FloatArray, hand_eye_step: FloatArray, shift_px: FloatArray) -> FloatArray:
         other = CameraModel.from_parameters(camera.parameters + sensor_step[:9], 2048, 1536)
         moved = (pair[0].updated(sensor_step[9:17]), pair[1].updated(sensor_step[17:]))
-        points, _ = meet_sheets(PLACES_PX + shift_px, SHEET_OF, rig.sensor_of(other, moved))
+        points, _ = intersect_sheets(PLACES_PX + shift_px, SHEET_OF, rig.sensor_of(other, moved))
         hand_eye = rig.stepped(rig.TOOL_FROM_SENSOR, hand_eye_step + rig.coupling() @ sensor_step)
         return (rig.BASE_FROM_TOOL @ (hand_eye @ Points(points))).xyz_mm
 
@@ -101,13 +102,13 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
             hand_eye=replace(placing.scanner.hand_eye, arm_noise=ArmNoise(0.0, 0.0)),
         ),
     )
-    cloud = place_stripe(stripe, profile, rig.BASE_FROM_TOOL, quiet)
+    cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, quiet)
     # The coupling reaches the other sheet's parameters, which move this point through the
     # hand-eye alone: they belong to the joint covariance too.
     expected = covariance_by_differences()
     size = np.abs(expected).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(cloud.covariance_mm2 / size, expected / size, atol=1e-5)
-    loud = place_stripe(stripe, profile, rig.BASE_FROM_TOOL, placing)
+    loud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
     middle = (
         rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(scan_point_mm(placing.scanner)[None]))
     ).xyz_mm[0]
@@ -131,7 +132,7 @@ def test_covariance_is_that_of_repeats() -> None:
     camera, pair = thesis_rig().camera, rig.sheets()
     place, sheet = PLACES_PX[:1], SHEET_OF[:1]
     profile = rig.profile_at(place)
-    cloud = place_stripe(
+    cloud = propagate_to_base(
         triangulate_stripe(profile, sheet, scanner.sensor), profile, rig.BASE_FROM_TOOL, placing
     )
     middle = (
@@ -146,7 +147,7 @@ def test_covariance_is_that_of_repeats() -> None:
         other = CameraModel.from_parameters(camera.parameters + error[:9], 2048, 1536)
         moved = (pair[0].updated(error[9:17]), pair[1].updated(error[17:25]))
         noisy = place + rng.normal(0.0, rig.SIGMA_PX) * np.array([0.6, 0.8])
-        points, _ = meet_sheets(noisy, sheet, rig.sensor_of(other, moved))
+        points, _ = intersect_sheets(noisy, sheet, rig.sensor_of(other, moved))
         spin = rotation_from_vector(rng.normal(0.0, turn, 3))
         arm = Pose(
             spin @ rig.BASE_FROM_TOOL.rotation,

@@ -10,10 +10,9 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import IntArray
-from armscan.reconstruction.named_profile import NameFate
-from armscan.reconstruction.sheet_scores import log_ratio
-from armscan.reconstruction.stereo_measure import StereoMeasurement, measure_stereo
-from armscan.reconstruction.stereo_options import StereoNamingOptions
+from armscan.reconstruction.label_stereo import StereoLabelOptions, log_ratio
+from armscan.reconstruction.labels import LabelStatus
+from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
 from armscan.reconstruction.triangulate import sensor_covariance
 from armscan.vision.stripe.extract import empty_profile
 from placing_rig import scanner
@@ -54,7 +53,7 @@ def test_shared_points_get_their_sheets_and_hardly_any_a_wrong_one(kind: str) ->
         shared += int(both.sum())
         right_names += int((both & (found.left.sheet == left.sheet)).sum())
         wrong += n_wrong(found.left.sheet, left) + n_wrong(found.right.sheet, right)
-        named += found.left.count(NameFate.NAMED) + found.right.count(NameFate.NAMED)
+        named += found.left.count(LabelStatus.NAMED) + found.right.count(LabelStatus.NAMED)
     assert right_names >= LEAST_NAMED * shared
     assert wrong <= MOST_WRONG * named
 
@@ -112,7 +111,7 @@ def test_each_point_is_counted_once() -> None:
     assert len(np.unique(found.left_points.row)) == len(found.left_points.row)
     named = found.left.sheet[found.left_points.row]
     assert (named == found.left_points.sheet).all()
-    total = sum(found.left.count(fate) for fate in NameFate)
+    total = sum(found.left.count(fate) for fate in LabelStatus)
     assert total == len(left.profile)
     assert len(found.right.sheet) == len(right.profile)
 
@@ -135,9 +134,9 @@ def test_one_camera_is_refused() -> None:
 
 def test_options_out_of_range_are_refused() -> None:
     with pytest.raises(OptionError, match="runner_up"):
-        StereoNamingOptions(runner_up=1.5)
+        StereoLabelOptions(runner_up=1.5)
     with pytest.raises(OptionError, match="reach_px"):
-        StereoNamingOptions(reach_px=0.0)
+        StereoLabelOptions(reach_px=0.0)
 
 
 def test_log_ratio_is_that_of_a_seen_gaussian_against_an_even_spread() -> None:

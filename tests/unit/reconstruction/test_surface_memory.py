@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Sensor
-from armscan.geometry.poses import Points, Pose
-from armscan.reconstruction.surface_memory import REACH_MM, SPACING_MM, SurfaceMemory
+from armscan.geometry.poses import Base, Points, Pose, Sensor
+from armscan.reconstruction.label_cross import REACH_MM, SPACING_MM, SurfaceMemory
 
 BASE_FROM_SENSOR: Pose[Base, Sensor] = Pose.from_vectors([2.9, 0.3, -0.2], [600.0, -150.0, 140.0])
 SLOPE_X, SLOPE_Y = 0.4, -0.3

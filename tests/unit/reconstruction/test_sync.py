@@ -11,10 +11,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.poses import Pose
-from armscan.reconstruction.exposure_poses import PoseFate
-from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.records.arm_track import ArmTrack
-from armscan.records.session import ExposureRow
+from armscan.reconstruction.sync import PoseStatus, SyncOptions, exposure_poses
+from armscan.records.recording import ArmTrack, ExposureRow
 
 MS = 1_000_000
 EPOCH_NS = 1_760_000_000_000_000_000
@@ -70,13 +68,13 @@ def test_unknown_samples_are_not_bridged() -> None:
         rows([EPOCH_NS + t * MS for t in (25, 35, 40, 45, 50)]), steady_track(is_known=known)
     )
     expected = [
-        PoseFate.FOUND,
-        PoseFate.GAP,
-        PoseFate.UNKNOWN_SAMPLE,
-        PoseFate.GAP,
-        PoseFate.FOUND,
+        PoseStatus.FOUND,
+        PoseStatus.GAP,
+        PoseStatus.UNKNOWN_SAMPLE,
+        PoseStatus.GAP,
+        PoseStatus.FOUND,
     ]
-    assert [PoseFate(int(fate)) for fate in poses.fate] == expected
+    assert [PoseStatus(int(fate)) for fate in poses.fate] == expected
     assert poses.sample.tolist() == [2, -1, -1, -1, 5]
     assert "2 in a gap" in poses.missing
     with pytest.raises(InputError, match="gap"):
@@ -91,7 +89,7 @@ def test_neighbours_too_far_apart_are_not_bridged() -> None:
         track.t_ns[kept], track.rotations[kept], track.translations_mm[kept], np.ones(8, bool)
     )
     wanted = rows([EPOCH_NS + t * MS for t in (25, 50)])
-    assert exposure_poses(wanted, holed).fate.tolist() == [PoseFate.FOUND, PoseFate.GAP]
+    assert exposure_poses(wanted, holed).fate.tolist() == [PoseStatus.FOUND, PoseStatus.GAP]
     wide = exposure_poses(wanted, holed, options=SyncOptions(max_gap_ns=40 * MS))
     assert wide.has_pose.all()
     assert wide.how == "by time, between samples up to 40 ms apart"
@@ -105,15 +103,15 @@ def test_poses_taken_now_and_then_are_not_joined() -> None:
     """One sample a posture, seconds apart: three median periods would bridge them all."""
     track = steady_track(period_ns=5_000 * MS)
     poses = exposure_poses(rows([EPOCH_NS + 5_000 * MS, EPOCH_NS + 7_000 * MS]), track)
-    assert poses.fate.tolist() == [PoseFate.FOUND, PoseFate.GAP]
+    assert poses.fate.tolist() == [PoseStatus.FOUND, PoseStatus.GAP]
 
 
 def test_before_and_after_the_track_there_is_no_pose() -> None:
     poses = exposure_poses(rows([EPOCH_NS - 1, EPOCH_NS, EPOCH_NS + 100 * MS + 1]), steady_track())
     assert poses.fate.tolist() == [
-        PoseFate.BEFORE_TRACK,
-        PoseFate.FOUND,
-        PoseFate.AFTER_TRACK,
+        PoseStatus.BEFORE_TRACK,
+        PoseStatus.FOUND,
+        PoseStatus.AFTER_TRACK,
     ]
 
 
@@ -124,7 +122,7 @@ def test_trigger_ids_win_over_times() -> None:
     assert poses.how == "by trigger id"
     assert poses.sample[:2].tolist() == [2, 0]
     np.testing.assert_array_equal(poses.translations_mm[:2], track.translations_mm[[2, 0]])
-    assert poses.fate[2:].tolist() == [PoseFate.UNKNOWN_TRIGGER, PoseFate.NO_TRIGGER]
+    assert poses.fate[2:].tolist() == [PoseStatus.UNKNOWN_TRIGGER, PoseStatus.NO_TRIGGER]
     assert poses.warnings == ()
 
 
@@ -142,7 +140,7 @@ def test_an_unknown_sample_of_a_trigger_is_no_pose() -> None:
     known[2] = False
     track = steady_track(trigger_ids=np.arange(11), is_known=known)
     poses = exposure_poses(rows([0, 1], [2, 3]), track, clock="separate")
-    assert poses.fate.tolist() == [PoseFate.UNKNOWN_SAMPLE, PoseFate.FOUND]
+    assert poses.fate.tolist() == [PoseStatus.UNKNOWN_SAMPLE, PoseStatus.FOUND]
 
 
 def test_what_cannot_be_put_together_is_refused_with_a_way_out() -> None:

@@ -11,11 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.exposure_poses import PoseFate
-from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.sync import PoseStatus, exposure_poses
 from armscan.reconstruction.track_faults import check_track
-from armscan.records.arm_track import ArmTrack
-from armscan.records.session import ExposureRow
+from armscan.records.recording import ArmTrack, ExposureRow
 
 PERIOD_NS = 4_000_000
 NOISE_MM = 0.01
@@ -134,7 +132,7 @@ def test_exposures_at_faulty_samples_get_no_pose_and_a_word() -> None:
     times = [int(track.t_ns[k]) + PERIOD_NS // 2 for k in (600, 699, 700, 701)]
     rows = [ExposureRow(k, t, 0, f"{k}.png", ("A",)) for k, t in enumerate(times)]
     poses = exposure_poses(rows, track)
-    wrong, found = PoseFate.CONTRADICTED, PoseFate.FOUND
+    wrong, found = PoseStatus.CONTRADICTED, PoseStatus.FOUND
     assert poses.fate.tolist() == [found, wrong, wrong, found]
     assert len(poses.track_faults) == 1
     assert any("off the track" in text for text in poses.warnings)

@@ -11,8 +11,8 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.merge import merge_clouds
-from armscan.reconstruction.triangulate import meet_sheets, triangulate
+from armscan.reconstruction.place import merge_clouds
+from armscan.reconstruction.triangulate import intersect_sheets, triangulate
 from armscan.records.profile import Profile
 from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 
@@ -65,7 +65,7 @@ def test_points_on_boards_come_back_through_a_distorting_lens() -> None:
     rig = replace(thesis_rig(), sigma_stripe_px=1e-6)
     for index in range(len(rig.poses)):
         q, _ = rig.stripe(index, rig.sheets[0], np.random.default_rng(0))
-        points, is_met = meet_sheets(
+        points, is_met = intersect_sheets(
             q, np.zeros(len(q), dtype=np.int64), sensor(rig.camera, printed_sheet())
         )
         assert is_met.all()
@@ -80,7 +80,7 @@ def test_stripe_noise_alone_is_one_direction_by_hand() -> None:
     cloud = triangulate(profile_at(place), np.array([0]), calibration)
     step = 1e-4 * np.array([[0.6, 0.8]])
     zero = np.array([0])
-    up, down = (meet_sheets(place + s * step, zero, calibration)[0] for s in (1, -1))
+    up, down = (intersect_sheets(place + s * step, zero, calibration)[0] for s in (1, -1))
     across = SIGMA_PX * (up - down)[0] / 2e-4
     np.testing.assert_allclose(cloud.covariance_mm2[0], np.outer(across, across), rtol=1e-6)
     np.testing.assert_allclose(cloud.sigma_noise_mm, np.linalg.norm(across), rtol=1e-6)
@@ -99,7 +99,7 @@ def test_covariance_is_that_of_repeats_with_all_errors() -> None:
     joint[:12, :12] = correlation * np.outer(sigma, sigma)
     sheet = printed_sheet()
     place = np.array([[1400.0, 600.0]])
-    truth, _ = meet_sheets(place, np.array([0]), sensor(rig.camera, sheet))
+    truth, _ = intersect_sheets(place, np.array([0]), sensor(rig.camera, sheet))
     cloud = triangulate(
         profile_at(place), np.array([0]), sensor(rig.camera, sheet, covariance=joint)
     )
@@ -109,7 +109,7 @@ def test_covariance_is_that_of_repeats_with_all_errors() -> None:
         camera = CameraModel.from_parameters(rig.camera.parameters + error[:9], 2048, 1536)
         wrong = sheet.updated(np.concatenate([error[9:], np.zeros(5)]))
         noisy = place + rng.normal(0.0, SIGMA_PX) * np.array([[0.6, 0.8]])
-        found, _ = meet_sheets(noisy, np.array([0]), sensor(camera, wrong))
+        found, _ = intersect_sheets(noisy, np.array([0]), sensor(camera, wrong))
         miss = (found - truth)[0]
         squares.append(miss @ np.linalg.solve(cloud.covariance_mm2[0], miss))
     assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / 1000)
@@ -135,7 +135,7 @@ def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
         step = sign * step
         other = CameraModel.from_parameters(camera.parameters + step[:9], 2048, 1536)
         turned = (sheets[0].updated(step[9:17]), sheets[1].updated(step[17:]))
-        return meet_sheets(place, np.array([0, 1]), sensor(other, *turned))[0]
+        return intersect_sheets(place, np.array([0, 1]), sensor(other, *turned))[0]
 
     steps = np.diag(1e-3 * np.where(sigma > 0.0, sigma, 0.0))
     by = np.stack([moved(step, 1.0) - moved(step, -1.0) for step in steps], axis=2)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.stripe_names import best_states
-from armscan.reconstruction.unbroken import cut_stripes, take_samples
+from armscan.kernels.chains import best_states
+from armscan.reconstruction.segments import cut_stripes, take_samples
 from armscan.records.profile import Profile
 from sheet_rig import make_profile
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.records.markers import MarkerSet
-from armscan.storage.marker_files import markers_csv, read_marker_list
+from armscan.records.points import MarkerSet
+from armscan.storage.points import markers_csv, read_marker_list
 
 HEAD = "x_mm,y_mm,z_mm"
 ROWS = "1.5,2,3\n100,2,3\n1,200,3\n"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, OptionError
-from armscan.records.probing import ProbedPoints
-from armscan.storage.probed_points import (
+from armscan.records.points import ProbedPoints
+from armscan.storage.points import (
     parse_plane,
     probed_points_csv,
     read_points_or_plane,

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.storage.profiles import read_profiles
-from armscan.storage.robot_poses import read_robot_poses
+from armscan.storage.points import read_profiles
+from armscan.storage.poses import read_robot_poses
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[4] / "shared" / "data"))
 YAML = "%YAML:1.0\n---\nscan_line: [ 1.5e+00, 0., .Nan, 2.,\n    0., -3.5, 4., 0., -6. ]\n"

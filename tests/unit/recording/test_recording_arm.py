@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError
-from armscan.models.arm import ArmModel, thesis_arm
-from armscan.models.arm_forward import forward
-from armscan.storage.arm_files import arm_model_toml, read_arm_model
-from armscan.storage.recording_reader import FolderRecording, read_recording
+from armscan.models.arm import ArmModel, forward, thesis_arm
+from armscan.storage.arm import arm_model_toml, read_arm_model
+from armscan.storage.recording import FolderRecording, read_recording
 from recording_folders import ARM, POSITION, SESSION, lab_folder, refusal, table
 
 NO_SESSION = SESSION.replace('form = "quaternion"\n', "")

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from armscan.errors import ArmscanError, FileFormatError, OptionError
-from armscan.records.sensor_window import SensorWindow
-from armscan.records.session import CameraSetup, Session
-from armscan.storage.recording_reader import read_recording
+from armscan.records.exposure import SensorWindow
+from armscan.records.recording import CameraSetup, Session
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import read_session_file, session_toml
-from armscan.storage.simulated import are_simulated
 from recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
 
 

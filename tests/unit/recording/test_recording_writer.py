@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError, OutputError
-from armscan.records.arm_track import ArmTrack
-from armscan.records.session import CameraSetup
-from armscan.storage.csv_table import csv_bytes
-from armscan.storage.probe_files import ProbeTip, read_probe_tip, write_probing
-from armscan.storage.recording_reader import read_arm_track, read_recording
+from armscan.records.recording import ArmTrack, CameraSetup
+from armscan.storage.arm import ProbeTip, read_probe_tip, write_probing
+from armscan.storage.recording import read_arm_track, read_recording
 from armscan.storage.recording_writer import write_recording
+from armscan.storage.tables import csv_bytes
 from recording_folders import EXPOSURES, SESSION, lab_folder, memory_scan, pixels
 
 

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError, InputError
-from armscan.storage.calibration_files import (
+from armscan.storage.documents import (
     camera_document,
     read_camera_calibration,
+    read_scanner_calibration,
     read_sensor_calibration,
+    scanner_document,
     sensor_document,
 )
-from armscan.storage.scanner_files import read_scanner_calibration, scanner_document
 from calibration_documents import (
     assert_same,
     camera_calibration,

@@ -11,22 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.calibration.laser.calibrate import calibrate_sheets
-from armscan.calibration.laser.result import LackOfFit, LaserFit, PointUse
-from armscan.calibration.laser.target_edges import TargetEdges
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.result import LackOfFit, LaserFit, PointUse
+from armscan.calibration.sheets.target_edges import TargetEdges
+from armscan.jobs.sheets import laser_summary
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
-from armscan.report.camera_figures import ARROW_SHARE, residual_magnification
-from armscan.report.camera_page import camera_page
-from armscan.report.laser_job import laser_summary
-from armscan.report.laser_page import USE_COLOURS, lack_of_fit_text, laser_page
-from armscan.report.numbers import with_sigma
+from armscan.report.camera import ARROW_SHARE, camera_page, residual_magnification
 from armscan.report.page import render_page
-from armscan.report.stripe_figures import FLAG_COLOURS
+from armscan.report.quantity import with_sigma
+from armscan.report.sheets import USE_COLOURS, lack_of_fit_text, laser_page
+from armscan.report.stripes import FLAG_COLOURS
 from camera_scene import Scene, make_views
 from sheet_rig import PROVENANCE, thesis_rig
 

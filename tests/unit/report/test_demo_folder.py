@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import OutputError
-from armscan.report.demo_folder import replaced_demo
-from armscan.report.head_demo_job import OWN_FILES
+from armscan.jobs.demo import OWN_FILES, replaced_demo
 
 HEX = "0123456789abcdef0123456789abcdef"
 FILES = (

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.repeat_study import angle_covariance
-from armscan.geometry.euler import rotations_from_euler
-from armscan.models.scanner import HandEyeCalibration, ScannerCalibration
-from armscan.report.hand_eye_job import hand_eye_summary
-from armscan.report.hand_eye_numbers import chi2_verdict, hand_eye_numbers
-from armscan.report.hand_eye_page import hand_eye_page
-from armscan.report.hand_eye_repeat import repeat_blocks
+from armscan.geometry.rotations import rotations_from_euler
+from armscan.jobs.hand_eye import hand_eye_summary
+from armscan.models.calibration import HandEyeCalibration, ScannerCalibration
+from armscan.report.hand_eye import chi2_verdict, hand_eye_numbers, hand_eye_page, repeat_blocks
 from armscan.report.page import render_page
 from hand_eye_fake import N_POSTURES, TOOL_FROM_SENSOR, fake_fit
 from sheet_rig import PROVENANCE

@@ -8,8 +8,15 @@ from pathlib import Path
 import pytest
 
 from armscan.errors import EstimationError, OptionError
-from armscan.report.head_demo_job import TRUTH, HeadDemoRequest, run_head_demo
-from armscan.report.three_heads_job import DATA, FOLDERS, PAGE, run_three_heads
+from armscan.jobs.demo import (
+    DATA,
+    FOLDERS,
+    PAGE,
+    TRUTH,
+    HeadDemoRequest,
+    run_head_demo,
+    run_three_heads,
+)
 
 
 def test_a_head_without_demo_is_refused_before_any_work(tmp_path: Path) -> None:
@@ -31,7 +38,7 @@ def test_no_old_comparison_stands_beside_new_heads(
     def fail(request: HeadDemoRequest, progress: object) -> None:
         raise EstimationError(f"{request.head} failed")
 
-    monkeypatch.setattr("armscan.report.three_heads_job.make_head_demo", fail)
+    monkeypatch.setattr("armscan.jobs.demo.make_head_demo", fail)
     with pytest.raises(EstimationError, match="thesis-single failed"):
         run_three_heads(HeadDemoRequest(tmp_path))
     assert [path.name for path in tmp_path.iterdir()] == [single.name]

@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
+from armscan.records.exposure import Exposure, SensorWindow
 from armscan.report.drawing import Marks, display_levels, photo_markup
 from armscan.report.page import (
     Card,
@@ -24,8 +23,8 @@ from armscan.report.page import (
     Text,
     render_page,
 )
-from armscan.report.scene import SceneLines, ramp_colours, scene_markup, uniform_dots
-from armscan.report.summary import Table
+from armscan.report.quantity import Table
+from armscan.report.scene3d import SceneLines, ramp_colours, scene_markup, uniform_dots
 
 HOSTILE = '<script>alert("1")</script>&'
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.errors import ArmscanError, EstimationError, InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.records.probing import ProbedPoints
-from armscan.report.plate_file import read_plate
+from armscan.jobs.inspect import read_plate
+from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import ply_bytes
-from armscan.storage.probed_points import probed_points_csv
+from armscan.storage.points import probed_points_csv
 from inspection_clouds import cloud_of
 
 ORIGIN = np.zeros(3)

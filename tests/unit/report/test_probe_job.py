@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-from armscan.cli import main
+from armscan.cli.run import main
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError, OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.records.arm_track import ArmTrack
-from armscan.records.probing import ProbedPoints
-from armscan.report.probe_job import ProbeRequest, read_touches, run_probing
-from armscan.storage.probe_files import ProbeTip, write_probing
-from armscan.storage.probed_points import probed_points_csv, read_probed_points
+from armscan.jobs.probe import ProbeRequest, read_touches, run_probing
+from armscan.records.points import ProbedPoints
+from armscan.records.recording import ArmTrack
+from armscan.storage.arm import ProbeTip, write_probing
+from armscan.storage.points import probed_points_csv, read_probed_points
 
 TIP = ProbeTip(np.array([2.0, -5.0, 120.0]), 6.0)
 PLANE = np.array([0.0, -0.6, 0.8, -30.0])

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
+from armscan.jobs.info import describe_files
 from armscan.models.arm import thesis_arm
-from armscan.records.arm_track import ArmTrack
-from armscan.report.file_info import describe_files
-from armscan.report.summary import summary_json, summary_text
-from armscan.storage.arm_files import arm_model_toml
-from armscan.storage.probe_files import ProbeTip, write_probing
-from armscan.storage.scanner_files import scanner_document
+from armscan.records.recording import ArmTrack
+from armscan.report.quantity import summary_json, summary_text
+from armscan.storage.arm import ProbeTip, arm_model_toml, write_probing
+from armscan.storage.documents import scanner_document
 from calibration_documents import scanner_calibration
 from recording_folders import ARM, EXPOSURES, lab_folder
 

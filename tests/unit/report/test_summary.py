@@ -9,8 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from armscan.report.numbers import sentence, significant, with_sigma
-from armscan.report.summary import Summary, Table, summary_json, summary_text
+from armscan.report.quantity import (
+    Summary,
+    Table,
+    sentence,
+    significant,
+    summary_json,
+    summary_text,
+    with_sigma,
+)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
-from armscan.vision.rings.detect import RingDetection, detect_rings
-from armscan.vision.rings.options import RingOptions
+from armscan.records.exposure import Exposure, SensorWindow
+from armscan.vision.rings import RingDetection, RingOptions, detect_rings
 from ring_scenes import GROUND, Mark, Rendered, render, tilted
 
 DISTANCE_MM = 300.0

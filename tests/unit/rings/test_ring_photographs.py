@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from armscan.storage.images import read_exposures
-from armscan.vision.rings.detect import RingDetection, detect_rings
+from armscan.vision.rings import RingDetection, detect_rings
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
 FOLDER = DATA / "ring_markers"

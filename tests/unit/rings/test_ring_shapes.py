@@ -8,9 +8,8 @@ import pytest
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.vision.rings.concentric_centre import common_centres
-from armscan.vision.rings.options import RingOptions, perimeter_limits
-from armscan.vision.rings.shape import perimeters_px, roundness
+from armscan.vision.ring_edges import common_centres
+from armscan.vision.rings import RingOptions, perimeter_limits, perimeters_px, roundness
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
 
 FOCAL_PX, DISTANCE_MM = 5000.0, 140.0

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.flat_pattern import ChessboardPattern, CirclePattern
-from armscan.simulation.flat_target import (
+from armscan.simulation.objects.board_image import (
     Lighting,
     illumination,
     reflectance_image,
     render_flat_target,
 )
-from armscan.simulation.optics import RenderCamera
+from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.simulation.optics.camera import RenderCamera
 
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
 TILTED = cv2.Rodrigues(np.array([0.5, -0.4, 0.2]))[0]

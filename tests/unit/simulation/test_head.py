@@ -9,16 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.euler import rotations_from_euler
-from armscan.geometry.frames import Base, Plate, Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.simulation.head import Head, Window, build_head
-from armscan.simulation.head_drawing import Tolerances
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.printed_heads import SINGLE_SHEET
-from armscan.simulation.shapes import Placed
+from armscan.geometry.poses import Base, Plate, Pose, Sensor, Tool
+from armscan.geometry.rotations import rotations_from_euler
+from armscan.simulation.head import Head, Tolerances, Window, build_head
+from armscan.simulation.heads import SINGLE_SHEET
+from armscan.simulation.objects.shapes import FlatPlate, Placed
+from armscan.simulation.optics.scene import SceneObject
 from armscan.simulation.station import ExposureSettings, Station, TrueStripe, true_stripes
-from armscan.simulation.thing import Thing
 
 EXACT = Tolerances(*([0.0] * 8))
 MATRIX = np.array([[5145.36, 0.0, 1517.37], [0.0, 5153.66, 1023.36], [0.0, 0.0, 1.0]])
@@ -49,7 +46,7 @@ def plate_on_the_table() -> Station:
     centre = np.array([600.0, -200.0, 0.0])
     centre[2] = -(PLATE_PLANE[0] * 600.0 - PLATE_PLANE[1] * 200.0 + 6.3935) / PLATE_PLANE[2]
     pose: Pose[Base, Plate] = Pose(rotation, centre)
-    return Station((Thing("plate", Placed(FlatPlate(np.array([300.0, 300.0])), pose)),))
+    return Station((SceneObject("plate", Placed(FlatPlate(np.array([300.0, 300.0])), pose)),))
 
 
 def posture(row: NDArray[np.float64], head: Head) -> Pose[Base, Sensor]:

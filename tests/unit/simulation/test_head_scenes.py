@@ -10,23 +10,19 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from armscan.devices.twin import TwinScene
-from armscan.geometry.frames import Sensor
-from armscan.geometry.poses import Points
-from armscan.pipeline.fewer_views import FewerViews
-from armscan.simulation.aim import Aim, sensor_over
-from armscan.simulation.arm_inverse import reach
-from armscan.simulation.hand_eye_plan import hand_eye_poses
+from armscan.devices.sources import TwinScene
+from armscan.geometry.poses import Points, Sensor
+from armscan.pipeline.scan_part import FewerViews
+from armscan.simulation.arm.arm import reach
+from armscan.simulation.arm.hand import CAMERA_CLOCK_NS, HeadOrientation, aim_point_mm, sensor_over
+from armscan.simulation.arm.passes import SweptScene, strokes_of
 from armscan.simulation.head import MountedCamera
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.marker_plan import PLACES, marker_poses
-from armscan.simulation.posture import aim_point_mm
-from armscan.simulation.scan_plan import SweptScene, strokes_of
-from armscan.simulation.shared_places import MULTI_FAR_PLACES, MULTI_LEFT_PLACES
-from armscan.simulation.sweep import CAMERA_CLOCK_NS
+from armscan.simulation.scenes import PLACES, hand_eye_poses, marker_poses
+from armscan.simulation.shots import RenderRequest, TwinScan
+from armscan.simulation.targets import MULTI_FAR_PLACES, MULTI_LEFT_PLACES
 from armscan.simulation.twin import build_twin
-from armscan.simulation.twin_scan import Shot, TwinScan
-from armscan.storage.recording_reader import read_recording
+from armscan.storage.recording import read_recording
 from armscan.storage.recording_writer import write_recording
 
 SEEDS = range(1, 11)
@@ -42,7 +38,7 @@ def _pixels(eye: MountedCamera, points: Points[Sensor]) -> np.ndarray:
     return eye.camera.project((eye.camera_from_sensor @ points).xyz_mm)
 
 
-def _marks_in_view(shot: Shot, eye: MountedCamera) -> bool:
+def _marks_in_view(shot: RenderRequest, eye: MountedCamera) -> bool:
     target = shot.station.target
     assert target is not None
     pixels = _pixels(eye, Points((target.base_from_board @ _marks(shot)).xyz_mm))
@@ -50,7 +46,7 @@ def _marks_in_view(shot: Shot, eye: MountedCamera) -> bool:
     return bool(((pixels > 20.0) & (pixels < size - 20.0)).all())
 
 
-def _marks(shot: Shot) -> Points:
+def _marks(shot: RenderRequest) -> Points:
     assert shot.station.target is not None
     marks = shot.station.target.pattern.marks_board_mm
     return Points(np.column_stack([marks[:, :2], np.zeros(len(marks))]))
@@ -128,7 +124,7 @@ def test_marks_reach_the_corners_of_both_cameras():
             assert np.abs(share - corner).max(axis=1).min() < 0.2
 
 
-def _lit_lengths(tools: Instrument, shot: Shot) -> dict[str, tuple[float, float]]:
+def _lit_lengths(tools: Instrument, shot: RenderRequest) -> dict[str, tuple[float, float]]:
     """Length of each sheet's line on the target that camera 0 sees, and its mean depth."""
     assert shot.station.target is not None
     pose = shot.station.target.base_from_board
@@ -176,7 +172,7 @@ def test_the_arm_reaches_every_posture_and_stroke(head: str):
                 for share, stray in ((0.0, 3.0), (1.0, -3.0)):
                     spot = stroke.start_mm + share * (stroke.end_mm - stroke.start_mm)
                     aim = stroke.aim
-                    held = Aim(
+                    held = HeadOrientation(
                         aim.tilt_x_deg + stray, aim.tilt_y_deg + stray, aim.roll_deg, aim.depth_mm
                     )
                     middle = aim_point_mm(tools.head, aim.depth_mm)

@@ -8,10 +8,9 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Pose, Sensor
 from armscan.simulation.head import build_head
-from armscan.simulation.laser_source import LaserSource, in_sources
+from armscan.simulation.optics.lasers import LaserSource, in_sources
 
 N_POINTS = 4000
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.light import LineLaser
+from armscan.simulation.optics.lasers import LineLaser
 
 SKEW_RAD = 0.02
 

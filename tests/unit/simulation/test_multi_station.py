@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armscan.geometry.frames import Base, Part, Plate, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import Base, Part, Plate, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import LEFT, RIGHT, Head, Window, build_head
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.render import Speckle, render_laser
-from armscan.simulation.shapes import Box, Placed
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed
+from armscan.simulation.optics.render import Speckle, render_laser
+from armscan.simulation.optics.scene import GROUND_STEEL, Material, SceneObject, Sphere
 from armscan.simulation.station import (
     ExposureSettings,
     Station,
@@ -25,10 +24,8 @@ from armscan.simulation.station import (
     seen_from,
     true_stripes,
 )
-from armscan.simulation.surfaces import Sphere
-from armscan.simulation.thing import GROUND_STEEL, Finish, Thing
 
-MATT = Finish()
+MATT = Material()
 WINDOW = Window(1150, 750, 700, 500)
 REACH_PX = 30
 SINGLE_SUM, SINGLE_ROW = 7_158_746, 1190.4936837553118
@@ -63,10 +60,10 @@ def above(head: Head, height_mm: float = 0.0, tilt_rad: float = 0.08) -> Pose[Ba
     return Pose(rotation, np.array([0.0, 0.0, height_mm]) - rotation @ aim)
 
 
-def plate(finish: Finish = MATT, flatness_mm: float = 0.015) -> Thing:
+def plate(finish: Material = MATT, flatness_mm: float = 0.015) -> SceneObject:
     flat = FlatPlate.draw((200.0, 150.0), flatness_mm, np.random.default_rng(1))
     lying: Pose[Base, Plate] = Pose(np.eye(3), np.zeros(3))
-    return Thing("plate", Placed(flat, lying), finish)
+    return SceneObject("plate", Placed(flat, lying), finish)
 
 
 def light_of(
@@ -113,8 +110,8 @@ def test_every_line_is_centred_on_its_truth_in_both_cameras(camera: int) -> None
 
 def test_all_lines_in_one_pass_equal_line_by_line_with_every_sample_traced() -> None:
     head = quiet(build_head("thesis-multi", seed=3))
-    ball = Thing("ball", Sphere(np.array([2.0, 0.5, 3.0]), 5.0), MATT)
-    block = Thing("block", Box(np.array([6.0, 40.0, 4.0])), MATT)
+    ball = SceneObject("ball", Sphere(np.array([2.0, 0.5, 3.0]), 5.0), MATT)
+    block = SceneObject("block", Box(np.array([6.0, 40.0, 4.0])), MATT)
     station = Station((plate(flatness_mm=0.001), ball, block))
     window = Window(1300, 900, 400, 260)
     quick = light_of(head, station, LEFT, window)
@@ -211,7 +208,7 @@ def test_the_single_head_renders_what_it_did_before_there_were_others() -> None:
         for h in (-0.05, 0.0, 0.05)
     ]
     flat = FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(1))
-    station = Station((Thing("plate", flat, GROUND_STEEL),))
+    station = Station((SceneObject("plate", flat, GROUND_STEEL),))
     settings = ExposureSettings(head.scan_window, ("A",))
     image = render_exposure(head, station, poses, settings, np.random.default_rng(5))
     assert int(image.sum()) == pytest.approx(SINGLE_SUM, rel=1e-5)

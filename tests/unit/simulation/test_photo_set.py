@@ -12,9 +12,7 @@ import pytest
 
 from armscan.devices.registry import load_driver
 from armscan.errors import InputError, OutputError
-from armscan.simulation.bench import BOARD
-from armscan.simulation.photo_set import PhotoSetOptions, render_photo_set
-from armscan.simulation.photo_truth import PhotoSetTruth
+from armscan.simulation.photos import BOARD, PhotoSetOptions, PhotoSetTruth, render_photo_set
 
 SMALL = PhotoSetOptions(width_px=320, height_px=240, n_camera=2, n_laser=2)
 FILES = (

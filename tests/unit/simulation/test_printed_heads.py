@@ -11,18 +11,23 @@ import pytest
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Plate, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.simulation.head import HEADS, LEFT, RIGHT, Head, build_head
-from armscan.simulation.head_drawing import Tolerances
-from armscan.simulation.light import LineLaser
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.printed_heads import CROSS_SHEETS, MULTI_SHEETS
-from armscan.simulation.shapes import Placed
-from armscan.simulation.sheet_middle import sheet_middle_mm, sheet_points_mm
+from armscan.geometry.poses import Base, Plate, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.simulation.head import (
+    HEADS,
+    LEFT,
+    RIGHT,
+    Head,
+    Tolerances,
+    build_head,
+    sheet_middle_mm,
+    sheet_points_mm,
+)
+from armscan.simulation.heads import CROSS_SHEETS, MULTI_SHEETS
+from armscan.simulation.objects.shapes import FlatPlate, Placed
+from armscan.simulation.optics.lasers import LineLaser
+from armscan.simulation.optics.scene import SceneObject
 from armscan.simulation.station import ExposureSettings, Station, TrueStripe, true_stripes
-from armscan.simulation.thing import Thing
 
 EXACT = Tolerances(*([0.0] * 8))
 HALF_FIELD_MM = 36.0
@@ -45,7 +50,7 @@ def plate_facing(head: Head, tilt: NDArray[np.float64] | None = None) -> Station
     if tilt is not None:
         rotation = rotation @ rotation_from_vector(tilt)
     pose: Pose[Base, Plate] = Pose(rotation, centre)
-    return Station((Thing("plate", Placed(FlatPlate(np.array([300.0, 300.0])), pose)),))
+    return Station((SceneObject("plate", Placed(FlatPlate(np.array([300.0, 300.0])), pose)),))
 
 
 def stripes(head: Head, station: Station, camera: int = LEFT) -> dict[str, TrueStripe]:

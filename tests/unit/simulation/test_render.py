@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armscan.geometry.frames import Part, Sensor
-from armscan.geometry.poses import Pose
-from armscan.simulation.body import Body, Limb
-from armscan.simulation.detector import Detector
-from armscan.simulation.light import LineLaser
-from armscan.simulation.optics import RenderCamera
-from armscan.simulation.render import Speckle, laser_band, render_laser, render_room
-from armscan.simulation.scene import Lamp, Scene
-from armscan.simulation.stripe_truth import camera_rays
-from armscan.simulation.surfaces import Floor, Sphere
+from armscan.geometry.poses import Part, Pose, Sensor
+from armscan.simulation.objects.body import Body, MetaballLimb
+from armscan.simulation.optics.camera import Detector, RenderCamera
+from armscan.simulation.optics.lasers import LineLaser
+from armscan.simulation.optics.render import (
+    Speckle,
+    camera_rays,
+    laser_band,
+    render_laser,
+    render_room,
+)
+from armscan.simulation.optics.scene import Floor, RoomLight, Scene, Sphere
 
 WHITE = (1.0, 1.0, 1.0)
 NO_SPECKLE = Speckle(contrast=0.0)
@@ -93,7 +95,11 @@ def test_centroid_of_the_rendered_light_is_the_true_centre(skew_rad: float) -> N
 def test_truth_projects_onto_its_pixels_and_lies_on_sheet_and_surface() -> None:
     pose: Pose[Sensor, Part] = Pose(np.eye(3), np.array([0.0, 0.0, 300.0]))
     body = Body(
-        (Limb((-8, -40, 0), (4, 40, 0), 25.0, 15.0), Limb((0, 0, -25), (0, 5, -26), 9, 8, 5)), pose
+        (
+            MetaballLimb((-8, -40, 0), (4, 40, 0), 25.0, 15.0),
+            MetaballLimb((0, 0, -25), (0, 5, -26), 9, 8, 5),
+        ),
+        pose,
     )
     laser = side_laser(0.02)
     lens = camera(k1=-0.1)
@@ -181,7 +187,7 @@ def test_speckle_has_mean_one_and_the_stated_contrast() -> None:
 def test_room_image_shows_the_ball_before_the_wall() -> None:
     ball = Sphere(np.array([0.0, 0.0, 300.0]), 30.0, (0.9, 0.6, 0.3))
     wall = Floor(np.array([0.0, 0.0, 500.0]), np.array([0.0, 0.0, -1.0]), (0.1, 0.2, 0.3))
-    lamp = Lamp(even=0.9, direct=0.0)
+    lamp = RoomLight(even=0.9, direct=0.0)
     image = render_room(Scene((ball, wall), lamp=lamp), camera(0.0))
     assert image.shape == (240, 320, 3)
     # both surfaces face the camera here: two thirds of the even light

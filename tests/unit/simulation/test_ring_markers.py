@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 
 from armscan.geometry.poses import Points, Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.flat_target import Lighting, render_flat_target
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import build_head
-from armscan.simulation.marked_plate import N_MARKERS
-from armscan.simulation.ring_image import draw_markers
-from armscan.simulation.ring_markers import Marked, RingMarker
-from armscan.simulation.scene import Scene
-from armscan.simulation.surfaces import Floor, Sphere
+from armscan.simulation.objects.board_image import Lighting, render_flat_target
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.fixtures import N_MARKERS
+from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
+from armscan.simulation.optics.scene import Floor, Scene, Sphere
 from armscan.simulation.twin import build_twin
 
 CAMERA = build_head("thesis-multi", seed=3).camera.cropped(1300, 800, 500, 420)

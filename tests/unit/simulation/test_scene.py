@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.simulation.light import LineLaser
-from armscan.simulation.scene import Lamp, Scene
-from armscan.simulation.surfaces import Floor, Sphere
+from armscan.simulation.optics.lasers import LineLaser
+from armscan.simulation.optics.scene import Floor, RoomLight, Scene, Sphere
 
 WALL_MM = 400.0
 BALL_MM = 20.0
@@ -68,7 +67,7 @@ def test_laser_light_is_hidden_from_the_laser_although_the_camera_sees_the_place
 
 
 def test_room_light_is_the_even_part_plus_the_cosine_of_the_lamp() -> None:
-    lamp = Lamp(even=0.3, direct=0.5, position_mm=(0.0, -400.0, 0.0))
+    lamp = RoomLight(even=0.3, direct=0.5, position_mm=(0.0, -400.0, 0.0))
     scene = Scene((wall(),), lamp=lamp)
     hits = scene.trace(np.zeros(3), np.array([[0.0, 0.0, 1.0]]))
     # The wall is vertical: two thirds of the even part. The lamp stands 45 degrees up.

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.band_light import speckle_piece
-from armscan.simulation.detector import Detector
-from armscan.simulation.region import Image32, Region, between_nodes, enlarged
-from armscan.simulation.render import Speckle
-from armscan.simulation.sensor_noise import expose_mono, with_ghost, with_halo
+from armscan.simulation.optics.camera import Detector, expose_mono, with_ghost, with_halo
+from armscan.simulation.optics.render import Image32, Region, Speckle, between_nodes, enlarged
+from armscan.simulation.optics.stripe_light import speckle_piece
 
 
 def line(row: int = 40) -> Image32:

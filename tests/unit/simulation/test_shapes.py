@@ -8,12 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Part
-from armscan.geometry.poses import Pose
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.shapes import Box, Placed, Rod, Solid
-from armscan.simulation.surfaces import Sphere
-from armscan.simulation.thing import Finish, Thing
+from armscan.geometry.poses import Base, Part, Pose
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Rod, Solid
+from armscan.simulation.optics.scene import Material, SceneObject, Sphere
 
 SOLIDS: dict[str, Solid] = {
     "box": Box(np.array([30.0, 9.0, 20.0])),
@@ -129,8 +126,10 @@ def test_a_perfect_plate_is_a_plane_with_sharp_ends() -> None:
 
 
 def test_texture_has_its_contrast_and_grain_and_stays_on_the_thing() -> None:
-    finish = Finish(texture=0.1, texture_mm=0.5)
-    thing = Thing("plate", FlatPlate(np.array([200.0, 150.0]), colour=(0.5, 0.5, 0.5)), finish)
+    finish = Material(texture=0.1, texture_mm=0.5)
+    thing = SceneObject(
+        "plate", FlatPlate(np.array([200.0, 150.0]), colour=(0.5, 0.5, 0.5)), finish
+    )
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-60, 60, (20000, 2)), np.zeros(20000)])
     albedo = thing.albedo(points)[:, 0]
@@ -142,7 +141,7 @@ def test_texture_has_its_contrast_and_grain_and_stays_on_the_thing() -> None:
     assert near > 0.8
     assert abs(far) < 0.05
     np.testing.assert_array_equal(thing.albedo(points)[:, 0], albedo)
-    assert finish.scaled(2.0, 0.0) == Finish(texture=0.0, texture_mm=0.5)
+    assert finish.scaled(2.0, 0.0) == Material(texture=0.0, texture_mm=0.5)
 
 
 def test_shapes_without_size_are_refused() -> None:
@@ -150,8 +149,8 @@ def test_shapes_without_size_are_refused() -> None:
         lambda: Box(np.array([1.0, 0.0, 1.0])),
         lambda: Rod(1.0, 0.0),
         lambda: FlatPlate(np.array([-1.0, 1.0])),
-        lambda: Finish(gloss=-1.0),
-        lambda: Finish(texture_mm=0.0),
+        lambda: Material(gloss=-1.0),
+        lambda: Material(texture_mm=0.0),
     ):
         with pytest.raises(InputError):
             make()

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from armscan.devices.twin import TwinScene
+from armscan.devices.sources import TwinScene
 from armscan.simulation.twin import build_twin
 
 scan_of = cache(build_twin(seed=7).scan)

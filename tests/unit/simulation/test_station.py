@@ -10,16 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.frames import Base, Board, Part, Sensor
-from armscan.geometry.poses import Pose
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.head import Head, Window, build_head
-from armscan.simulation.head_drawing import Tolerances
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.render import Speckle, render_laser
-from armscan.simulation.shapes import Box, Placed, Rod
+from armscan.geometry.poses import Base, Board, Part, Pose, Sensor
+from armscan.records.exposure import Exposure, SensorWindow
+from armscan.simulation.head import Head, Tolerances, Window, build_head
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Rod
+from armscan.simulation.optics.render import Speckle, render_laser
+from armscan.simulation.optics.scene import MATT_PAINT, Material, SceneObject, Sphere
 from armscan.simulation.station import (
     ExposureSettings,
     Station,
@@ -30,14 +27,12 @@ from armscan.simulation.station import (
     seen_from,
     true_stripes,
 )
-from armscan.simulation.surfaces import Sphere
-from armscan.simulation.thing import MATT_PAINT, Finish, Thing
 from armscan.vision.stripe.extract import extract_stripes
 
-MATT = Finish()
-GROUND = Thing("ground", FlatPlate(np.array([200.0, 150.0])), MATT)
-BALL = Thing("ball", Sphere(np.array([2.0, 0.5, 6.0]), 6.0), MATT)
-BLOCK = Thing("block", Box(np.array([20.0, 40.0, 5.0])), MATT)
+MATT = Material()
+GROUND = SceneObject("ground", FlatPlate(np.array([200.0, 150.0])), MATT)
+BALL = SceneObject("ball", Sphere(np.array([2.0, 0.5, 6.0]), 6.0), MATT)
+BLOCK = SceneObject("block", Box(np.array([20.0, 40.0, 5.0])), MATT)
 STAND_OFF_MM = 140.0
 SMALL = Window(1200, 650, 500, 640)
 
@@ -93,7 +88,7 @@ def centroid_errors(
 @pytest.mark.parametrize("seed", [1, 2])
 def test_light_on_a_plate_is_centred_on_the_truth(seed: int) -> None:
     head = quiet(build_head(seed=seed))
-    plate = Thing("plate", FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(seed)))
+    plate = SceneObject("plate", FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(seed)))
     station = Station((plate,))
     window = Window(800, 500, 1200, 1000)
     (stripe,) = true_stripes(head, station, above(), on(window))
@@ -163,7 +158,7 @@ def test_a_block_lifts_the_line_and_hides_the_laser_behind_it() -> None:
 
 def test_extraction_finds_the_truth_within_the_sigma_it_states() -> None:
     head = build_head("thesis-single", "thesis", 3)
-    station = Station((Thing("plate", GROUND.surface, MATT_PAINT),))
+    station = Station((SceneObject("plate", GROUND.surface, MATT_PAINT),))
     rng = np.random.default_rng(11)
     window = head.scan_window
     image = render_exposure(head, station, [above()], on(window), rng)
@@ -233,8 +228,8 @@ def test_gloss_brightens_the_mirror_direction_only() -> None:
     head = replace(head, imaging=base)
     window = Window(400, 400, 2200, 1200)
     ball = BALL.surface
-    matt = light_of(head, Station((Thing("ball", ball, MATT),)), window, 8.0)
-    glossy = light_of(head, Station((Thing("ball", ball, Finish(gloss=2.0)),)), window, 8.0)
+    matt = light_of(head, Station((SceneObject("ball", ball, MATT),)), window, 8.0)
+    glossy = light_of(head, Station((SceneObject("ball", ball, Material(gloss=2.0)),)), window, 8.0)
     gain = glossy - matt
     assert gain.min() > -1e-6
     assert gain.max() > 1.0
@@ -246,7 +241,7 @@ def test_gloss_brightens_the_mirror_direction_only() -> None:
 
 def test_a_post_stands_in_the_cameras_way() -> None:
     post_pose: Pose[Base, Part] = Pose(np.eye(3), np.array([0.0, 6.0, 0.0]))
-    post = Thing("post", Placed(Rod(2.0, 40.0), post_pose), MATT)
+    post = SceneObject("post", Placed(Rod(2.0, 40.0), post_pose), MATT)
     head = quiet(build_head(tolerances=Tolerances(*([0.0] * 8))))
     pose = above()
     free = true_stripes(head, Station((GROUND,)), pose, on(head.full_window))[0]

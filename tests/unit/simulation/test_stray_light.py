@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.frames import Base, Plate, Sensor
-from armscan.geometry.poses import Pose
+from armscan.geometry.poses import Base, Plate, Pose, Sensor
 from armscan.simulation.head import build_head
-from armscan.simulation.imaging import IMAGING
-from armscan.simulation.laser_source import LaserSource, in_sources
-from armscan.simulation.plate import FlatPlate
-from armscan.simulation.shapes import Placed
-from armscan.simulation.stray_light import CentreSpot, stray_lights
-from armscan.simulation.thing import CERAMIC, GROUND_STEEL, Finish, Thing
+from armscan.simulation.objects.shapes import FlatPlate, Placed
+from armscan.simulation.optics.lasers import LaserSource, in_sources
+from armscan.simulation.optics.render import IMAGING
+from armscan.simulation.optics.scene import CERAMIC, GROUND_STEEL, Material, SceneObject
+from armscan.simulation.optics.stray_light import CentreSpot, stray_lights
 
 HERE: Pose[Base, Sensor] = Pose.from_vectors([0.3, 0.2, -0.1], [400.0, 20.0, 150.0])
 THESIS = IMAGING["thesis"]
@@ -28,7 +26,7 @@ def projector() -> LaserSource:
     return source
 
 
-def plate(finish: Finish) -> Thing:
+def plate(finish: Material) -> SceneObject:
     """Turned towards the projector, but not quite; placed in Base by the head's pose."""
     up = np.array([0.5, 0.05, -0.8])
     up /= np.linalg.norm(up)
@@ -37,7 +35,7 @@ def plate(finish: Finish) -> Thing:
     rotation = np.stack([x, np.cross(up, x), up], axis=1)
     sensor_from_plate: Pose[Sensor, Plate] = Pose(rotation, np.array([0.0, 0.0, 140.0]))
     shape = FlatPlate(np.array([200.0, 200.0]))
-    return Thing("plate", Placed(shape, HERE @ sensor_from_plate), finish)
+    return SceneObject("plate", Placed(shape, HERE @ sensor_from_plate), finish)
 
 
 def onto(origins: FloatArray, rays: FloatArray, normal: FloatArray, at: FloatArray) -> FloatArray:

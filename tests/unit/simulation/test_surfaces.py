@@ -8,24 +8,21 @@ import pytest
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.frames import Board, Part, Sensor
-from armscan.geometry.poses import Pose
-from armscan.simulation.board import PrintedBoard
-from armscan.simulation.body import GRADIENT_STEP_MM, HIT_MM, Body, Limb
-from armscan.simulation.bust import bust
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.surfaces import Floor, Sphere
+from armscan.geometry.poses import Board, Part, Pose, Sensor
+from armscan.simulation.objects.boards import CirclePattern, PrintedBoard
+from armscan.simulation.objects.body import GRADIENT_STEP_MM, HIT_MM, Body, MetaballLimb, bust
+from armscan.simulation.optics.scene import Floor, Sphere
 
 POSE: Pose[Sensor, Part] = Pose.from_vectors([0.4, -0.7, 0.3], [10.0, -20.0, 300.0])
 LIMBS = (
-    Limb((0, 0, 0), (0, 40, 0), 20.0, 9.0),
-    Limb((-25, 30, 0), (25, 34, 5), 6.0, 11.0, 8.0),
-    Limb((0, 10, 16), (2, 12, 18), 7.0, 8.0, 3.0, is_hollow=True),
-    Limb((0, 60, 0), (0, 60, 0), 12.0, 12.0, 0.0),
+    MetaballLimb((0, 0, 0), (0, 40, 0), 20.0, 9.0),
+    MetaballLimb((-25, 30, 0), (25, 34, 5), 6.0, 11.0, 8.0),
+    MetaballLimb((0, 10, 16), (2, 12, 18), 7.0, 8.0, 3.0, is_hollow=True),
+    MetaballLimb((0, 60, 0), (0, 60, 0), 12.0, 12.0, 0.0),
 )
 
 
-def distance_by_balls(limb: Limb, points: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_by_balls(limb: MetaballLimb, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """A limb is the union of balls along its axis: search for the nearest one."""
     share = np.linspace(0.0, 1.0, 4001)[:, None]
     centres = (1 - share) * np.array(limb.start_mm) + share * np.array(limb.end_mm)
@@ -34,7 +31,7 @@ def distance_by_balls(limb: Limb, points: NDArray[np.float64]) -> NDArray[np.flo
     return np.asarray(gaps.min(axis=1))
 
 
-def melted(limbs: tuple[Limb, ...], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def melted(limbs: tuple[MetaballLimb, ...], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Readable twin of the kernel."""
     total = distance_by_balls(limbs[0], points)
     for limb in limbs[1:]:
@@ -95,7 +92,7 @@ def test_normals_are_the_gradient_and_face_the_ray() -> None:
 
 
 def test_a_body_of_one_ball_is_a_sphere() -> None:
-    ball = Body((Limb((1, 2, 3), (1, 2, 3), 25.0, 25.0),), POSE)
+    ball = Body((MetaballLimb((1, 2, 3), (1, 2, 3), 25.0, 25.0),), POSE)
     centre = POSE.rotation @ [1.0, 2.0, 3.0] + POSE.translation_mm
     sphere = Sphere(centre, 25.0)
     origins, directions = rays_at_body(900, 4)
@@ -155,11 +152,11 @@ def test_rays_hit_the_whole_bust_and_not_a_part_of_its_limbs() -> None:
 
 def test_impossible_limbs_are_refused() -> None:
     with pytest.raises(InputError, match="positive radii"):
-        Limb((0, 0, 0), (0, 1, 0), 0.0, 1.0)
+        MetaballLimb((0, 0, 0), (0, 1, 0), 0.0, 1.0)
     with pytest.raises(InputError, match="swallows"):
-        Limb((0, 0, 0), (0, 1, 0), 5.0, 1.0)
+        MetaballLimb((0, 0, 0), (0, 1, 0), 5.0, 1.0)
     with pytest.raises(InputError, match="must be solid"):
-        Body((Limb((0, 0, 0), (0, 1, 0), 1.0, 1.0, is_hollow=True),), POSE)
+        Body((MetaballLimb((0, 0, 0), (0, 1, 0), 1.0, 1.0, is_hollow=True),), POSE)
     with pytest.raises(InputError, match="sphere of radius"):
         Sphere(np.zeros(3), -1.0)
 
@@ -168,7 +165,11 @@ def test_rays_along_a_body_neither_stop_before_it_nor_cut_through_it() -> None:
     """Rays that nearly touch: where they must hit is known from dense samples of the distance."""
     pose: Pose[Sensor, Part] = Pose(np.eye(3), np.zeros(3))
     body = Body(
-        (Limb((-30, 0, 0), (30, 0, 0), 9.0, 12.0), Limb((5, 6, 4), (9, 8, 6), 7, 7, 9)), pose
+        (
+            MetaballLimb((-30, 0, 0), (30, 0, 0), 9.0, 12.0),
+            MetaballLimb((5, 6, 4), (9, 8, 6), 7, 7, 9),
+        ),
+        pose,
     )
     rng = np.random.default_rng(4)
     origins = np.column_stack(

@@ -8,16 +8,12 @@ import functools
 import numpy as np
 import pytest
 
-from armscan.devices.twin import Preset
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from armscan.simulation.aim import FACE_DOWN
-from armscan.simulation.arm_inverse import COMFORTABLE_RAD, reach
-from armscan.simulation.instrument import MECHANICS
-from armscan.simulation.measuring_arm import MeasuringArm
-from armscan.simulation.plate_probing import TRUE_PROBE_MM
-from armscan.simulation.screw_arm import nominal_arm
+from armscan.devices.sources import Preset
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.simulation.arm.arm import COMFORTABLE_RAD, MeasuringArm, nominal_arm, reach
+from armscan.simulation.arm.hand import FACE_DOWN
+from armscan.simulation.instrument import MECHANICS, TRUE_PROBE_MM
 
 SEATS_MM = ((450.0, -200.0, 0.0), (620.0, -160.0, 0.0), (780.0, 100.0, 60.0))
 LENGTHS_MM = (100.0, 200.0, 300.0, 400.0, 500.0)

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 
 from armscan.errors import EstimationError
-from armscan.geometry.frames import Base, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import vector_from_rotation
-from armscan.models.arm import quarter_turn_flange, thesis_arm
-from armscan.models.arm_forward import forward
-from armscan.simulation.arm_inverse import COMFORTABLE_RAD, reach
-from armscan.simulation.measuring_arm import ARC_SECOND_RAD, ArmErrors, MeasuringArm, bent_arm
-from armscan.simulation.screw_arm import nominal_arm
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.models.arm import forward, quarter_turn_flange, thesis_arm
+from armscan.simulation.arm.arm import (
+    ARC_SECOND_RAD,
+    COMFORTABLE_RAD,
+    ArmErrors,
+    MeasuringArm,
+    bent_arm,
+    nominal_arm,
+    reach,
+)
 
 
 def test_a_quarter_turn_of_shoulder_and_elbow_is_where_the_drawing_says():

@@ -6,15 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.devices.twin import TwinScene
+from armscan.devices.sources import TwinScene
 from armscan.errors import InputError
-from armscan.records.arm_track import NO_TRIGGER
-from armscan.simulation.aim import Aim
-from armscan.simulation.arm_recording import SAMPLE_NS
-from armscan.simulation.hand_path import Unsteadiness
-from armscan.simulation.sheet_middle import sheet_middle_mm
-from armscan.simulation.strokes import plate_strokes
-from armscan.simulation.sweep import CAMERA_CLOCK_NS, Stroke, sweep
+from armscan.records.recording import NO_TRIGGER
+from armscan.simulation.arm.hand import (
+    CAMERA_CLOCK_NS,
+    HandTremor,
+    HeadOrientation,
+    ScanPass,
+    sweep,
+)
+from armscan.simulation.arm.single_passes import plate_strokes
+from armscan.simulation.head import sheet_middle_mm
+from armscan.simulation.instrument import SAMPLE_NS
 from armscan.simulation.twin import build_twin
 
 TWIN = build_twin(seed=2)
@@ -51,8 +55,8 @@ def test_a_steady_hand_follows_the_line_at_even_speed():
     here = TOOLS.bench.base_from_plate
     start = here.translation_mm
     end = start + 60.0 * here.rotation[:, 0]
-    stroke = Stroke(here.rotation, start, end, Aim(-20.0, 0.0, 0.0, 137.0), 40.0, 4)
-    steady = Unsteadiness(tilt_deg=0.0, depth_mm=0.0, aside_mm=0.0, speed=0.0)
+    stroke = ScanPass(here.rotation, start, end, HeadOrientation(-20.0, 0.0, 0.0, 137.0), 40.0, 4)
+    steady = HandTremor(tilt_deg=0.0, depth_mm=0.0, aside_mm=0.0, speed=0.0)
     done = sweep(stroke, TOOLS.head, TOOLS.arm.true, steady, np.random.default_rng(1))
     times = np.linspace(0.0, 1.5, 31)
     wanted = start + np.outer(40.0 * times, here.rotation[:, 0])
@@ -63,10 +67,10 @@ def test_a_steady_hand_follows_the_line_at_even_speed():
 def test_a_stroke_too_short_for_its_images_is_refused():
     here = TOOLS.bench.base_from_plate
     end = here.translation_mm + 5.0 * here.rotation[:, 0]
-    aim = Aim(0.0, 0.0, 0.0, 137.0)
-    stroke = Stroke(here.rotation, here.translation_mm, end, aim, 40.0, 50)
+    aim = HeadOrientation(0.0, 0.0, 0.0, 137.0)
+    stroke = ScanPass(here.rotation, here.translation_mm, end, aim, 40.0, 50)
     with pytest.raises(InputError, match="50 images"):
-        sweep(stroke, TOOLS.head, TOOLS.arm.true, Unsteadiness(), np.random.default_rng(1))
+        sweep(stroke, TOOLS.head, TOOLS.arm.true, HandTremor(), np.random.default_rng(1))
 
 
 @pytest.mark.parametrize(("scene", "count"), [("plate", 24), ("ball", 70), ("steps", 24)])

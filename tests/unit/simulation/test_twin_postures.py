@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.simulation.hand_eye_plan import PLAN
 from armscan.simulation.instrument import Instrument
+from armscan.simulation.scenes import PLAN
+from armscan.simulation.shots import TwinScan
 from armscan.simulation.twin import build_twin
-from armscan.simulation.twin_scan import TwinScan
 
 
 def _stripe_on_plate(tools: Instrument, scan: TwinScan, row: int) -> np.ndarray:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from armscan.devices.registry import load_driver
-from armscan.devices.scan_source import ScanSource
-from armscan.devices.twin import Probing, Twin, TwinScene, TwinTruth
+from armscan.devices.sources import Probing, ScanSource, Twin, TwinScene, TwinTruth
 from armscan.errors import OptionError
-from armscan.simulation.stations import STEP_CENTRES_MM
+from armscan.simulation.objects.fixtures import STEP_CENTRES_MM
 from armscan.simulation.twin import build_twin
 
 IMAGE_SCENES = [scene for scene in get_args(TwinScene) if scene != "probing"]

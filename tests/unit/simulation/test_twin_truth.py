@@ -10,7 +10,7 @@ import pytest
 
 from armscan.simulation.head import HEADS, RIGHT
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.twin_truth import InstrumentTruth
+from armscan.simulation.twin import InstrumentTruth
 
 
 @pytest.mark.parametrize("name", HEADS)

@@ -8,8 +8,8 @@ import pytest
 from scipy.optimize import brentq
 
 from armscan.errors import InputError
-from armscan.simulation.surfaces import MISS
-from armscan.simulation.wavy_plate import Wave, WavyPlate
+from armscan.simulation.objects.shapes import Wave, WavyPlate
+from armscan.simulation.optics.scene import MISS
 
 PLATE = WavyPlate((110.0, 90.0), (Wave(1.6, 40.0, 15.0, 0.4), Wave(0.9, 26.0, 105.0, 2.0)))
 

@@ -8,22 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.options import StereoOptions
-from armscan.calibration.stereo.pairs import StereoPair
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions, StereoPair
+from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
-from stereo_rig import (
-    CONVERGING,
-    StereoScene,
-    make_pairs,
-    normalised_stereo_error,
-    pair_at,
-)
+from armscan.geometry.rotations import rotation_from_vector
+from stereo_rig import CONVERGING, StereoScene, make_pairs, normalised_stereo_error, pair_at
 
 SCENE = StereoScene(n_pairs=8)
 OPTIONS = StereoOptions(CameraOptions(distortion="k1k2p1p2k3", n_folds=0), n_folds=0)

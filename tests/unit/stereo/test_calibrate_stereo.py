@@ -10,18 +10,16 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.camera.calibrate import calibrate_camera
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.result import CameraFit
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.options import StereoOptions
-from armscan.calibration.stereo.pairs import StereoPair, views_of
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions, StereoPair, views_of
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
-from armscan.models.stereo import IntrinsicsUse
+from armscan.models.two_views import IntrinsicsUse
 from stereo_rig import (
     CONVERGING,
     LEFT,

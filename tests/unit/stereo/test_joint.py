@@ -6,19 +6,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.calibration.stereo.joint import (
+from armscan.calibration.cameras.joint import (
     N_SHARED,
     Predicted,
     StereoState,
-    moved_state,
     predict_left,
     predict_right,
+    retract_state,
+    stack_pair_observations,
 )
-from armscan.calibration.stereo.solve import gather_both
 from stereo_rig import CONVERGING, LEFT, RIGHT, StereoScene, make_pairs
 
 PAIRS, POSES = make_pairs(StereoScene(n_pairs=2), 0)
-OBSERVATIONS = gather_both(PAIRS)
+OBSERVATIONS = stack_pair_observations(PAIRS)
 STATE = StereoState(
     np.concatenate([LEFT.parameters, RIGHT.parameters]),
     CONVERGING,
@@ -40,7 +40,7 @@ def test_derivatives_by_shared_unknowns(side: int, number: int) -> None:
     step, still = np.zeros(N_SHARED), np.zeros((2, 6))
     step[number] = STEPS[number]
     ends = [
-        predicted(moved_state(STATE, np.eye(N_SHARED), sign * step, still), side).points_px
+        predicted(retract_state(STATE, np.eye(N_SHARED), sign * step, still), side).points_px
         for sign in (1.0, -1.0)
     ]
     expected = (ends[0] - ends[1]) / (2.0 * STEPS[number])
@@ -54,7 +54,9 @@ def test_derivatives_by_the_boards_pose(side: int, number: int) -> None:
     steps, size = np.zeros((2, 6)), (1e-6, 1e-4)[number // 3]
     steps[1, number] = size
     ends = [
-        predicted(moved_state(STATE, np.zeros((24, 0)), np.zeros(0), sign * steps), side).points_px
+        predicted(
+            retract_state(STATE, np.zeros((24, 0)), np.zeros(0), sign * steps), side
+        ).points_px
         for sign in (1.0, -1.0)
     ]
     expected = (ends[0] - ends[1]) / (2.0 * size)

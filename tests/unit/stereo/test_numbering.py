@@ -8,18 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.options import StereoOptions
-from armscan.calibration.stereo.pairs import StereoPair
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions, StereoPair
+from armscan.calibration.cameras.result import CameraOptions
+from armscan.calibration.cameras.stereo_result import StereoFit
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.frames import CameraRight, Sensor
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import rotation_from_vector
+from armscan.geometry.poses import CameraRight, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.two_views import TwoViews
-from armscan.vision.targets.definition import Charuco, Chessboard, CircleGrid, Target
-from armscan.vision.targets.symmetry import numberings, renumbered
+from armscan.vision.targets.detect import numberings, renumbered
+from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target
 from stereo_rig import (
     CONVERGING,
     LEFT,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from armscan.cli.run import main
-from armscan.storage.stereo_files import read_stereo_calibration
+from armscan.storage.documents import read_stereo_calibration
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
 PAIRS = DATA / "stereo_chessboard"

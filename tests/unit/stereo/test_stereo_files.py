@@ -10,10 +10,14 @@ import numpy as np
 import pytest
 
 from armscan.errors import FileFormatError
-from armscan.models.stereo import StereoCalibration, StereoDiagnostics
-from armscan.report.file_info import describe_files
-from armscan.storage.calibration_files import camera_document, read_sensor_calibration
-from armscan.storage.stereo_files import read_stereo_calibration, stereo_document
+from armscan.jobs.info import describe_files
+from armscan.models.two_views import StereoCalibration, StereoDiagnostics
+from armscan.storage.documents import (
+    camera_document,
+    read_sensor_calibration,
+    read_stereo_calibration,
+    stereo_document,
+)
 from stereo_rig import CONVERGING, LEFT, RIGHT, held
 
 

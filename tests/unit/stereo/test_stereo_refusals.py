@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.camera.options import CameraOptions
-from armscan.calibration.camera.refusals import LARGEST_FOCAL_SIGMA
-from armscan.calibration.stereo.calibrate import calibrate_stereo
-from armscan.calibration.stereo.options import StereoOptions
-from armscan.calibration.stereo.refusals import LARGEST_BASELINE_SIGMA, reasons_to_refuse
-from armscan.calibration.stereo.result import StereoFit
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import StereoOptions
+from armscan.calibration.cameras.result import LARGEST_FOCAL_SIGMA, CameraOptions
+from armscan.calibration.cameras.stereo_result import (
+    LARGEST_BASELINE_SIGMA,
+    StereoFit,
+    reasons_to_refuse,
+)
 from armscan.models.camera import PARAMETER_NAMES
 from stereo_rig import StereoScene, make_pairs
 

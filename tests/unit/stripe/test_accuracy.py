@@ -4,9 +4,16 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_curves import CircleCurve, StraightCurve, WaveCurve
-from armscan.simulation.stripe_image import NO_NOISE, SimulatedStripe, StripeNoise, StripeScene
-from armscan.vision.stripe.options import StripeOptions
+from armscan.simulation.stripe_image import (
+    NO_NOISE,
+    CircleCurve,
+    SimulatedStripe,
+    StraightCurve,
+    StripeNoise,
+    StripeScene,
+    WaveCurve,
+)
+from armscan.vision.stripe.image import StripeOptions
 from stripe_scenes import line, score
 
 NOISE_LIMIT_PX = 0.045

@@ -6,10 +6,8 @@ import pytest
 
 from armscan.records.exposure import Exposure
 from armscan.simulation.stripe_image import StripeNoise, StripeScene
-from armscan.vision.stripe.colour import find_laser_colour, split_channels
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.laser_off import subtract
-from armscan.vision.stripe.options import StripeOptions
+from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
 from stripe_scenes import line
 
 SCENE = StripeScene((line(75.0),), 320, 240)

@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.simulation.stripe_curves import StraightCurve
-from armscan.simulation.stripe_image import NO_NOISE, SimulatedStripe, StripeNoise, StripeScene
+from armscan.simulation.stripe_image import (
+    NO_NOISE,
+    SimulatedStripe,
+    StraightCurve,
+    StripeNoise,
+    StripeScene,
+)
 from armscan.vision.stripe.extract import extract_stripes
 
 ANGLES_DEG = (-50.0, 55.0)

@@ -6,20 +6,17 @@ import pytest
 from scipy.ndimage import correlate
 from scipy.optimize import curve_fit
 
-from armscan.kernels.stripe_fit import (
-    AMPLITUDE,
-    CENTRE,
-    SIGMA,
-    VARIANCE,
-    fit_profiles,
-    read_sides,
+from armscan.kernels.chains import find_other_lines, walk_chains
+from armscan.kernels.profile_fit import AMPLITUDE, CENTRE, SIGMA, VARIANCE, fit_profiles, read_sides
+from armscan.kernels.ridge import (
+    derivatives_at,
+    find_runs,
+    gaussian_taps,
+    interpolate_columns,
+    refine_candidates,
 )
-from armscan.kernels.stripe_hessian import derivatives_at, gaussian_taps, refine_candidates
-from armscan.kernels.stripe_links import walk_chains
-from armscan.kernels.stripe_neighbours import find_other_lines
-from armscan.kernels.stripe_runs import find_runs, interpolate_columns
-from armscan.kernels.stripe_smooth import SHIFT, smooth_chains
-from armscan.kernels.stripe_smooth import SIGMA as SMOOTH_SIGMA
+from armscan.kernels.smooth import SHIFT, smooth_chains
+from armscan.kernels.smooth import SIGMA as SMOOTH_SIGMA
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""

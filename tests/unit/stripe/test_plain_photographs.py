@@ -3,13 +3,10 @@
 
 import numpy as np
 
-from armscan.records.exposure import Exposure
-from armscan.records.sensor_window import SensorWindow
+from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.level import measure_level
-from armscan.vision.stripe.ridge import find_candidates
-from armscan.vision.stripe.width import find_line_sigma
+from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
 from stripe_scenes import line
 
 

@@ -4,14 +4,11 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_curves import CircleCurve
-from armscan.simulation.stripe_image import NO_NOISE, SimulatedStripe, StripeScene
-from armscan.vision.stripe.centres import StripeCentres
-from armscan.vision.stripe.classic import THESIS_METHODS
+from armscan.simulation.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.level import measure_level
-from armscan.vision.stripe.options import StripeMethod, StripeOptions
-from armscan.vision.stripe.plane import mono_plane
+from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
+from armscan.vision.stripe.ridge import measure_level
+from armscan.vision.stripe.thesis import THESIS_METHODS, StripeCentres
 from stripe_scenes import line, score
 
 METHODS: tuple[StripeMethod, ...] = ("threshold", "centroid", "template", "hessian")

@@ -10,11 +10,10 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
-from armscan.simulation.flat_pattern import ChessboardPattern
-from armscan.simulation.flat_target import Lighting, RenderedTarget
-from armscan.vision.targets.definition import Chessboard
+from armscan.simulation.objects.board_image import Lighting, RenderedTarget
+from armscan.simulation.objects.boards import ChessboardPattern
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import OtherCountSeen, TargetView
+from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
 from target_scenes import (
     BareChessboard,
     exposure,

@@ -7,13 +7,12 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.simulation.flat_pattern import CirclePattern
-from armscan.simulation.flat_target import Lighting, RenderedTarget
-from armscan.vision.targets.circle_centres import correct_centres
+from armscan.simulation.objects.board_image import Lighting, RenderedTarget
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.circle_edges import measure_circles
-from armscan.vision.targets.definition import CircleGrid
+from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.view import TargetView
+from armscan.vision.targets.target import CircleGrid, TargetView
 from target_scenes import camera, exposure, model, nees, render
 
 TARGET = CircleGrid(6, 5, 3.75)

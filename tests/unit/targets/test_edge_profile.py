@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from armscan.vision.targets.edge_profile import fit_profiles
-from armscan.vision.targets.ellipse_band import BandPixels, Rims, band_pixels
+from armscan.vision.targets.circle_edges import fit_profiles
+from armscan.vision.targets.ellipse import BandPixels, Rims, band_pixels
 
 NOISE = 2.0
 SHIFT_PX = 0.3

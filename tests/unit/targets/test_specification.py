@@ -4,10 +4,12 @@ from __future__ import annotations
 import pytest
 
 from armscan.errors import OptionError
-from armscan.vision.targets.definition import Charuco, Chessboard, CircleGrid
-from armscan.vision.targets.options import TargetOptions
-from armscan.vision.targets.specification import (
+from armscan.vision.targets.target import (
     EXAMPLES,
+    Charuco,
+    Chessboard,
+    CircleGrid,
+    TargetOptions,
     describe_target,
     format_target,
     parse_target,

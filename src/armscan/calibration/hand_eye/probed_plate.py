@@ -1,23 +1,135 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plate's plane from touches of a probe (eqs. 2.54 and 2.55)."""
+"""A plate from touches of a ball probe: plane with covariance, its side, touches that do not
+belong to it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
+from scipy.stats import t as student
 
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.calibration.hand_eye.plate_side import TAKEN_FOR_GRANTED, ProbeSide, face_towards
-from armscan.calibration.hand_eye.touch_outliers import find_outliers
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.fitting import Plane, fit_plane, plane_from_coefficients
-from armscan.models.probe_tip import compensate_tip
-from armscan.records.probing import ProbedPoints
+from armscan.geometry.shapes import Plane, fit_plane, plane_from_coefficients
+from armscan.models.probe import compensate_tip
+from armscan.records.points import ProbedPoints
+
+ProbeSide = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+"""Axis of Base along which the plate's face looks, roughly."""
+
+DEFAULT_SIDE: ProbeSide = "+z"
+TAKEN_FOR_GRANTED = "taken for granted: nobody said where the tool was"
+CLEAR_SIDE = 0.26
+"""Cosine of 75 degrees: a plate steeper than that towards an axis has no clear side along it."""
+LEAST_HEIGHT_MM = 1.0
+"""The tool must be further than that from the plate's plane to tell its side."""
+
+
+def face_towards(
+    plane: Plane,
+    towards_mm: FloatArray | None,
+    side: ProbeSide | None,
+    *,
+    is_sign_only: bool = False,
+) -> tuple[Plane, str] | FitFailure:
+    """Turn a plane's normal to the side of the probe.
+
+    Parameters
+    ----------
+    plane
+        The plane in Base.
+    towards_mm
+        (3,) or (M, 3) places of the tool; None where not known.
+    side
+        The user's word, which wins; None to follow the tool, or `DEFAULT_SIDE` without it.
+    is_sign_only
+        Nothing but the normal's sign depends on the side: where nobody says it and `DEFAULT_SIDE`
+        is not clear, the axis that the plate faces most will do.
+
+    Returns
+    -------
+    plane, side_from
+        The plane, and how its side was found, in words; a failure if it is not clear.
+    """
+    if side is None and towards_mm is not None:
+        heights = plane.distance_mm(np.atleast_2d(np.asarray(towards_mm, dtype=np.float64)))
+        above = float(np.median(heights))
+        if abs(above) < LEAST_HEIGHT_MM:
+            return FitFailure(
+                "the tool lies in the plate's plane: the side of the probe is not clear",
+                "say it with --side",
+            )
+        return _facing(plane, above), "where the tool was"
+    how = "as asked for" if side else TAKEN_FOR_GRANTED
+    if side is None and is_sign_only and abs(plane.normal[2]) < CLEAR_SIDE:
+        axis = int(np.argmax(np.abs(plane.normal)))
+        return _facing(plane, float(plane.normal[axis])), f"+{'xyz'[axis]}, {how}"
+    side = side or DEFAULT_SIDE
+    cosine = float(plane.normal["xyz".index(side[1])]) * (1.0 if side[0] == "+" else -1.0)
+    if abs(cosine) < CLEAR_SIDE:
+        return FitFailure(
+            f"the plate stands within {90.0 - np.degrees(np.arccos(CLEAR_SIDE)):.0f} degrees of "
+            f"the axis {side[1]}: '{side}' does not say which side was touched",
+            "say it with --side, along the axis that the plate faces",
+        )
+    return _facing(plane, cosine), f"{side}, {how}"
+
+
+def _facing(plane: Plane, sign: float) -> Plane:
+    """The same plane; its normal turned over, about the first axis, for a negative sign."""
+    if sign > 0.0:
+        return plane
+    return Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
+
+
+OUTLIER_PROBABILITY = 0.01
+"""Chance that good touches, all together, get one of them named."""
+FEWEST_TO_JUDGE = 6
+ROUNDING_MM = 1e-9
+"""Residuals that small are the rounding of numbers, not touches."""
+
+
+def find_outliers(points_mm: FloatArray) -> tuple[int, ...]:
+    """Touches that do not fit the others: the worst first, each judged without itself.
+
+    The externally studentised residual of the worst touch follows Student's t with n - 4 degrees
+    of freedom if all are good; it is named if it is less probable than `OUTLIER_PROBABILITY` over
+    n, and the rest is judged again. At most a quarter of the touches is named.
+    """
+    left = np.arange(len(points_mm))
+    named: list[int] = []
+    while len(left) >= FEWEST_TO_JUDGE and len(named) < len(points_mm) // 4:
+        scores = _studentised(points_mm[left])
+        worst = int(np.argmax(scores))
+        limit = student.isf(OUTLIER_PROBABILITY / (2 * len(left)), len(left) - 4)
+        if not scores[worst] > limit:
+            break
+        named.append(int(left[worst]))
+        left = np.delete(left, worst)
+    return tuple(named)
+
+
+def _studentised(points: FloatArray) -> FloatArray:
+    """(N,) size of each residual over its standard deviation as the others tell it."""
+    fit = fit_plane(points)
+    n = len(points)
+    if isinstance(fit, FitFailure):
+        return np.zeros(n)
+    along = (points - fit.value.point_mm) @ fit.value.axes[:2].T
+    leverage = 1.0 / n + (along**2 / np.maximum((along**2).sum(axis=0), 1e-300)).sum(axis=1)
+    free = np.maximum(1.0 - leverage, 1e-12)
+    squares = float(fit.residuals @ fit.residuals)
+    if squares <= n * ROUNDING_MM**2:
+        return np.zeros(n)
+    others = np.maximum(squares - fit.residuals**2 / free, 1e-24 * squares)
+    return np.asarray(np.abs(fit.residuals) / np.sqrt(others / (n - 4) * free))
+
 
 LEAST_WIDTH = 0.05
 """Touches narrower than this part of their length leave the tilt about that length open."""

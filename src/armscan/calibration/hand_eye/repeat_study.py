@@ -12,11 +12,9 @@ from scipy.stats import chi2
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.euler import euler_from_rotations
-from armscan.geometry.frames import Sensor, Tool
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotation import nearest_rotation
-from armscan.models.scanner import HandEyeCalibration
+from armscan.geometry.poses import Pose, Sensor, Tool
+from armscan.geometry.rotations import euler_from_rotations, nearest_rotation
+from armscan.models.calibration import HandEyeCalibration
 
 REPEAT_NAMES = ("theta_deg", "gamma_deg", "phi_deg", "x_mm", "y_mm", "z_mm")
 """Order of all (6,) and (K, 6) arrays here: angles of eq. 2.69, then the translation in Tool."""
@@ -114,7 +112,8 @@ def study_poses(
     poses
         ``tool_from_sensor`` of each calibration.
     covariances
-        (6, 6) of each in the order of `armscan.models.scanner.HAND_EYE_PARAMETER_NAMES`, or None.
+        (6, 6) of each in the order of
+        `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`, or None.
 
     Raises
     ------
@@ -160,7 +159,7 @@ def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray
     rotation
         (3, 3) of ``tool_from_sensor``; gamma not 90 degrees.
     covariance
-        (6, 6) in the order of `armscan.models.scanner.HAND_EYE_PARAMETER_NAMES`.
+        (6, 6) in the order of `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`.
     """
     theta = float(np.radians(_values(Pose(rotation, np.zeros(3)))[0]))
     turned_y = np.array([0.0, np.cos(theta), np.sin(theta)])

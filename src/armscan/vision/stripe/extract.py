@@ -8,33 +8,37 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.stripe_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
+from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.vision.stripe.classic import THESIS_METHODS, link_centres
-from armscan.vision.stripe.colour import colour_plane
-from armscan.vision.stripe.ends import is_cut_off
+from armscan.vision.stripe.fit import ProfileFits, axis_component, fit_ridge
 from armscan.vision.stripe.flags import (
     is_asymmetric,
     is_background_step,
+    is_cut_off,
     is_near_other_line,
     is_saturated,
     is_short,
 )
-from armscan.vision.stripe.gate import has_laser_colour, is_on_known_ground
-from armscan.vision.stripe.laser_off import check_background
-from armscan.vision.stripe.level import measure_level
-from armscan.vision.stripe.options import StripeOptions
-from armscan.vision.stripe.plane import StripePlane, mono_plane
-from armscan.vision.stripe.profile_fit import ProfileFits, axis_component, fit_ridge
+from armscan.vision.stripe.image import (
+    StripeOptions,
+    StripePlane,
+    check_background,
+    colour_plane,
+    has_laser_colour,
+    is_on_known_ground,
+    mono_plane,
+)
 from armscan.vision.stripe.ridge import (
     RidgePoints,
     find_candidates,
+    find_line_sigma,
     is_bright,
+    measure_level,
     trace_ridges,
 )
-from armscan.vision.stripe.smoothing import Course, curvature, scatter, smooth
-from armscan.vision.stripe.width import find_line_sigma
+from armscan.vision.stripe.smooth import Course, curvature, scatter, smooth
+from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
 """What pixel locking and the shape of the profile leave without any noise."""

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is doubtful about each stripe point."""
+"""What is doubtful about each stripe point, and ends of lines that are cut at a slant."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.kernels.stripe_fit import AMPLITUDE, SKEW, SKEW_NORM
-from armscan.vision.stripe.chains import chain_bounds, chain_lengths_px, sum_along
-from armscan.vision.stripe.profile_fit import ProfileFits
+from armscan.kernels.chains import REACH_PX
+from armscan.kernels.profile_fit import AMPLITUDE, REACH_SIGMAS, SKEW, SKEW_NORM
+from armscan.vision.stripe.fit import ProfileFits, axis_component
+from armscan.vision.stripe.ridge import chain_bounds, chain_lengths_px, mean_along, sum_along
 
 SIGNIFICANT = 5.0
 MERGED_SIGMAS = 20.0
@@ -107,3 +110,127 @@ def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray
 def is_short(points: FloatArray, chain: IntArray, shortest_px: float) -> BoolArray:
     """(N,) True where the point's chain is shorter than ``shortest_px``."""
     return np.asarray(chain_lengths_px(points, chain) < shortest_px)
+
+
+HALF = 4
+"""Neighbours over which the profile's shape is averaged."""
+LEAST_SINE = 0.25
+"""Cuts at a smaller angle to the line are followed no farther than those of this sine."""
+STEEPEST_SINE = 0.87
+REFERENCE_SIGMAS = 15.0
+"""The line farther in, over this length, is what the end is compared with."""
+LEAST_REFERENCE = 8
+SKEW_SCORE = 4.0
+SCATTERS = 3.5
+LEAST_SHRINKING = 0.04
+GAP_SIGMAS = 1.5
+"""A sound stretch longer than this (and a link) is the line itself."""
+MARGIN_SIGMAS = 1.0
+BLUR_PX = 1.0
+"""The cut's own blur, which matters beside narrow lines."""
+BORDER_SIGMAS = 1.0
+BORDER_PX = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Shape:
+    """What the profiles (N,) look like along the chains: width, and how surely they lean.
+
+    ``sine`` is that of the angle between the fitted column or row and the normal.
+    """
+
+    points: FloatArray
+    width: FloatArray
+    mean_width: FloatArray
+    lean: FloatArray
+    sine: FloatArray
+
+
+def is_cut_off(
+    fits: ProfileFits, points: FloatArray, width_px: FloatArray, shape: tuple[int, ...]
+) -> BoolArray:
+    """(N,) True where a line's end inside the image truncates the fitted column or row.
+
+    Where an edge cuts a slanted line, part of the profile lies beyond the cut: it is narrower than
+    the line farther in or leans, and its centre follows the edge. From each end these
+    signs are followed inwards, at least as far as a cut at right angles to the line takes effect
+    (2.7 sigma times the slant's tangent) and at most as far as one along the rows or columns.
+    Ends at the image's border and closed loops have none.
+
+    Parameters
+    ----------
+    fits
+        Fitted profiles.
+    points
+        (N, 2) fitted centres, image pixels.
+    width_px
+        (N,) sigma of the line.
+    shape
+        Rows and columns of the image.
+    """
+    chain = fits.ridge.chain
+    found = np.zeros(len(chain), dtype=np.bool_)
+    seen = _shapes(fits, points, width_px)
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(chain) != 0]))
+    for first, stop in zip(starts, np.append(starts[1:], len(chain)), strict=True):
+        order = np.arange(first, stop)
+        sigma = float(np.median(width_px[first:stop]))
+        gap = float(np.hypot(*(points[first] - points[stop - 1])))
+        if len(order) > 2 * LEAST_REFERENCE and gap <= REACH_PX:
+            continue
+        for inwards in (order, order[::-1]):
+            if not _is_at_border(points[inwards[0]], sigma, shape):
+                found[inwards[: _count_cut(seen, inwards, sigma)]] = True
+    return found
+
+
+def _shapes(fits: ProfileFits, points: FloatArray, width_px: FloatArray) -> _Shape:
+    table, values, chain = fits.ridge.table, fits.values, fits.ridge.chain
+    lean = sum_along(values[:, SKEW], chain, HALF)
+    norm = sum_along(values[:, SKEW_NORM], chain, HALF)
+    across = axis_component(table)
+    ones = np.ones(len(table))
+    return _Shape(
+        points,
+        width_px,
+        mean_along(width_px, ones, chain, HALF),
+        lean / np.sqrt(np.maximum(norm, 1e-12)),
+        np.sqrt(np.maximum(1.0 - across**2, 0.0)),
+    )
+
+
+def _is_at_border(point: FloatArray, sigma_px: float, shape: tuple[int, ...]) -> bool:
+    room = min(point[0], point[1], shape[1] - 1 - point[0], shape[0] - 1 - point[1])
+    return bool(room < BORDER_SIGMAS * sigma_px + BORDER_PX)
+
+
+def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
+    """How many points from the end, in the order ``inwards``, have a truncated profile."""
+    points = seen.points[inwards]
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    reach = REACH_SIGMAS * sigma_px
+    is_near = arc <= 2.0 * reach / LEAST_SINE
+    sine = max(float(np.median(seen.sine[inwards[is_near]])), LEAST_SINE)
+    farthest = min(2.0 * reach / (sine * np.sqrt(1.0 - sine**2)), 0.5 * float(arc[-1]))
+    beyond = (arc >= farthest) & (arc <= farthest + REFERENCE_SIGMAS * sigma_px)
+    chosen = inwards[beyond] if beyond.sum() >= LEAST_REFERENCE else inwards
+    slant = min(float(np.median(seen.sine[chosen])), STEEPEST_SINE)
+    last = (reach + BLUR_PX) * slant / np.sqrt(1.0 - slant**2)
+    width = float(np.median(seen.width[chosen]))
+    spread = max(
+        _spread(seen.width[chosen]) / np.sqrt(2 * HALF + 1), _spread(seen.mean_width[chosen])
+    )
+    narrow = width - max(LEAST_SHRINKING * width, SCATTERS * spread)
+    lean = np.abs(seen.lean[inwards] - np.median(seen.lean[chosen]))
+    leaning = SKEW_SCORE * max(1.0, _spread(seen.lean[chosen]))
+    is_cut = (seen.mean_width[inwards] < narrow) | (lean > leaning)
+    for at in arc[is_cut & (arc < farthest)]:
+        if at - last > GAP_SIGMAS * sigma_px + REACH_PX:
+            break
+        last = max(last, float(at) + MARGIN_SIGMAS * sigma_px)
+    return int(np.searchsorted(arc, last))
+
+
+def _spread(values: FloatArray) -> float:
+    """Standard deviation of most of the values."""
+    return 1.4826 * float(np.median(np.abs(values - np.median(values))))

@@ -1,19 +1,239 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linked ridge points: candidates, then the Hessian at the candidates, then chains."""
+"""Ridge points linked into chains, from the image's noise level and its lines' width."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.kernels.stripe_hessian import gaussian_taps, refine_candidates
-from armscan.kernels.stripe_links import REACH_PX, find_neighbours, place_points, walk_chains
-from armscan.kernels.stripe_runs import find_runs
-from armscan.vision.stripe.chains import strong_median
-from armscan.vision.stripe.level import CELL_PX, ImageLevel
+from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
+from armscan.kernels.chains import find_neighbours, place_points, walk_chains
+from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates
+
+CELL_PX = 64
+SQRT2 = math.sqrt(2.0)
+SAMPLE_STEP_PX = 4
+CLUTTER_LAG_PX = 12
+BACKGROUND_QUANTILE = 0.4
+MAD_TO_SIGMA = 1.4826
+LEAST_NOISE = 0.35
+"""Rounding to whole grey levels hides smaller noise."""
+THRESHOLD_SIGMAS = 6.0
+LEAST_PEAK_SHARE = 0.06
+"""Lines fainter than this share of the brightest ones are reflections, not stripes."""
+PEAK_QUANTILE = 0.999
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageLevel:
+    """What the pixels beside the lines look like.
+
+    Parameters
+    ----------
+    background
+        (rows, columns) float32 background level per cell of `CELL_PX` pixels.
+    noise
+        Standard deviation of a background pixel against its neighbour.
+    clutter
+        The same at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and
+        surface texture show; never less than ``noise``.
+    rise
+        Height above the background at which a line begins.
+    """
+
+    background: NDArray[np.float32]
+    noise: float
+    clutter: float
+    rise: float
+
+
+def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageLevel:
+    """Estimate background and noise from a sample of the pixels.
+
+    Parameters
+    ----------
+    image
+        (H, W) float32.
+    threshold
+        Least height of a line above the background, or None to set it from the noise.
+    """
+    background = _cell_quantiles(image)
+    noise = _noise(image, 1)
+    clutter = max(_noise(image, CLUTTER_LAG_PX), noise)
+    if threshold is None:
+        sample = image[::2, ::2]
+        peak = float(np.quantile(sample, PEAK_QUANTILE)) - float(np.median(background))
+        threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
+    return ImageLevel(background, noise, clutter, threshold)
+
+
+def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    height, width = image.shape
+    rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
+    steps = CELL_PX // SAMPLE_STEP_PX
+    sample = image[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
+    missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
+    filled = np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge")
+    cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
+    ordered = np.sort(cells.reshape(rows, columns, steps * steps), axis=2)
+    return np.ascontiguousarray(ordered[:, :, int(BACKGROUND_QUANTILE * steps * steps)])
+
+
+def _noise(image: NDArray[np.float32], lag: int) -> float:
+    rows = image[:: 2 * SAMPLE_STEP_PX]
+    if rows.shape[1] <= lag:
+        return LEAST_NOISE
+    step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
+    typical = float(np.median(step)) * MAD_TO_SIGMA
+    trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * math.sqrt(math.pi / 2.0)
+    return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2
+
+
+def chain_bounds(chain: IntArray) -> tuple[IntArray, IntArray]:
+    """First index, and index after the last, of each point's chain: two (N,) arrays."""
+    first = np.searchsorted(chain, chain, side="left")
+    stop = np.searchsorted(chain, chain, side="right")
+    return first.astype(np.int64), stop.astype(np.int64)
+
+
+def sum_along(values: FloatArray, chain: IntArray, half: int) -> FloatArray:
+    """Sum (N, ...) over the neighbours within ``half`` places on the same chain."""
+    first, stop = chain_bounds(chain)
+    place = np.arange(len(chain))
+    low = np.maximum(first, place - half)
+    high = np.minimum(stop, place + half + 1)
+    running = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
+    return np.asarray(running[high] - running[low])
+
+
+def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: int) -> FloatArray:
+    """Weighted mean (N,) over the neighbours; 0 where the weights sum to 0."""
+    total = sum_along(weights, chain, half)
+    mean = sum_along(weights * values, chain, half)
+    return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 0.0))
+
+
+def chain_lengths_px(points_px: FloatArray, chain: IntArray) -> FloatArray:
+    """Arc length (N,) of each point's chain."""
+    n = int(chain.max()) + 1 if len(chain) else 0
+    step = np.hypot(*np.diff(points_px, axis=0).T) * (np.diff(chain) == 0)
+    total = np.bincount(chain[1:], weights=step, minlength=n) if n else np.zeros(0)
+    return np.asarray(total[chain])
+
+
+def strong_median(values: FloatArray) -> float:
+    """Median of values (N,) >= 0 weighted by their squares: typical of the strong ones."""
+    order = np.sort(values)
+    weight = np.cumsum(order * order)
+    if not len(order) or weight[-1] <= 0.0:
+        return 0.0
+    return float(order[np.searchsorted(weight, 0.5 * weight[-1])])
+
+
+SCALES_PX = (3.0, 8.0)
+RIDGE_POWER = 1.5
+"""Of the scale, by which second derivatives of ridges are compared (Lindeberg 1998): lines of sigma
+above 5 px are sought at the wider scale."""
+SAMPLE = 3000
+MEASURED = 300
+STRONG_SHARE = 0.4
+REACH_PX = 30.0
+STEP_PX = 0.5
+FWHM_PER_SIGMA = 2.3548
+SIGMA_LIMITS_PX = (0.7, 10.0)
+FALLBACK_PX = 2.0
+ALONG_PX = (-2.0, 0.0, 2.0)
+LOPSIDED = 1.8
+
+
+def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
+    """Median sigma of the brighter lines from their full width at half height, in px.
+
+    Parameters
+    ----------
+    image
+        (H, W) float32.
+    runs
+        (N, 3) candidates; a sample of them is measured across the local ridge direction.
+    level
+        Background and threshold.
+    """
+    points = _strongest(image, runs)
+    if not len(points):
+        return FALLBACK_PX
+    points = points[:: max(len(points) // MEASURED, 1)]
+    profiles = _across(image, points)
+    half_widths, heights = _half_widths(profiles)
+    bright = heights >= max(STRONG_SHARE * strong_median(heights), level.rise)
+    bright &= half_widths < REACH_PX
+    if not bright.any():
+        return FALLBACK_PX
+    fwhm = 2.0 * float(np.median(half_widths[bright]))
+    blur = STEP_PX**2 / 3.0
+    sigma = np.sqrt(max((fwhm / FWHM_PER_SIGMA) ** 2 - blur, 0.0))
+    return float(np.clip(sigma, *SIGMA_LIMITS_PX))
+
+
+def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
+    """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
+
+    A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
+    it would be taken for the line.
+    """
+    sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
+    best, best_strength = np.zeros((0, 6)), 0.0
+    for scale in SCALES_PX:
+        points = np.zeros((len(sample), 6))
+        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), 0.0, points)
+        strength = scale**RIDGE_POWER * strong_median(points[:n, 4])
+        if strength > best_strength:
+            best, best_strength = points[:n], strength
+    return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
+
+
+def _across(image: NDArray[np.float32], points: FloatArray) -> FloatArray:
+    """Profiles (N, K) across the ridges, averaged over a few places along them."""
+    t = np.arange(-REACH_PX, REACH_PX + STEP_PX, STEP_PX)
+    total = np.zeros((len(points), len(t)))
+    for along in ALONG_PX:
+        x = points[:, :1] + points[:, 2:3] * t - points[:, 3:4] * along
+        y = points[:, 1:2] + points[:, 3:4] * t + points[:, 2:3] * along
+        total += map_coordinates(image, [y, x], order=1, mode="nearest")
+    return total / len(ALONG_PX)
+
+
+def _half_widths(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean distance (N,) from the centre to half height, and height (N,).
+
+    The height counts from the higher of the two feet, and is 0 where one side is much wider than
+    the other: an edge between two areas is no line.
+    """
+    middle = profiles.shape[1] // 2
+    near = profiles[:, middle - 2 : middle + 3].mean(axis=1)
+    foot = np.maximum(profiles[:, :middle].min(axis=1), profiles[:, middle:].min(axis=1))
+    height = near - foot
+    level = foot + 0.5 * height
+    sides = [_first_below(side, level) for side in (profiles[:, middle:], profiles[:, middle::-1])]
+    narrow, wide = np.minimum(*sides), np.maximum(*sides)
+    is_line = wide < LOPSIDED * narrow + STEP_PX
+    return 0.5 * (narrow + wide), np.where(is_line, height, 0.0)
+
+
+def _first_below(side: FloatArray, level: FloatArray) -> FloatArray:
+    """Distance (N,) at which each profile (N, K), read outwards, first falls below its level."""
+    rows = np.arange(len(side))
+    below = side < level[:, None]
+    first = np.where(below.any(axis=1), np.argmax(below, axis=1), side.shape[1] - 1)
+    first = np.maximum(first, 1)
+    inner, outer = side[rows, first - 1], side[rows, first]
+    fraction = np.clip((inner - level) / np.maximum(inner - outer, 1e-6), 0.0, 1.0)
+    return np.asarray((first - 1 + fraction) * STEP_PX)
+
 
 LONGEST_RUN_PX = 90
 HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
@@ -45,7 +265,7 @@ class RidgePoints:
         if len(table) == 0:
             return RidgePoints(table, chain)
         step = np.hypot(*np.diff(table[:, :2], axis=0).T)
-        is_new = (np.diff(chain) != 0) | (step > REACH_PX)
+        is_new = (np.diff(chain) != 0) | (step > CHAINS_REACH_PX)
         return RidgePoints(table, np.concatenate([[0], np.cumsum(is_new)]).astype(np.int64))
 
 

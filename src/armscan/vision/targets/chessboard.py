@@ -1,7 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chessboards: a lattice of crossings, numbered by count, ends and tone, measured on raw pixels.
+"""Chessboards: a lattice of crossings, numbered by count, ends and tone, on raw pixels.
 
-The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board is
+The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a
+table:
+one tone. Where that is seen along a side, the outermost corners are the board's own, and the
+count is known although another side is hidden or out of view. A hand or a sheet of paper
+that covers corners does not end along a line of the squares and gives no such evidence.
+
+The camera looks at the front of a print, so that in the image the board's y lies clockwise
+of
+its x. Where several numberings remain, the one whose x points most to the right is taken.
+
+A flat board seen through any lens is a homography followed by a smooth field: a polynomial
+of
+third degree over the image holds distortion and a bow. A corner that a light stripe or a
+shadow
+pulled lies off it by many times the scatter of the rest.
+
+The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board
+is
 enough where its ends tell which part it is.
 """
 
@@ -9,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -16,16 +34,311 @@ import numpy as np
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.board_lattice import NumberedCorners, is_sure, numberings
-from armscan.vision.targets.board_regularity import off_lattice
-from armscan.vision.targets.chessboard_extent import SMALLEST, Extent, extents
-from armscan.vision.targets.crossing_lattice import find_lattices, predict_cells
-from armscan.vision.targets.crossings import find_crossings
-from armscan.vision.targets.definition import Chessboard
+from armscan.vision.targets.crossings import (
+    Crossings,
+    Lattice,
+    cell_arrays,
+    find_crossings,
+    find_lattices,
+    predict_cells,
+)
 from armscan.vision.targets.grey import Grey32, RawGrey, grey_channels, sample
-from armscan.vision.targets.options import TargetOptions
 from armscan.vision.targets.saddle import fit_saddles
-from armscan.vision.targets.view import OtherCountSeen, TargetView
+from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetOptions, TargetView
+
+Side = Literal["ends", "may end", "continues", "unknown"]
+"""What is seen beyond the outermost corners; "may end" where too few of them tell."""
+
+SMALLEST = 3
+"""Fewest columns and rows of corners that are taken for a chessboard."""
+_MIN_FILLED = 0.6
+"""Least fraction of its cells that an outermost row needs in order not to be tried without."""
+_ALONG = (0.2, 0.35)
+_WHOLE = 0.95
+"""Least filled fraction of a rectangle that may be a whole board."""
+_PROBES = (0.12, 0.2, 0.28)
+"""Steps from the corners along both lines: near, so that what covers a board has to end within
+this much of one of its lines in order to be taken for its end."""
+_ALTERNATES = 0.5
+"""Least difference between squares, of the difference beside them, that is one."""
+_ONE_TONE = 0.35
+"""Largest difference beyond the border squares that is none."""
+_AGREEING = 0.7
+_KNOWN = 0.6
+_SUSPECT = 0.4
+"""Fraction of the corners in view that must look like an end to make one possible."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extent:
+    """A rectangle of corners, as they lie in the image.
+
+    Parameters
+    ----------
+    cells
+        (N, 2) cells (a, b) of the corners found, from (0, 0); b lies clockwise of a.
+    points_px
+        (N, 2) their image points.
+    size
+        Counts along a and b.
+    sides
+        What is beyond: before the first and after the last a, before the first and after
+        the last b.
+    """
+
+    cells: IntArray
+    points_px: FloatArray
+    size: tuple[int, int]
+    sides: tuple[Side, Side, Side, Side]
+
+    @property
+    def is_whole(self) -> bool:
+        """Tell whether the corners fill their rectangle and the board does not go on."""
+        is_filled = len(self.cells) >= _WHOLE * self.size[0] * self.size[1]
+        return is_filled and "continues" not in self.sides
+
+    @property
+    def counts(self) -> tuple[int, int]:
+        """Counts along a and b, with one more for a side on which the board goes on."""
+        more = [side == "continues" for side in self.sides]
+        return self.size[0] + more[0] + more[1], self.size[1] + more[2] + more[3]
+
+
+def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
+    """Yield the rectangle of a lattice, then those without its sparse outermost rows.
+
+    Parameters
+    ----------
+    grey
+        (H, W) levels of the image in which the crossings were found.
+    crossings
+        All of the image.
+    lattice
+        Those that make a lattice.
+    """
+    cells, index = cell_arrays(lattice)
+    while len(cells) and (np.ptp(cells, axis=0) + 1).min() >= SMALLEST:
+        low = cells.min(axis=0)
+        size = np.ptp(cells, axis=0) + 1
+        placed = cells - low
+        points = crossings.points_px[index]
+        sides = _sides(grey, placed, points, size)
+        yield Extent(placed, points, (int(size[0]), int(size[1])), sides)
+        kept = _without_sparsest(placed, size)
+        if kept is None:
+            return
+        cells, index = cells[kept], index[kept]
+
+
+def _without_sparsest(cells: IntArray, size: IntArray) -> IntArray | None:
+    """Rows of ``cells`` that remain without the emptiest outermost row; None if all are full."""
+    filled = [
+        (float(np.mean(np.isin(np.arange(size[1 - axis]), cells[on, 1 - axis]))), axis, end)
+        for axis in (0, 1)
+        for end in (0, int(size[axis]) - 1)
+        for on in (cells[:, axis] == end,)
+    ]
+    fraction, axis, end = min(filled)
+    return None if fraction >= _MIN_FILLED else np.flatnonzero(cells[:, axis] != end)
+
+
+def _sides(
+    grey: Grey32, cells: IntArray, points: FloatArray, size: IntArray
+) -> tuple[Side, Side, Side, Side]:
+    grid = _with_one_row_around(cells, points, size)
+    before_b, after_b = _last_side(grey, grid[::-1]), _last_side(grey, grid)
+    turned = grid.transpose(1, 0, 2)
+    return _last_side(grey, turned[::-1]), _last_side(grey, turned), before_b, after_b
+
+
+def _with_one_row_around(cells: IntArray, points: FloatArray, size: IntArray) -> FloatArray:
+    """Image points (b + 2, a + 2, 2) of the rectangle and of one row around it."""
+    b, a = np.mgrid[-1 : size[1] + 1, -1 : size[0] + 1]
+    every = np.stack([a.ravel(), b.ravel()], axis=-1)
+    grid = predict_cells(cells, points, every).reshape(*a.shape, 2)
+    grid[cells[:, 1] + 1, cells[:, 0] + 1] = points
+    return grid
+
+
+def _last_side(grey: Grey32, grid: FloatArray) -> Side:
+    """What lies beyond the last row; ``grid``'s outermost rows are predictions."""
+    border, last, before = grid[-1, 1:-1], grid[-2, 1:-1], grid[-3, 1:-1]
+    sign = (-1.0) ** np.arange(len(last))
+    along_last, along = np.gradient(last, axis=0), np.gradient(border, axis=0)
+    inside = sign * _difference(grey, last, along_last, before - last)
+    known = np.isfinite(inside)
+    if not known.any():
+        return "unknown"
+    contrast = float(np.median(inside[known]))
+    if contrast == 0.0:
+        return "unknown"
+    squares = -sign * _difference(grey, border, along, last - border) / contrast
+    beyond = sign * _difference(grey, border, along, border - last) / contrast
+    known = np.isfinite(squares) & np.isfinite(beyond)
+    if not known.any():
+        return "unknown"
+    alternates = squares[known] > _ALTERNATES
+    is_end = alternates & (np.abs(beyond[known]) < _ONE_TONE)
+    if known.sum() >= max(SMALLEST - 1, _KNOWN * len(known)):
+        if np.mean(is_end) >= _AGREEING:
+            return "ends"
+        if np.mean(alternates & (beyond[known] > _ALTERNATES)) >= _AGREEING:
+            return "continues"
+    return "may end" if np.mean(is_end) >= _SUSPECT else "unknown"
+
+
+def _difference(
+    grey: Grey32, corners_px: FloatArray, along_px: FloatArray, across_px: FloatArray
+) -> FloatArray:
+    """Level (N,) ahead of each corner less that behind it, on one side; NaN out of view."""
+    total = np.zeros(len(corners_px))
+    for p in _ALONG:
+        for q in _PROBES:
+            ahead = sample(grey, corners_px + p * along_px + q * across_px)
+            total += ahead - sample(grey, corners_px - p * along_px + q * across_px)
+    return total / (len(_ALONG) * len(_PROBES))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NumberedCorners:
+    """Corners with their places on the board.
+
+    Parameters
+    ----------
+    cells
+        (N, 2) column and row of each.
+    points_px
+        (N, 2) image points.
+    quarter_turns
+        How far the board's x is turned against the lattice's a.
+    """
+
+    cells: IntArray
+    points_px: FloatArray
+    quarter_turns: int
+
+
+def numberings(extent: Extent, columns: int, rows: int) -> list[NumberedCorners]:
+    """All ways to number the corners of an extent, the one whose x points most to the right first.
+
+    A count that is smaller than the board's needs one side on which the board is seen to end and
+    another on which nothing looks like an end: there the missing rows lie.
+    """
+    found = []
+    size = np.array(extent.size)
+    cells, sides = extent.cells, extent.sides
+    for quarter_turns in range(4):
+        shift = [
+            _first_number(int(n), wanted, sides[2 * axis], sides[2 * axis + 1])
+            for axis, (n, wanted) in enumerate(zip(size, (columns, rows), strict=True))
+        ]
+        if shift[0] is not None and shift[1] is not None:
+            placed = cells + np.array([shift[0], shift[1]])
+            found.append(NumberedCorners(placed, extent.points_px, quarter_turns))
+        # A quarter turn: a becomes b, b runs backwards along the new a.
+        cells = np.stack([size[1] - 1 - cells[:, 1], cells[:, 0]], axis=-1)
+        size = size[::-1]
+        sides = (sides[3], sides[2], sides[0], sides[1])
+    return sorted(found, key=lambda numbered: -_rightness(numbered))
+
+
+def is_sure(choices: list[NumberedCorners], *, is_square: bool) -> bool:
+    """Tell whether the numberings that remain are one but for a turn that the board permits."""
+    turns = {numbered.quarter_turns for numbered in choices}
+    return bool(turns) and (is_square or turns <= {0, 2} or turns <= {1, 3})
+
+
+def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | None:
+    """Number on the board of the first of ``count`` rows; None if it is not known."""
+    if "continues" in (before, after) or count > wanted:
+        return None
+    if count == wanted:
+        return 0
+    if before == "ends" and after == "unknown":
+        return 0
+    if after == "ends" and before == "unknown":
+        return wanted - count
+    return None
+
+
+def _rightness(numbered: NumberedCorners) -> float:
+    design = np.column_stack([numbered.cells, np.ones(len(numbered.cells))])
+    affine = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
+    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
+
+
+_OUTLIER_SIGMAS = 6.0
+_TUKEY = 4.7
+_HOMOGRAPHIES, _ROUNDS = 3, 6
+_TRUSTED = 0.1
+"""Least weight with which a point helps to fix the homography."""
+_POINTS_PER_TERM = 3.0
+"""Fewest points per term of the polynomial; fewer let it follow a single corner."""
+
+
+def off_lattice(
+    board: FloatArray, points_px: FloatArray, least_sigma_px: FloatArray, tolerance_px: float
+) -> tuple[BoolArray, float]:
+    """Tell which of N corners are off the lattice that the others make.
+
+    Parameters
+    ----------
+    board
+        (N, 2) places on the board, any unit.
+    points_px
+        (N, 2) image points.
+    least_sigma_px
+        (N,) their standard deviations; the scatter found is not taken to be smaller.
+    tolerance_px
+        What a print's own errors may be; corners that are off by less stay.
+
+    Returns
+    -------
+    is_off
+        (N,) True for corners to leave out.
+    scatter_px
+        Robust standard deviation, per axis, of the rest; infinite if there is no homography.
+    """
+    weights = np.ones(len(board))
+    size = scatter = np.full(len(board), np.inf)
+    for _ in range(_HOMOGRAPHIES):
+        trusted = weights > _TRUSTED
+        if trusted.sum() < 4:
+            break
+        homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
+        if homography is None:
+            break
+        image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(homography).T
+        mapped = np.asarray(image[:, :2] / image[:, 2:], dtype=np.float64)
+        field = _terms(mapped)
+        for _ in range(_ROUNDS):
+            size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)
+            # The median length of a two-dimensional normal is 1.18 sigma.
+            scatter = np.maximum(np.median(size) / 1.1774, least_sigma_px)
+            weights = np.clip(1.0 - (size / (_TUKEY * 1.5 * scatter)) ** 2, 1e-3, None) ** 2
+    is_off = size > np.maximum(_OUTLIER_SIGMAS * scatter, tolerance_px)
+    return is_off, float(np.median(size) / 1.1774)
+
+
+def _without_itself(field: FloatArray, residual: FloatArray, weights: FloatArray) -> FloatArray:
+    """Distance (N, 2) of each point from the smooth field through the others."""
+    root = np.sqrt(weights)[:, None]
+    q, _ = np.linalg.qr(field * root)
+    smooth = q @ (q.T @ (residual * root)) / root
+    leverage = np.einsum("np,np->n", q, q)
+    return np.asarray((residual - smooth) / np.maximum(1.0 - leverage, 0.05)[:, None])
+
+
+def _terms(image: FloatArray) -> FloatArray:
+    """Polynomial terms (N, P) over the image, as many as the points can bear."""
+    middle = 0.5 * (image.min(axis=0) + image.max(axis=0))
+    x, y = ((image - middle) / np.maximum(0.5 * np.ptp(image, axis=0), 1e-9)).T
+    terms = [np.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3]
+    for count in (10, 6, 3):
+        if len(image) >= _POINTS_PER_TERM * count:
+            return np.stack(terms[:count], axis=-1)
+    return np.stack(terms[:1], axis=-1)
+
 
 MIN_SEEN_FRACTION = 0.4
 """Least fraction of a board's corners that makes a view."""

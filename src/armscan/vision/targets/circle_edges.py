@@ -1,17 +1,206 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sub-pixel edge points of circles, starting from rough ellipses."""
+"""Edge points of circles by least squares on raw pixels, starting from rough ellipses.
+
+Each rim is cut into sectors. In a sector the level depends on the distance d to the rim as
+``I = inner + (outer - inner) Phi((d - shift) / blur)`` with Phi the normal distribution (an
+erf
+edge). Inner level, outer level and shift belong to the sector, the blur to the circle; no
+pixel
+is shared, so that the shifts of sectors are independent and their sigma follows from the
+fit.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr
 
-from armscan.geometry.arrays import BoolArray, FloatArray
-from armscan.vision.targets.edge_profile import EdgeProfiles, fit_profiles
-from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
-from armscan.vision.targets.ellipse_band import Rims, band_pixels
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.vision.targets.ellipse import BandPixels, Ellipses, Rims, band_pixels, fit_ellipses
 from armscan.vision.targets.grey import RawGrey
+
+APERTURE_SIGMA_PX = 0.29
+"""Standard deviation of a pixel's own width, 1 / sqrt(12): no edge is sharper."""
+LEVEL_SCATTER = 0.03
+"""Scatter of the levels along a rim, as a fraction of the contrast."""
+_STEPS = 5
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeProfiles:
+    """Fitted profiles of N circles in K sectors.
+
+    Parameters
+    ----------
+    shift_px
+        (N, K) outward shift of the edge from the rim.
+    sigma_px
+        (N, K) its standard deviation; infinite where a sector has too few pixels.
+    inner, outer
+        (N, K) levels of the two sides.
+    misfit
+        (N, K) mean squared residual of the sector over that of its circle.
+    blur_px
+        (N,) standard deviation of the edge.
+    noise
+        (N,) standard deviation of the residuals, grey levels.
+    """
+
+    shift_px: FloatArray
+    sigma_px: FloatArray
+    inner: FloatArray
+    outer: FloatArray
+    misfit: FloatArray
+    blur_px: FloatArray
+    noise: FloatArray
+
+    @property
+    def contrast(self) -> FloatArray:
+        """(N, K) outer minus inner level."""
+        return self.outer - self.inner
+
+
+def fit_profiles(
+    pixels: BandPixels,
+    n_sectors: int,
+    blur_px: FloatArray,
+    before: EdgeProfiles | None = None,
+) -> EdgeProfiles:
+    """Fit all sectors of all circles by Gauss-Newton steps.
+
+    Parameters
+    ----------
+    pixels
+        The bands' pixels.
+    n_sectors
+        K.
+    blur_px
+        (N,) blur to start from.
+    before
+        An earlier fit: the levels of a circle's sectors are then taken to scatter by
+        `LEVEL_SCATTER` of the contrast around their medians. A sector of a small circle has too
+        few pixels to tell its levels from its shift; in a large one this changes nothing.
+    """
+    n_circles = len(blur_px)
+    turn = np.mod(pixels.angle_rad / (2.0 * np.pi), 1.0)
+    sector = pixels.ellipse * n_sectors + np.minimum(
+        (turn * n_sectors).astype(np.int64), n_sectors - 1
+    )
+    fit = _SectorFit(pixels, sector, n_circles, n_sectors)
+    if before is not None:
+        fit.expect(before)
+    parameters, blur = fit.start(blur_px)
+    for _ in range(_STEPS):
+        parameters, blur = fit.step(parameters, blur)
+    return fit.profiles(parameters, blur)
+
+
+class _SectorFit:
+    """Normal equations of the sectors (3 unknowns each), bordered by the circles' blurs."""
+
+    def __init__(
+        self, pixels: BandPixels, sector: IntArray, n_circles: int, n_sectors: int
+    ) -> None:
+        self._pixels = pixels
+        self._sector = sector
+        self._shape = (n_circles, n_sectors)
+        self._n = n_circles * n_sectors
+        self._count = self._sum(np.ones(len(sector)))
+        width = np.zeros(n_circles)
+        np.maximum.at(width, pixels.ellipse, np.abs(pixels.distance_px))
+        self._width = width
+        self._expected = np.zeros((self._n, 2))
+        self._expectation_weight = np.zeros(self._n)
+
+    def expect(self, before: EdgeProfiles) -> None:
+        """Expect the levels of an earlier fit, with the weight of that many pixels."""
+        n_sectors = self._shape[1]
+        levels = np.stack(
+            [np.median(before.inner, axis=1), np.median(before.outer, axis=1)], axis=-1
+        )
+        contrast = np.maximum(np.abs(levels[:, 1] - levels[:, 0]), 1e-6)
+        weight = (before.noise / (LEVEL_SCATTER * contrast)) ** 2
+        self._expected = np.repeat(levels, n_sectors, axis=0)
+        self._expectation_weight = np.repeat(weight, n_sectors)
+
+    def start(self, blur_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Levels from the two halves of each sector, no shift."""
+        outside = (self._pixels.distance_px > 0.0).astype(np.float64)
+        levels = self._pixels.levels
+        n_outer = self._sum(outside)
+        outer = self._sum(levels * outside) / np.maximum(n_outer, 1.0)
+        inner = self._sum(levels * (1.0 - outside)) / np.maximum(self._count - n_outer, 1.0)
+        return np.stack([inner, outer, np.zeros(self._n)], axis=-1), blur_px.copy()
+
+    def step(self, parameters: FloatArray, blur: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """One step; the blurs' own equations come from eliminating the sectors (Schur)."""
+        residual, columns, by_blur = self._linearise(parameters, blur)
+        inverse = self._inverse(columns)
+        rhs = np.stack([self._sum(c * residual) for c in columns], axis=-1)
+        rhs[:, :2] += self._expectation_weight[:, None] * (self._expected - parameters[:, :2])
+        border = np.stack([self._sum(c * by_blur) for c in columns], axis=-1)
+        eliminated = np.einsum("nij,nj->ni", inverse, border)
+        stiffness = self._sum(by_blur * by_blur) - (border * eliminated).sum(axis=1)
+        pull = self._sum(by_blur * residual) - (rhs * eliminated).sum(axis=1)
+        stiffness, pull = (x.reshape(self._shape).sum(axis=1) for x in (stiffness, pull))
+        blur_step = np.clip(pull / np.maximum(stiffness, 1e-9), -0.4 * blur, 0.6 * blur)
+        new_blur = np.clip(blur + blur_step, APERTURE_SIGMA_PX, 0.8 * self._width)
+        shared = np.repeat(new_blur - blur, self._shape[1])
+        change = np.einsum("nij,nj->ni", inverse, rhs) - eliminated * shared[:, None]
+        changed = parameters + change
+        limit = 0.6 * np.repeat(self._width, self._shape[1])
+        changed[:, 2] = np.clip(changed[:, 2], -limit, limit)
+        return changed, new_blur
+
+    def profiles(self, parameters: FloatArray, blur: FloatArray) -> EdgeProfiles:
+        """Sigma and misfit at the solution."""
+        residual, columns, _ = self._linearise(parameters, blur)
+        inverse = self._inverse(columns)
+        square = self._sum(residual**2).reshape(self._shape)
+        count = self._count.reshape(self._shape)
+        freedom = np.maximum(count.sum(axis=1) - 3.0 * self._shape[1] - 1.0, 1.0)
+        variance = np.maximum(square.sum(axis=1) / freedom, 1e-6)
+        own = square / np.maximum(count - 3.0, 1.0)
+        typical = np.maximum(np.median(own, axis=1), 1e-6)
+        sigma = np.sqrt(inverse[:, 2, 2]).reshape(self._shape) * np.sqrt(variance)[:, None]
+        sigma[count < 5] = np.inf
+        by_sector = parameters.reshape(*self._shape, 3)
+        return EdgeProfiles(
+            by_sector[..., 2],
+            sigma,
+            by_sector[..., 0],
+            by_sector[..., 1],
+            own / typical[:, None],
+            blur,
+            np.sqrt(variance),
+        )
+
+    def _linearise(
+        self, parameters: FloatArray, blur: FloatArray
+    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
+        inner, outer, shift = parameters[self._sector].T
+        s = blur[self._pixels.ellipse]
+        z = (self._pixels.distance_px - shift) / s
+        share = ndtr(z)
+        slope = (outer - inner) * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * s)
+        residual = self._pixels.levels - inner - (outer - inner) * share
+        return residual, [1.0 - share, share, -slope], -slope * z
+
+    def _inverse(self, columns: list[FloatArray]) -> FloatArray:
+        normal = np.zeros((self._n, 3, 3))
+        for i, j in _PAIRS:
+            normal[:, i, j] = normal[:, j, i] = self._sum(columns[i] * columns[j])
+        normal[:, 0, 0] += self._expectation_weight
+        normal[:, 1, 1] += self._expectation_weight
+        trace = np.trace(normal, axis1=1, axis2=2)
+        return np.asarray(np.linalg.inv(normal + (1e-9 * trace + 1e-9)[:, None, None] * np.eye(3)))
+
+    def _sum(self, values: FloatArray) -> FloatArray:
+        return np.bincount(self._sector, values, self._n).astype(np.float64)
+
 
 SECTOR_PX = 4.0
 """Arc length of a sector, px."""

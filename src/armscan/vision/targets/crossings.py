@@ -1,13 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places in an image where two edges cross and the four sectors alternate: chessboard corners.
+"""Crossings of two edges with alternating sectors, and the lattices they form: chessboards.
 
-The blurred image has a saddle there, whatever the contrast. On a ring around a crossing opposite
-sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the outer
+The blurred image has a saddle there, whatever the contrast. On a ring around a crossing
+opposite
+sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the
+outer
 corner of a square or a blob lose it), and it changes its tone twice: the two edges.
+
+From a corner of a chessboard four edges run to its four neighbours, and each neighbour has
+light
+and dark sectors swapped. Crossings that are the nearest such neighbours of each other are
+linked;
+what hangs together is a lattice. Cells in which no crossing was found (a light stripe, a
+reflection, a finger) are bridged by a homography of the cells around them.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
@@ -152,3 +162,272 @@ def _first_of_each(table: FloatArray) -> BoolArray:
         if kept[fine]:
             kept[coarse] = False
     return kept
+
+
+Cell = tuple[int, int]
+Lattice = dict[Cell, int]
+"""Crossing in each cell (a, b); b lies clockwise of a in the image, as y of x."""
+
+_NEIGHBOURS = 24
+_ALONG_EDGE_RAD = 0.25
+_SAME_EDGE_RAD = 0.35
+_MAX_CONTRAST_RATIO = 4.0
+_MIN_CELLS = 6
+_MAX_LATTICES = 8
+_POSITION_TOLERANCE = 0.15
+"""Of a step: how far from its prediction a crossing may lie."""
+_NEAR_CELLS = 14
+_GAP = 2
+"""Most cells without a crossing that are bridged."""
+_MAX_ROUNDS = 40
+
+
+def find_lattices(crossings: Crossings) -> list[Lattice]:
+    """Lattices of at least `_MIN_CELLS` crossings, the largest first."""
+    if len(crossings) < _MIN_CELLS:
+        return []
+    links = _links(crossings)
+    lattices: list[Lattice] = []
+    taken: set[int] = set()
+    for seed in np.argsort(-(links >= 0).sum(axis=1), kind="stable").tolist():
+        if (links[seed] >= 0).sum() < 2:
+            break
+        if seed not in taken:
+            lattice = _connected(crossings, links, seed)
+            taken.update(lattice.values())
+            if len(lattice) >= _MIN_CELLS:
+                lattices.append(lattice)
+    lattices.sort(key=len, reverse=True)
+    grown: list[Lattice] = []
+    held: set[int] = set()
+    for lattice in lattices[:_MAX_LATTICES]:
+        if len(held.intersection(lattice.values())) < 0.5 * len(lattice):
+            whole = _extended(crossings, _regular(crossings, lattice))
+            held.update(whole.values())
+            grown.append(whole)
+    return sorted(grown, key=len, reverse=True)
+
+
+def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
+    """Cells (N, 2) of a lattice and the crossing (N,) in each."""
+    return (
+        np.array(list(lattice), dtype=np.int64).reshape(-1, 2),
+        np.array(list(lattice.values()), dtype=np.int64),
+    )
+
+
+def predict_cells(cells: IntArray, points_px: FloatArray, wanted: IntArray) -> FloatArray:
+    """Image points (M, 2) of ``wanted`` cells (M, 2), each from the known cells nearest to it.
+
+    Parameters
+    ----------
+    cells, points_px
+        (N, 2) known cells and their image points.
+    wanted
+        (M, 2) cells.
+
+    Returns
+    -------
+    (M, 2) image points; NaN where the cells around do not fix a homography.
+    """
+    _, near = _nearest(cells, wanted, min(_NEAR_CELLS, len(cells)))
+    return _mapped_by_homography(
+        (cells[near] - wanted[:, None, :]).astype(np.float64), points_px[near]
+    )
+
+
+def _mapped_by_homography(cells: FloatArray, points_px: FloatArray) -> FloatArray:
+    """Image (M, 2) of the cell (0, 0) by the homographies that M sets of K pairs fix."""
+    middle = points_px.mean(axis=1, keepdims=True)
+    scale = np.maximum(np.abs(points_px - middle).max(axis=(1, 2)), 1e-9)
+    uv = (points_px - middle) / scale[:, None, None]
+    a, b = cells[..., 0], cells[..., 1]
+    one, zero = np.ones_like(a), np.zeros_like(a)
+    blocks = []
+    for k, (x, y, w) in enumerate(((a, b, one), (a, b, one))):
+        u = uv[..., k]
+        left = (x, y, w, zero, zero, zero) if k == 0 else (zero, zero, zero, x, y, w)
+        blocks.append(np.stack([*left, -u * a, -u * b], axis=-1))
+    design = np.concatenate(blocks, axis=1)
+    known = np.concatenate([uv[..., 0], uv[..., 1]], axis=1)
+    normal = design.transpose(0, 2, 1) @ design
+    normal += 1e-7 * np.eye(8)
+    solved = np.linalg.solve(normal, design.transpose(0, 2, 1) @ known[..., None])[..., 0]
+    spans = np.linalg.eigvalsh(
+        np.einsum("mki,mkj->mij", cells - cells.mean(axis=1, keepdims=True), cells)
+    )
+    solved[spans[:, 0] < 0.5] = np.nan
+    return np.asarray(solved[:, [2, 5]] * scale[:, None] + middle[:, 0])
+
+
+def _links(crossings: Crossings) -> IntArray:
+    """Neighbour (N, 4) along the rising edge, the falling edge, and against them; -1 for none."""
+    points = crossings.points_px
+    count = len(points)
+    distance, near = _nearest(points, points, min(_NEIGHBOURS + 1, count))
+    near, distance = near[:, 1:], distance[:, 1:]
+    way = np.arctan2(*np.moveaxis(points[near] - points[:, None, :], -1, 0)[::-1])
+    rising, falling = crossings.rising_rad, crossings.falling_rad
+    swapped = np.abs(_half_turn(rising[near] - falling[:, None])) < _SAME_EDGE_RAD
+    swapped &= np.abs(_half_turn(falling[near] - rising[:, None])) < _SAME_EDGE_RAD
+    contrast = crossings.contrast
+    ratio = np.abs(np.log(contrast[near] / contrast[:, None]))
+    swapped &= ratio < np.log(_MAX_CONTRAST_RATIO)
+    links = np.full((count, 4), -1, dtype=np.int64)
+    for k, edge in enumerate((rising, falling, rising + np.pi, falling + np.pi)):
+        turn = np.mod(way - edge[:, None] + np.pi, 2.0 * np.pi) - np.pi
+        fits = swapped & (np.abs(turn) < _ALONG_EDGE_RAD)
+        first = np.argmin(np.where(fits, distance, np.inf), axis=1)
+        has = fits.any(axis=1)
+        links[has, k] = near[has, first[has]]
+    return _mutual(links)
+
+
+def _nearest(
+    known: FloatArray | IntArray, places: FloatArray | IntArray, count: int
+) -> tuple[FloatArray, IntArray]:
+    """Distance and index (M, count) of the known points nearest to each place."""
+    distance, index = cKDTree(known).query(places, np.arange(1, count + 1))
+    return np.asarray(distance, dtype=np.float64), np.asarray(index, dtype=np.int64)
+
+
+def _mutual(links: IntArray) -> IntArray:
+    """Links without those that the other end does not share."""
+    back = links[np.maximum(links, 0)]
+    shared = (back == np.arange(len(links))[:, None, None]).any(axis=2)
+    return np.where((links >= 0) & shared, links, -1)
+
+
+def _half_turn(angle_rad: FloatArray) -> FloatArray:
+    """Angles modulo half a turn, within a quarter turn of 0."""
+    return np.asarray(np.mod(angle_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)
+
+
+def _connected(crossings: Crossings, links: IntArray, seed: int) -> Lattice:
+    """Cells of everything linked to a seed; a crossing or cell that two claim stays the first's."""
+    points = crossings.points_px
+    edges = np.stack([crossings.rising_rad, crossings.falling_rad], axis=-1)
+    way_a = np.array([np.cos(edges[seed, 0]), np.sin(edges[seed, 0])])
+    way_b = np.array([np.cos(edges[seed, 1]), np.sin(edges[seed, 1])])
+    if way_a[0] * way_b[1] - way_a[1] * way_b[0] < 0.0:
+        way_b = -way_b
+    lattice: Lattice = {(0, 0): seed}
+    taken = {seed}
+    queue: deque[tuple[Cell, FloatArray]] = deque([((0, 0), np.stack([way_a, way_b]))])
+    while queue:
+        cell, ways = queue.popleft()
+        at = lattice[cell]
+        for other in links[at].tolist():
+            if other < 0 or other in taken:
+                continue
+            step = points[other] - points[at]
+            step = step / np.hypot(*step)
+            along = ways @ step
+            axis = int(np.argmax(np.abs(along)))
+            sign = 1 if along[axis] > 0.0 else -1
+            beside = (cell[0] + sign, cell[1]) if axis == 0 else (cell[0], cell[1] + sign)
+            if beside in lattice:
+                continue
+            lattice[beside] = other
+            taken.add(other)
+            queue.append((beside, _carried(edges[other], ways)))
+    return lattice
+
+
+def _carried(edges_rad: FloatArray, ways: FloatArray) -> FloatArray:
+    """The two axes (2, 2) at a neighbour: its own edges nearest to the axes before."""
+    own = np.stack([np.cos(edges_rad), np.sin(edges_rad)], axis=-1)
+    along = ways @ own.T
+    chosen = [0, 1] if abs(along[0, 0] * along[1, 1]) > abs(along[0, 1] * along[1, 0]) else [1, 0]
+    sign = np.sign([along[0, chosen[0]], along[1, chosen[1]]])
+    return np.asarray(own[chosen] * sign[:, None])
+
+
+def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
+    """The lattice without cells that do not lie where their neighbours say."""
+    cells, index = cell_arrays(lattice)
+    if len(cells) < _NEAR_CELLS:
+        return lattice
+    points = crossings.points_px[index]
+    others = _nearest(cells, cells, _NEAR_CELLS)[1][:, 1:]
+    predicted = _mapped_by_homography(
+        (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
+    )
+    missed = np.hypot(*(predicted - points).T)
+    step = _step_px(points, others)
+    is_regular = ~(missed > _POSITION_TOLERANCE * step)
+    return {
+        (int(a), int(b)): int(k)
+        for (a, b), k, keep in zip(cells, index, is_regular, strict=True)
+        if keep
+    }
+
+
+def _step_px(points: FloatArray, others: IntArray) -> FloatArray:
+    """Way (N,) to the nearest other point."""
+    return np.asarray(np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1))
+
+
+def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:
+    """The lattice with crossings that lie, with the right sectors, where its cells continue."""
+    lattice = dict(lattice)
+    for _ in range(_MAX_ROUNDS):
+        cells, index = cell_arrays(lattice)
+        if len(cells) < _MIN_CELLS:
+            return lattice
+        points = crossings.points_px[index]
+        wanted = _free_cells(cells)
+        places = predict_cells(cells, points, wanted)
+        beside = predict_cells(cells, points, wanted + np.array([1, 0]))
+        below = predict_cells(cells, points, wanted + np.array([0, 1]))
+        step = np.minimum(np.hypot(*(beside - places).T), np.hypot(*(below - places).T))
+        known = np.isfinite(places).all(axis=1) & np.isfinite(step)
+        nearest, beside_it = _nearest(crossings.points_px, np.where(known[:, None], places, 0.0), 1)
+        distance, found = nearest[:, 0], beside_it[:, 0]
+        fits = known & (distance < _POSITION_TOLERANCE * step)
+        fits &= ~np.isin(found, index)
+        fits &= _is_alike(crossings, lattice, wanted, found)
+        if not fits.any():
+            return lattice
+        order = np.argsort(distance, kind="stable")
+        used: set[int] = set()
+        for k in order[fits[order]].tolist():
+            if int(found[k]) not in used:
+                used.add(int(found[k]))
+                lattice[int(wanted[k, 0]), int(wanted[k, 1])] = int(found[k])
+    return lattice
+
+
+def _free_cells(cells: IntArray) -> IntArray:
+    """Cells (M, 2) without a crossing, within a gap of one that has."""
+    low = cells.min(axis=0) - _GAP
+    size = np.ptp(cells, axis=0) + 1 + 2 * _GAP
+    taken = np.zeros(size, dtype=np.bool_)
+    taken[tuple((cells - low).T)] = True
+    near = np.zeros_like(taken)
+    for a in range(-_GAP, _GAP + 1):
+        for b in range(-_GAP, _GAP + 1):
+            at = cells - low + np.array([a, b])
+            inside = ((at >= 0) & (at < size)).all(axis=1)
+            near[tuple(at[inside].T)] = True
+    free: IntArray = np.argwhere(near & ~taken).astype(np.int64) + low
+    return free
+
+
+def _is_alike(
+    crossings: Crossings, lattice: Lattice, wanted: IntArray, found: IntArray
+) -> BoolArray:
+    """Tell whether crossings (M,) have the edges and sectors that a lattice has in cells (M, 2)."""
+    cells, index = cell_arrays(lattice)
+    near = _nearest(cells, wanted, 1)[1][:, 0]
+    beside = index[near]
+    parity = (wanted.sum(axis=1) - cells[near].sum(axis=1)) % 2
+    rising, falling = crossings.rising_rad, crossings.falling_rad
+    like_rising = np.where(parity == 0, rising[beside], falling[beside])
+    like_falling = np.where(parity == 0, falling[beside], rising[beside])
+    contrast = np.abs(np.log(crossings.contrast[found] / crossings.contrast[beside]))
+    return np.asarray(
+        (np.abs(_half_turn(rising[found] - like_rising)) < _SAME_EDGE_RAD)
+        & (np.abs(_half_turn(falling[found] - like_falling)) < _SAME_EDGE_RAD)
+        & (contrast < np.log(_MAX_CONTRAST_RATIO))
+    )

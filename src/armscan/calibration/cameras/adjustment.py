@@ -1,0 +1,523 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bundle adjustment of one camera over views of a target: observations, parameters, the damped
+normal equations with the views eliminated, and the covariance of what comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    MAX_STEPS,
+    CameraOptions,
+    DistortionModel,
+)
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, skew
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.vision.targets.target import TargetView
+
+WARP_NAMES = ("bow_x_mm", "bow_y_mm")
+SHARED_NAMES = (*PARAMETER_NAMES, *WARP_NAMES)
+"""Unknowns that all views share: the camera, and the bow of the board."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """Target points of V views, one after the other.
+
+    Parameters
+    ----------
+    points_px
+        (N, 2) observed image points.
+    whitening
+        (N, 2, 2) matrices L with ``L' L`` the inverse of each point's covariance.
+    board_mm
+        (N, 3) points of the flat board.
+    board_warp_shape
+        (N, 2) height of the board per unit of the two bow parameters.
+    starts
+        (V + 1,) first row of each view, and N.
+    width_px, height_px
+        Size of the image.
+    """
+
+    points_px: FloatArray
+    whitening: FloatArray
+    board_mm: FloatArray
+    board_warp_shape: FloatArray
+    starts: tuple[int, ...]
+    width_px: int
+    height_px: int
+
+    @property
+    def n_views(self) -> int:
+        """Count of views."""
+        return len(self.starts) - 1
+
+    def rows(self, view: int) -> slice:
+        """Rows of one view."""
+        return slice(self.starts[view], self.starts[view + 1])
+
+    @property
+    def view_of_point(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """(N,) the view of each point."""
+        return np.repeat(np.arange(self.n_views), np.diff(self.starts))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Values of all unknowns.
+
+    Parameters
+    ----------
+    shared
+        (11,) in the order of `SHARED_NAMES`.
+    rotations
+        (V, 3, 3) of ``sensor_from_board``.
+    translations_mm
+        (V, 3) of ``sensor_from_board``.
+    """
+
+    shared: FloatArray
+    rotations: FloatArray
+    translations_mm: FloatArray
+
+    def camera(self, width_px: int, height_px: int) -> CameraModel:
+        """The camera of this state."""
+        return CameraModel.from_parameters(self.shared[:9], width_px, height_px)
+
+    def pose(self, view: int) -> Pose[Sensor, Board]:
+        """``sensor_from_board`` of one view."""
+        return Pose(self.rotations[view], self.translations_mm[view])
+
+    @staticmethod
+    def from_poses(shared: FloatArray, poses: Sequence[Pose[Sensor, Board]]) -> State:
+        """Put a state together from the shared unknowns and one pose a view."""
+        return State(
+            np.asarray(shared, dtype=np.float64),
+            np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3),
+            np.array([pose.translation_mm for pose in poses]).reshape(-1, 3),
+        )
+
+
+def gather(views: Sequence[TargetView]) -> Observations:
+    """Collect the points of views, which must show images of one size.
+
+    Raises
+    ------
+    InputError
+        If the images differ in size or no view is given.
+    """
+    if not views:
+        raise InputError("no views of the target were given")
+    sizes = {(view.width_px, view.height_px) for view in views}
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise InputError(
+            f"the views come from images of different sizes: {listed} px",
+            remedy="calibrate each camera, and each sensor setting, on its own images",
+        )
+    board = np.concatenate([view.points_board_mm for view in views])
+    covariance = np.concatenate([view.covariance_px2 for view in views])
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance)) if len(board) else covariance
+    return Observations(
+        np.concatenate([view.points_px for view in views]),
+        np.asarray(whitening, dtype=np.float64),
+        board,
+        board_warp_shape(board),
+        tuple(int(n) for n in np.cumsum([0] + [len(view) for view in views])),
+        views[0].width_px,
+        views[0].height_px,
+    )
+
+
+def board_warp_shape(board_mm: FloatArray) -> FloatArray:
+    """(N, 2) factors ``1 - u^2`` and ``1 - v^2`` of the bow (see `BoardWarp`).
+
+    The factors refer to the extent of all points of the target that were seen in any view.
+    """
+    if not len(board_mm):
+        return np.zeros((0, 2))
+    low, high = board_mm[:, :2].min(axis=0), board_mm[:, :2].max(axis=0)
+    half = np.maximum(0.5 * (high - low), np.finfo(np.float64).tiny)
+    unit = (board_mm[:, :2] - 0.5 * (low + high)) / half
+    return np.asarray(1.0 - unit**2)
+
+
+def free_basis(
+    model: DistortionModel, options: CameraOptions, *, with_board_warp: bool
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Directions in the shared unknowns that are solved.
+
+    Returns
+    -------
+    basis
+        (11, F): a step is ``basis @ free_step``.
+    names
+        Names of the camera's free parameters; with a fixed aspect ``fy_px`` follows ``fx_px``.
+    """
+    names = ["fx_px"] + ([] if options.is_aspect_fixed else ["fy_px"])
+    if not options.is_principal_point_fixed:
+        names += ["cx_px", "cy_px"]
+    names += [name for name in PARAMETER_NAMES[4:] if name in DISTORTION_PARAMETERS[model]]
+    solved = names + (list(WARP_NAMES) if with_board_warp else [])
+    return basis_of(solved, is_aspect_fixed=options.is_aspect_fixed), tuple(names)
+
+
+def basis_of(names: Sequence[str], *, is_aspect_fixed: bool) -> FloatArray:
+    """(11, F) directions of F shared unknowns; with a fixed aspect fy follows fx, the first."""
+    basis = np.zeros((len(SHARED_NAMES), len(names)))
+    for column, name in enumerate(names):
+        basis[SHARED_NAMES.index(name), column] = 1.0
+    if is_aspect_fixed:
+        basis[SHARED_NAMES.index("fy_px"), 0] = 1.0
+    return basis
+
+
+CONVERGED = 1e-12
+"""Relative decrease of chi2 at which the iteration ends."""
+
+MAX_DAMPING = 1e12
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Gauss-Newton normal equations in blocks: F shared unknowns and V poses.
+
+    Parameters
+    ----------
+    chi2
+        Weighted sum of squares.
+    shared, cross, pose
+        (F, F), (V, F, 6) and (V, 6, 6) blocks of ``J' J``.
+    shared_gradient, pose_gradient
+        (F,) and (V, 6) of ``J' r`` with r observed minus predicted.
+    """
+
+    chi2: float
+    shared: FloatArray
+    cross: FloatArray
+    pose: FloatArray
+    shared_gradient: FloatArray
+    pose_gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjustment(Generic[S]):
+    """Where an adjustment ended.
+
+    Parameters
+    ----------
+    state
+        The unknowns.
+    equations
+        The normal equations there.
+    is_converged
+        False if the last step allowed still lowered chi2: a lower minimum is near.
+    """
+
+    state: S
+    equations: NormalEquations
+    is_converged: bool
+
+
+def predict(
+    observations: Observations, state: State
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Predict the image points, with derivatives.
+
+    Returns
+    -------
+    predicted_px
+        (N, 2).
+    by_shared
+        (N, 2, 11) derivative by the shared unknowns.
+    by_pose
+        (N, 2, 6) derivative by the pose of the point's view: rotation-vector increment (rad,
+        Sensor frame, on the left) and translation (mm).
+
+    None if the state is impossible: a point behind the camera, or a focal length not positive.
+    """
+    if not np.isfinite(state.shared).all() or min(state.shared[:2]) <= 0.0:
+        return None
+    camera = CameraModel.from_parameters(
+        state.shared[:9], observations.width_px, observations.height_px
+    )
+    board = observations.board_mm.copy()
+    board[:, 2] += observations.board_warp_shape @ state.shared[9:]
+    turned = np.concatenate(
+        [board[observations.rows(v)] @ state.rotations[v].T for v in range(observations.n_views)]
+    )
+    counts = np.diff(observations.starts)
+    points = turned + np.repeat(state.translations_mm, counts, axis=0)
+    if not points[:, 2].min() > 0.0:
+        return None
+    predicted, by_point, by_camera = camera.project_with_jacobian(points)
+    normal = np.repeat(state.rotations[:, :, 2], counts, axis=0)
+    by_height = (by_point @ normal[:, :, None])[:, :, 0]
+    by_bow = by_height[:, :, None] * observations.board_warp_shape[:, None, :]
+    by_shared = np.concatenate([by_camera, by_bow], axis=2)
+    by_pose = np.concatenate([-by_point @ skew(turned), by_point], axis=2)
+    return predicted, by_shared, by_pose
+
+
+def linearise(
+    observations: Observations, state: State, basis: FloatArray, weights: FloatArray
+) -> NormalEquations | None:
+    """Form the normal equations at ``state``; ``weights`` (N,) multiply each point's chi2."""
+    prediction = predict(observations, state)
+    if prediction is None:
+        return None
+    predicted, by_shared, by_pose = prediction
+    return normal_equations(observations, predicted, by_shared @ basis, by_pose, weights)
+
+
+def normal_equations(
+    observations: Observations,
+    predicted_px: FloatArray,
+    by_shared: FloatArray,
+    by_pose: FloatArray,
+    weights: FloatArray,
+) -> NormalEquations:
+    """Sum up the points' equations in blocks.
+
+    Parameters
+    ----------
+    observations
+        N points of V views; a view may have none.
+    predicted_px
+        (N, 2) prediction.
+    by_shared, by_pose
+        (N, 2, F) and (N, 2, 6) its derivatives by the free shared unknowns and by the view's pose.
+    weights
+        (N,) factors of each point's chi2.
+    """
+    whitening = observations.whitening * np.sqrt(weights)[:, None, None]
+    residual = (whitening @ (observations.points_px - predicted_px)[:, :, None])[:, :, 0]
+    jacobian = whitening @ np.concatenate([by_shared, by_pose], axis=2)
+    f = by_shared.shape[2]
+    n = observations.n_views
+    shared, gradient = np.zeros((f, f)), np.zeros(f)
+    cross, pose, pose_gradient = np.zeros((n, f, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6))
+    for v in range(n):
+        rows = observations.rows(v)
+        block = jacobian[rows].reshape(-1, f + 6)
+        normal = block.T @ block
+        projected = block.T @ residual[rows].reshape(-1)
+        shared += normal[:f, :f]
+        gradient += projected[:f]
+        cross[v], pose[v], pose_gradient[v] = normal[:f, f:], normal[f:, f:], projected[f:]
+    return NormalEquations(float(np.sum(residual**2)), shared, cross, pose, gradient, pose_gradient)
+
+
+def damped_step(equations: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray] | None:
+    """Solve the damped normal equations by Schur's complement of the poses.
+
+    Returns
+    -------
+    shared_step, pose_steps
+        (F,) and (V, 6), or None if the matrix is singular.
+    """
+    pose = equations.pose + damping * _diagonals(equations.pose)
+    shared = equations.shared + damping * np.diag(np.diag(equations.shared))
+    try:
+        inverse = np.linalg.inv(pose)
+        carried = equations.cross @ inverse
+        schur = shared - np.sum(carried @ equations.cross.transpose(0, 2, 1), axis=0)
+        right = equations.shared_gradient - np.sum(
+            (carried @ equations.pose_gradient[:, :, None])[:, :, 0], axis=0
+        )
+        shared_step = _solve_scaled(schur, right)
+    except np.linalg.LinAlgError:
+        return None
+    remaining = equations.pose_gradient - equations.cross.transpose(0, 2, 1) @ shared_step
+    return shared_step, (inverse @ remaining[:, :, None])[:, :, 0]
+
+
+def _solve_scaled(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve after scaling to unit diagonal: focal lengths and k3 differ by many orders."""
+    if not len(right):
+        return right
+    diagonal = np.diag(matrix)
+    if not diagonal.min() > 0.0:
+        raise np.linalg.LinAlgError
+    scale = 1.0 / np.sqrt(diagonal)
+    return np.asarray(scale * np.linalg.solve(matrix * np.outer(scale, scale), scale * right))
+
+
+def _diagonals(blocks: FloatArray) -> FloatArray:
+    return np.asarray(blocks * np.eye(blocks.shape[-1]))
+
+
+def moved(
+    state: State, basis: FloatArray, shared_step: FloatArray, pose_steps: FloatArray
+) -> State:
+    """Apply a step; a product of a few dozen rotations stays one to 1e-14."""
+    rotations = np.array(
+        [
+            rotation_from_vector(step[:3]) @ rotation
+            for step, rotation in zip(pose_steps, state.rotations, strict=True)
+        ]
+    )
+    return State(
+        state.shared + basis @ shared_step, rotations, state.translations_mm + pose_steps[:, 3:]
+    )
+
+
+def adjust(
+    observations: Observations,
+    start: State,
+    basis: FloatArray,
+    weights: FloatArray | None = None,
+    max_steps: int = MAX_STEPS,
+) -> Adjustment[State] | FitFailure:
+    """Minimise eq. 2.39, weighted by each point's covariance.
+
+    Parameters
+    ----------
+    observations
+        The image points.
+    start
+        Starting values.
+    basis
+        (11, F) from `free_basis`; (11, 0) solves the poses alone.
+    weights
+        (N,) factors of each point's chi2, 0 to leave a point out; all 1 if None.
+    max_steps
+        Most iterations; what is reached by then is returned.
+
+    Returns
+    -------
+    adjustment
+        The minimum, or what was reached by the last step; or why there is none.
+    """
+    used = np.ones(len(observations.points_px)) if weights is None else weights
+    return descend(
+        start,
+        lambda state: linearise(observations, state, basis, used),
+        lambda state, shared_step, pose_steps: moved(state, basis, shared_step, pose_steps),
+        max_steps,
+    )
+
+
+def descend(
+    start: S,
+    equations_at: Callable[[S], NormalEquations | None],
+    move: Callable[[S, FloatArray, FloatArray], S],
+    max_steps: int = MAX_STEPS,
+) -> Adjustment[S] | FitFailure:
+    """Levenberg-Marquardt with the poses eliminated per view, over any such unknowns.
+
+    Parameters
+    ----------
+    start
+        Starting values.
+    equations_at
+        Normal equations at a state, or None where it is impossible.
+    move
+        The state after a step of the (F,) shared unknowns and the (V, 6) poses.
+    max_steps
+        Most iterations; what is reached by then is returned.
+    """
+    equations = equations_at(start)
+    if equations is None:
+        return FitFailure("the starting values put the board behind the camera")
+    state, damping = start, 1e-4
+    for _ in range(max_steps):
+        step = damped_step(equations, damping)
+        trial = move(state, *step) if step is not None else None
+        proposed = equations_at(trial) if trial is not None else None
+        if trial is None or proposed is None or not proposed.chi2 <= equations.chi2:
+            if damping > MAX_DAMPING or (step is not None and _is_tiny(equations, step)):
+                return Adjustment(state, equations, is_converged=True)
+            damping *= 10.0
+            continue
+        decrease = equations.chi2 - proposed.chi2
+        state, equations, damping = trial, proposed, max(0.1 * damping, 1e-14)
+        if decrease <= CONVERGED * equations.chi2:
+            return Adjustment(state, equations, is_converged=True)
+    return Adjustment(state, equations, is_converged=False)
+
+
+def _is_tiny(equations: NormalEquations, step: tuple[FloatArray, FloatArray]) -> bool:
+    """True if the step promises a decrease that rounding hides."""
+    promised = float(
+        equations.shared_gradient @ step[0] + np.sum(equations.pose_gradient * step[1])
+    )
+    return promised <= CONVERGED * equations.chi2
+
+
+SINGULAR_CONDITION = 1e13
+
+
+def reduced_normal_matrix(equations: NormalEquations) -> FloatArray:
+    """(F, F) normal matrix of the shared unknowns after the poses are eliminated."""
+    carried = equations.cross @ np.linalg.inv(equations.pose)
+    return np.asarray(
+        equations.shared - np.sum(carried @ equations.cross.transpose(0, 2, 1), axis=0)
+    )
+
+
+def condition_number(matrix: FloatArray) -> float:
+    """Condition of a symmetric matrix scaled to unit diagonal; infinite if not positive."""
+    diagonal = np.diag(matrix)
+    if not np.isfinite(matrix).all() or not diagonal.min() > 0.0:
+        return float("inf")
+    scale = 1.0 / np.sqrt(diagonal)
+    values = np.linalg.eigvalsh(matrix * np.outer(scale, scale))
+    return float(values[-1] / values[0]) if values[0] > 0.0 else float("inf")
+
+
+def joint_covariance(
+    equations: NormalEquations, basis: FloatArray
+) -> tuple[FloatArray, float] | FitFailure:
+    """Invert the normal equations.
+
+    Parameters
+    ----------
+    equations
+        At the minimum.
+    basis
+        (S, F) from `free_basis`.
+
+    Returns
+    -------
+    covariance
+        (S + 6 V, S + 6 V) of the shared unknowns and the poses, for points whose covariance is
+        what the detector says; scale it by sigma0 squared.
+    condition
+        Of the reduced normal matrix, see `condition_number`.
+
+    or why the unknowns are not determined.
+    """
+    reduced = reduced_normal_matrix(equations)
+    condition = condition_number(reduced)
+    if not condition < SINGULAR_CONDITION:
+        return FitFailure(
+            f"the views do not determine all camera parameters (condition {condition:.1e})",
+            "add views in which the board is tilted differently and reaches the image's corners, "
+            "or free fewer distortion coefficients",
+        )
+    scale = 1.0 / np.sqrt(np.diag(reduced))
+    free = np.linalg.inv(reduced * np.outer(scale, scale)) * np.outer(scale, scale)
+    s, n = len(basis), len(equations.pose)
+    inverse = np.linalg.inv(equations.pose)
+    # The poses follow the shared unknowns by -V^-1 W' (implicit function).
+    followed = -inverse @ equations.cross.transpose(0, 2, 1)
+    lever = np.concatenate([basis, followed.reshape(6 * n, -1)])
+    covariance = lever @ free @ lever.T
+    for v in range(n):
+        rows = slice(s + 6 * v, s + 6 * v + 6)
+        covariance[rows, rows] += inverse[v]
+    return 0.5 * (covariance + covariance.T), condition

@@ -1,0 +1,496 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrate one camera from views of a target: check and prepare the views, start, choose the
+model, adjust, and put the result together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armscan.calibration.cameras.adjustment import (
+    Observations,
+    free_basis,
+    gather,
+    joint_covariance,
+)
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.model_choice import ChosenModel, choose_model, cross_validate, rms
+from armscan.calibration.cameras.result import (
+    MIN_VIEWS,
+    CameraFit,
+    CameraOptions,
+    CrossValidation,
+    DistortionModel,
+    RefusedView,
+    ViewFit,
+    advise,
+    largest_angle_deg,
+    measure_coverage,
+)
+from armscan.calibration.cameras.robust import (
+    MISFIT_LEVEL,
+    MISFIT_OUTLIERS,
+    Solution,
+    board_residuals,
+    chi2_of_points,
+    claimed_covariances,
+    covariance_with_target_error,
+    decide_board_warp,
+    estimate_target_error,
+    excess_variance_px2,
+    residuals_px,
+    solve_robustly,
+    with_board_warp,
+    with_excess,
+)
+from armscan.calibration.cameras.start import repeated_views, starting_state, view_homography
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.models.camera import CameraModel
+from armscan.vision.targets.target import TargetView
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedViews:
+    """Views sorted by what can be done with them.
+
+    Parameters
+    ----------
+    used
+        Indices of the views that take part.
+    homographies
+        (3, 3) of each used view.
+    left_out
+        Index and reason of views that have a pose and do not take part.
+    refused
+        Views from which no pose can be had.
+    repeats
+        Used views that repeat an earlier one: index to earlier index.
+    """
+
+    used: tuple[int, ...]
+    homographies: tuple[FloatArray, ...]
+    left_out: dict[int, str]
+    refused: tuple[RefusedView, ...]
+    repeats: dict[int, int]
+
+
+def prepare_views(
+    views: Sequence[TargetView], options: CameraOptions
+) -> PreparedViews | FitFailure:
+    """Sort the views, and refuse a set that cannot determine a camera.
+
+    Raises
+    ------
+    InputError
+        If the images differ in size, or two views have one name.
+    OptionError
+        If a view to leave out does not exist.
+    """
+    gather(views)
+    sources = [view.source for view in views]
+    twice = sorted({source for source in sources if sources.count(source) > 1})
+    if twice:
+        raise InputError(f"views share a name: {', '.join(twice)}", remedy="give each image once")
+    unknown = sorted(set(options.leave_out) - set(sources))
+    if unknown:
+        raise OptionError(
+            f"cannot leave out {', '.join(unknown)}: no such view",
+            remedy=f"the views are {', '.join(sources)}",
+        )
+    used: list[int] = []
+    homographies: list[FloatArray] = []
+    left_out: dict[int, str] = {}
+    refused: list[RefusedView] = []
+    for index, view in enumerate(views):
+        homography = view_homography(view, options.min_points)
+        if isinstance(homography, FitFailure):
+            refused.append(RefusedView(view.source, homography.reason))
+        elif view.source in options.leave_out:
+            left_out[index] = "left out by request"
+        else:
+            used.append(index)
+            homographies.append(homography)
+    among_used = repeated_views([views[i] for i in used])
+    repeats = {used[later]: used[earlier] for later, earlier in among_used.items()}
+    prepared = PreparedViews(tuple(used), tuple(homographies), left_out, tuple(refused), repeats)
+    failure = _too_few(prepared, len(views))
+    return prepared if failure is None else failure
+
+
+def _too_few(prepared: PreparedViews, n_given: int) -> FitFailure | None:
+    n_distinct = len(prepared.used) - len(prepared.repeats)
+    if n_distinct >= MIN_VIEWS:
+        return None
+    facts = []
+    if prepared.refused:
+        listed = "; ".join(f"{view.source}: {view.reason}" for view in prepared.refused)
+        facts.append(f"{len(prepared.refused)} not usable ({listed})")
+    if prepared.left_out:
+        facts.append(f"{len(prepared.left_out)} left out")
+    if prepared.repeats:
+        facts.append(f"{len(prepared.repeats)} nearly identical to another")
+    detail = f": of {n_given}, " + ", ".join(facts) if facts else ""
+    return FitFailure(
+        f"{n_distinct} different usable views of the target, a camera needs {MIN_VIEWS}{detail}",
+        "take 10 to 20 images with the board tilted by 20 to 45 degrees in different directions",
+    )
+
+
+N_CAMERA, N_SHARED = 9, 11
+MAX_RELATIVE_FOCAL_SIGMA = 0.05
+
+
+def assemble(
+    views: Sequence[TargetView],
+    prepared: PreparedViews,
+    chosen: ChosenModel,
+    is_misfit: BoolArray,
+    options: CameraOptions,
+) -> CameraFit | FitFailure:
+    """Put the result together, or refuse a solution that the views do not determine."""
+    used = [views[index] for index in prepared.used]
+    solution, validation = chosen.solution, chosen.cross_validation
+    if options.solve_warp:
+        bowed = with_board_warp(solution, options.max_steps)
+        if isinstance(bowed, FitFailure):
+            return bowed
+        solution = bowed
+        sources = tuple(view.source for view in used)
+        validation = cross_validate(solution, sources, options.n_folds)
+    observations = solution.observations
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return determined
+    found = board_residuals(solution)
+    target_error = estimate_target_error(found)
+    covariance = covariance_with_target_error(
+        determined[0], solution.variance_factor, target_error, found
+    )
+    condition = determined[1]
+    refusal = _focal_refusal(solution, covariance)
+    if refusal is not None:
+        return refusal
+    warp = decide_board_warp(chosen.solution, solution, covariance) if options.solve_warp else None
+    camera = solution.state.camera(observations.width_px, observations.height_px)
+    fits, refused = _view_fits(
+        views, prepared, solution, covariance=covariance, is_misfit=is_misfit, camera=camera
+    )
+    kept = solution.weights > 0.0
+    coverage = measure_coverage(
+        observations.points_px[kept],
+        solution.state.rotations[:, :, 2],
+        observations.width_px,
+        observations.height_px,
+    )
+    rows = np.r_[:N_CAMERA, N_SHARED : len(covariance)]
+    fit = CameraFit(
+        camera=camera,
+        covariance=covariance[:N_CAMERA, :N_CAMERA],
+        free_parameters=free_basis(chosen.model, options, with_board_warp=False)[1],
+        joint_covariance=covariance[np.ix_(rows, rows)],
+        views=fits,
+        refused_views=prepared.refused + refused,
+        rms_px=rms(residuals_px(observations, solution.state)[kept]),
+        sigma_point_px=_sigma_point_px(solution),
+        noise_scale=_noise_scale(used, solution),
+        target_error_mm=target_error.sigma_mm,
+        degrees_of_freedom=solution.degrees_of_freedom,
+        condition=condition,
+        coverage=coverage,
+        cross_validation=validation,
+        warp=warp,
+        model_reason=chosen.reason,
+        warnings=(),
+        options=options,
+    )
+    repeats = [(views[a].source, views[b].source) for a, b in prepared.repeats.items()]
+    return advise(fit, repeats, is_converged=solution.is_converged)
+
+
+def _focal_refusal(solution: Solution, covariance: FloatArray) -> FitFailure | None:
+    relative = np.sqrt(np.diag(covariance)[:2]) / solution.state.shared[:2]
+    if relative.max() <= MAX_RELATIVE_FOCAL_SIGMA:
+        return None
+    return FitFailure(
+        f"the focal length is uncertain by {100 * relative.max():.0f} %",
+        "tilt the board by 20 to 45 degrees, in a different direction from view to view, and "
+        "check the number of columns and rows",
+    )
+
+
+def _sigma_point_px(solution: Solution) -> float:
+    kept = solution.weights > 0.0
+    covariances = claimed_covariances(solution.observations)[kept]
+    mean_variance = 0.5 * float(np.mean(np.trace(covariances, axis1=1, axis2=2)))
+    return float(np.sqrt(mean_variance * solution.variance_factor))
+
+
+def _noise_scale(used: Sequence[TargetView], solution: Solution) -> float:
+    kept = solution.weights > 0.0
+    chi2 = float(chi2_of_points(gather(used), solution.state)[kept].sum())
+    return float(np.sqrt(chi2 / max(solution.degrees_of_freedom, 1)))
+
+
+def _view_fits(
+    views: Sequence[TargetView],
+    prepared: PreparedViews,
+    solution: Solution,
+    *,
+    covariance: FloatArray,
+    is_misfit: BoolArray,
+    camera: CameraModel,
+) -> tuple[tuple[ViewFit, ...], tuple[RefusedView, ...]]:
+    """Evidence of each view with a pose, in the order given."""
+    observations = solution.observations
+    residuals = residuals_px(observations, solution.state)
+    fits: dict[int, ViewFit] = {}
+    refused: list[RefusedView] = []
+    for position, index in enumerate(prepared.used):
+        rows = observations.rows(position)
+        block = slice(N_SHARED + 6 * position, N_SHARED + 6 * position + 6)
+        fits[index] = _view_fit(
+            views[index],
+            solution.state.pose(position),
+            covariance=covariance[block, block],
+            residuals=residuals[rows],
+            is_outlier=solution.weights[rows] == 0.0,
+            level=float(solution.view_levels[position]),
+            is_misfit=bool(is_misfit[position]),
+        )
+    for index, note in prepared.left_out.items():
+        left = _left_out_fit(views[index], camera, solution, note)
+        if isinstance(left, FitFailure):
+            refused.append(RefusedView(views[index].source, f"{note}; {left.reason}"))
+        else:
+            fits[index] = left
+    return tuple(fits[index] for index in sorted(fits)), tuple(refused)
+
+
+def _view_fit(
+    view: TargetView,
+    pose: Pose[Sensor, Board],
+    *,
+    covariance: FloatArray,
+    residuals: FloatArray,
+    is_outlier: BoolArray,
+    level: float,
+    is_misfit: bool,
+    left_out: str = "",
+) -> ViewFit:
+    note = left_out
+    if is_misfit:
+        note = f"residuals {np.sqrt(level):.1f} times those of the typical view: leave it out"
+    middle = pose.rotation @ view.points_board_mm.mean(axis=0) + pose.translation_mm
+    tilt = float(np.rad2deg(np.arccos(min(1.0, abs(float(pose.rotation[2, 2]))))))
+    return ViewFit(
+        view=view,
+        sensor_from_board=pose,
+        pose_covariance=covariance,
+        residuals_px=residuals,
+        is_outlier=is_outlier,
+        chi2_per_point=level,
+        tilt_deg=tilt,
+        distance_mm=float(middle[2]),
+        is_used=not left_out,
+        is_misfit=is_misfit,
+        note=note,
+    )
+
+
+def _left_out_fit(
+    view: TargetView,
+    camera: CameraModel,
+    solution: Solution,
+    note: str,
+) -> ViewFit | FitFailure:
+    bow = solution.state.shared[N_CAMERA:]
+    pose = estimate_board_pose(view, camera, bow_mm=bow, allow_ambiguous=True)
+    if isinstance(pose, FitFailure):
+        return pose
+    typical = float(
+        np.mean(np.sum(residuals_px(solution.observations, solution.state) ** 2, axis=1))
+    )
+    level = float(np.mean(np.sum(pose.residuals**2, axis=1))) / max(typical, 1e-300)
+    return _view_fit(
+        view,
+        pose.value,
+        covariance=pose.covariance,
+        residuals=pose.residuals,
+        is_outlier=np.zeros(len(view), dtype=np.bool_),
+        level=level,
+        is_misfit=False,
+        left_out=note,
+    )
+
+
+WRONG_LEVEL = 100.0
+"""A view whose residuals are ten times those of the typical view is not noisy but wrong: numbered
+wrongly, or moved during the exposure."""
+
+EXCESS_ROUNDS = 2
+
+MIN_ANGLE_DEG = 5.0
+"""Boards that differ in tilt by less than this are parallel: the focal length is not determined."""
+
+PARALLEL = FitFailure(
+    "the board is parallel to itself in all views (tilts differ by less than "
+    f"{MIN_ANGLE_DEG:.0f} degrees), so that the focal length is not determined",
+    "tilt the board by 20 to 45 degrees, in a different direction from view to view",
+)
+
+
+def calibrate_camera(
+    views: Sequence[TargetView], options: CameraOptions | None = None
+) -> CameraFit | FitFailure:
+    """Calibrate a camera from views of one flat target.
+
+    Homographies and Zhang's closed form (eqs. 2.27 to 2.35) and linear distortion (2.36 to 2.38)
+    start a Levenberg-Marquardt solution over intrinsics, distortion and all poses (2.39), each
+    point weighted by its covariance (see `armscan.calibration.cameras.robust` for what is added to
+    the detector's). The covariance is that of the normal equations, scaled by sigma0 squared =
+    chi2 / degrees of freedom: the point covariances give the weights, the residuals the level.
+
+    A target of wrong size in mm cannot be noticed here: it scales the poses and leaves the camera
+    as it is. A numbering that starts at the opposite corner of a symmetric target is harmless.
+
+    Parameters
+    ----------
+    views
+        One a photograph, all of one camera.
+    options
+        See `CameraOptions`.
+
+    Returns
+    -------
+    fit
+        The camera with its evidence; or why the views do not determine one.
+
+    Raises
+    ------
+    InputError
+        If the images differ in size, or two views have one name.
+    OptionError
+        If a view to leave out does not exist.
+    """
+    options = options or CameraOptions()
+    prepared = prepare_views(views, options)
+    if isinstance(prepared, FitFailure):
+        return prepared
+    chosen = _solve_model(views, prepared, options)
+    if isinstance(chosen, FitFailure):
+        return chosen
+    while (bad := _to_leave_out(chosen.solution, options)).any():
+        smaller = _without(bad, prepared, chosen.solution)
+        if len(smaller.used) < max(3, len(prepared.used) // 2):
+            break
+        again = _solve_model(views, smaller, options)
+        if isinstance(again, FitFailure):
+            break
+        prepared, chosen = smaller, again
+    return assemble(views, prepared, chosen, misfits(chosen.solution), options)
+
+
+def misfits(solution: Solution) -> BoolArray:
+    """(V,) True for views that fit so much worse than the typical one that they should go."""
+    return np.asarray(
+        (solution.view_levels > MISFIT_LEVEL) | (solution.outlier_shares > MISFIT_OUTLIERS)
+    )
+
+
+def _to_leave_out(solution: Solution, options: CameraOptions) -> BoolArray:
+    """Misfits if wanted; views that are plainly wrong in any case."""
+    if options.leave_out_misfits:
+        return misfits(solution)
+    return np.asarray(solution.view_levels > WRONG_LEVEL)
+
+
+def _without(bad: BoolArray, prepared: PreparedViews, solution: Solution) -> PreparedViews:
+    left_out = dict(prepared.left_out)
+    for position, index in enumerate(prepared.used):
+        if bad[position]:
+            ratio = float(np.sqrt(solution.view_levels[position]))
+            left_out[index] = f"left out: residuals {ratio:.1f} times those of the typical view"
+    keep = [position for position in range(len(prepared.used)) if not bad[position]]
+    used = tuple(prepared.used[position] for position in keep)
+    return PreparedViews(
+        used,
+        tuple(prepared.homographies[position] for position in keep),
+        left_out,
+        prepared.refused,
+        {later: earlier for later, earlier in prepared.repeats.items() if later in used},
+    )
+
+
+def _solve_model(
+    views: Sequence[TargetView], prepared: PreparedViews, options: CameraOptions
+) -> ChosenModel | FitFailure:
+    """Solve with the wanted model, or with the one that the rule chooses."""
+    used = [views[index] for index in prepared.used]
+    observations = gather(used)
+    sources = tuple(view.source for view in used)
+
+    def solve(model: DistortionModel) -> Solution | FitFailure:
+        return _solve(used, observations, prepared, model, options)
+
+    def validate(solution: Solution, reference: Solution) -> CrossValidation | None:
+        on_points = replace(solution, weights=reference.weights)
+        return cross_validate(on_points, sources, options.n_folds)
+
+    def folds(solution: Solution) -> bool:
+        camera = solution.state.camera(observations.width_px, observations.height_px)
+        return len(camera.folded_border()) > 0
+
+    if options.distortion == "auto" and options.n_folds:
+        return choose_model(solve, validate, folds)
+    model: DistortionModel = options.distortion
+    reason = f"{model} was asked for"
+    if model == "auto":
+        model, reason = "k1k2p1p2k3", "all five coefficients, no hold-out test was wanted"
+    solution = solve(model)
+    if isinstance(solution, FitFailure):
+        return solution
+    return ChosenModel(model, solution, validate(solution, solution), reason)
+
+
+def _solve(
+    used: Sequence[TargetView],
+    observations: Observations,
+    prepared: PreparedViews,
+    model: DistortionModel,
+    options: CameraOptions,
+) -> Solution | FitFailure:
+    start = starting_state(used, observations, prepared.homographies, model, options)
+    if isinstance(start, FitFailure):
+        return start
+    basis, _ = free_basis(model, options, with_board_warp=False)
+    solution = solve_robustly(observations, start[0], basis, start[1], options.max_steps)
+    for _ in range(EXCESS_ROUNDS):
+        if isinstance(solution, FitFailure):
+            return solution
+        excess = _excess_variance_px2(observations, solution)
+        if excess <= 0.0:
+            break
+        noisier = with_excess(observations, excess)
+        solution = solve_robustly(noisier, solution.state, basis, start[1], options.max_steps)
+    if isinstance(solution, FitFailure):
+        return solution
+    if largest_angle_deg(solution.state.rotations[:, :, 2]) < MIN_ANGLE_DEG:
+        return PARALLEL
+    return solution
+
+
+def _excess_variance_px2(observations: Observations, solution: Solution) -> float:
+    """Variance to add to the detector's covariances, by the rule of `calibration.camera.noise`."""
+    kept = solution.weights > 0.0
+    return excess_variance_px2(
+        residuals_px(observations, solution.state)[kept],
+        claimed_covariances(observations)[kept],
+        float(chi2_of_points(observations, solution.state)[kept].sum()),
+        solution.degrees_of_freedom,
+    )

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of views for a stereo calibration, its options, and what each camera gives by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import get_args
+
+import numpy as np
+
+from armscan.calibration.cameras.adjustment import basis_of
+from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.model_choice import rms
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import CameraCalibration
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.two_views import IntrinsicsUse
+from armscan.vision.targets.detect import Numbering, renumbered
+from armscan.vision.targets.target import Target, TargetView
+
+INTRINSICS_USES: tuple[IntrinsicsUse, ...] = get_args(IntrinsicsUse)
+
+MIN_PAIRS = 3
+"""Two pairs that disagree do not say which of them is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class StereoOptions:
+    """How two cameras are calibrated together.
+
+    Parameters
+    ----------
+    camera
+        Of each camera: distortion model, what is held, least points of a view, most steps. What it
+        says of views to leave out and of folds does not count here.
+    intrinsics
+        What given calibrations of the cameras are for: ``free`` takes none, ``prior`` takes their
+        values with their covariance as observations beside the images, ``fixed`` holds them (their
+        covariance is carried into the result).
+    leave_out
+        Names of images whose pairs are not used.
+    leave_out_misfits
+        Use the images of pairs that disagree with the others for each camera alone, instead of
+        only naming such pairs. Pairs that are plainly wrong are taken apart in any case.
+    n_folds
+        Folds of the hold-out test over pairs; 0 switches it off.
+    """
+
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    intrinsics: IntrinsicsUse = "free"
+    leave_out: tuple[str, ...] = ()
+    leave_out_misfits: bool = False
+    n_folds: int = 5
+
+    def __post_init__(self) -> None:
+        if self.intrinsics not in INTRINSICS_USES:
+            raise OptionError(
+                f"intrinsics '{self.intrinsics}' is not known",
+                remedy="choose " + ", ".join(INTRINSICS_USES),
+            )
+        if self.n_folds < 0 or self.n_folds == 1:
+            raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")
+
+
+SIDES = ("left", "right")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoPair:
+    """What the two cameras saw of the target at one instant.
+
+    Parameters
+    ----------
+    left, right
+        The views; None where a camera did not find the target.
+    """
+
+    left: TargetView | None
+    right: TargetView | None
+
+    def __post_init__(self) -> None:
+        if self.left is None and self.right is None:
+            raise InputError("a pair needs a view of at least one camera")
+
+    @property
+    def name(self) -> str:
+        """Names of its images."""
+        return " + ".join(view.source for view in self.views if view is not None)
+
+    @property
+    def views(self) -> tuple[TargetView | None, TargetView | None]:
+        """Left and right view."""
+        return self.left, self.right
+
+    @property
+    def is_seen_by_both(self) -> bool:
+        """True if both cameras found the target."""
+        return self.left is not None and self.right is not None
+
+    def numbered(self, target: Target, right: Numbering) -> StereoPair:
+        """The pair with other numbers of the target's points in the right image."""
+        view = self.right
+        return self if view is None else replace(self, right=renumbered(view, target, right))
+
+
+def views_of(pairs: Sequence[StereoPair], side: int) -> list[TargetView]:
+    """All views of one camera, 0 for the left and 1 for the right."""
+    return [view for pair in pairs if (view := pair.views[side]) is not None]
+
+
+def check_pairs(pairs: Sequence[StereoPair], leave_out: Sequence[str]) -> list[StereoPair]:
+    """The pairs without those to leave out.
+
+    Raises
+    ------
+    InputError
+        If two views of one camera have one name.
+    OptionError
+        If a pair to leave out does not exist.
+    """
+    for side, word in enumerate(SIDES):
+        names = [view.source for view in views_of(pairs, side)]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(
+                f"{word} images share a name: {', '.join(twice)}", remedy="give each image once"
+            )
+    known = {view.source for pair in pairs for view in pair.views if view is not None}
+    unknown = sorted(set(leave_out) - known)
+    if unknown:
+        raise OptionError(
+            f"cannot leave out {', '.join(unknown)}: no such image with the target",
+            remedy=f"the images are {', '.join(sorted(known))}",
+        )
+    return [
+        pair
+        for pair in pairs
+        if not any(view is not None and view.source in leave_out for view in pair.views)
+    ]
+
+
+WRONG_LEVEL = 100.0
+"""Given intrinsics ten standard deviations from what the images say are of another camera, if those
+given for the other camera lie within three..."""
+RIGHT_LEVEL = 9.0
+
+STRANGE_RATIO = 2.0
+"""Given intrinsics under which the images fit twice as badly as with a camera of their own belong
+to another camera, or to another focus."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SingleCamera:
+    """One camera before the two are solved together.
+
+    Parameters
+    ----------
+    camera
+        Starting values, or what is held.
+    free_parameters
+        Names of those of its parameters that will be solved.
+    basis
+        (9, F) directions of these.
+    outliers
+        (M,) outliers among the points of each view that can be used, by source.
+    left_out
+        Reason for each other view, by source.
+    fit
+        The camera by itself; None if its views do not determine one and it was given.
+    reason
+        Why these parameters are free.
+    given_level
+        Squared distance of given intrinsics from what the images say by themselves, over both
+        covariances and the degrees of freedom; NaN where there is none.
+    """
+
+    camera: CameraModel
+    free_parameters: tuple[str, ...]
+    basis: FloatArray
+    outliers: Mapping[str, BoolArray]
+    left_out: Mapping[str, str]
+    fit: CameraFit | None
+    reason: str
+    given_level: float = float("nan")
+
+    def kept(self, view: TargetView | None) -> TargetView | None:
+        """The view if it can be used."""
+        return view if view is not None and view.source in self.outliers else None
+
+
+def prepare_cameras(
+    views: Sequence[Sequence[TargetView]],
+    options: StereoOptions,
+    given: tuple[CameraCalibration, CameraCalibration] | None,
+) -> tuple[SingleCamera, SingleCamera] | FitFailure:
+    """Solve each camera by itself, and check given intrinsics against its images.
+
+    Parameters
+    ----------
+    views
+        Of the left and of the right camera.
+    options
+        See `StereoOptions`.
+    given
+        Calibrations of both, for intrinsics that are not ``free``.
+
+    Raises
+    ------
+    InputError
+        If images and a given camera differ in size.
+    """
+    prepared = []
+    for side, word in enumerate(SIDES):
+        fit = calibrate_camera(views[side], replace(options.camera, leave_out=()))
+        if given is None:
+            if isinstance(fit, FitFailure):
+                return FitFailure(f"{word} camera: {fit.reason}", fit.remedy)
+            prepared.append(_solved(fit, options))
+            continue
+        _check_size(views[side], given[side].camera, word)
+        own = None if isinstance(fit, FitFailure) else fit
+        strange = None if own is None else _strange(views[side], own, given, side)
+        if strange is not None:
+            return strange
+        prepared.append(_given(views[side], given[side], own, options))
+    return prepared[0], prepared[1]
+
+
+def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
+    left_out = {view.source: view.note for view in fit.views if not view.is_used}
+    left_out |= {view.source: view.reason for view in fit.refused_views}
+    basis = basis_of(fit.free_parameters, is_aspect_fixed=options.camera.is_aspect_fixed)
+    return SingleCamera(
+        fit.camera,
+        fit.free_parameters,
+        basis[: len(PARAMETER_NAMES)],
+        {view.source: view.is_outlier for view in fit.used_views},
+        left_out,
+        fit,
+        fit.model_reason,
+    )
+
+
+def _given(
+    views: Sequence[TargetView],
+    given: CameraCalibration,
+    fit: CameraFit | None,
+    options: StereoOptions,
+) -> SingleCamera:
+    known = np.diag(given.covariance) > 0.0
+    is_prior = options.intrinsics == "prior"
+    names = tuple(name for name, is_free in zip(PARAMETER_NAMES, known, strict=True) if is_free)
+    free = names if is_prior else ()
+    outliers: dict[str, BoolArray] = {}
+    left_out: dict[str, str] = {}
+    found = {view.source: view for view in fit.used_views} if fit is not None else {}
+    refused = {view.source: view.reason for view in fit.refused_views} if fit is not None else {}
+    for view in views:
+        if len(view) < options.camera.min_points or view.source in refused:
+            left_out[view.source] = refused.get(view.source, f"only {len(view)} target points")
+        elif fit is not None and view.source not in found:
+            left_out[view.source] = "its residuals are far larger than those of the other views"
+        else:
+            is_known = view.source in found
+            outliers[view.source] = (
+                found[view.source].is_outlier if is_known else np.zeros(len(view), dtype=np.bool_)
+            )
+    word = "a prior" if is_prior else "held"
+    return SingleCamera(
+        given.camera,
+        free,
+        basis_of(free, is_aspect_fixed=False)[: len(PARAMETER_NAMES)],
+        outliers,
+        left_out,
+        fit,
+        f"the given calibration is {word}",
+        float("nan") if fit is None else _level(fit, given),
+    )
+
+
+def _check_size(views: Sequence[TargetView], camera: CameraModel, word: str) -> None:
+    for view in views:
+        if (view.width_px, view.height_px) != (camera.width_px, camera.height_px):
+            raise InputError(
+                f"the image is {view.width_px}x{view.height_px} px, the {word} camera was "
+                f"calibrated with {camera.width_px}x{camera.height_px} px",
+                where=view.source,
+                remedy="give the calibration of the camera that took the images, and check that "
+                "left and right are not swapped",
+            )
+
+
+def _strange(
+    views: Sequence[TargetView],
+    own: CameraFit,
+    given: tuple[CameraCalibration, CameraCalibration],
+    side: int,
+) -> FitFailure | None:
+    """Why the given camera cannot be the one that took the images."""
+    word, other = SIDES[side], SIDES[1 - side]
+    if _level(own, given[side]) > WRONG_LEVEL and _level(own, given[1 - side]) < RIGHT_LEVEL:
+        return FitFailure(
+            f"the {word} images fit the calibration given for the {other} camera, and not that "
+            f"given for the {word} one: left and right are swapped",
+            "swap the lists of images, or the two calibrations",
+        )
+    with_given, with_other = (_rms_px(views, given[k].camera) for k in (side, 1 - side))
+    if with_given < STRANGE_RATIO * own.rms_px:
+        return None
+    reason = (
+        f"the {word} images do not fit the calibration given for the {word} camera: rms "
+        f"{with_given:.2f} px, and {own.rms_px:.2f} px with a camera of their own"
+    )
+    if with_other < STRANGE_RATIO * own.rms_px:
+        return FitFailure(
+            f"{reason}; they fit that of the {other} camera ({with_other:.2f} px)",
+            "swap the lists of images, or the two calibrations",
+        )
+    return FitFailure(reason, "calibrate the cameras as they are focused now, or give none")
+
+
+def _level(own: CameraFit, given: CameraCalibration) -> float:
+    """Squared distance of given intrinsics from the camera's own, per degree of freedom."""
+    a, b = own.camera, given.camera
+    if (a.width_px, a.height_px) != (b.width_px, b.height_px):
+        return float("inf")
+    free = np.flatnonzero(own.sigma > 0.0)
+    apart = (a.parameters - b.parameters)[free]
+    covariance = (own.covariance + given.covariance)[np.ix_(free, free)]
+    sigma = np.sqrt(np.diag(covariance))
+    white = np.linalg.solve(covariance / np.outer(sigma, sigma), apart / sigma)
+    return float(white @ (apart / sigma)) / len(free)
+
+
+def _rms_px(views: Sequence[TargetView], camera: CameraModel) -> float:
+    """Of the poses alone; infinite if the camera cannot have taken the images."""
+    residuals = []
+    for view in views:
+        if (view.width_px, view.height_px) != (camera.width_px, camera.height_px):
+            return float("inf")
+        pose = estimate_board_pose(view, camera, allow_ambiguous=True)
+        if not isinstance(pose, FitFailure):
+            residuals.append(pose.residuals)
+    return rms(np.concatenate(residuals)) if residuals else float("inf")

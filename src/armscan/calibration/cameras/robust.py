@@ -1,0 +1,459 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What disturbs a bundle adjustment: the noise of the target's points, outliers, errors of the
+target itself and the bend of the board.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from armscan.calibration.cameras.adjustment import (
+    SHARED_NAMES,
+    WARP_NAMES,
+    NormalEquations,
+    Observations,
+    State,
+    adjust,
+    predict,
+)
+from armscan.calibration.cameras.result import BoardWarp
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+
+SIGNIFICANT_SIGMAS = 4.0
+
+
+def excess_variance_px2(
+    residuals: FloatArray, covariances: FloatArray, chi2: float, degrees_of_freedom: int
+) -> float:
+    """Variance per axis to be added to the detector's covariances.
+
+    Parameters
+    ----------
+    residuals
+        (N, 2) of the points used, in px.
+    covariances
+        (N, 2, 2) that the detector claims for them.
+    chi2
+        Squared residuals over these covariances.
+    degrees_of_freedom
+        Coordinates minus unknowns.
+
+    Returns
+    -------
+    variance
+        In px^2; 0 unless chi2 is larger than its expectation by four of its standard deviations.
+    """
+    if degrees_of_freedom < 1:
+        return 0.0
+    expected_spread = np.sqrt(2.0 / degrees_of_freedom)
+    if chi2 / degrees_of_freedom < 1.0 + SIGNIFICANT_SIGMAS * expected_spread:
+        return 0.0
+    scatter = float(np.sum(residuals**2)) / degrees_of_freedom
+    claimed = 0.5 * float(np.mean(np.trace(covariances, axis1=1, axis2=2)))
+    return max(scatter - claimed, 0.0)
+
+
+def claimed_covariances(observations: Observations) -> FloatArray:
+    """(N, 2, 2) covariances in px^2 that the whitening stands for."""
+    whitening = observations.whitening
+    return np.asarray(np.linalg.inv(whitening.transpose(0, 2, 1) @ whitening))
+
+
+def with_excess(observations: Observations, variance_px2: float) -> Observations:
+    """The observations with a variance added to every point and axis."""
+    covariances = claimed_covariances(observations) + variance_px2 * np.eye(2)
+    return replace(observations, whitening=np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+MEDIAN_OF_CHI2_2 = 2.0 * float(np.log(2.0))
+"""Median of a chi-squared variable with two degrees of freedom."""
+
+FALSE_ALARM = 1e-3
+"""A point is an outlier if Gaussian noise would yield one so far out, among all the points of a
+calibration, once in a thousand calibrations."""
+
+MISFIT_LEVEL = 9.0
+"""A view is a misfit if its residuals are three times as large as in the typical view."""
+
+MISFIT_OUTLIERS = 0.25
+"""...or if more than this share of its points are outliers."""
+
+SUSPECT_LEVEL = 4.0
+CAUCHY_SCALE = 2.4
+ROBUST_ROUNDS = 8
+FIRST_STEPS = 15
+STEPS_PER_ROUND = 4
+WEIGHTS_STABLE = 0.02
+NO_SAY = 1e-6
+"""Weight of points that must not pull: not zero, so that every pose stays determined."""
+
+REJECTION_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """A minimum of eq. 2.39 over the points kept.
+
+    Parameters
+    ----------
+    observations
+        What was adjusted, with the weights that were in force.
+    state
+        The unknowns.
+    basis
+        Which of them were free, see `free_basis`.
+    equations
+        Normal equations at the minimum, points kept only.
+    weights
+        (N,) 1 for points kept and 0 for outliers.
+    view_levels
+        (V,) robust chi2 per coordinate of each view over that of the typical view.
+    outlier_shares
+        (V,) share of each view's points that lie too far out for the typical view's noise.
+    is_converged
+        False if the adjustment was stopped before the minimum.
+    """
+
+    observations: Observations
+    state: State
+    basis: FloatArray
+    equations: NormalEquations
+    weights: FloatArray
+    view_levels: FloatArray
+    outlier_shares: FloatArray
+    is_converged: bool
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Coordinates used minus unknowns."""
+        n_views = len(self.state.rotations)
+        n_coordinates = 2 * int(self.weights.sum())
+        return n_coordinates - int(self.basis.shape[1]) - 6 * n_views
+
+    @property
+    def variance_factor(self) -> float:
+        """sigma0 squared: chi2 over the degrees of freedom."""
+        return self.equations.chi2 / max(self.degrees_of_freedom, 1)
+
+
+def residuals_px(observations: Observations, state: State) -> FloatArray:
+    """(N, 2) observed minus predicted; infinite for an impossible state."""
+    prediction = predict(observations, state)
+    if prediction is None:
+        return np.full_like(observations.points_px, np.inf)
+    return observations.points_px - prediction[0]
+
+
+def chi2_of_points(observations: Observations, state: State) -> FloatArray:
+    """(N,) squared residual of each point over its detector's covariance."""
+    residual = residuals_px(observations, state)
+    white = (observations.whitening @ residual[:, :, None])[:, :, 0]
+    return np.asarray(np.sum(white**2, axis=1))
+
+
+def solve_robustly(
+    observations: Observations,
+    start: State,
+    basis: FloatArray,
+    trusted: BoolArray,
+    max_steps: int,
+) -> Solution | FitFailure:
+    """Solve, look for outliers, and solve again without them where there are any.
+
+    Parameters
+    ----------
+    observations
+        The image points.
+    start, trusted
+        From `armscan.calibration.cameras.start.starting_state`.
+    basis
+        From `free_basis`.
+    max_steps
+        Most iterations of each adjustment.
+    """
+    if trusted.all():
+        result = adjust(observations, start, basis, max_steps=max_steps)
+        if isinstance(result, FitFailure):
+            return result
+        chi2 = chi2_of_points(observations, result.state)
+        levels, outlier = judge(observations, chi2)
+        if not outlier.any() and levels.max() < SUSPECT_LEVEL:
+            return Solution(
+                observations,
+                result.state,
+                basis,
+                result.equations,
+                np.ones(len(chi2)),
+                levels,
+                0.0 * levels,
+                result.is_converged,
+            )
+    state = _reweighted(observations, start, basis, trusted)
+    chi2 = chi2_of_points(observations, state)
+    levels, outlier = judge(observations, chi2)
+    shares = _outlier_shares(observations, chi2)
+    for _ in range(REJECTION_ROUNDS):
+        weights = np.where(outlier, 0.0, 1.0)
+        kept = adjust(observations, state, basis, weights, max_steps)
+        if isinstance(kept, FitFailure):
+            return kept
+        state, equations, is_converged = kept.state, kept.equations, kept.is_converged
+        _, again = judge(observations, chi2_of_points(observations, state))
+        if np.array_equal(again, outlier):
+            break
+        outlier = again
+    return Solution(observations, state, basis, equations, weights, levels, shares, is_converged)
+
+
+def _reweighted(
+    observations: Observations, state: State, basis: FloatArray, trusted: BoolArray
+) -> State:
+    """Iterate with Cauchy weights at the level of the typical view."""
+    weights = np.where(trusted[observations.view_of_point], 1.0, NO_SAY)
+    for round_number in range(ROBUST_ROUNDS):
+        steps = STEPS_PER_ROUND if round_number else FIRST_STEPS
+        result = adjust(observations, state, basis, weights, steps)
+        if isinstance(result, FitFailure):
+            return state
+        state = result.state
+        chi2 = chi2_of_points(observations, state)
+        typical = _typical(_view_levels(observations, chi2))
+        before = weights
+        weights = np.maximum(1.0 / (1.0 + chi2 / (CAUCHY_SCALE**2 * typical)), NO_SAY)
+        if float(np.abs(weights - before).max()) < WEIGHTS_STABLE:
+            break
+    return state
+
+
+def judge(observations: Observations, chi2: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Relative level (V,) of each view and which points (N,) are outliers against their own view.
+
+    Every view must have a point; ``chi2`` is (N,) as from `chi2_of_points`.
+    """
+    absolute = _view_levels(observations, chi2)
+    typical = _typical(absolute)
+    own = np.maximum(absolute, typical)[observations.view_of_point]
+    outlier = np.asarray(chi2 > _limit(len(chi2)) * own)
+    for v in range(observations.n_views):
+        rows = observations.rows(v)
+        # Too few points left for a pose: then the view is judged as a whole, not by its points.
+        if (~outlier[rows]).sum() < max(6, 0.5 * len(outlier[rows])):
+            outlier[rows] = False
+    return absolute / typical, outlier
+
+
+def _view_levels(observations: Observations, chi2: FloatArray) -> FloatArray:
+    medians = [float(np.median(chi2[observations.rows(v)])) for v in range(observations.n_views)]
+    return np.array(medians) / MEDIAN_OF_CHI2_2
+
+
+def _outlier_shares(observations: Observations, chi2: FloatArray) -> FloatArray:
+    limit = _limit(len(chi2)) * _typical(_view_levels(observations, chi2))
+    shares = [
+        float(np.mean(chi2[observations.rows(v)] > limit)) for v in range(observations.n_views)
+    ]
+    return np.array(shares)
+
+
+def _limit(n_points: int) -> float:
+    """Value that chi2 with two degrees of freedom exceeds in `FALSE_ALARM` of n-point samples."""
+    return 2.0 * float(np.log(n_points / FALSE_ALARM))
+
+
+def _typical(levels: FloatArray) -> float:
+    return max(float(np.median(levels)), 1e-12)
+
+
+FEWEST_VIEWS = 4
+LEAST_INDEPENDENT = 0.05
+SAME_POINT_MM = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class TargetError:
+    """How far the target's points miss their places.
+
+    Parameters
+    ----------
+    sigma_mm
+        Standard deviation along each axis of the board; 0 where views show none.
+    independent_share
+        Part of the residuals' variance that is new in every view.
+    """
+
+    sigma_mm: float
+    independent_share: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardResiduals:
+    """Residuals of N points kept, and what a move of a point on its board does to them.
+
+    Parameters
+    ----------
+    board_mm
+        (N, 3) places on the board: equal places are one point of the target.
+    residuals_px
+        (N, 2) observed minus predicted.
+    by_board
+        (N, 2, 2) derivative of the prediction by the point's place along the board's axes.
+    by_shared, by_pose
+        (N, 2, S) and (N, 2, 6) derivative by the shared unknowns and by the pose of its board.
+    information
+        (N, 2, 2) inverse covariance of the points.
+    board
+        (N,) number of the pose in the order of the unknowns.
+    view
+        (N,) number of the view: two cameras have two views of one board.
+    """
+
+    board_mm: FloatArray
+    residuals_px: FloatArray
+    by_board: FloatArray
+    by_shared: FloatArray
+    by_pose: FloatArray
+    information: FloatArray
+    board: IntArray
+    view: IntArray
+
+    @property
+    def point(self) -> IntArray:
+        """(N,) number of the target's point."""
+        places = np.rint(self.board_mm[:, :2] / SAME_POINT_MM).astype(np.int64)
+        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+    @staticmethod
+    def joined(parts: Sequence[BoardResiduals]) -> BoardResiduals:
+        """All of several cameras' points."""
+        names = BoardResiduals.__slots__
+        return BoardResiduals(
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        )
+
+
+def board_residuals(solution: Solution) -> BoardResiduals | None:
+    """The points kept of one camera's solution; None if that is impossible."""
+    observations, state = solution.observations, solution.state
+    prediction = predict(observations, state)
+    if prediction is None:
+        return None
+    predicted, by_shared, by_pose = prediction
+    kept = np.flatnonzero(solution.weights > 0.0)
+    view = np.asarray(observations.view_of_point)[kept]
+    whitening = observations.whitening[kept]
+    return BoardResiduals(
+        observations.board_mm[kept],
+        (observations.points_px - predicted)[kept],
+        by_pose[kept][:, :, 3:] @ state.rotations[view][:, :, :2],
+        by_shared[kept],
+        by_pose[kept],
+        whitening.transpose(0, 2, 1) @ whitening,
+        view,
+        view,
+    )
+
+
+def estimate_target_error(found: BoardResiduals | None) -> TargetError:
+    """Find how far target points miss their places, from how residuals agree between views."""
+    if found is None or len(np.unique(found.view)) < FEWEST_VIEWS:
+        return TargetError(0.0, 1.0)
+    residuals, by_board, point = found.residuals_px, found.by_board, found.point
+    missed = np.linalg.solve(by_board, residuals[:, :, None])[:, :, 0]
+    count = np.bincount(point)
+    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
+    squares = np.bincount(point, np.sum(missed**2, axis=1))
+    products = float(np.sum(total**2) - squares.sum())
+    pairs = float(np.sum(count * (count - 1)))
+    scatter = float(squares.sum()) / (2.0 * len(point))
+    if not products > SIGNIFICANT_SIGMAS * 2.0 * scatter * np.sqrt(pairs):
+        return TargetError(0.0, 1.0)
+    variance = products / (2.0 * pairs)
+    explained = variance * float(np.mean(np.sum(by_board**2, axis=(1, 2))))
+    share = 1.0 - explained / float(np.mean(np.sum(residuals**2, axis=1)))
+    return TargetError(float(np.sqrt(variance)), max(share, LEAST_INDEPENDENT))
+
+
+def covariance_with_target_error(
+    unit_covariance: FloatArray,
+    variance_factor: float,
+    error: TargetError,
+    found: BoardResiduals | None,
+) -> FloatArray:
+    """Covariance (S + 6 V, S + 6 V) of shared unknowns and poses with the target's own errors.
+
+    Parameters
+    ----------
+    unit_covariance
+        From `armscan.calibration.cameras.adjustment.joint_covariance`.
+    variance_factor
+        sigma0 squared of the solution.
+    error
+        Of the target.
+    found
+        The residuals that showed it.
+    """
+    covariance = error.independent_share * variance_factor * unit_covariance
+    if error.sigma_mm == 0.0 or found is None:
+        return covariance
+    pull = _pull_of_points(found, len(unit_covariance))
+    moved = np.tensordot(unit_covariance, pull, axes=(1, 1))
+    return np.asarray(covariance + error.sigma_mm**2 * np.einsum("ipk,jpk->ij", moved, moved))
+
+
+def _pull_of_points(found: BoardResiduals, size: int) -> FloatArray:
+    """(P, S + 6 V, 2) right-hand side that a unit error of each target point causes."""
+    point = found.point
+    weighted = found.information @ found.by_board
+    shared = found.by_shared.transpose(0, 2, 1) @ weighted
+    pose = found.by_pose.transpose(0, 2, 1) @ weighted
+    n_shared = found.by_shared.shape[2]
+    pull = np.zeros((int(point.max()) + 1, size, 2))
+    np.add.at(pull[:, :n_shared], point, shared)
+    first = n_shared + 6 * found.board
+    for k in range(6):
+        np.add.at(pull, (point, first + k), pose[:, k])
+    return pull
+
+
+_FIRST = SHARED_NAMES.index(WARP_NAMES[0])
+WARP_ROWS = slice(_FIRST, _FIRST + len(WARP_NAMES))
+
+
+def with_board_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
+    """Free the two bow parameters, starting from the flat solution and over the same points."""
+    columns = np.zeros((len(SHARED_NAMES), len(WARP_NAMES)))
+    columns[WARP_ROWS] = np.eye(len(WARP_NAMES))
+    basis = np.concatenate([flat.basis, columns], axis=1)
+    result = adjust(flat.observations, flat.state, basis, flat.weights, max_steps)
+    if isinstance(result, FitFailure):
+        return result
+    return replace(
+        flat,
+        state=result.state,
+        basis=basis,
+        equations=result.equations,
+        is_converged=result.is_converged,
+    )
+
+
+def decide_board_warp(flat: Solution, bowed: Solution, covariance: FloatArray) -> BoardWarp:
+    """Test the bow by the decrease of chi2 (F test with two parameters).
+
+    Parameters
+    ----------
+    flat, bowed
+        The solutions without and with bow.
+    covariance
+        (11 + 6 V, 11 + 6 V) scaled joint covariance of the bowed solution.
+    """
+    n_parameters = len(WARP_NAMES)
+    decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
+    statistic = decrease / n_parameters / bowed.variance_factor
+    p_value = float(stats.f.sf(statistic, n_parameters, max(bowed.degrees_of_freedom, 1)))
+    bow = bowed.state.shared[WARP_ROWS]
+    return BoardWarp(bow, covariance[WARP_ROWS, WARP_ROWS], float(statistic), p_value)

@@ -1,0 +1,401 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Starting values of a camera calibration: homographies between board and image, Zhang's closed
+form, and the poses that follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from armscan.calibration.cameras.adjustment import Observations, State
+from armscan.calibration.cameras.result import DISTORTION_PARAMETERS, CameraOptions, DistortionModel
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Board, Pose, Sensor
+from armscan.geometry.rotations import nearest_rotation
+from armscan.models.camera import PARAMETER_NAMES, distort
+from armscan.vision.targets.target import TargetView
+
+MIN_POINTS = 4
+COLLINEAR_RATIO = 1e-3
+"""Width over length of a point set below which it counts as a line."""
+
+REFINEMENT_STEPS = 6
+
+
+def estimate_homography(board_xy: FloatArray, image_xy: FloatArray) -> FloatArray | FitFailure:
+    """Fit ``s m' = H M'`` (eq. 2.29): normalised linear solution, then least squares in the image.
+
+    Parameters
+    ----------
+    board_xy
+        (M, 2) points on the board, in any unit.
+    image_xy
+        (M, 2) image points, in pixels or normalised coordinates.
+
+    Returns
+    -------
+    homography
+        (3, 3), scaled to unit Frobenius norm, that maps the points to positive third coordinates;
+        or why there is none.
+    """
+    if len(board_xy) < MIN_POINTS:
+        return FitFailure(f"{len(board_xy)} points, a homography needs {MIN_POINTS}")
+    if flatness(board_xy) < COLLINEAR_RATIO or flatness(image_xy) < COLLINEAR_RATIO:
+        return FitFailure("the points lie on one line", "turn the board towards the camera")
+    board_norm, image_norm = _normaliser(board_xy), _normaliser(image_xy)
+    board = _apply(board_norm, board_xy)
+    image = _apply(image_norm, image_xy)
+    inner = _refine(_linear(board, image), board, image)
+    homography = np.linalg.inv(image_norm) @ inner @ board_norm
+    depth = homography[2, :2] @ board_xy.mean(axis=0) + homography[2, 2]
+    homography = homography / np.linalg.norm(homography) * (1.0 if depth > 0.0 else -1.0)
+    if not np.isfinite(homography).all():
+        return FitFailure("the points do not fit a flat target")
+    return np.asarray(homography)
+
+
+def map_points(homography: FloatArray, xy: FloatArray) -> FloatArray:
+    """Map (M, 2) points by a (3, 3) homography."""
+    return _apply(homography, xy)
+
+
+def flatness(xy: FloatArray) -> float:
+    """Ratio of the smaller to the larger extent of (M, 2) points: 0 for points on a line."""
+    singular = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+    return float(singular[1] / singular[0]) if singular[0] > 0.0 else 0.0
+
+
+def _normaliser(xy: FloatArray) -> FloatArray:
+    centre = xy.mean(axis=0)
+    scale = float(np.sqrt(2.0 / np.mean(np.sum((xy - centre) ** 2, axis=1))))
+    matrix = np.diag([scale, scale, 1.0])
+    matrix[:2, 2] = -scale * centre
+    return matrix
+
+
+def _apply(homography: FloatArray, xy: FloatArray) -> FloatArray:
+    mapped = xy @ homography[:, :2].T + homography[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def _linear(board: FloatArray, image: FloatArray) -> FloatArray:
+    ones = np.ones(len(board))
+    rows = np.stack([board[:, 0], board[:, 1], ones], axis=1)
+    system = np.zeros((2 * len(board), 9))
+    system[0::2, 0:3] = system[1::2, 3:6] = rows
+    system[0::2, 6:] = -image[:, :1] * rows
+    system[1::2, 6:] = -image[:, 1:] * rows
+    normal = system.T @ system if len(board) > MIN_POINTS else None
+    if normal is not None:
+        return np.asarray(np.linalg.eigh(normal)[1][:, 0].reshape(3, 3))
+    return np.asarray(np.linalg.svd(system)[2][-1].reshape(3, 3))
+
+
+def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> FloatArray:
+    """Gauss-Newton on the image distances; the points are centred, so that h33 is not zero."""
+    h = homography / homography[2, 2]
+    rows = np.column_stack([board, np.ones(len(board))])
+    best: FloatArray = h
+    best_cost = float(np.sum((_apply(h, board) - image) ** 2))
+    for _ in range(REFINEMENT_STEPS):
+        mapped = rows @ h.T
+        w = mapped[:, 2:]
+        predicted = mapped[:, :2] / w
+        jacobian = np.zeros((2 * len(board), 8))
+        jacobian[0::2, 0:3] = jacobian[1::2, 3:6] = rows / w
+        jacobian[0::2, 6:] = -predicted[:, :1] * board / w
+        jacobian[1::2, 6:] = -predicted[:, 1:] * board / w
+        error = (image - predicted).reshape(-1)
+        step = np.linalg.lstsq(jacobian, error, rcond=None)[0]
+        h = h + np.append(step, 0.0).reshape(3, 3)
+        cost = float(np.sum((_apply(h, board) - image) ** 2))
+        if not cost < best_cost:
+            break
+        converged = best_cost - cost < 1e-12 * best_cost
+        best, best_cost = h, cost
+        if converged:
+            break
+    return best
+
+
+_B11, _B22, _B13, _B23, _B33 = range(5)
+_FREE_CENTRE = (_B11, _B22, _B13, _B23, _B33)
+_FIXED_CENTRE = (_B11, _B22, _B33)
+
+
+def constraint_rows(homography: FloatArray) -> FloatArray:
+    """Two equations of one view (eq. 2.34) for ``b = (B11, B12, B22, B13, B23, B33)``.
+
+    Parameters
+    ----------
+    homography
+        (3, 3) from board to image.
+
+    Returns
+    -------
+    rows
+        (2, 6) rows ``v12`` and ``v11 - v22``.
+
+    Notes
+    -----
+    The thesis prints ``v12 - v22`` in the second row, which is wrong, and lists b as ``B11 B12 B13
+    B22 B23 B33``, which does not go with its own ``v_ij`` of eq. 2.33; both are corrected here.
+    """
+
+    def v(i: int, j: int) -> FloatArray:
+        a, b = homography[:, i], homography[:, j]
+        return np.array(
+            [
+                a[0] * b[0],
+                a[0] * b[1] + a[1] * b[0],
+                a[1] * b[1],
+                a[2] * b[0] + a[0] * b[2],
+                a[2] * b[1] + a[1] * b[2],
+                a[2] * b[2],
+            ]
+        )
+
+    return np.stack([v(0, 1), v(0, 0) - v(1, 1)])
+
+
+def intrinsics_from_homographies(
+    homographies: Sequence[FloatArray], width_px: int, height_px: int
+) -> FloatArray | FitFailure:
+    """Solve eq. 2.34 for the intrinsic matrix without skew.
+
+    First with all five unknowns of B; if noise leaves no positive definite B (eq. 2.32), with the
+    principal point in the middle of the image; and then with one focal length.
+
+    Parameters
+    ----------
+    homographies
+        (3, 3) matrices from board to pixels.
+    width_px, height_px
+        Size of the image.
+
+    Returns
+    -------
+    matrix
+        (3, 3) intrinsic matrix of eq. 2.18, or why there is none.
+    """
+    centre = np.array([0.5 * (width_px - 1), 0.5 * (height_px - 1)])
+    scale = 0.5 * (width_px + height_px)
+    to_unit = np.array([[1, 0, -centre[0]], [0, 1, -centre[1]], [0, 0, scale]]) / scale
+    blocks = []
+    for homography in homographies:
+        unit = to_unit @ homography
+        blocks.append(constraint_rows(unit / np.linalg.norm(unit[:, :2])))
+    # Without skew B12 is zero: its column drops out.
+    rows = np.concatenate(blocks)[:, [0, 2, 3, 4, 5]]
+    for solution in (_solve(rows, _FREE_CENTRE), _solve(rows, _FIXED_CENTRE), _solve_square(rows)):
+        matrix = _matrix_from_b(solution)
+        if matrix is not None:
+            return np.asarray(np.linalg.inv(to_unit) @ matrix)
+    return FitFailure(
+        "the views do not determine a focal length",
+        "tilt the board by 20 to 45 degrees, in a different direction from view to view",
+    )
+
+
+def _solve(rows: FloatArray, free: tuple[int, ...]) -> FloatArray:
+    b = np.zeros(5)
+    b[list(free)] = np.linalg.svd(rows[:, free])[2][-1]
+    return b
+
+
+def _solve_square(rows: FloatArray) -> FloatArray:
+    reduced = np.stack([rows[:, _B11] + rows[:, _B22], rows[:, _B33]], axis=1)
+    b = np.zeros(5)
+    b[[_B11, _B33]] = np.linalg.svd(reduced)[2][-1]
+    b[_B22] = b[_B11]
+    return b
+
+
+def _matrix_from_b(b: FloatArray) -> FloatArray | None:
+    """Intrinsic matrix in unit coordinates from B, or None if B is not definite or absurd."""
+    b = b * (1.0 if b[_B11] > 0.0 else -1.0)
+    if b[_B11] <= 0.0 or b[_B22] <= 0.0:
+        return None
+    cx, cy = -b[_B13] / b[_B11], -b[_B23] / b[_B22]
+    factor = b[_B33] - b[_B13] ** 2 / b[_B11] - b[_B23] ** 2 / b[_B22]
+    if factor <= 0.0:
+        return None
+    fx, fy = np.sqrt(factor / b[_B11]), np.sqrt(factor / b[_B22])
+    if max(abs(cx), abs(cy)) > 1.0 or not 0.05 < min(fx, fy) <= max(fx, fy) < 500.0:
+        return None
+    if not 0.5 < fx / fy < 2.0:
+        return None
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def pose_from_homography(homography: FloatArray, matrix: FloatArray) -> Pose[Sensor, Board]:
+    """Pose of a flat board from its homography (eq. 2.35), made a proper rotation.
+
+    Parameters
+    ----------
+    homography
+        (3, 3) from board mm to pixels.
+    matrix
+        (3, 3) intrinsic matrix.
+    """
+    columns = np.linalg.solve(matrix, homography)
+    scale = 0.5 * (np.linalg.norm(columns[:, 0]) + np.linalg.norm(columns[:, 1]))
+    columns = columns / scale * (1.0 if columns[2, 2] > 0.0 else -1.0)
+    third = np.cross(columns[:, 0], columns[:, 1])
+    rotation = nearest_rotation(np.column_stack([columns[:, 0], columns[:, 1], third]))
+    return Pose(rotation, columns[:, 2])
+
+
+def linear_distortion(
+    ideal_xy: FloatArray, observed_xy: FloatArray, free: Sequence[int]
+) -> FloatArray:
+    """Distortion by linear least squares, ``K = (L'L)^-1 L'F`` (eqs. 2.36 to 2.38).
+
+    Parameters
+    ----------
+    ideal_xy
+        (N, 2) normalised coordinates predicted without distortion.
+    observed_xy
+        (N, 2) normalised coordinates observed.
+    free
+        Indices into ``k1 k2 p1 p2 k3`` of the coefficients to solve; the thesis has the first four.
+
+    Returns
+    -------
+    coefficients
+        (5,) with zeros where not free.
+    """
+    coefficients = np.zeros(5)
+    if not len(free):
+        return coefficients
+    _, _, by_coefficient = distort(ideal_xy, coefficients)
+    design = by_coefficient[:, :, list(free)].reshape(-1, len(free))
+    difference = (observed_xy - ideal_xy).reshape(-1)
+    coefficients[list(free)] = np.linalg.lstsq(design, difference, rcond=None)[0]
+    return coefficients
+
+
+SUSPECT_HOMOGRAPHY = 6.0
+"""A view whose homography fits this much worse than the median is not used for the start."""
+
+EDGE_ON = 0.02
+NEAR_PX_PER_WIDTH = 0.005
+"""Two views whose points differ by less than this share of the image width are the same view."""
+
+
+def view_homography(view: TargetView, min_points: int) -> FloatArray | FitFailure:
+    """Homography of a view, or why the view cannot be used at all."""
+    if len(view) < min_points:
+        return FitFailure(f"only {len(view)} target points, needs {min_points}")
+    if flatness(view.points_px) < EDGE_ON:
+        return FitFailure("the board is seen edge-on")
+    return estimate_homography(view.points_board_mm[:, :2], view.points_px)
+
+
+def homography_rms_px(view: TargetView, homography: FloatArray) -> float:
+    """Root median square distance of a view's points from its homography."""
+    error = map_points(homography, view.points_board_mm[:, :2]) - view.points_px
+    return float(np.sqrt(np.median(np.sum(error**2, axis=1))))
+
+
+def repeated_views(views: Sequence[TargetView]) -> dict[int, int]:
+    """Views that show the board where an earlier view shows it: index to earlier index."""
+    repeated: dict[int, int] = {}
+    for later in range(len(views)):
+        for earlier in range(later):
+            if earlier not in repeated and _is_repeated(views[earlier], views[later]):
+                repeated[later] = earlier
+                break
+    return repeated
+
+
+def _is_repeated(a: TargetView, b: TargetView) -> bool:
+    _, in_a, in_b = np.intersect1d(a.point_index, b.point_index, return_indices=True)
+    if not len(in_a):
+        return False
+    shift = a.points_px[in_a] - b.points_px[in_b]
+    rms = float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
+    return rms < NEAR_PX_PER_WIDTH * a.width_px
+
+
+def starting_state(
+    views: Sequence[TargetView],
+    observations: Observations,
+    homographies: Sequence[FloatArray],
+    model: DistortionModel,
+    options: CameraOptions,
+) -> tuple[State, BoolArray] | FitFailure:
+    """Closed-form camera and poses.
+
+    Parameters
+    ----------
+    views
+        The views.
+    observations
+        The same views from `gather`.
+    homographies
+        One (3, 3) a view, from board mm to pixels.
+    model, options
+        Which parameters are free.
+
+    Returns
+    -------
+    state
+        Starting values with those parameters at rest that are not free.
+    trusted
+        (V,) False for views that fit a plane so badly that they had no say.
+
+    or why there are none.
+    """
+    width, height = observations.width_px, observations.height_px
+    rms = np.array([homography_rms_px(v, h) for v, h in zip(views, homographies, strict=True)])
+    trusted = np.asarray(rms <= max(SUSPECT_HOMOGRAPHY * float(np.median(rms)), 1e-6))
+    chosen = [h for h, ok in zip(homographies, trusted, strict=True) if ok]
+    matrix = intrinsics_from_homographies(chosen, width, height)
+    if isinstance(matrix, FitFailure):
+        return matrix
+    matrix = _held(matrix, width, height, options)
+    shared = np.zeros(11)
+    shared[:4] = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
+    state = State.from_poses(shared, [pose_from_homography(h, matrix) for h in homographies])
+    return _with_distortion(state, observations, trusted, model), trusted
+
+
+def _held(matrix: FloatArray, width: int, height: int, options: CameraOptions) -> FloatArray:
+    matrix = matrix.copy()
+    if options.is_principal_point_fixed:
+        matrix[:2, 2] = 0.5 * (width - 1), 0.5 * (height - 1)
+    if options.is_aspect_fixed:
+        matrix[0, 0] = matrix[1, 1] = np.sqrt(matrix[0, 0] * matrix[1, 1])
+    return matrix
+
+
+def _with_distortion(
+    state: State, observations: Observations, trusted: BoolArray, model: DistortionModel
+) -> State:
+    """Add linear distortion (eqs. 2.36 to 2.38) where it is small enough to be believed."""
+    free = [PARAMETER_NAMES.index(name) - 4 for name in DISTORTION_PARAMETERS[model]]
+    # k3 is told from k1 and k2 only poorly before the poses are refined.
+    free = [index for index in free if index != 4]
+    points = np.concatenate(
+        [
+            observations.board_mm[observations.rows(v)] @ state.rotations[v].T
+            + state.translations_mm[v]
+            for v in range(observations.n_views)
+        ]
+    )
+    ideal = points[:, :2] / points[:, 2:]
+    observed = (observations.points_px - state.shared[2:4]) / state.shared[:2]
+    rows = trusted[observations.view_of_point]
+    if not rows.any() or not (points[rows, 2] > 0.0).all():
+        return state
+    coefficients = linear_distortion(ideal[rows], observed[rows], free)
+    radius = float(np.sum(observed[rows] ** 2, axis=1).max())
+    if abs(coefficients[0]) * radius + abs(coefficients[1]) * radius**2 > 0.5:
+        return state
+    shared = state.shared.copy()
+    shared[4:9] = coefficients
+    return State(shared, state.rotations, state.translations_mm)

@@ -1,0 +1,334 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points where rays of the head's cameras meet a board, with their covariance by pixels, board
+pose and cameras, in one view or two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.sheets.result import PlacedBoard
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.estimate import Estimate
+from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import rotation_from_vector, skew, vector_from_rotation
+from armscan.models.calibration import CameraCalibration, SecondCamera
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.light_sheet import LightSheet
+from armscan.models.two_views import StereoCalibration
+from armscan.vision.targets.target import TargetView
+
+N_CAMERA = len(PARAMETER_NAMES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadCameras:
+    """Camera 0, whose frame is Sensor, and camera 1 of a stereo head.
+
+    Parameters
+    ----------
+    left
+        Camera 0.
+    second
+        Camera 1, if there is one.
+    covariance
+        (P, P) of the P parameters that all images have in common: 9, or 24 in the order of
+        `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
+    """
+
+    left: CameraCalibration
+    second: SecondCamera | None
+    covariance: FloatArray
+
+    @staticmethod
+    def of(calibration: CameraCalibration | StereoCalibration) -> HeadCameras:
+        """The cameras of a calibration of one or of two."""
+        if isinstance(calibration, CameraCalibration):
+            return HeadCameras(calibration, None, calibration.covariance)
+        second = SecondCamera(calibration.right, calibration.right_from_left)
+        return HeadCameras(calibration.left, second, calibration.covariance)
+
+    @property
+    def n_parameters(self) -> int:
+        """Count P of the cameras' parameters."""
+        return len(self.covariance)
+
+    @property
+    def has_covariance(self) -> bool:
+        """False if a camera came without uncertainty."""
+        return self.left.has_covariance and (
+            self.second is None or self.second.camera.has_covariance
+        )
+
+    def model(self, camera: int) -> CameraModel:
+        """The model of camera 0 or 1.
+
+        Raises
+        ------
+        InputError
+            If there is no such camera.
+        """
+        if camera == 0:
+            return self.left.camera
+        return self._right(camera).camera.camera
+
+    def centre_mm(self, camera: int) -> FloatArray:
+        """(3,) where the rays of camera 0 or 1 start, in Sensor."""
+        if camera == 0:
+            return np.zeros(3)
+        place = self._right(camera).right_from_sensor
+        return np.asarray(-place.translation_mm @ place.rotation)
+
+    def right(self) -> SecondCamera:
+        """Camera 1.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        return self._right(1)
+
+    def _right(self, camera: int) -> SecondCamera:
+        if self.second is None or camera != 1:
+            raise InputError(
+                f"an image of camera {camera} is given, and that camera is not calibrated",
+                remedy="give the stereo calibration of the head, or the images of camera 0 alone",
+            )
+        return self.second
+
+    def by_parameters(self, by_left: FloatArray) -> FloatArray:
+        """Derivatives (..., 9) by camera 0's parameters as derivatives (..., P) by all."""
+        wide = np.zeros((*by_left.shape[:-1], self.n_parameters))
+        wide[..., :N_CAMERA] = by_left
+        return wide
+
+
+GRAZING = 1e-6
+"""Rays within this sine of the board's plane do not meet it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardPoints:
+    """Points of a board's plane behind (N, 2) pixels, with derivatives.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in the Sensor frame; NaN where there is none.
+    is_valid
+        (N,) False where the lens model has no inverse or the ray misses the plane.
+    dpoint_dq
+        (N, 3, 2) by the pixel, mm/px.
+    dpoint_dpose
+        (N, 3, 6) by the rotation-vector increment (rad, Sensor frame, from the left) and the
+        translation (mm) of ``sensor_from_board``.
+    dpoint_dcamera
+        (N, 3, 9) by the camera's parameters, the pose being held; (N, 3, P) by those of all
+        cameras of a head.
+    """
+
+    points_mm: FloatArray
+    is_valid: BoolArray
+    dpoint_dq: FloatArray
+    dpoint_dpose: FloatArray
+    dpoint_dcamera: FloatArray
+
+
+def intersect_board(
+    q_px: FloatArray, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
+) -> BoardPoints:
+    """Intersect the rays of (N, 2) full-sensor pixels with the board's plane ``z = 0``.
+
+    The ray is ``(x, y, 1)`` of eq. 2.14 and the plane takes the place of the light sheet in
+    eq. 2.21.
+    """
+    xy, is_valid, dxy_dq, dxy_dcamera = camera.undistort_with_jacobian(q_px)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    normal = sensor_from_board.rotation[:, 2]
+    slope = rays @ normal
+    is_valid = is_valid & (np.abs(slope) > GRAZING * np.linalg.norm(rays, axis=1))
+    slope = np.where(is_valid, slope, 1.0)
+    depth = float(normal @ sensor_from_board.translation_mm) / slope
+    is_valid = is_valid & (depth > 0.0)
+    points = np.where(is_valid[:, None], rays * depth[:, None], np.nan)
+    dpoint_dxy = rays[:, :, None] * (-depth / slope)[:, None, None] * normal[None, None, :2]
+    dpoint_dxy[:, 0, 0] += depth
+    dpoint_dxy[:, 1, 1] += depth
+    lever = sensor_from_board.translation_mm - points
+    ddepth_dpose = np.zeros((len(xy), 6))
+    ddepth_dpose[:, :3] = np.cross(normal, lever)
+    ddepth_dpose[:, 3:] = normal
+    dpoint_dpose = rays[:, :, None] * (ddepth_dpose / slope[:, None])[:, None, :]
+    return BoardPoints(
+        points, is_valid, dpoint_dxy @ dxy_dq, dpoint_dpose, dpoint_dxy @ dxy_dcamera
+    )
+
+
+def pose_by_camera(
+    view: TargetView, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
+) -> FloatArray:
+    """(6, 9) derivative of the board's pose, as estimated from ``view``, by the camera.
+
+    The pose minimises the weighted reprojection error, so at the optimum a change of the camera
+    moves it by ``-(Jp' W Jp)^-1 Jp' W Jc`` (Gauss-Newton form of the implicit function theorem).
+    """
+    rotated = view.points_board_mm @ sensor_from_board.rotation.T
+    _, dq_dpoint, dq_dcamera = camera.project_with_jacobian(
+        rotated + sensor_from_board.translation_mm
+    )
+    dq_dpose = np.concatenate([-dq_dpoint @ skew(rotated), dq_dpoint], axis=2)
+    weight = np.linalg.inv(view.covariance_px2)
+    weighted = np.einsum("nki,nkl->nil", dq_dpose, weight)
+    normal = np.einsum("nik,nkj->ij", weighted, dq_dpose)
+    return np.asarray(-np.linalg.solve(normal, np.einsum("nik,nkj->ij", weighted, dq_dcamera)))
+
+
+RIGHT_CAMERA = slice(9, 18)
+RIGHT_POSE = slice(18, 24)
+
+
+def intersect_board_of(
+    q_px: FloatArray, camera: int, sensor_from_board: Pose[Sensor, Board], cameras: HeadCameras
+) -> BoardPoints:
+    """Intersect the rays of (N, 2) pixels of one of the cameras with a board.
+
+    As `intersect_board`, with the points in the Sensor frame and derivatives by the parameters of
+    all cameras.
+    """
+    if camera == 0:
+        points = intersect_board(q_px, sensor_from_board, cameras.left.camera)
+        return BoardPoints(
+            points.points_mm,
+            points.is_valid,
+            points.dpoint_dq,
+            points.dpoint_dpose,
+            cameras.by_parameters(points.dpoint_dcamera),
+        )
+    second = cameras.right()
+    place = second.right_from_sensor
+    turn, shift = place.rotation, place.translation_mm
+    right_from_board: Pose[CameraRight, Board] = place @ sensor_from_board
+    # The function knows one frame: to it, the right camera's is the sensor's.
+    as_sensor: Pose[Sensor, Board] = Pose(
+        right_from_board.rotation, right_from_board.translation_mm
+    )
+    seen = intersect_board(q_px, as_sensor, second.camera.camera)
+    back = turn.T
+    follow = np.zeros((6, 6))
+    follow[:3, :3] = np.eye(3)
+    follow[3:, :3] = -skew(turn @ sensor_from_board.translation_mm)
+    follow[3:, 3:] = np.eye(3)
+    carried = np.concatenate(
+        [skew(seen.points_mm - shift), np.tile(-np.eye(3), (len(q_px), 1, 1))], axis=2
+    )
+    by_cameras = np.zeros((len(q_px), 3, cameras.n_parameters))
+    by_cameras[:, :, RIGHT_CAMERA] = back @ seen.dpoint_dcamera
+    by_cameras[:, :, RIGHT_POSE] = back @ (seen.dpoint_dpose @ follow + carried)
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = turn
+    return BoardPoints(
+        (seen.points_mm - shift) @ turn,
+        seen.is_valid,
+        back @ seen.dpoint_dq,
+        back @ seen.dpoint_dpose @ turned,
+        by_cameras,
+    )
+
+
+def intersect_sheet_of(
+    q_px: FloatArray, camera: int, sheet: LightSheet, cameras: HeadCameras
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 3) in Sensor where the rays of pixels (N, 2) of one camera meet a sheet.
+
+    With the second value (N,), False where there is none; what reconstruction does with a stripe.
+    """
+    xy, has_ray = cameras.model(camera).undistort(q_px)
+    if camera == 0:
+        points, is_met = sheet.intersect(xy)
+        return points, is_met & has_ray
+    place = cameras.right().right_from_sensor
+    points, is_met = sheet.in_frame(place.rotation, place.translation_mm).intersect(xy)
+    return (points - place.translation_mm) @ place.rotation, is_met & has_ray
+
+
+def place_board(
+    seen: Sequence[tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]], cameras: HeadCameras
+) -> PlacedBoard:
+    """Pose of a board in Sensor from what one or both cameras saw of it.
+
+    Parameters
+    ----------
+    seen
+        Camera, target, and the board's pose in that camera's own frame as
+        `armscan.calibration.cameras.board_pose.estimate_board_pose` gives it, one entry a camera.
+    cameras
+        The cameras.
+
+    Returns
+    -------
+    PlacedBoard
+        Mean of the poses weighted by their covariances, the cameras being held; the derivative
+        tells how it follows the cameras' errors, which the two views do not share.
+    """
+    poses = [_in_sensor(camera, view, found, cameras) for camera, view, found in seen]
+    first = poses[0]
+    if len(poses) == 1:
+        return first
+    second = poses[1]
+    information = [np.linalg.inv(pose.covariance) for pose in poses]
+    covariance = np.linalg.inv(information[0] + information[1])
+    gain = covariance @ information[1]
+    a, b = first.sensor_from_board, second.sensor_from_board
+    step = gain @ _apart(a, b)
+    pose: Pose[Sensor, Board] = Pose(
+        rotation_from_vector(step[:3]) @ a.rotation, a.translation_mm + step[3:]
+    )
+    follow = first.by_cameras + gain @ (second.by_cameras - first.by_cameras)
+    return PlacedBoard(pose, 0.5 * (covariance + covariance.T), follow)
+
+
+def _in_sensor(
+    camera: int,
+    view: TargetView,
+    found: Estimate[Pose[Sensor, Board]],
+    cameras: HeadCameras,
+) -> PlacedBoard:
+    own = pose_by_camera(view, found.value, cameras.model(camera))
+    if camera == 0:
+        return PlacedBoard(found.value, found.covariance, cameras.by_parameters(own))
+    place = cameras.right().right_from_sensor
+    back, offset = place.rotation.T, found.value.translation_mm - place.translation_mm
+    turned = np.zeros((6, 6))
+    turned[:3, :3] = turned[3:, 3:] = back
+    follow = np.zeros((6, cameras.n_parameters))
+    follow[:, RIGHT_CAMERA] = turned @ own
+    follow[:3, 18:21] = -back
+    follow[3:, 18:21] = back @ skew(offset)
+    follow[3:, 21:24] = -back
+    pose: Pose[Sensor, Board] = Pose(back @ found.value.rotation, back @ offset)
+    return PlacedBoard(pose, turned @ found.covariance @ turned.T, follow)
+
+
+def poses_chi2(
+    left: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
+    right: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
+    cameras: HeadCameras,
+) -> float:
+    """How far two cameras disagree about a board: 6 on average, the cameras' errors included."""
+    a, b = (_in_sensor(*item, cameras) for item in (left, right))
+    follow = b.by_cameras - a.by_cameras
+    covariance = a.covariance + b.covariance + follow @ cameras.covariance @ follow.T
+    apart = _apart(a.sensor_from_board, b.sensor_from_board)
+    return float(apart @ np.linalg.solve(covariance, apart))
+
+
+def _apart(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
+    """(6,) step from pose a to pose b: rotation vector from the left, then translation."""
+    return np.concatenate(
+        [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]
+    )

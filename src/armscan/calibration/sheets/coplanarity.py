@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do lines on several boards lie in one plane, and do they determine it? The test of a common
+plane and the geometry of boards that fixes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.calibration.sheets.stripes_on_board import StripeObservation
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.shapes import Plane, fit_plane
+from armscan.models.light_sheet import LightSheet
+
+ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedObservation:
+    """A stripe with the covariance of its board's pose (6, 6) and of the camera (9, 9)."""
+
+    sighting: StripeObservation
+    pose_covariance: FloatArray
+    camera_covariance: FloatArray
+
+    def own_covariance_mm2(self, normal: FloatArray) -> FloatArray:
+        """(2, 2) covariance of the ends along ``normal`` by the board's pose and stripe noise."""
+        by_pose = np.einsum("i,eij->ej", normal, self.sighting.ends_by_pose)
+        noise = self.sighting.noise_ends_mm2 * float(self.sighting.across @ normal) ** 2
+        return np.asarray(by_pose @ self.pose_covariance @ by_pose.T + noise)
+
+    def by_camera(self, normal: FloatArray) -> FloatArray:
+        """(2, 9) derivative of the ends along ``normal`` by the camera."""
+        return np.asarray(np.einsum("i,eij->ej", normal, self.sighting.ends_by_camera))
+
+    def height_covariance_mm2(self, normal: FloatArray) -> FloatArray:
+        """(2, 2) covariance of the ends along ``normal``, the camera's error included."""
+        by_camera = self.by_camera(normal)
+        return np.asarray(
+            self.own_covariance_mm2(normal) + by_camera @ self.camera_covariance @ by_camera.T
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonPlane:
+    """Plane through the ends of L stripes, each weighted by its covariance.
+
+    Parameters
+    ----------
+    plane
+        The plane.
+    chi2
+        Weighted sum of squares of what the ends miss it by.
+    degrees_of_freedom
+        ``2 L - 3``: one for two stripes, because any two coplanar lines fit.
+    largest_mm, sigma_largest_mm
+        Largest distance of an end from the plane and that distance's standard deviation.
+    """
+
+    plane: Plane
+    chi2: float
+    degrees_of_freedom: int
+    largest_mm: float
+    sigma_largest_mm: float
+
+
+def fit_common_plane(stripes: Sequence[PosedObservation]) -> CommonPlane | FitFailure:
+    """Fit one plane to two or more stripes by generalised least squares on their ends."""
+    ends = np.concatenate([s.sighting.ends_mm for s in stripes])
+    start = fit_plane(ends)
+    if isinstance(start, FitFailure):
+        return start
+    plane = start.value
+    for _ in range(ROUNDS):
+        local = (ends - plane.point_mm) @ plane.axes.T
+        design = np.stack([local[:, 0], local[:, 1], np.ones(len(ends))], axis=1)
+        # All boards share the camera's error, hence one full matrix.
+        by_camera = np.concatenate([s.by_camera(plane.normal) for s in stripes])
+        covariance = by_camera @ stripes[0].camera_covariance @ by_camera.T
+        for k, stripe in enumerate(stripes):
+            block = slice(2 * k, 2 * k + 2)
+            covariance[block, block] += stripe.own_covariance_mm2(plane.normal)
+        weighted = np.linalg.solve(covariance, design)
+        normal_matrix = design.T @ weighted
+        step = np.linalg.solve(normal_matrix, weighted.T @ local[:, 2])
+        missed = local[:, 2] - design @ step
+        plane = _tilted(plane, step)
+    remaining = covariance - design @ np.linalg.solve(normal_matrix, design.T)
+    worst = int(np.argmax(np.abs(missed)))
+    return CommonPlane(
+        plane,
+        float(missed @ np.linalg.solve(covariance, missed)),
+        len(ends) - 3,
+        float(np.abs(missed[worst])),
+        float(np.sqrt(max(remaining[worst, worst], 0.0))),
+    )
+
+
+def _tilted(plane: Plane, step: FloatArray) -> Plane:
+    """Add ``step[0] x + step[1] y + step[2]`` to the plane's height."""
+    normal = plane.axes[2] - step[0] * plane.axes[0] - step[1] * plane.axes[1]
+    normal = normal / np.linalg.norm(normal)
+    first = plane.axes[0] - (plane.axes[0] @ normal) * normal
+    first = first / np.linalg.norm(first)
+    point = plane.point_mm + step[2] * plane.axes[2]
+    return Plane(point, np.stack([first, np.cross(normal, first), normal]))
+
+
+MIN_SPREAD_RATIO = 0.01
+"""Spread across the stripes over that along them, below which there is only one line."""
+MIN_SPREAD_SIGMAS = 5.0
+"""Spread across the stripes over its own uncertainty, below which it is not known to be there: a
+spread that is partly error makes the sheet look better known than it is."""
+MAX_TILT_SIGMA_DEG = 2.0
+MAX_PARALLEL_TILT_SIGMA_DEG = 0.4
+"""For parallel boards. Beyond it they lie so close that small differences of their poses decide:
+with simulated boards the errors were then several times the sigmas."""
+WEAK_TILT_SIGMA_DEG = 0.2
+PARALLEL_DEG = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SheetGeometry:
+    """How the boards of one sheet lie.
+
+    Parameters
+    ----------
+    n_boards
+        Board placements.
+    board_angle_deg
+        Largest angle between two boards.
+    depth_range_mm
+        Smallest and largest Z of the points.
+    spread_mm
+        (2,) root mean square spread of the points along the stripes and across them, in the sheet.
+    """
+
+    n_boards: int
+    board_angle_deg: float
+    depth_range_mm: tuple[float, float]
+    spread_mm: FloatArray
+
+    @property
+    def facts(self) -> str:
+        """The numbers, in words."""
+        low, high = self.depth_range_mm
+        return (
+            f"{self.n_boards} boards, largest angle between them {self.board_angle_deg:.2f} deg, "
+            f"depth {low:.1f} to {high:.1f} mm, points spread {self.spread_mm[0]:.2f} mm along "
+            f"the stripes and {self.spread_mm[1]:.3f} mm across them"
+        )
+
+
+def describe_geometry(
+    sheet: LightSheet, points_mm: FloatArray, board_normals: FloatArray
+) -> SheetGeometry:
+    """Measure how the (N, 3) points and the (M, 3) boards' normals spread over a sheet."""
+    local = (points_mm - points_mm.mean(axis=0)) @ sheet.axes[:2].T
+    cosine = np.clip(np.abs(board_normals @ board_normals.T), 0.0, 1.0)
+    return SheetGeometry(
+        len(board_normals),
+        float(np.degrees(np.arccos(cosine.min()))),
+        (float(points_mm[:, 2].min()), float(points_mm[:, 2].max())),
+        np.sqrt((local**2).mean(axis=0)),
+    )
+
+
+def refuse_few_boards(name: str, n_boards: int) -> FitFailure | None:
+    """Refuse fewer than two boards."""
+    if n_boards >= 2:
+        return None
+    return FitFailure(
+        f"sheet {name}: {n_boards or 'no'} board placement shows its stripe, and one stripe is a "
+        "line through which any number of planes pass",
+        "photograph the stripe on the board in at least two placements, better six, tilted "
+        "differently and at different distances",
+    )
+
+
+def refuse_one_line(name: str, geometry: SheetGeometry) -> FitFailure | None:
+    """Refuse boards whose stripes are all (nearly) the same line in space."""
+    along, across = (float(value) for value in geometry.spread_mm)
+    if across > MIN_SPREAD_RATIO * along:
+        return None
+    return FitFailure(
+        f"sheet {name}: all stripes lie on nearly one line in space, so that the sheet may turn "
+        f"about it ({geometry.facts}; ratio {across / max(along, 1e-12):.2g}, need "
+        f"{MIN_SPREAD_RATIO})",
+        "move the board in depth or tilt it between the images",
+    )
+
+
+def refuse_lost_spread(
+    name: str, geometry: SheetGeometry, across_sigma_mm: float
+) -> FitFailure | None:
+    """Refuse stripes whose spread is hardly larger than the errors of their boards' poses.
+
+    ``across_sigma_mm`` is the sigma of a point's place across the stripes by its board's pose.
+    """
+    across = float(geometry.spread_mm[1])
+    if across >= MIN_SPREAD_SIGMAS * across_sigma_mm:
+        return None
+    return FitFailure(
+        f"sheet {name}: its stripes spread {across:.3f} mm across each other, and the boards' "
+        f"poses are known to {across_sigma_mm:.3f} mm there: the spread must be "
+        f"{MIN_SPREAD_SIGMAS:.0f} times as large to tell the sheet's direction ({geometry.facts})",
+        "move the board further in depth, tilt it more, or show more of the target",
+    )
+
+
+def refuse_underdetermined_tilt(
+    name: str, geometry: SheetGeometry, tilt_sigma_deg: float
+) -> FitFailure | None:
+    """Refuse a sheet whose direction the boards' own errors leave open."""
+    is_parallel = geometry.board_angle_deg < PARALLEL_DEG
+    limit = MAX_PARALLEL_TILT_SIGMA_DEG if is_parallel else MAX_TILT_SIGMA_DEG
+    if tilt_sigma_deg <= limit:
+        return None
+    return FitFailure(
+        f"sheet {name}: its direction is known to {tilt_sigma_deg:.2f} deg only, need "
+        f"{limit} ({geometry.facts})",
+        "move the board further in depth, tilt it more, or show more of the target",
+    )
+
+
+def geometry_warnings(
+    geometry: SheetGeometry, common: CommonPlane | None, tilt_sigma_deg: float
+) -> tuple[str, ...]:
+    """What is weak about the boards of a solved sheet."""
+    warnings = []
+    if geometry.n_boards == 2 and common is not None:
+        sigmas = common.largest_mm / max(common.sigma_largest_mm, 1e-12)
+        warnings.append(
+            "two boards only: nothing is redundant but that their two stripes must lie in one "
+            f"plane (they miss it by {common.largest_mm:.3f} mm, {sigmas:.1f} sigma); a wrong "
+            "board pose that keeps the stripes in one plane, or a bow, would not be noticed: use "
+            "three boards or more"
+        )
+    if geometry.board_angle_deg < PARALLEL_DEG:
+        warnings.append(
+            f"the boards are parallel (largest angle {geometry.board_angle_deg:.2f} deg): the "
+            "sheet rests on their distances alone, and stripes given to the wrong sheet would be "
+            "coplanar all the same: tilt the board by 20 deg or more between images"
+        )
+    if tilt_sigma_deg > WEAK_TILT_SIGMA_DEG:
+        warnings.append(
+            f"the sheet's direction is known to {tilt_sigma_deg:.2f} deg only: spread the boards "
+            "over more depth"
+        )
+    return tuple(warnings)

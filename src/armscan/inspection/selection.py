@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Choice of the points to be inspected: options, region, robust rejection, search for the
+dominant flat and for a ball.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
+from armscan.geometry.estimate import FitFailure
+from armscan.records.cloud import PointCloud
+
+
+@dataclass(frozen=True, slots=True)
+class InspectionOptions:
+    """How a feature is found in a cloud.
+
+    Parameters
+    ----------
+    feature_mm
+        Points up to this far from the surface belong to the feature: every statistic counts them,
+        outliers included. Points further away are other objects and are only counted.
+    outlier_sigma
+        A fit leaves out points further from its surface than this many robust standard deviations
+        (1.4826 times the median absolute deviation), in turn with the fit.
+    kept_band_mm
+        Points nearer to the surface than this are never left out of a fit.
+    search_band_mm
+        Half width of the band in which points support a candidate while a feature is searched.
+    min_points
+        Fewest points that make a feature.
+    """
+
+    feature_mm: float = 1.0
+    outlier_sigma: float = 4.0
+    kept_band_mm: float = 0.02
+    search_band_mm: float = 0.2
+    min_points: int = 30
+
+    def __post_init__(self) -> None:
+        _require(
+            0.0 < self.feature_mm < math.inf,
+            f"feature_mm is {self.feature_mm}",
+            "give more than 0 mm, as 1.0",
+        )
+        _require(
+            2.0 <= self.outlier_sigma < math.inf,
+            f"outlier limit of {self.outlier_sigma} sigma",
+            "give at least 2, or good points are lost",
+        )
+        _require(
+            0.0 <= self.kept_band_mm < math.inf,
+            f"a kept band of {self.kept_band_mm} mm",
+            "give 0 or up",
+        )
+        _require(
+            0.0 < self.search_band_mm <= self.feature_mm,
+            f"a search band of {self.search_band_mm} mm",
+            f"give more than 0 and at most feature_mm, {self.feature_mm}",
+        )
+        _require(self.min_points >= 4, f"features of {self.min_points} points", "give at least 4")
+
+
+@dataclass(frozen=True, slots=True)
+class StepOptions:
+    """How two parallel faces are found.
+
+    Parameters
+    ----------
+    margin_mm
+        Points this near to an end of their face are left out: along each stripe its runs on the
+        face are shortened by it, and left out is all that lies this near to points off the face,
+        seen along the normal, or to the face's outline in a cloud of many stripes.
+    height_tolerance
+        Faces are searched up to this part of the nominal height from it.
+    """
+
+    margin_mm: float = 1.0
+    height_tolerance: float = 0.05
+
+    def __post_init__(self) -> None:
+        _require(
+            0.0 <= self.margin_mm < 100.0, f"margin_mm is {self.margin_mm}", "give 0 to 100 mm"
+        )
+        _require(
+            0.0 < self.height_tolerance <= 0.5,
+            f"a height tolerance of {self.height_tolerance}",
+            "give more than 0 and at most 0.5",
+        )
+
+
+def _require(holds: bool, what: str, remedy: str) -> None:
+    if not holds:
+        raise OptionError(what, where="inspection options", remedy=remedy)
+
+
+S = TypeVar("S")
+MAX_ROUNDS = 20
+SMALLEST_EXTENT_MM = 2.0
+"""Points that all lie this near to each other are taken for metres."""
+
+LEAST_CONCENTRATION = 0.5
+"""Part of the feature's points that must lie within the search band of the surface that was found:
+a shape that merely passes through the feature's shell spreads evenly over it instead."""
+
+ROBUST_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """A box along the axes of the cloud's frame.
+
+    Parameters
+    ----------
+    low_mm, high_mm
+        (3,) smallest and largest coordinates.
+    """
+
+    low_mm: FloatArray
+    high_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("low_mm", "high_mm"):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), (3,), name))
+        if not bool((self.low_mm < self.high_mm).all()):
+            raise OptionError(
+                "the region's lower limits are not all below the upper ones",
+                remedy="give xmin,xmax,ymin,ymax,zmin,zmax in mm",
+            )
+
+    def holds(self, points_mm: FloatArray) -> BoolArray:
+        """(N,) True for points inside."""
+        return np.asarray(((points_mm >= self.low_mm) & (points_mm <= self.high_mm)).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Selection:
+    """Points of a cloud that an inspection looks at.
+
+    Parameters
+    ----------
+    cloud
+        The cloud.
+    rows
+        (N,) rows of it.
+    options
+        What belongs to a feature.
+    """
+
+    cloud: PointCloud
+    rows: IntArray
+    options: InspectionOptions
+
+    @property
+    def points_mm(self) -> FloatArray:
+        """(N, 3) their positions."""
+        return np.asarray(self.cloud.points_mm[self.rows])
+
+
+def select(
+    cloud: PointCloud, region: Region | None, options: InspectionOptions, min_points: int
+) -> Selection:
+    """Take the points of a cloud inside a region.
+
+    Raises
+    ------
+    InputError
+        If fewer than ``min_points`` are left, or the cloud looks like metres.
+    """
+    extent = float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0))) if len(cloud) else 0.0
+    if len(cloud) >= min_points and extent < SMALLEST_EXTENT_MM:
+        raise InputError(
+            f"all {len(cloud)} points lie within {extent:.3g} mm: these look like metres",
+            remedy="multiply the coordinates by 1000",
+        )
+    if region is None:
+        rows = np.arange(len(cloud))
+    else:
+        rows = np.flatnonzero(region.holds(cloud.points_mm))
+    if len(rows) < min_points:
+        place = "the cloud holds" if region is None else "in the region lie"
+        of_all = "" if region is None else f" of the cloud's {len(cloud)}"
+        raise InputError(
+            f"{place} {len(rows)}{of_all} points; an inspection needs {min_points}",
+            remedy="measure more points" if region is None else "widen the region",
+        )
+    return Selection(cloud, rows, options)
+
+
+def fit_robustly(
+    points_mm: FloatArray,
+    start: S,
+    fit: Callable[[FloatArray], S | FitFailure],
+    distance_mm: Callable[[S, FloatArray], FloatArray],
+    options: InspectionOptions,
+) -> tuple[S, BoolArray] | FitFailure:
+    """Fit and leave out outliers in turn until the choice stands.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) points of the feature.
+    start
+        Surface from which the first outliers are told.
+    fit
+        Least-squares fit to points.
+    distance_mm
+        Signed distances (N,) of points from a surface.
+    options
+        Outlier rule.
+
+    Returns
+    -------
+    surface, is_fitted
+        The last fit and the (N,) points that it used.
+    """
+    surface, kept = start, np.zeros(len(points_mm), dtype=np.bool_)
+    for _ in range(MAX_ROUNDS):
+        chosen = inliers(distance_mm(surface, points_mm), options)
+        if np.array_equal(chosen, kept):
+            break
+        kept = chosen
+        fitted = fit(points_mm[kept])
+        if isinstance(fitted, FitFailure):
+            return fitted
+        surface = fitted
+    return surface, kept
+
+
+def inliers(distance_mm: FloatArray, options: InspectionOptions) -> BoolArray:
+    """(N,) True where a distance is no outlier: the rule that `outlier_rule` puts in words."""
+    middle = float(np.median(distance_mm))
+    spread = ROBUST_SIGMA * float(np.median(np.abs(distance_mm - middle)))
+    limit = max(options.outlier_sigma * spread, options.kept_band_mm)
+    return np.asarray(np.abs(distance_mm - middle) <= limit)
+
+
+def outlier_rule(options: InspectionOptions) -> str:
+    """The rule of `inliers` in words."""
+    return (
+        f"the fit left out points further from the median distance than {options.outlier_sigma:g} "
+        f"robust standard deviations, but at least {options.kept_band_mm:g} mm (in turn with the "
+        "fit); the statistics count them all the same"
+    )
+
+
+N_TRIALS = 800
+N_SCORED = 3000
+"""Points, drawn evenly at random, on which candidates are scored."""
+
+BATCH = 100
+POLISHING_ROUNDS = 4
+MIN_SINE = 0.02
+"""Flattest triangle, as height over length, that may carry a candidate."""
+
+
+def dominant_flat(points: FloatArray, band: float) -> FloatArray | FitFailure:
+    """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points lie near.
+
+    Parameters
+    ----------
+    points
+        (N, D) points.
+    band
+        Largest distance of a supporting point.
+    """
+    rng = np.random.default_rng(0)
+    n, dimension = points.shape
+    drawn = points[rng.integers(0, n, (N_TRIALS, dimension))]
+    normals, is_valid = _normals(drawn)
+    if not is_valid.any():
+        return FitFailure("the points lie on one line", "give points that spread in a face")
+    normals, start = normals[is_valid], drawn[is_valid, 0]
+    scored = points[rng.permutation(n)[:N_SCORED]]
+    offsets = np.einsum("md,md->m", normals, start)
+    votes = np.concatenate(
+        [
+            (np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH]) <= band).sum(axis=0)
+            for k in range(0, len(normals), BATCH)
+        ]
+    )
+    best = int(votes.argmax())
+    return _polished(points, normals[best], float(offsets[best]), band)
+
+
+def _normals(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normals of (M, D, D) sets of points, and which of them are determined."""
+    edge = drawn[:, 1] - drawn[:, 0]
+    length = np.linalg.norm(edge, axis=1)
+    if drawn.shape[1] == 2:
+        normal = np.stack([-edge[:, 1], edge[:, 0]], axis=1)
+        is_valid = length > 0.0
+    else:
+        other = drawn[:, 2] - drawn[:, 0]
+        normal = np.cross(edge, other)
+        is_valid = np.linalg.norm(normal, axis=1) > MIN_SINE * length * np.linalg.norm(
+            other, axis=1
+        )
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal / np.where(size > 0.0, size, 1.0), is_valid
+
+
+def _polished(points: FloatArray, normal: FloatArray, offset: float, band: float) -> FloatArray:
+    for _ in range(POLISHING_ROUNDS):
+        near = points[np.abs(points @ normal - offset) <= band]
+        if len(near) < points.shape[1]:
+            break
+        centre = near.mean(axis=0)
+        normal = np.linalg.svd(near - centre, full_matrices=False)[2][-1]
+        offset = float(normal @ centre)
+    return normal
+
+
+def find_ball(
+    points_mm: FloatArray, radius_mm: float, band_mm: float
+) -> tuple[FloatArray, int] | FitFailure:
+    """Centre (3,) of the ball of known radius that most points lie on, and their count.
+
+    Candidates pass through three points of one neighbourhood each, as a ball may be a small part
+    of the cloud; each has two centres.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) points.
+    radius_mm
+        Radius of the ball.
+    band_mm
+        Largest distance of a supporting point from the surface.
+    """
+    rng = np.random.default_rng(0)
+    scored = points_mm[rng.permutation(len(points_mm))[:N_SCORED]]
+    centres = _ball_candidates(scored, radius_mm, rng)
+    if len(centres) == 0:
+        return FitFailure(
+            f"no three points could lie on a ball of radius {radius_mm:g} mm",
+            "check the diameter and the unit (mm)",
+        )
+    votes = np.concatenate(
+        [
+            _ball_votes(scored, centres[k : k + BATCH], radius_mm, band_mm)
+            for k in range(0, len(centres), BATCH)
+        ]
+    )
+    centre = centres[int(votes.argmax())]
+    near = np.abs(np.linalg.norm(points_mm - centre, axis=1) - radius_mm) <= band_mm
+    return centre, int(near.sum())
+
+
+def _ball_candidates(scored: FloatArray, radius_mm: float, rng: np.random.Generator) -> FloatArray:
+    found = []
+    for first in scored[rng.integers(0, len(scored), N_TRIALS)]:
+        offset = np.linalg.norm(scored - first, axis=1)
+        near = scored[(offset <= 1.6 * radius_mm) & (offset > 0.2 * radius_mm)]
+        if len(near) >= 2:
+            found.append([first, *near[rng.choice(len(near), 2, replace=False)]])
+    if not found:
+        return np.zeros((0, 3))
+    corners = np.array(found)
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(a, b)
+    size2 = np.einsum("ij,ij->i", across, across)
+    aa, bb = np.einsum("ij,ij->i", a, a), np.einsum("ij,ij->i", b, b)
+    is_wide = size2 > (0.1 * np.sqrt(aa * bb)) ** 2
+    a, b, across, size2, aa, bb = (item[is_wide] for item in (a, b, across, size2, aa, bb))
+    # circumcentre of each triangle, seen from its first corner
+    middle = np.cross(aa[:, None] * b - bb[:, None] * a, across) / (2.0 * size2)[:, None]
+    rise2 = radius_mm**2 - np.einsum("ij,ij->i", middle, middle)
+    is_possible = rise2 > 0.0
+    middle, start = middle[is_possible], corners[is_wide, 0][is_possible]
+    up = across[is_possible] / np.sqrt(size2[is_possible])[:, None]
+    rise = np.sqrt(rise2[is_possible])[:, None] * up
+    return np.concatenate([start + middle + rise, start + middle - rise])
+
+
+def _ball_votes(
+    scored: FloatArray, centres: FloatArray, radius_mm: float, band_mm: float
+) -> FloatArray:
+    # |p - c|^2 by its parts: no (M, N, 3) array; about the mean, so that digits are kept
+    mean = scored.mean(axis=0)
+    p, c = scored - mean, centres - mean
+    squared = (c**2).sum(axis=1)[:, None] + (p**2).sum(axis=1)[None, :] - 2.0 * c @ p.T
+    distance = np.sqrt(np.maximum(squared, 0.0))
+    return np.asarray((np.abs(distance - radius_mm) <= band_mm).sum(axis=1))

@@ -1,0 +1,608 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What files and folders are, and whether the installation is complete."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import platform
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan import kernels
+from armscan.devices.registry import driver_names
+from armscan.errors import ArmscanError, FileFormatError
+from armscan.geometry.arrays import IntArray
+from armscan.models.calibration import (
+    HAND_EYE_PARAMETER_NAMES,
+    CameraCalibration,
+    Provenance,
+    ScannerCalibration,
+    SecondCamera,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.models.camera import PARAMETER_NAMES
+from armscan.models.two_views import StereoCalibration
+from armscan.reconstruction.sync import SyncOptions, exposure_poses, largest_gap_ns
+from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
+from armscan.report.quantity import Summary, with_sigma
+from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
+from armscan.storage.clouds import parse_ply, read_ply
+from armscan.storage.documents import (
+    RegistrationDocument,
+    read_calibration,
+    read_camera_calibration,
+    read_registration,
+    read_scanner_calibration,
+    read_stereo_calibration,
+)
+from armscan.storage.image_paths import expand_paths
+from armscan.storage.images import image_format, read_bytes, read_exposure
+from armscan.storage.json_text import parse_json
+from armscan.storage.observations import read_observations
+from armscan.storage.points import read_probed_points
+from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
+from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.schema import REGISTRATION_SCHEMA, SCANNER_SCHEMA, STEREO_SCHEMA
+
+
+def describe_registration(document: RegistrationDocument) -> dict[str, Any]:
+    """Scans, markers and evidence of ``registration.json``."""
+    return {
+        "what": f"registration by markers ({document.kind}), {len(document.transforms)} scans in "
+        f"the {document.common_frame} frame of {document.common_frame_of}",
+        "scans": [one.name for one in document.transforms],
+        "markers": sum(one.n_markers for one in document.transforms),
+        "rms_mm": [one.rms_mm for one in document.transforms],
+        "moved_markers": [one.id for one in document.moved],
+        "not_joined": [one.name for one in document.not_joined],
+        "simulated": document.simulated,
+        "created_utc": document.provenance.created_utc,
+        "command": " ".join(document.provenance.command),
+    }
+
+
+def describe_stereo(calibration: StereoCalibration) -> dict[str, Any]:
+    """Cameras, relative pose and evidence of ``stereo.json``, origin apart."""
+    left, right = calibration.left.camera, calibration.right.camera
+    pose = calibration.right_from_left
+    angle = float(np.rad2deg(np.arccos(np.clip(pose.rotation[2, 2], -1.0, 1.0))))
+    known = calibration.diagnostics
+    content: dict[str, Any] = {
+        "what": f"stereo calibration, cameras {left.width_px} x {left.height_px} px and "
+        f"{right.width_px} x {right.height_px} px",
+        "baseline_mm": round(float(np.linalg.norm(pose.translation_mm)), 4),
+        "angle_between_axes_deg": round(angle, 4),
+        "translation_right_mm": [round(float(value), 4) for value in pose.translation_mm],
+        "rms_px": calibration.rms_px,
+        "pairs": calibration.n_pairs,
+        "points": calibration.n_points,
+    }
+    if known is not None:
+        content["epipolar_rms_px"] = known.epipolar_rms_px
+        content["epipolar_mean_px"] = known.epipolar_mean_px
+        if known.hold_out_rms_px is not None:
+            content["hold_out_rms_px"] = known.hold_out_rms_px
+        content["intrinsics"] = known.intrinsics
+        content["taken_apart"] = [name for name, _ in known.left_out]
+    return content
+
+
+NS_PER_S = 1e9
+NS_PER_MS = 1e6
+
+
+def describe_recording(folder: Path) -> dict[str, Any]:
+    """Count exposures and samples, and say what is odd or was assumed."""
+    scan = read_recording(folder)
+    times = [row.t_ns for row in scan.rows]
+    lasers = sorted({name for row in scan.rows for name in row.lasers})
+    content: dict[str, Any] = {
+        "what": f"recording ({scan.session.kind}), {len(scan.rows)} exposures"
+        + (", simulated" if scan.is_simulated else ""),
+        "kind": scan.session.kind,
+        "simulated": scan.is_simulated,
+        "exposures": len(scan.rows),
+        "views": _n_views(scan),
+        "seconds": round((max(times) - min(times)) / NS_PER_S, 3),
+        **_steps("exposure", np.unique(np.array(times, dtype=np.int64))),
+        **({"lasers": lasers} if lasers else {}),
+        "cameras": [_camera_line(setup) for setup in scan.session.cameras],
+    }
+    if scan.arm is not None:
+        content |= {"pose_form": scan.session.pose_form, "clock": scan.session.clock}
+        content |= _track(scan.arm) | _poses(scan, scan.arm)
+    return content | _notes(scan.session.assumed, scan.warnings)
+
+
+def describe_touches(folder: Path) -> dict[str, Any]:
+    """Describe a folder of the arm's samples without images, as a probing is."""
+    track, notes = read_arm_track(folder)
+    tip = folder / "probe.toml"
+    what = "touches of a probe" if tip.is_file() else "an arm's samples"
+    content = {"what": f"{what}, {len(track)} samples", **_track(track)}
+    if tip.is_file():
+        content |= {key: value for key, value in describe_probe(tip).items() if key != "what"}
+    return content | _notes((), notes)
+
+
+def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
+    """Values of the hand-eye with their uncertainty, and what it rests on."""
+    hand_eye = calibration.hand_eye
+    sensor = calibration.sensor
+    second = None if sensor is None else sensor.second
+    sheets = "no images" if sensor is None else f"{len(sensor.sheets)} light sheets"
+    sigma = np.sqrt(np.diag(hand_eye.covariance))
+    pose = hand_eye.tool_from_sensor
+    values = [*pose.rotation_vector_rad, *pose.translation_mm]
+    names = [name.replace("rotation_", "rotation_vector_") for name in HAND_EYE_PARAMETER_NAMES]
+    known = hand_eye.diagnostics
+    return {
+        "what": f"scanner calibration, {sheets}",
+        **({} if second is None else second_camera_facts(second)),
+        **{
+            name: with_sigma(float(value), float(spread))
+            for name, value, spread in zip(names, values, sigma, strict=True)
+        },
+        "rms_mm": hand_eye.rms_mm,
+        "postures": hand_eye.n_postures,
+        "points": hand_eye.n_points,
+        **({} if known is None else {"method": known.method, "condition": known.condition}),
+        "latency_ns": calibration.latency_ns,
+    }
+
+
+def second_camera_facts(second: SecondCamera) -> dict[str, Any]:
+    """The right camera of a stereo head, and how far and how turned it stands from the left."""
+    camera, pose = second.camera.camera, second.right_from_sensor
+    turn_deg = float(np.degrees(np.linalg.norm(pose.rotation_vector_rad)))
+    return {
+        "second_camera": f"{camera.width_px} x {camera.height_px} px, "
+        f"fx {camera.fx_px:.2f} px, turned by {turn_deg:.3f} deg",
+        "baseline_mm": round(float(np.linalg.norm(pose.translation_mm)), 4),
+    }
+
+
+def describe_arm(path: Path) -> dict[str, Any]:
+    """Name and size of an arm."""
+    arm = read_arm_model(path)
+    reach = float(np.abs(arm.offset_mm).sum() + np.abs(arm.length_mm).sum())
+    return {
+        "what": f"arm '{arm.name}', {arm.n_axes} joints",
+        "joints": arm.n_axes,
+        "longest_reach_mm": round(reach, 3),
+    }
+
+
+def describe_probe(path: Path) -> dict[str, Any]:
+    """Size and place of a probe's tip."""
+    tip = read_probe_tip(path)
+    return {
+        "what": f"probe, tip of {tip.diameter_mm:g} mm",
+        "tip_diameter_mm": tip.diameter_mm,
+        "centre_tool_mm": [round(float(value), 4) for value in tip.centre_tool_mm],
+    }
+
+
+def describe_points(path: Path) -> dict[str, Any]:
+    """Count and extent of probed points."""
+    points = read_probed_points(path)
+    kind = "centres of the tip" if points.are_tip_centres else "on the surface"
+    low, high = points.points_mm.min(axis=0), points.points_mm.max(axis=0)
+    return {
+        "what": f"{len(points)} probed points, {kind}",
+        "points": len(points),
+        "tip_diameter_mm": points.tip_diameter_mm,
+        "features": sorted(set(points.features)),
+        **{
+            f"{axis}_range_mm": [round(float(low[k]), 4), round(float(high[k]), 4)]
+            for k, axis in enumerate("xyz")
+        },
+    }
+
+
+def _camera_line(setup: CameraSetup) -> str:
+    window = setup.window
+    place = f" at {window.x_px}, {window.y_px}" if window.x_px or window.y_px else ""
+    return f"{setup.width_px} x {setup.height_px} px{place}, {setup.bits_used} bits, {setup.colour}"
+
+
+def _n_views(scan: FolderRecording) -> int:
+    """Arrangements that were seen: a row without a view is one of its own."""
+    named = {row.view for row in scan.rows if row.view is not None}
+    return len(named) + sum(row.view is None for row in scan.rows)
+
+
+def _track(track: ArmTrack) -> dict[str, Any]:
+    known = track.translations_mm[track.is_known]
+    content: dict[str, Any] = {
+        "arm_samples": len(track),
+        "arm_samples_without_pose": int((~track.is_known).sum()),
+        **_steps("arm", track.t_ns),
+        "has_joints": track.joints_rad is not None,
+        "has_triggers": track.trigger_ids is not None
+        and bool((track.trigger_ids != NO_TRIGGER).any()),
+    }
+    if len(known):
+        extent = np.linalg.norm(known.max(axis=0) - known.min(axis=0))
+        content["arm_extent_mm"] = round(float(extent), 3)
+    return content
+
+
+def _steps(what: str, t_ns: IntArray) -> dict[str, float]:
+    """Median and longest step between times; nothing for a single one."""
+    if len(t_ns) < 2:
+        return {}
+    steps_ms = np.diff(t_ns) / NS_PER_MS
+    return {
+        f"{what}_median_period_ms": round(float(np.median(steps_ms)), 6),
+        f"{what}_longest_step_ms": round(float(steps_ms.max()), 6),
+    }
+
+
+def _poses(scan: FolderRecording, track: ArmTrack) -> dict[str, Any]:
+    """How many exposures have a pose, how it is found, and why the others have none."""
+    limit_ns = largest_gap_ns(track, SyncOptions())
+    gaps = {
+        "arm_gap_limit_ms": limit_ns / NS_PER_MS,
+        "arm_steps_above_gap_limit": int((np.diff(track.t_ns) > limit_ns).sum()),
+    }
+    try:
+        poses = exposure_poses(scan.rows, track, scan.session.clock)
+    except ArmscanError as error:
+        return {**gaps, "exposures_with_pose": 0, "exposures_without_pose": error.what}
+    return {
+        **gaps,
+        "exposures_with_pose": int(poses.has_pose.sum()),
+        "poses_found": poses.how,
+        **({"exposures_without_pose": poses.missing} if poses.missing else {}),
+        **({"poses_doubtful": list(poses.warnings)} if poses.warnings else {}),
+    }
+
+
+def _notes(assumed: tuple[str, ...], warnings: tuple[str, ...]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    if assumed:
+        content["assumed"] = list(assumed)
+    if warnings:
+        content["warnings"] = list(warnings)
+    return content
+
+
+Facts = list[tuple[str, str]]
+
+
+def _parent(path: Path) -> dict[str, Any]:
+    """A table of a recording is described with its recording."""
+    return _folder(path.parent)
+
+
+DESCRIBE_NAMED: dict[str, Callable[[Path], dict[str, Any]]] = {
+    ARM_MODEL_FILE: describe_arm,
+    PROBE_FILE: describe_probe,
+    SESSION_FILE: _parent,
+    EXPOSURES_FILE: _parent,
+    ARM_FILE: _parent,
+}
+
+
+def describe_files(names: Sequence[str]) -> Summary:
+    """Describe files, folders and quoted patterns.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is missing, damaged, or nothing that armscan knows.
+    """
+    facts: Facts = []
+    data: list[dict[str, Any]] = []
+    for name in names:
+        paths = [Path(name)] if Path(name).is_dir() else expand_paths([name])
+        for path in paths:
+            described = _folder(path) if path.is_dir() else _file(path)
+            facts += [(str(path), "\n".join(_line(key, value) for key, value in described.items()))]
+            data.append({"path": path.as_posix(), **described})
+    count = f"{len(data)} item" + ("s" if len(data) != 1 else "")
+    return Summary(title=count, facts=tuple(facts), data={"kind": "info", "items": data})
+
+
+def _line(key: str, value: Any) -> str:
+    if key == "what":
+        return str(value)
+    if isinstance(value, list):
+        return f"{key.replace('_', ' ')}: " + ", ".join(str(item) for item in value)
+    return f"{key.replace('_', ' ')}: {f'{value:.6g}' if isinstance(value, float) else value}"
+
+
+def _file(path: Path) -> dict[str, Any]:
+    data = read_bytes(path)
+    if image_format(data):
+        return _image(path)
+    if data.startswith(b"ply"):
+        return _ply(path, data)
+    if data.startswith(b"PK"):
+        return _observations(path)
+    return _text(path, data)
+
+
+def _text(path: Path, data: bytes) -> dict[str, Any]:
+    stripped = data.lstrip(b"\xef\xbb\xbf \t\r\n")
+    if stripped.startswith(b"{") and "schema" in (content := parse_json(data, str(path))):
+        return DESCRIBE_SCHEMA.get(content["schema"], _calibration)(path)
+    if path.name in DESCRIBE_NAMED:
+        return DESCRIBE_NAMED[path.name](path)
+    if path.suffix.lower() == ".csv":
+        return describe_points(path)
+    if path.suffix.lower() in (".json", ".yaml", ".yml", ".xml"):
+        return _camera(read_camera_calibration(path), "camera calibration of another program")
+    raise FileFormatError(
+        "armscan does not know this kind of file",
+        where=str(path),
+        remedy="give an image, a calibration, a PLY cloud, probed points or a folder",
+    )
+
+
+def _image(path: Path) -> dict[str, Any]:
+    exposure = read_exposure(path)
+    image = exposure.image
+    saturated = float(np.mean(image.reshape(-1) >= exposure.full_scale))
+    return {
+        "what": f"image, {exposure.width_px} x {exposure.height_px} px, "
+        f"{'grey' if exposure.colour == 'mono' else 'colour'}, {exposure.bits_used} bits",
+        "width_px": exposure.width_px,
+        "height_px": exposure.height_px,
+        "colour": exposure.colour,
+        "bits_used": exposure.bits_used,
+        "mean_level": round(float(image.mean()), 2),
+        "highest_level": int(image.max()),
+        "saturated_fraction": round(saturated, 6),
+    }
+
+
+def _ply(path: Path, data: bytes) -> dict[str, Any]:
+    vertices = parse_ply(data, str(path))
+    fields = list(vertices.table.dtype.names or ())
+    content: dict[str, Any] = {"what": f"point cloud, {len(vertices.table)} points"}
+    if "cov_xx_mm2" in fields:
+        cloud = read_ply(path)
+        content["frame"] = cloud.frame
+        content["simulated"] = cloud.is_simulated
+        content |= {"forced": list(cloud.forced)} if cloud.forced else {}
+        content["sheets"] = list(cloud.sheet_names)
+        content["exposures"] = list(cloud.exposure_sources)
+        content["median_sigma_mm"] = float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0
+    if len(vertices.table) and {"x", "y", "z"} <= set(fields):
+        for axis in "xyz":
+            values = vertices.table[axis]
+            content[f"{axis}_range"] = [
+                round(float(values.min()), 4),
+                round(float(values.max()), 4),
+            ]
+    content["properties"] = fields
+    return content
+
+
+def _observations(path: Path) -> dict[str, Any]:
+    found = read_observations(path)
+    return {
+        "what": f"observations of a calibration: {len(found.views)} target views, "
+        f"{len(found.profiles)} stripe images",
+        "target_points": sum(len(view) for view in found.views),
+        "stripe_points": sum(len(profile) for profile in found.profiles),
+    }
+
+
+def _calibration(path: Path) -> dict[str, Any]:
+    document = read_calibration(path)
+    if isinstance(document, CameraCalibration):
+        return _camera(document, "camera calibration")
+    return _sensor(document)
+
+
+def _scanner(path: Path) -> dict[str, Any]:
+    document = read_scanner_calibration(path)
+    return {**describe_scanner(document), **_origin(document.provenance)}
+
+
+def _stereo(path: Path) -> dict[str, Any]:
+    document = read_stereo_calibration(path)
+    return {**describe_stereo(document), **_origin(document.provenance)}
+
+
+def _registration(path: Path) -> dict[str, Any]:
+    return describe_registration(read_registration(path))
+
+
+DESCRIBE_SCHEMA: dict[str, Callable[[Path], dict[str, Any]]] = {
+    SCANNER_SCHEMA: _scanner,
+    STEREO_SCHEMA: _stereo,
+    REGISTRATION_SCHEMA: _registration,
+}
+
+
+def _camera(calibration: CameraCalibration, what: str) -> dict[str, Any]:
+    camera = calibration.camera
+    sigma = np.sqrt(np.diag(calibration.covariance))
+    values = {
+        name: with_sigma(value, spread if calibration.has_covariance else 0.0)
+        for name, value, spread in zip(PARAMETER_NAMES, camera.parameters, sigma, strict=True)
+    }
+    return {
+        "what": f"{what}, {camera.width_px} x {camera.height_px} px",
+        **values,
+        **_evidence(calibration),
+    }
+
+
+def _evidence(calibration: CameraCalibration) -> dict[str, Any]:
+    if not calibration.has_covariance:
+        return {"uncertainty": "none given"}
+    known = calibration.diagnostics
+    hold_out = None if known is None else known.hold_out_rms_px
+    return {
+        "rms_px": calibration.rms_px,
+        **({} if hold_out is None else {"hold_out_rms_px": hold_out}),
+        "views": calibration.n_views,
+        "points": calibration.n_points,
+        **_origin(calibration.provenance),
+    }
+
+
+def _sensor(calibration: SensorCalibration) -> dict[str, Any]:
+    camera = calibration.camera.camera
+    sheets = [_sheet_line(sheet) for sheet in calibration.sheets]
+    return {
+        "what": f"sensor calibration, {len(sheets)} light sheets, camera "
+        f"{camera.width_px} x {camera.height_px} px",
+        "sheets": sheets,
+        **({} if calibration.second is None else second_camera_facts(calibration.second)),
+        **_origin(calibration.provenance),
+    }
+
+
+def _sheet_line(sheet: SheetCalibration) -> str:
+    low, high = sheet.depth_range_mm
+    known = sheet.diagnostics
+    fit = f", lack of fit p = {known.final_test.p_value:.2g}" if known else ""
+    return (
+        f"{sheet.name} (rms {sheet.rms_mm:.4f} mm, Z {low:.1f} to {high:.1f} mm, "
+        f"{sheet.n_boards} boards{fit})"
+    )
+
+
+def _origin(provenance: Provenance) -> dict[str, Any]:
+    return {
+        "id": provenance.document_id,
+        "written": f"{provenance.created_utc} by armscan {provenance.armscan_version}",
+        "from": f"{len(provenance.inputs)} files",
+        **({"forced": list(provenance.forced)} if provenance.forced else {}),
+    }
+
+
+def _folder(path: Path) -> dict[str, Any]:
+    if is_recording(path):
+        return describe_recording(path)
+    if (path / ARM_FILE).is_file():
+        return describe_touches(path)
+    items = sorted(item for item in path.iterdir() if not item.name.startswith("."))
+    if not items:
+        raise FileFormatError("the folder is empty", where=str(path), remedy="name another folder")
+    kinds = Counter(item.suffix.lower() or "other" for item in items if item.is_file())
+    n_folders = sum(item.is_dir() for item in items)
+    content: dict[str, Any] = {
+        "what": f"folder with {sum(kinds.values())} files and {n_folders} folders"
+    }
+    for kind, count in sorted(kinds.items()):
+        content[f"files_{kind.lstrip('.')}"] = count
+    return content
+
+
+NEEDED = (
+    "numpy",
+    "scipy",
+    "numba",
+    "opencv-python-headless",
+    "pydantic",
+    "typer",
+    "rich",
+    "jinja2",
+    "matplotlib",
+)
+OPENCV_NAMES = (
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+)
+OPTIONAL = {"mrcal": "a second opinion on camera calibrations"}
+
+
+def examine_installation(*, warm: bool = False) -> Summary:
+    """Check packages, the compiler and the folder for temporary files.
+
+    Parameters
+    ----------
+    warm
+        Also compile all kernels, so that the first use does not wait.
+
+    Returns
+    -------
+    Summary
+        Its warnings are what is wrong; none if all is well.
+    """
+    problems: list[str] = []
+    facts = [
+        ("armscan", version("armscan")),
+        ("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"),
+    ]
+    packages = {name: _version_of(name) for name in NEEDED}
+    for name, found in packages.items():
+        facts.append((name, found or "not found"))
+        if not found:
+            problems.append(f"the package {name} is missing; install armscan again")
+    for name, use in OPTIONAL.items():
+        facts.append((name, _version_of(name) or f"not installed (optional: {use})"))
+    facts.append(("drivers", ", ".join(driver_names()) or "none"))
+    writable = _temporary_folder_fact(problems)
+    facts.append(("temporary files", writable))
+    facts.append(("compiler", _compiler_fact(problems)))
+    if warm:
+        facts.append(("kernels", _compile_kernels(problems)))
+    is_ready = not problems
+    return Summary(
+        title="armscan is ready." if is_ready else "armscan is not ready.",
+        facts=tuple(facts),
+        warnings=tuple(problems),
+        data={"kind": "doctor", "is_ready": is_ready, "found": dict(facts)},
+    )
+
+
+def _version_of(name: str) -> str:
+    for candidate in OPENCV_NAMES if name.startswith("opencv") else (name,):
+        try:
+            return version(candidate)
+        except PackageNotFoundError:
+            continue
+    return ""
+
+
+def _temporary_folder_fact(problems: list[str]) -> str:
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "probe").write_bytes(b"armscan")
+    except OSError as error:
+        problems.append(f"no folder for temporary files can be written ({error.strerror})")
+        return "not writable"
+    return "writable"
+
+
+def _compiler_fact(problems: list[str]) -> str:
+    try:
+        numba = importlib.import_module("numba")
+        start = time.perf_counter()
+        is_right = int(numba.njit("int64(int64)")(lambda n: 2 * n + 1)(20)) == 41
+    except Exception as error:
+        problems.append(f"numba cannot compile ({error}); install numba and llvmlite again")
+        return "fails"
+    if not is_right:
+        problems.append("numba compiles wrong code; install numba and llvmlite again")
+    return f"works ({time.perf_counter() - start:.1f} s for a first function)"
+
+
+def _compile_kernels(problems: list[str]) -> str:
+    start = time.perf_counter()
+    names = [item.name for item in pkgutil.iter_modules(kernels.__path__)]
+    for name in names:
+        try:
+            importlib.import_module(f"{kernels.__name__}.{name}")
+        except Exception as error:
+            problems.append(f"kernel module {name} does not compile ({error})")
+    return f"{len(names)} modules compiled in {time.perf_counter() - start:.1f} s"

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The job behind `armscan simulate`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from armscan.devices.sources import TwinScene
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene
+from armscan.report.quantity import Summary
+
+
+@dataclass(frozen=True, slots=True)
+class SimulateRequest:
+    """What to simulate.
+
+    Parameters
+    ----------
+    head, scene
+        Names of the head and of what it looks at.
+    folder
+        Of the recording.
+    options
+        Preset, seed, processes.
+    """
+
+    head: str
+    scene: TwinScene
+    folder: Path
+    options: SimulateOptions = field(default_factory=SimulateOptions)
+
+
+def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Summary:
+    """Write the recording, and its truth beside it.
+
+    Raises
+    ------
+    ArmscanError
+        As `simulate_scene`.
+    """
+    found = simulate_scene(request.folder, request.head, request.scene, request.options, progress)
+    counts = [("images", str(found.n_images))] if found.n_images else []
+    counts += [("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []
+    return Summary(
+        title=f"Simulated: head {request.head}, scene {request.scene}, preset "
+        f"{request.options.preset}, seed {request.options.seed}",
+        facts=(*counts, ("target", found.target)),
+        written=(found.folder, found.truth),
+        next_step=_next_step(request.scene, found),
+        data={
+            "kind": "simulate",
+            "simulated": True,
+            "head": request.head,
+            "scene": request.scene,
+            **asdict(request.options),
+            "images": found.n_images,
+            "arm_samples": found.n_arm_samples,
+            "target": found.target,
+            "folder": found.folder.as_posix(),
+            "truth": found.truth.as_posix(),
+        },
+    )
+
+
+def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
+    folder = found.folder
+    if scene in ("camera", "laser"):
+        return f"{_next_calibration(scene, found)} --target {found.target} -o " + (
+            "sensor.json" if scene == "laser" else _cameras_document(found)
+        )
+    if scene == "probing":
+        return f"armscan probe {folder} -o plate.csv"
+    if scene == "hand-eye":
+        return (
+            f"armscan calibrate hand-eye {folder} --sensor sensor.json --plate plate.csv "
+            "-o scanner.json"
+        )
+    if scene in ("markers", "markers-moved"):
+        return _next_for_markers(found)
+    return f"armscan reconstruct {folder} --scanner scanner.json -o cloud.ply"
+
+
+def _next_calibration(scene: TwinScene, found: SimulatedScene) -> str:
+    if scene == "camera":
+        kind = "stereo" if found.n_cameras > 1 else "camera"
+        return f"armscan calibrate {kind} --scan {found.folder}"
+    return f"armscan calibrate laser --camera {_cameras_document(found)} --scan {found.folder}"
+
+
+def _cameras_document(found: SimulatedScene) -> str:
+    return "stereo.json" if found.n_cameras > 1 else "camera.json"
+
+
+def _next_for_markers(found: SimulatedScene) -> str:
+    images = found.folder / "images"
+    if found.n_cameras == 1:
+        return f"armscan markers {images} -o rings.html"
+    left, right = (images / side / "0001.png" for side in ("left", "right"))
+    return f"armscan markers {left} {right} --stereo stereo.json -o markers.csv"

@@ -1,0 +1,466 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ridge points: runs of pixels above the background, then Newton steps (eq. 2.41)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, types
+
+from armscan.kernels.arrays import (
+    COLUMN,
+    FLOATS_OUT,
+    IMAGE_IN,
+    ROW,
+    ROW_OUT,
+    TABLE_IN,
+    TABLE_OUT,
+    TAPS_IN,
+    TAPS_OUT,
+    Float32Array,
+    Float64Array,
+)
+
+VALLEY_RATIO = 0.5
+"""A dip below this share of the peak splits a run into two lines."""
+
+
+@njit(types.void(IMAGE_IN, types.int64, types.int64, ROW_OUT), cache=True, nogil=True)
+def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Array) -> None:
+    """Write row ``i`` of the grid, interpolated linearly between cell centres, to ``row`` (W,)."""
+    columns = grid.shape[1]
+    for x in range(row.shape[0]):
+        u = min(max((x + 0.5) / cell_px - 0.5, 0.0), columns - 1.0)
+        k = min(int(u), max(columns - 2, 0))
+        m = min(k + 1, columns - 1)
+        row[x] = grid[i, k] + (u - k) * (grid[i, m] - grid[i, k])
+
+
+@njit(types.float64(IMAGE_IN, types.int64, types.int64, types.int64), cache=True, nogil=True)
+def level_at(image: Float32Array, axis: int, line: int, k: int) -> float:
+    """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
+    return float(image[k, line] if axis == COLUMN else image[line, k])
+
+
+@njit(
+    types.float64(
+        IMAGE_IN, types.int64, types.int64, types.int64, types.int64, types.float64, types.float64
+    ),
+    cache=True,
+    nogil=True,
+)
+def hump_centre(
+    image: Float32Array,
+    axis: int,
+    line: int,
+    first: int,
+    last: int,
+    background: float,
+    peak: float,
+) -> float:
+    """Centroid of what rises above half of the peak, so that a bright ground does not pull it."""
+    floor = background + 0.5 * peak
+    weight = moment = 0.0
+    for k in range(first, last + 1):
+        above = max(level_at(image, axis, line, k) - floor, 0.0)
+        weight += above
+        moment += above * k
+    return moment / weight if weight > 0.0 else 0.5 * (first + last)
+
+
+@njit(
+    types.int64(
+        IMAGE_IN,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.int64,
+        types.float64,
+        types.float64,
+        TABLE_OUT,
+        types.int64,
+    ),
+    cache=True,
+    nogil=True,
+)
+def split_run(
+    image: Float32Array,
+    axis: int,
+    line: int,
+    first: int,
+    last: int,
+    background: float,
+    rise: float,
+    runs: Float64Array,
+    count: int,
+) -> int:
+    """Append the centre of each hump of one run; return the new count.
+
+    A run is split where the three-pixel mean dips below half of the peaks on both sides, so that
+    two lines that share a foot become two candidates.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    axis, line, first, last
+        The run: pixels ``first..last`` of column (axis 0) or row (axis 1) ``line``.
+    background, rise
+        Local background, and the height above it at which the run was cut.
+    runs
+        (capacity, 3) output rows ``x, y, axis``; rows beyond the capacity are counted only.
+    count
+        Rows used so far.
+    """
+    peak = 0.0
+    low = np.inf
+    low_at = start = first
+    for k in range(first, last + 2):
+        is_end = k > last
+        smooth = 0.0
+        if not is_end:
+            smooth = level_at(image, axis, line, k)
+            smooth += level_at(image, axis, line, max(k - 1, first))
+            smooth += level_at(image, axis, line, min(k + 1, last))
+            smooth = smooth / 3.0 - background
+        if is_end or (low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise):
+            if count < runs.shape[0]:
+                stop = last if is_end else low_at
+                centre = hump_centre(image, axis, line, start, stop, background, peak)
+                runs[count, 0] = line if axis == COLUMN else centre
+                runs[count, 1] = centre if axis == COLUMN else line
+                runs[count, 2] = axis
+            count += 1
+            start = low_at
+            peak = 0.0
+        if smooth >= peak:
+            peak = smooth
+            low = np.inf
+        if smooth < low:
+            low = smooth
+            low_at = k
+    return count
+
+
+@njit(
+    types.int64(IMAGE_IN, IMAGE_IN, types.int64, types.float64, types.int64, TABLE_OUT),
+    cache=True,
+    nogil=True,
+)
+def find_runs(
+    image: Float32Array,
+    background: Float32Array,
+    cell_px: int,
+    rise: float,
+    longest_px: int,
+    runs: Float64Array,
+) -> int:
+    """Find runs of pixels more than ``rise`` above the background in one pass over the image.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    background
+        (rows, columns) background per cell of ``cell_px`` pixels, interpolated in between.
+    cell_px
+        Side of a background cell.
+    rise
+        Height above the background.
+    longest_px
+        Longer runs are no cross-sections of a line and are left out.
+    runs
+        (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and the axis
+        (0: the run goes down a column, 1: along a row).
+
+    Returns
+    -------
+    int
+        Count of candidates; more than the capacity if the output was too short.
+    """
+    height, width = image.shape
+    floor = np.zeros(width, np.float32)
+    upper = np.zeros(width, np.float32)
+    lower = np.zeros(width, np.float32)
+    above = -1
+    start = np.full(width, -1, np.int64)
+    count = 0
+    lift = np.float32(rise)
+    for y in range(height + 1):
+        row_start = -1
+        if y < height:
+            v = min(max((y + 0.5) / cell_px - 0.5, 0.0), background.shape[0] - 1.0)
+            cell = int(v)
+            if cell != above:
+                interpolate_columns(background, cell_px, cell, upper)
+                following = min(cell + 1, background.shape[0] - 1)
+                interpolate_columns(background, cell_px, following, lower)
+                above = cell
+            fraction = np.float32(v - cell)
+            for x in range(width):
+                floor[x] = upper[x] + fraction * (lower[x] - upper[x]) + lift
+        for x in range(width):
+            if y < height and image[y, x] > floor[x]:
+                if start[x] < 0:
+                    start[x] = y
+                if row_start < 0:
+                    row_start = x
+                if x < width - 1:
+                    continue
+                stop = x
+            else:
+                if start[x] >= 0:
+                    if y - start[x] <= longest_px:
+                        base = float(floor[x]) - rise
+                        count = split_run(
+                            image, COLUMN, x, start[x], y - 1, base, rise, runs, count
+                        )
+                    start[x] = -1
+                stop = x - 1
+            if row_start >= 0:
+                if stop - row_start < longest_px:
+                    base = float(floor[x]) - rise
+                    count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
+                row_start = -1
+    return count
+
+
+REACH_SIGMAS = 3.5
+"""Taps cut at 3 sigma lock to pixels by 0.02 px, at 3.5 sigma by 0.003 px."""
+STEEPNESS_SLACK = 0.85
+REPEAT_PX = 1.5
+ROUNDS = 3
+
+
+def gaussian_taps(sigma_px: float) -> Float32Array:
+    """Sampled Gaussian and its first two derivatives, (3, 2 r + 1) with r = 3.5 sigma.
+
+    Scaled so that a constant, a ramp and a parabola give their exact derivatives.
+    """
+    radius = math.ceil(REACH_SIGMAS * sigma_px)
+    k = np.arange(-radius, radius + 1, dtype=np.float64)
+    smooth = np.exp(-0.5 * (k / sigma_px) ** 2)
+    smooth /= smooth.sum()
+    slope = k * smooth
+    slope /= (k * slope).sum()
+    bend = (k * k - (k * k * smooth).sum()) * smooth
+    bend /= 0.5 * (k * k * bend).sum()
+    return np.stack([smooth, slope, bend]).astype(np.float32)
+
+
+@njit(
+    types.void(IMAGE_IN, types.int64, types.int64, TAPS_IN, TAPS_OUT, FLOATS_OUT),
+    cache=True,
+    nogil=True,
+    fastmath=True,
+)
+def derivatives_at(
+    image: Float32Array,
+    x: int,
+    y: int,
+    taps: Float32Array,
+    columns: Float32Array,
+    result: Float64Array,
+) -> None:
+    """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    x, y
+        Pixel.
+    taps
+        (3, m) from `gaussian_taps`.
+    columns
+        (3, m) scratch.
+    result
+        (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
+    """
+    height, width = image.shape
+    m = taps.shape[1]
+    radius = m // 2
+    left = x - radius
+    is_inside = left >= 0 and left + m <= width
+    # views, because an index that might be negative keeps the loops from being vectorised
+    down0, down1, down2 = columns[0], columns[1], columns[2]
+    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
+    down0[:] = np.float32(0.0)
+    down1[:] = np.float32(0.0)
+    down2[:] = np.float32(0.0)
+    for j in range(m):
+        row = min(max(y + j - radius, 0), height - 1)
+        smooth = taps0[j]
+        slope = taps1[j]
+        bend = taps2[j]
+        if is_inside:
+            pixels = image[row, left : left + m]
+            for i in range(m):
+                value = pixels[i]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+        else:
+            for i in range(m):
+                value = image[row, min(max(left + i, 0), width - 1)]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+    gx = gy = gxx = gxy = gyy = np.float32(0.0)
+    for i in range(m):
+        gx += taps1[i] * down0[i]
+        gxx += taps2[i] * down0[i]
+        gxy += taps1[i] * down1[i]
+        gy += taps0[i] * down1[i]
+        gyy += taps0[i] * down2[i]
+    result[0] = gx
+    result[1] = gy
+    result[2] = gxx
+    result[3] = gxy
+    result[4] = gyy
+
+
+@njit(
+    types.boolean(
+        IMAGE_IN, types.float64, types.float64, TAPS_IN, TAPS_OUT, FLOATS_OUT, FLOATS_OUT
+    ),
+    cache=True,
+    nogil=True,
+)
+def step_to_ridge(
+    image: Float32Array,
+    x_px: float,
+    y_px: float,
+    taps: Float32Array,
+    scratch: Float32Array,
+    derivatives: Float64Array,
+    result: Float64Array,
+) -> bool:
+    """Walk from a start to the nearest ridge; False if there is none.
+
+    The eigenvector of the eigenvalue of largest curvature is the normal ``n``; along it the Taylor
+    polynomial has its maximum at ``t = -(g . n) / (n' H n)``. The expansion point is moved while
+    the step leaves its pixel.
+
+    Parameters
+    ----------
+    image, taps, scratch
+        As for `derivatives_at`.
+    x_px, y_px
+        Start.
+    derivatives
+        (5,) scratch.
+    result
+        (5,) output: x, y, normal x, normal y, negative second derivative along the normal.
+    """
+    height, width = image.shape
+    x = math.floor(x_px + 0.5)
+    y = math.floor(y_px + 0.5)
+    for _ in range(ROUNDS):
+        if x < 0 or y < 0 or x >= width or y >= height:
+            return False
+        derivatives_at(image, x, y, taps, scratch, derivatives)
+        half = 0.5 * (derivatives[2] - derivatives[4])
+        gxy = derivatives[3]
+        root = math.sqrt(half * half + gxy * gxy)
+        bend = 0.5 * (derivatives[2] + derivatives[4]) - root
+        if bend >= 0.0 or root <= 0.0:
+            return False
+        nx = root - half if half < 0.0 else -gxy
+        ny = -gxy if half < 0.0 else root + half
+        length = math.sqrt(nx * nx + ny * ny)
+        nx /= length
+        ny /= length
+        step = -(derivatives[0] * nx + derivatives[1] * ny) / bend
+        dx = step * nx
+        dy = step * ny
+        if abs(dx) <= 0.6 and abs(dy) <= 0.6:
+            result[0] = x + dx
+            result[1] = y + dy
+            result[2] = nx
+            result[3] = ny
+            result[4] = -bend
+            return True
+        if abs(step) > taps.shape[1] // 2:
+            return False
+        x += math.floor(dx + 0.5)
+        y += math.floor(dy + 0.5)
+    return False
+
+
+@njit(
+    types.int64(IMAGE_IN, TABLE_IN, types.int64, TAPS_IN, types.float64, TABLE_OUT),
+    cache=True,
+    nogil=True,
+)
+def refine_candidates(
+    image: Float32Array,
+    runs: Float64Array,
+    n_runs: int,
+    taps: Float32Array,
+    least_bend: float,
+    points: Float64Array,
+) -> int:
+    """Ridge point in the column or row of each candidate.
+
+    A column candidate is kept where the line is rather horizontal, a row candidate where it is
+    rather vertical, with some overlap around the diagonal so that none is lost there.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels.
+    runs
+        (>= n_runs, 3) from `find_runs`.
+    n_runs
+        Candidates to use.
+    taps
+        (3, m) from `gaussian_taps`.
+    least_bend
+        Smallest negative second derivative across the line.
+    points
+        (>= n_runs, 6) output rows: x, y, normal x, normal y, negative second derivative, axis.
+        The coordinate along the axis 0 (column) or 1 (row) that names the pixel line is whole.
+
+    Returns
+    -------
+    int
+        Count of points.
+    """
+    height, width = image.shape
+    scratch = np.zeros((3, taps.shape[1]), np.float32)
+    derivatives = np.zeros(5)
+    ridge = np.zeros(5)
+    latest = np.full((2, max(height, width)), -1e9)
+    count = 0
+    for r in range(n_runs):
+        is_row = runs[r, 2] == ROW
+        if not step_to_ridge(image, runs[r, 0], runs[r, 1], taps, scratch, derivatives, ridge):
+            continue
+        if ridge[4] < least_bend:
+            continue
+        nx = abs(ridge[2])
+        ny = abs(ridge[3])
+        if (nx if is_row else ny) < STEEPNESS_SLACK * (ny if is_row else nx):
+            continue
+        if is_row:
+            line = int(runs[r, 1])
+            centre = ridge[0] - (line - ridge[1]) * ridge[3] / ridge[2]
+        else:
+            line = int(runs[r, 0])
+            centre = ridge[1] - (line - ridge[0]) * ridge[2] / ridge[3]
+        side = ROW if is_row else COLUMN
+        if abs(centre - latest[side, line]) < REPEAT_PX:
+            continue
+        if centre < 0.0 or centre > (width if is_row else height) - 1:
+            continue
+        latest[side, line] = centre
+        points[count, 0] = centre if is_row else line
+        points[count, 1] = line if is_row else centre
+        points[count, 2] = ridge[2]
+        points[count, 3] = ridge[3]
+        points[count, 4] = ridge[4]
+        points[count, 5] = side
+        count += 1
+    return count

@@ -1,0 +1,458 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From photographs of a target to one calibrated camera or a calibrated stereo pair."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
+from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, StereoOptions, StereoPair
+from armscan.calibration.cameras.result import MIN_VIEWS, CameraFit, CameraOptions
+from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
+from armscan.errors import InputError
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.rotations import vector_from_rotation
+from armscan.models.calibration import CameraCalibration, CameraDiagnostics, Provenance
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.two_views import StereoCalibration, StereoDiagnostics
+from armscan.pipeline.instants import group_instants
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.targets import FoundTargets, find_targets
+from armscan.records.exposure import Exposure
+from armscan.records.recording import ExposureRow
+from armscan.vision.targets.circle_grid import correct_centres
+from armscan.vision.targets.target import Target, TargetOptions, TargetView
+
+CENTRE_ROUNDS = 5
+CENTRES_STABLE = 0.02
+"""Circle centres are stable when no camera parameter moves by more than this many sigmas."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraRun:
+    """A calibrated camera, and the exposures in which no target was found.
+
+    Parameters
+    ----------
+    fit
+        The result.
+    not_found
+        (source, reason) of exposures without a usable target.
+    centre_rounds
+        How often circle centres were measured again with the camera; 0 for other targets.
+    """
+
+    fit: CameraFit
+    not_found: tuple[tuple[str, str], ...]
+    centre_rounds: int
+
+
+def calibrate_camera_from_exposures(
+    exposures: Iterable[Exposure],
+    target: Target,
+    options: CameraOptions | None = None,
+    target_options: TargetOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> CameraRun | FitFailure:
+    """Find the target in each exposure and calibrate.
+
+    The centre of a circle's image is not the image of its centre, and the correction needs
+    undistorted edges: for circle grids the centres are measured again with each solution until the
+    camera stays where it is.
+
+    Parameters
+    ----------
+    exposures
+        Taken one after the other, so that a generator needs to hold only a few at a time.
+    target
+        What to look for.
+    options, target_options
+        Of the calibration and of the detection; None for the defaults.
+    progress
+        Is told of each exposure and of each solution.
+
+    Returns
+    -------
+    run
+        The camera with its evidence, or why there is none: with the reason for each exposure in
+        which the target was not found.
+
+    Raises
+    ------
+    InputError, OptionError
+        As `calibrate_camera`.
+    """
+    found = find_targets(exposures, target, target_options, progress=progress)
+    return calibrate_camera_from_found(found, options, progress=progress)
+
+
+def calibrate_camera_from_found(
+    found: FoundTargets, options: CameraOptions | None = None, *, progress: Progress = silent
+) -> CameraRun | FitFailure:
+    """As `calibrate_camera_from_exposures`, with the targets looked for already."""
+    options = options or CameraOptions()
+    if found.wrong_count is not None:
+        return found.wrong_count
+    missing = _too_few(found)
+    if missing is not None:
+        return missing
+    options = replace(options, leave_out=found.shown_of(options.leave_out))
+    run = calibrate_camera_from_views(found.views, options, progress=progress)
+    if isinstance(run, FitFailure):
+        return FitFailure(run.reason + found.not_found_text(), run.remedy)
+    return CameraRun(run.fit, found.not_found, run.centre_rounds)
+
+
+def calibrate_camera_from_views(
+    views: Sequence[TargetView],
+    options: CameraOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> CameraRun | FitFailure:
+    """Calibrate; for circles, correct the centres with the camera and calibrate again.
+
+    Parameters, errors and result as `calibrate_camera_from_exposures`, with the target found.
+    """
+    options = options or CameraOptions()
+    has_circles = any(view.edges is not None for view in views)
+    total = CENTRE_ROUNDS if has_circles else 1
+    fit = calibrate_camera(views, options)
+    progress(ProgressEvent("solve", 1, total))
+    if isinstance(fit, FitFailure):
+        return fit
+    rounds, is_stable = 0, False
+    while rounds < total - 1 and not is_stable:
+        views = [_corrected(view, fit) for view in views]
+        again = calibrate_camera(views, options)
+        if isinstance(again, FitFailure):
+            return again
+        rounds += 1
+        is_stable = _moved_sigmas(fit, again) < CENTRES_STABLE
+        fit = again
+        progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
+    return CameraRun(fit, (), rounds)
+
+
+def _corrected(view: TargetView, fit: CameraFit) -> TargetView:
+    return view if view.edges is None else correct_centres(view, fit.camera)
+
+
+def _moved_sigmas(before: CameraFit, after: CameraFit) -> float:
+    moved = np.abs(after.camera.parameters - before.camera.parameters)
+    is_free = after.sigma > 0.0
+    if not np.array_equal(is_free, before.sigma > 0.0):
+        return float("inf")
+    return float(np.max(moved[is_free] / after.sigma[is_free]))
+
+
+def _too_few(found: FoundTargets) -> FitFailure | None:
+    n_images = len(found.views) + len(found.not_found)
+    if len(found.views) >= MIN_VIEWS:
+        return None
+    if n_images < MIN_VIEWS:
+        given = "1 image was" if n_images == 1 else f"{n_images} images were"
+        return FitFailure(
+            f"{given} given, a camera needs at least {MIN_VIEWS}",
+            "take 10 to 20 images with the board tilted by 20 to 45 degrees in all directions",
+        )
+    return FitFailure(
+        f"the target was found in {len(found.views)} of {n_images} images, a camera needs "
+        f"{MIN_VIEWS}{found.not_found_text()}",
+        "check columns, rows and kind of the target, and that all of it is in the image",
+    )
+
+
+LISTED = 4
+
+Given = tuple[CameraCalibration, CameraCalibration]
+ExposedPair = tuple[Exposure | None, Exposure | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoRun:
+    """Two calibrated cameras, and the exposures in which no target was found.
+
+    Parameters
+    ----------
+    fit
+        The result.
+    not_found
+        (source, reason) of exposures without a usable target.
+    centre_rounds
+        How often circle centres were measured again with the cameras; 0 for other targets.
+    """
+
+    fit: StereoFit
+    not_found: tuple[tuple[str, str], ...]
+    centre_rounds: int
+
+
+def pair_lists(left: Sequence[Exposure], right: Sequence[Exposure]) -> list[ExposedPair]:
+    """Pair two lists of exposures in their order.
+
+    Raises
+    ------
+    InputError
+        If the lists differ in length, or an exposure is in both.
+    """
+    if len(left) != len(right):
+        raise InputError(
+            f"{len(left)} left images ({_listed(left)}) but {len(right)} right ones "
+            f"({_listed(right)})",
+            remedy="give one right image for each left image, in the same order",
+        )
+    on_the_right = {exposure.source for exposure in right}
+    for exposure in left:
+        if exposure.source in on_the_right:
+            raise InputError(
+                "the same image is given for both cameras",
+                where=exposure.source,
+                remedy="give the images of the right camera as the second argument",
+            )
+    return list(zip(left, right, strict=True))
+
+
+def stereo_rows(rows: Sequence[ExposureRow], where: str) -> list[tuple[int | None, int | None]]:
+    """Rows of a recording that show a target without laser, paired by instant.
+
+    Parameters
+    ----------
+    rows
+        Of the recording.
+    where
+        Its name, for messages.
+
+    Raises
+    ------
+    InputError
+        If there are not two cameras, or a camera took two exposures at one instant.
+    """
+    cameras = sorted({row.camera for row in rows})
+    if cameras != [0, 1]:
+        listed = ", ".join(str(camera) for camera in cameras)
+        raise InputError(
+            f"two cameras are needed, 0 (left) and 1 (right); the recording has {listed}",
+            where=where,
+            remedy="name a recording of a head with two cameras",
+        )
+    dark = [k for k, row in enumerate(rows) if not row.lasers]
+    chosen = dark or list(range(len(rows)))
+    pairs = []
+    for instant in group_instants([rows[k] for k in chosen], where):
+        of_camera = {rows[chosen[k]].camera: chosen[k] for k in instant.rows}
+        pairs.append((of_camera.get(0), of_camera.get(1)))
+    return pairs
+
+
+def calibrate_stereo_from_exposures(
+    exposures: Sequence[ExposedPair],
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    target_options: TargetOptions | None = None,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """Find the target in each exposure and calibrate.
+
+    Parameters
+    ----------
+    exposures
+        Left and right exposure of each instant; None where one camera has none.
+    target
+        What to look for.
+    options, given
+        As `calibrate_stereo`.
+    target_options
+        Of the detection; None for the defaults.
+    progress
+        Is told of each exposure and of each solution.
+
+    Returns
+    -------
+    run
+        Both cameras with their evidence, or why there are none.
+
+    Raises
+    ------
+    InputError, OptionError
+        As `calibrate_stereo`.
+    """
+    every = [exposure for pair in exposures for exposure in pair if exposure is not None]
+    found = find_targets(every, target, target_options, progress=progress)
+    return calibrate_stereo_from_found(exposures, found, target, options, given, progress=progress)
+
+
+def calibrate_stereo_from_found(
+    exposures: Sequence[ExposedPair],
+    found: FoundTargets,
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """As `calibrate_stereo_from_exposures`, with the targets looked for already."""
+    if found.wrong_count is not None:
+        return found.wrong_count
+    pairs = _found_pairs(exposures, {view.source: view for view in found.views})
+    missing = _stereo_too_few(exposures, pairs, found)
+    if missing is not None:
+        return missing
+    options = options or StereoOptions()
+    options = replace(options, leave_out=found.shown_of(options.leave_out))
+    run = calibrate_stereo_from_pairs(pairs, target, options, given, progress=progress)
+    if isinstance(run, FitFailure):
+        return FitFailure(run.reason + found.not_found_text(), run.remedy)
+    return replace(run, not_found=found.not_found)
+
+
+def calibrate_stereo_from_pairs(
+    pairs: Sequence[StereoPair],
+    target: Target,
+    options: StereoOptions | None = None,
+    given: Given | None = None,
+    *,
+    progress: Progress = silent,
+) -> StereoRun | FitFailure:
+    """Calibrate; for circles, correct the centres with the cameras and calibrate again.
+
+    Parameters, errors and result as `calibrate_stereo_from_exposures`, with the target found.
+    """
+    has_circles = any(
+        view is not None and view.edges is not None for pair in pairs for view in pair.views
+    )
+    total = CENTRE_ROUNDS if has_circles else 1
+    fit = calibrate_stereo(pairs, target, options, given)
+    progress(ProgressEvent("solve", 1, total))
+    if isinstance(fit, FitFailure):
+        return fit
+    rounds, is_stable = 0, False
+    while rounds < total - 1 and not is_stable:
+        cameras = fit.views.left, fit.views.right
+        pairs = [StereoPair(*map(_stereo_corrected, pair.views, cameras)) for pair in pairs]
+        again = calibrate_stereo(pairs, target, options, given)
+        if isinstance(again, FitFailure):
+            return again
+        rounds += 1
+        is_stable = _stereo_moved_sigmas(fit, again) < CENTRES_STABLE
+        fit = again
+        progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
+    return StereoRun(fit, (), rounds)
+
+
+def stereo_calibration(fit: StereoFit, provenance: Provenance) -> StereoCalibration:
+    """The document's content of a fit."""
+    n = len(PARAMETER_NAMES)
+    held_out = fit.hold_out
+    pairs = [pair for pair in fit.pairs if not pair.is_related]
+    return StereoCalibration(
+        left=_camera(fit.left, fit, fit.views.left, slice(0, n), provenance),
+        right=_camera(fit.right, fit, fit.views.right, slice(n, 2 * n), provenance),
+        right_from_left=fit.views.right_from_left,
+        covariance=fit.covariance,
+        rms_px=fit.rms_px,
+        n_pairs=len(fit.related),
+        n_points=fit.n_points,
+        provenance=provenance,
+        diagnostics=StereoDiagnostics(
+            epipolar_rms_px=fit.epipolar_rms_px,
+            epipolar_mean_px=fit.epipolar_mean_px,
+            left_out=tuple((pair.pair.name, pair.note) for pair in pairs),
+            intrinsics=fit.options.intrinsics,
+            hold_out_rms_px=None if held_out is None else held_out.rms_px,
+            typical_level=fit.typical_level,
+            target_error_mm=fit.target_error_mm,
+        ),
+    )
+
+
+def _camera(
+    side: SideFit, fit: StereoFit, camera: CameraModel, rows: slice, provenance: Provenance
+) -> CameraCalibration:
+    covariance = fit.covariance[rows, rows]
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance,
+        has_covariance=bool(np.any(covariance)),
+        rms_px=side.rms_px,
+        sigma_point_px=side.sigma_point_px,
+        n_views=side.n_views,
+        n_points=side.n_points,
+        covered_px=side.coverage.covered_px,
+        provenance=provenance,
+        diagnostics=CameraDiagnostics(
+            free_parameters=side.single.free_parameters,
+            model_reason=side.single.reason,
+            hold_out_rms_px=None,
+            n_folds=0,
+            condition=fit.condition,
+            noise_scale=side.noise_scale,
+            covered_fraction=side.coverage.fraction,
+            board=None,
+        ),
+    )
+
+
+def _found_pairs(
+    exposures: Sequence[ExposedPair], views: dict[str, TargetView]
+) -> list[StereoPair]:
+    pairs = []
+    for left, right in exposures:
+        seen = [None if one is None else views.get(one.source) for one in (left, right)]
+        if any(view is not None for view in seen):
+            pairs.append(StereoPair(seen[0], seen[1]))
+    return pairs
+
+
+def _stereo_too_few(
+    exposures: Sequence[ExposedPair],
+    pairs: Sequence[StereoPair],
+    found: FoundTargets,
+) -> FitFailure | None:
+    n_both = sum(pair.is_seen_by_both for pair in pairs)
+    if n_both >= MIN_PAIRS:
+        return None
+    counts = []
+    for side, word in enumerate(SIDES):
+        n_images = sum(pair[side] is not None for pair in exposures)
+        n_seen = sum(pair.views[side] is not None for pair in pairs)
+        counts.append(f"{n_seen} of {n_images} {word} images")
+    return FitFailure(
+        f"the target was found in {' and '.join(counts)}, in both of {n_both} pairs; "
+        f"{MIN_PAIRS} pairs are needed{found.not_found_text()}",
+        "take 10 to 20 pairs in which both cameras see the whole target, and check its columns, "
+        "rows and kind",
+    )
+
+
+def _stereo_corrected(view: TargetView | None, camera: CameraModel) -> TargetView | None:
+    return view if view is None or view.edges is None else correct_centres(view, camera)
+
+
+def _stereo_moved_sigmas(before: StereoFit, after: StereoFit) -> float:
+    """Largest change of a parameter over its standard deviation."""
+    old, new = before.views, after.views
+    turn = new.right_from_left.rotation @ old.right_from_left.rotation.T
+    moved = np.concatenate(
+        [
+            new.left.parameters - old.left.parameters,
+            new.right.parameters - old.right.parameters,
+            vector_from_rotation(turn),
+            new.right_from_left.translation_mm - old.right_from_left.translation_mm,
+        ]
+    )
+    is_free = after.sigma > 0.0
+    if not np.array_equal(is_free, before.sigma > 0.0):
+        return float("inf")
+    return float(np.max(np.abs(moved[is_free]) / after.sigma[is_free]))
+
+
+def _listed(exposures: Sequence[Exposure]) -> str:
+    names = [exposure.source for exposure in exposures[:LISTED]]
+    return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")

@@ -1,0 +1,526 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Left points on their sheets in the right image: residuals, and the right camera's drift."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.models.calibration import SensorCalibration
+from armscan.models.two_views import TwoViews
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.triangulate import N_CAMERA, N_SHEET, sensor_columns
+from armscan.records.profile import Profile
+
+ALONG_PX = 2.0
+"""A projected point farther than this beyond a stripe's end does not lie beside the stripe."""
+SINE_OF_SAME_DIRECTION = 0.42
+"""The projected stripe runs along the right one within 25 degrees."""
+BOW_DEPTH_SHARE = 0.03
+"""Part of the depth by which a bow may move a point from its place on the plane."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projections:
+    """Left stripe points, each on one sheet, in the right image.
+
+    Parameters
+    ----------
+    sheet
+        (H,) index into the sensor's sheets.
+    points_mm
+        (H, 3) in the Sensor frame (eq. 4.11).
+    q_px
+        (H, 2) pixels of the right image (eqs. 4.17 and 4.18).
+    is_met
+        (H,) False where the ray does not meet the sheet in front of both cameras.
+    point_by_px
+        (H, 3, 2) derivative of the point by the left pixel.
+    point_by_sensor
+        (H, 3, 17) by the left camera and the sheet.
+    q_by_point
+        (H, 2, 3) derivative of the right pixel by the point.
+    q_by_second
+        (H, 2, 15) by what the second camera adds, at a fixed point.
+    """
+
+    sheet: IntArray
+    points_mm: FloatArray
+    q_px: FloatArray
+    is_met: BoolArray
+    point_by_px: FloatArray
+    point_by_sensor: FloatArray
+    q_by_point: FloatArray
+    q_by_second: FloatArray
+
+    def q_by_sensor(self) -> FloatArray:
+        """(H, 2, 32) derivative of the right pixel by all parameters of the point's sheet."""
+        return np.concatenate([self.q_by_point @ self.point_by_sensor, self.q_by_second], axis=2)
+
+    def select(self, chosen: BoolArray | IntArray) -> Projections:
+        """Those that a mask or an index names."""
+        return Projections(
+            self.sheet[chosen],
+            self.points_mm[chosen],
+            self.q_px[chosen],
+            self.is_met[chosen],
+            self.point_by_px[chosen],
+            self.point_by_sensor[chosen],
+            self.q_by_point[chosen],
+            self.q_by_second[chosen],
+        )
+
+
+def possible_sheets(
+    points_px: FloatArray, sensor: SensorCalibration, depths: DepthRange
+) -> tuple[IntArray, IntArray]:
+    """Pairs of point and sheet whose planes meet within the depths accepted, widened for the bow.
+
+    Returns
+    -------
+    point, sheet
+        (H,) indices, ordered by point.
+    """
+    xy, is_valid = sensor.camera.camera.undistort(points_px)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    planes = np.stack([s.sheet.plane for s in sensor.sheets])
+    slope = rays @ planes[:, :3].T
+    depth = -planes[:, 3] / np.where(np.abs(slope) > 1e-9, slope, np.nan)
+    limits = np.array([depths.limits_mm(s) for s in sensor.sheets])
+    low, high = limits[:, 0] * (1.0 - BOW_DEPTH_SHARE), limits[:, 1] * (1.0 + BOW_DEPTH_SHARE)
+    with np.errstate(invalid="ignore"):
+        inside = (depth >= low) & (depth <= high) & is_valid[:, None]
+    point, sheet = np.nonzero(inside)
+    return point, sheet
+
+
+def project_on_sheets(
+    points_px: FloatArray, sheet: IntArray, sensor: SensorCalibration
+) -> Projections:
+    """Put each left pixel (H, 2) on its sheet (H,) and project it into the right camera."""
+    camera = sensor.camera.camera
+    xy, has_ray, xy_by_px, xy_by_camera = camera.undistort_with_jacobian(points_px)
+    n = len(points_px)
+    points = np.tile([0.0, 0.0, 1.0], (n, 1))
+    point_by_xy, by_sheet = np.zeros((n, 3, 2)), np.zeros((n, 3, N_SHEET))
+    is_met = np.zeros(n, dtype=np.bool_)
+    for k, calibrated in enumerate(sensor.sheets):
+        own = np.flatnonzero(has_ray & (sheet == k))
+        if not len(own):
+            continue
+        found, met, by_xy, by_parameters = calibrated.sheet.intersect_with_jacobian(xy[own])
+        own = own[met]
+        is_met[own] = True
+        points[own], point_by_xy[own], by_sheet[own] = found[met], by_xy[met], by_parameters[met]
+    by_sensor = np.zeros((n, 3, N_CAMERA + N_SHEET))
+    by_sensor[:, :, :N_CAMERA] = point_by_xy @ xy_by_camera
+    by_sensor[:, :, N_CAMERA:] = by_sheet
+    q, by_point, by_second = TwoViews.of_sensor(sensor).project_right_with_jacobian(points)
+    is_met &= np.isfinite(q).all(axis=1)
+    return Projections(
+        sheet, points, q, is_met, point_by_xy @ xy_by_px, by_sensor, by_point, by_second
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RightStripes:
+    """The right profile, ready for the search of the nearest stripe.
+
+    Parameters
+    ----------
+    profile
+        Stripe points of the right camera.
+    row
+        (R,) the accepted ones.
+    tree
+        Of their pixels.
+    """
+
+    profile: Profile
+    row: IntArray
+    tree: cKDTree
+
+    @staticmethod
+    def of(profile: Profile) -> RightStripes:
+        """Index the accepted points."""
+        row = np.flatnonzero(profile.is_accepted)
+        return RightStripes(profile, row, cKDTree(profile.points_px[row]))
+
+    def spacing_px(self) -> float:
+        """Mean distance between stripes: the picture's area over the stripes' length."""
+        if len(self.row) < 2:
+            return 1.0
+        size = np.ptp(self.profile.points_px[self.row], axis=0)
+        return max(float(size[0] * size[1]) / len(self.row), 1.0)
+
+    def covers(self, q_px: FloatArray) -> BoolArray:
+        """(H,) True within the rectangle in which there are right stripes."""
+        points = self.profile.points_px[self.row]
+        if not len(points):
+            return np.zeros(len(q_px), dtype=np.bool_)
+        low, high = points.min(axis=0), points.max(axis=0)
+        return np.asarray(((q_px >= low) & (q_px <= high)).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Crossings:
+    """The right stripe beside each projected point.
+
+    Parameters
+    ----------
+    row
+        (H,) index of the nearest point in the right profile; -1 where no stripe is within reach.
+    residual_px
+        (H,) signed distance of the projected point across that stripe, along its normal.
+    sigma_px
+        (H,) standard deviation of the residual from the noise of both stripes alone.
+    normal
+        (H, 2) across the right stripe.
+    """
+
+    row: IntArray
+    residual_px: FloatArray
+    sigma_px: FloatArray
+    normal: FloatArray
+
+    @property
+    def is_found(self) -> BoolArray:
+        """(H,) True where there is a stripe within reach."""
+        return np.asarray(self.row >= 0)
+
+    def select(self, chosen: BoolArray | IntArray) -> Crossings:
+        """Those that a mask or an index names."""
+        return Crossings(
+            self.row[chosen], self.residual_px[chosen], self.sigma_px[chosen], self.normal[chosen]
+        )
+
+
+def find_crossings(
+    projected: Projections,
+    normals_px: FloatArray,
+    sigma_px: FloatArray,
+    right: RightStripes,
+    reach_px: float,
+) -> Crossings:
+    """Find the right stripe that runs beside each projected point, and the distance across it.
+
+    Parameters
+    ----------
+    projected
+        (H,) left points on sheets.
+    normals_px, sigma_px
+        (H, 2) and (H,) of the left stripe.
+    right
+        The right profile.
+    reach_px
+        Largest distance.
+    """
+    n = len(projected.sheet)
+    row = np.full(n, -1)
+    residual, sigma, normal = np.zeros(n), np.ones(n), np.zeros((n, 2))
+    asked = np.flatnonzero(projected.is_met)
+    if not len(right.row) or not len(asked):
+        return Crossings(row, residual, sigma, normal)
+    distance, nearest = right.tree.query(
+        projected.q_px[asked], distance_upper_bound=float(np.hypot(reach_px, ALONG_PX))
+    )
+    is_near = np.isfinite(distance)
+    asked, nearest = asked[is_near], np.asarray(nearest)[is_near]
+    found = right.row[nearest]
+    n_right = right.profile.normals_px[found]
+    away = projected.q_px[asked] - right.profile.points_px[found]
+    across = np.sum(away * n_right, axis=1)
+    along = away[:, 0] * -n_right[:, 1] + away[:, 1] * n_right[:, 0]
+    by_left = projected.q_by_point[asked] @ projected.point_by_px[asked]
+    tangent = np.stack([-normals_px[asked, 1], normals_px[asked, 0]], axis=1)
+    runs = np.einsum("nij,nj->ni", by_left, tangent)
+    sine = np.abs(np.sum(runs * n_right, axis=1)) / np.maximum(np.linalg.norm(runs, axis=1), 1e-12)
+    good = (np.abs(along) <= ALONG_PX) & (np.abs(across) <= reach_px)
+    good &= sine <= SINE_OF_SAME_DIRECTION
+    gain = np.einsum("ni,nij,nj->n", n_right, by_left, normals_px[asked])
+    at = asked[good]
+    row[at], residual[at], normal[at] = found[good], across[good], n_right[good]
+    sigma[at] = np.hypot(gain * sigma_px[asked], right.profile.sigma_px[found])[good]
+    return Crossings(row, residual, sigma, normal)
+
+
+ROUNDS = 4
+HUBER_SIGMAS = 2.0
+CORRELATION = 3.0
+"""Samples along a stripe err together: their sigma counts as this much larger."""
+SLOPE_SHARE = 0.5
+"""Drift from the image's middle to its rim, as a part of the drift in the middle."""
+HALF_IMAGE = 0.5
+CERTAIN_SIGMAS = 3.0
+LEAST_SHARE = 0.05
+"""A stripe along the epipolar line says nothing about the offset across it."""
+LEAST_OFFSET_PX = 0.1
+"""Offsets below this change no name and hardly a point: no warning."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EpipolarOffset:
+    """What moves all residuals together.
+
+    Errors within the calibration's covariance and a drift of the right picture across the
+    epipolar lines (constant and linear over the image) are told apart by their priors alone; the
+    residuals determine their sum.
+
+    Parameters
+    ----------
+    parameter_step
+        (P,) most likely errors of the calibration's parameters (what to add to them).
+    drift
+        (3,) offset in the image's middle and its change to the right and lower rim, px.
+    factor
+        (P + 3, K) with ``factor @ factor.T`` the covariance of both together.
+    offset_px
+        Mean distance by which the right picture lies off the epipolar lines, positive downwards.
+    sigma_px
+        Its standard deviation.
+    allowed_px
+        Standard deviation that the calibration's covariance allows for it.
+    n_samples
+        Samples used.
+    """
+
+    parameter_step: FloatArray
+    drift: FloatArray
+    factor: FloatArray
+    offset_px: float
+    sigma_px: float
+    allowed_px: float
+    n_samples: int
+
+    @property
+    def is_beyond_calibration(self) -> bool:
+        """True if the calibration's covariance does not explain the offset."""
+        limit = CERTAIN_SIGMAS * float(np.hypot(self.allowed_px, self.sigma_px))
+        return abs(self.offset_px) > max(limit, LEAST_OFFSET_PX)
+
+
+def drift_directions(projected: Projections, sensor: SensorCalibration) -> FloatArray:
+    """(H, 2, 3) how the drift's three numbers move the right picture of each point.
+
+    The move is across the epipolar line, which is where the point's picture goes with its depth.
+    """
+    along = np.einsum("nij,nj->ni", projected.q_by_point, projected.points_mm)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    across *= np.where(across[:, 1] < 0.0, -1.0, 1.0)[:, None]
+    second = sensor.second
+    camera = sensor.camera.camera if second is None else second.camera.camera
+    size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    place = (projected.q_px - 0.5 * size) / (HALF_IMAGE * size)
+    basis = np.concatenate([np.ones((len(place), 1)), place], axis=1)
+    return np.asarray(across[:, :, None] * basis[:, None, :])
+
+
+def residual_derivatives(
+    projected: Projections, crossings: Crossings, sensor: SensorCalibration
+) -> FloatArray:
+    """(H, P + 3) of the residuals by steps of the parameters and of the right picture.
+
+    The true steps take the residuals to zero: what the calibration's errors made is undone by
+    adding them to its parameters, what a drift made by shifting the projected points with it.
+    """
+    by_own = np.einsum("ni,nij->nj", crossings.normal, projected.q_by_sensor())
+    n = len(projected.sheet)
+    result = np.zeros((n, len(sensor.covariance) + 3))
+    columns = np.stack([sensor_columns(sensor, k) for k in range(len(sensor.sheets))])
+    result[np.arange(n)[:, None], columns[projected.sheet]] = by_own
+    drift = drift_directions(projected, sensor)
+    result[:, -3:] = np.einsum("ni,nij->nj", crossings.normal, drift)
+    return result
+
+
+def prior_factor(sensor: SensorCalibration, drift_px: float) -> FloatArray:
+    """(P + 3, K) with ``F F'`` the covariance of the calibration and of the drift, before data."""
+    n = len(sensor.covariance)
+    scale = np.sqrt(np.maximum(np.diag(sensor.covariance), 0.0))
+    unit = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(sensor.covariance / np.outer(unit, unit))
+    kept = values > 1e-12 * max(float(values[-1]), 1e-300)
+    factor = np.zeros((n + 3, int(kept.sum()) + 3))
+    factor[:n, :-3] = unit[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    factor[n:, -3:] = np.diag([drift_px, SLOPE_SHARE * drift_px, SLOPE_SHARE * drift_px])
+    return factor
+
+
+def no_offset(sensor: SensorCalibration, drift_px: float) -> EpipolarOffset:
+    """What is known before any data: nothing has moved, as far as the priors say."""
+    n = len(sensor.covariance)
+    prior = prior_factor(sensor, drift_px)
+    return EpipolarOffset(np.zeros(n), np.zeros(3), prior, 0.0, drift_px, 0.0, 0)
+
+
+def estimate_offset(
+    projected: Projections,
+    crossings: Crossings,
+    sensor: SensorCalibration,
+    prior: EpipolarOffset,
+    floor_px: float,
+) -> EpipolarOffset:
+    """Most likely errors of the calibration and drift, given the residuals of named samples.
+
+    Robust (Huber's weights) and with the priors' covariance: few samples move little.
+
+    Parameters
+    ----------
+    projected, crossings
+        (H,) of samples whose sheet is certain.
+    sensor
+        Cameras and sheets.
+    prior
+        From `no_offset`.
+    floor_px
+        Noise of a residual beside that of the stripes.
+    """
+    if not len(projected.sheet):
+        return prior
+    equations = _Equations.of(projected, crossings, sensor, prior, floor_px=floor_px)
+    information = equations.information()
+    step = prior.factor @ equations.state
+    n = len(sensor.covariance)
+    return EpipolarOffset(
+        step[:n],
+        step[n:],
+        prior.factor @ np.linalg.cholesky(np.linalg.inv(information)),
+        *_mean_offset(equations, crossings, sensor),
+        len(projected.sheet),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Equations:
+    """Weighted linear equations of the residuals in whitened errors, and their solution.
+
+    ``by_all`` (H, P + 3) and ``design`` (H, K) are derivatives by the errors and by the whitened
+    errors, ``wanted`` (H,) what undoes the residuals.
+    """
+
+    by_all: FloatArray
+    design: FloatArray
+    wanted: FloatArray
+    sigma: FloatArray
+    weight: FloatArray
+    state: FloatArray
+
+    @staticmethod
+    def of(
+        projected: Projections,
+        crossings: Crossings,
+        sensor: SensorCalibration,
+        prior: EpipolarOffset,
+        *,
+        floor_px: float,
+        is_used: BoolArray | None = None,
+    ) -> _Equations:
+        by_all = residual_derivatives(projected, crossings, sensor)
+        design = by_all @ prior.factor
+        sigma = CORRELATION * np.hypot(crossings.sigma_px, floor_px)
+        wanted = -crossings.residual_px
+        used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
+        weight = used
+        state: FloatArray = np.zeros(design.shape[1])
+        for _ in range(ROUNDS):
+            found = _Equations(by_all, design, wanted, sigma, weight, state)
+            state = np.asarray(np.linalg.solve(found.information(), found.right_side()))
+            score = np.abs(wanted - design @ state) / sigma * CORRELATION
+            weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
+        return _Equations(by_all, design, wanted, sigma, found.weight, state)
+
+    def information(self) -> FloatArray:
+        """(K, K) with the prior's unit matrix."""
+        scaled = self.design * (self.weight / self.sigma**2)[:, None]
+        return np.asarray(self.design.T @ scaled + np.eye(self.design.shape[1]))
+
+    def right_side(self) -> FloatArray:
+        """(K,)."""
+        return np.asarray(self.design.T @ (self.wanted * self.weight / self.sigma**2))
+
+
+def left_out_scores(
+    projected: Projections,
+    crossings: Crossings,
+    stretch: IntArray,
+    is_used: BoolArray,
+    sensor: SensorCalibration,
+    *,
+    prior: EpipolarOffset,
+    floor_px: float,
+) -> FloatArray:
+    """How badly each stretch's residuals fit what all the others say of the offset.
+
+    A stripe that lies on another sheet's right stripe by chance does so with an offset of its own,
+    which the calibration's freedom would explain away were it asked about itself.
+
+    Parameters
+    ----------
+    projected, crossings
+        (H,) as for `estimate_offset`.
+    stretch
+        (H,) number of the stretch of stripe, counted from 0.
+    is_used
+        (H,) False for stretches that are asked but have no say.
+    sensor, prior, floor_px
+        As for `estimate_offset`.
+
+    Returns
+    -------
+    FloatArray
+        (B,) chi-square of mean, slope and bend of the stretch's residuals, over their count.
+    """
+    equations = _Equations.of(
+        projected, crossings, sensor, prior, floor_px=floor_px, is_used=is_used
+    )
+    information, right_side = equations.information(), equations.right_side()
+    n_stretches = int(stretch.max()) + 1 if len(stretch) else 0
+    scores = np.zeros(n_stretches)
+    for b in range(n_stretches):
+        own = np.flatnonzero(stretch == b)
+        if not len(own):
+            continue
+        design, sigma = equations.design[own], equations.sigma[own]
+        scaled = design * (equations.weight[own] / sigma**2)[:, None]
+        others = information - design.T @ scaled
+        state = np.linalg.solve(others, right_side - scaled.T @ equations.wanted[own])
+        place = np.linspace(-1.0, 1.0, len(own))
+        shape = np.stack([np.ones(len(own)), place, place**2], axis=1)[:, : min(len(own), 3)]
+        moments = np.linalg.pinv(shape)
+        gain = moments @ design
+        missed = moments @ equations.wanted[own] - gain @ state
+        spread = gain @ np.linalg.solve(others, gain.T) + (moments * sigma**2) @ moments.T
+        spread[0, 0] += floor_px**2
+        scores[b] = float(missed @ np.linalg.solve(spread, missed)) / len(missed)
+    return scores
+
+
+def _mean_offset(
+    equations: _Equations, crossings: Crossings, sensor: SensorCalibration
+) -> tuple[float, float, float]:
+    """Weighted mean of the residuals across the epipolar lines, its sigma, and that allowed."""
+    unit = equations.by_all[:, -3]
+    weight = equations.weight / equations.sigma**2
+    share = np.where(np.abs(unit) > LEAST_SHARE, unit, 0.0) * weight
+    total = float(share @ unit)
+    if total <= 0.0:
+        return 0.0, float(np.inf), 0.0
+    share = share / total
+    by_parameters = share @ equations.by_all[:, :-3]
+    allowed = float(by_parameters @ sensor.covariance @ by_parameters)
+    mean = -float(share @ crossings.residual_px)
+    return mean, float(np.sqrt(1.0 / total)), float(np.sqrt(max(allowed, 0.0)))
+
+
+def predicted_residuals(
+    projected: Projections, crossings: Crossings, sensor: SensorCalibration, offset: EpipolarOffset
+) -> tuple[FloatArray, FloatArray]:
+    """Residual (H,) that calibration errors and drift explain, and its standard deviation (H,)."""
+    by_all = residual_derivatives(projected, crossings, sensor)
+    step = np.concatenate([offset.parameter_step, offset.drift])
+    spread = by_all @ offset.factor
+    return -(by_all @ step), np.sqrt(np.sum(spread**2, axis=1))

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ring markers, as images and in space, and points touched with the arm's probe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RingImages:
+    """Images of N ring markers in one exposure.
+
+    Parameters
+    ----------
+    source
+        The exposure's source name.
+    centres_px
+        (N, 2) images of the rings' centres, full-sensor pixels; these are not the centres of the
+        ellipses.
+    covariance_px2
+        (N, 2, 2) their covariance.
+    outer_half_px, inner_half_px
+        (N, 2) half axes of the ring's outer and inner rim, the shorter one first.
+    direction_rad
+        (N,) direction of the outer rim's longer axis, from x towards y.
+    contrast
+        (N,) level of the disc minus level of the ring, as a fraction of full scale.
+    perimeter_px
+        (N,) circumference of the outer rim if the ring were not tilted (P of eq. 4.19).
+    roundness
+        (N,) C of eq. 4.20; 1 for a ring that is not tilted.
+    """
+
+    source: str
+    centres_px: FloatArray
+    covariance_px2: FloatArray
+    outer_half_px: FloatArray
+    inner_half_px: FloatArray
+    direction_rad: FloatArray
+    contrast: FloatArray
+    perimeter_px: FloatArray
+    roundness: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.centres_px)
+        shapes = {
+            "centres_px": (n, 2),
+            "covariance_px2": (n, 2, 2),
+            "outer_half_px": (n, 2),
+            "inner_half_px": (n, 2),
+            "direction_rad": (n,),
+            "contrast": (n,),
+            "perimeter_px": (n,),
+            "roundness": (n,),
+        }
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+        _check_covariances(self.covariance_px2, "covariance_px2", self.source)
+
+    def __len__(self) -> int:
+        """Count of rings."""
+        return len(self.centres_px)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerSet:
+    """Markers as points in space; they carry no code, so an id says nothing outside its set.
+
+    Parameters
+    ----------
+    ids
+        (N,) numbers of the markers in this set, each once.
+    points_mm
+        (N, 3) centres in ``frame``.
+    covariance_mm2
+        (N, 3, 3) covariance of each centre, independent between markers: that of measuring its
+        images. What a calibration adds is common to all markers and not in here.
+    frame
+        Name of the coordinate frame, for example ``Sensor`` or ``Base``.
+    source
+        Where they came from, for messages.
+    """
+
+    ids: IntArray
+    points_mm: FloatArray
+    covariance_mm2: FloatArray
+    frame: str = "Sensor"
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        n = len(self.points_mm)
+        object.__setattr__(self, "ids", frozen_ints(self.ids, (n,), "marker ids"))
+        object.__setattr__(self, "points_mm", frozen_floats(self.points_mm, (n, 3), "markers (mm)"))
+        covariance = frozen_floats(self.covariance_mm2, (n, 3, 3), "markers' covariance (mm2)")
+        object.__setattr__(self, "covariance_mm2", covariance)
+        if len(np.unique(self.ids)) != n:
+            raise InputError("a marker's id occurs twice", where=self.source)
+        _check_covariances(covariance, "markers' covariance (mm2)", self.source)
+
+    def __len__(self) -> int:
+        """Count of markers."""
+        return len(self.points_mm)
+
+
+def _check_covariances(covariance: FloatArray, name: str, where: str) -> None:
+    if len(covariance) and float(np.linalg.eigvalsh(covariance).min()) <= 0.0:
+        raise InputError(f"{name} is not positive definite", where=where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProbedPoints:
+    """Points in Base that a probe touched.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in Base: on the surface, or the tip's centres.
+    tip_diameter_mm
+        Diameter of the tip that touched; 0 where not known, for points on the surface.
+    features
+        (N,) name of the feature that each point belongs to; empty where nobody said.
+    source
+        Where they came from, for messages.
+    is_compensated
+        True if the tip's radius was taken off already: the points are on the surface.
+    rows
+        (N,) row of each point in its table, from 1; all rows in turn if empty.
+    """
+
+    points_mm: FloatArray
+    tip_diameter_mm: float = 0.0
+    features: tuple[str, ...] = ()
+    source: str = ""
+    is_compensated: bool = False
+    rows: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        points = frozen_floats(self.points_mm, (None, 3), "probed points (mm)")
+        object.__setattr__(self, "points_mm", points)
+        if not 0.0 <= self.tip_diameter_mm < 1000.0:
+            raise InputError(f"a tip of {self.tip_diameter_mm} mm diameter", where=self.source)
+        if self.features and len(self.features) != len(points):
+            raise InputError(
+                f"{len(self.features)} features for {len(points)} points", where=self.source
+            )
+        rows = self.rows or tuple(range(1, len(points) + 1))
+        if len(rows) != len(points):
+            raise InputError(f"{len(rows)} rows for {len(points)} points", where=self.source)
+        object.__setattr__(self, "rows", rows)
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.points_mm)
+
+    @property
+    def are_tip_centres(self) -> bool:
+        """True if the points still have to be compensated for the tip's radius."""
+        return self.tip_diameter_mm > 0.0 and not self.is_compensated

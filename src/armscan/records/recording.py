@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording's cameras, clock, pose form, arm track and laser schedule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import EulerConvention
+from armscan.records.exposure import SensorWindow
+
+SessionKind = Literal["scan", "calibration"]
+Clock = Literal["shared", "separate"]
+PoseForm = Literal["quaternion", "matrix", "euler", "joints"]
+PixelAlignment = Literal["low", "high"]
+PixelColour = Literal["mono", "rgb", "bayer_rggb"]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSetup:
+    """How one camera delivered its images.
+
+    Parameters
+    ----------
+    width_px, height_px
+        Size of the images; None where nobody said.
+    window
+        Where the image lies on the full sensor.
+    bits_used
+        Significant bits of a pixel.
+    align
+        Where they lie in 16 stored bits.
+    colour
+        Layout of the pixels as stored.
+    """
+
+    width_px: int | None = None
+    height_px: int | None = None
+    window: SensorWindow = field(default_factory=SensorWindow)
+    bits_used: int = 8
+    align: PixelAlignment = "low"
+    colour: PixelColour = "mono"
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """Facts about a recording that are not in its tables.
+
+    Parameters
+    ----------
+    kind
+        What it was taken for.
+    cameras
+        One entry a camera.
+    clock
+        ``shared`` if exposures and arm samples bear times of one clock.
+    pose_form, rotation
+        How the arm's poses are written, and the convention if they are Euler angles.
+    head
+        Path of a description of the head beside the recording, or None.
+    is_simulated
+        True if the recording says that its images were rendered.
+    assumed
+        What nobody said and the program took for granted, in words.
+    """
+
+    kind: SessionKind = "scan"
+    cameras: tuple[CameraSetup, ...] = (CameraSetup(),)
+    clock: Clock = "shared"
+    pose_form: PoseForm = "quaternion"
+    rotation: EulerConvention = "intrinsic-xyz"
+    head: str | None = None
+    is_simulated: bool = False
+    assumed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureRow:
+    """One line of a recording's list of exposures: everything but the pixels.
+
+    Parameters
+    ----------
+    index
+        The exposure's own number in the recording.
+    t_ns
+        Mid-exposure time.
+    camera
+        Number of the camera, counted from 0.
+    source
+        Name of the image, a path relative to the recording.
+    lasers
+        Names of the laser sources that were on.
+    trigger_id
+        Number of the trigger, or None.
+    view
+        Exposures of equal view saw one rigid arrangement; None stands for a view of its own.
+    """
+
+    index: int
+    t_ns: int
+    camera: int
+    source: str
+    lasers: tuple[str, ...] = ()
+    trigger_id: int | None = None
+    view: str | None = None
+
+
+NO_TRIGGER = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmTrack:
+    """Samples of ``base_from_tool`` in time order; unknown ones are gaps, never bridged.
+
+    Parameters
+    ----------
+    t_ns
+        (N,) time of each sample, strictly increasing.
+    rotations
+        (N, 3, 3) proper rotations; anything in rows that are not known.
+    translations_mm
+        (N, 3) origin of Tool in Base; anything finite in rows that are not known.
+    is_known
+        (N,) False where the arm gave no pose.
+    trigger_ids
+        (N,) number of the trigger that each sample belongs to, `NO_TRIGGER` for none; or None.
+    joints_rad
+        (N, J) joint angles as delivered, NaN in unknown rows; None where the arm gave poses only.
+
+    Raises
+    ------
+    InputError
+        If times do not increase or shapes do not fit.
+    """
+
+    t_ns: IntArray
+    rotations: FloatArray
+    translations_mm: FloatArray
+    is_known: BoolArray
+    trigger_ids: IntArray | None = None
+    joints_rad: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        times = frozen_ints(self.t_ns, (None,), "t_ns")
+        n = len(times)
+        if n and not bool((np.diff(times) > 0).all()):
+            row = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
+            raise InputError(
+                f"times of the arm's samples do not increase at sample {row}",
+                remedy="sort the samples by time and remove duplicates",
+            )
+        object.__setattr__(self, "t_ns", times)
+        for name, shape in (("rotations", (n, 3, 3)), ("translations_mm", (n, 3))):
+            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+        known = np.array(self.is_known, dtype=np.bool_)
+        if known.shape != (n,):
+            raise InputError(f"is_known has shape {known.shape}, expected ({n},)")
+        known.setflags(write=False)
+        object.__setattr__(self, "is_known", known)
+        if self.trigger_ids is not None:
+            ids = frozen_ints(self.trigger_ids, (n,), "trigger_ids")
+            object.__setattr__(self, "trigger_ids", ids)
+        if self.joints_rad is not None:
+            joints = frozen_floats(self.joints_rad, (n, None), "joints_rad", allow_nan=True)
+            object.__setattr__(self, "joints_rad", joints)
+
+    def __len__(self) -> int:
+        """Count of samples, unknown ones included."""
+        return len(self.t_ns)
+
+    def pose(self, row: int) -> Pose[Base, Tool]:
+        """Pose of one known sample.
+
+        Raises
+        ------
+        InputError
+            If the sample is a gap.
+        """
+        if not self.is_known[row]:
+            raise InputError(f"the arm gave no pose at sample {row}")
+        return Pose(self.rotations[row], self.translations_mm[row])
+
+
+@dataclass(frozen=True, slots=True)
+class LaserSchedule:
+    """Lasers that are on, exposure by exposure, over and over.
+
+    Parameters
+    ----------
+    pattern
+        Names of the sources that are on in each exposure of a period.
+    """
+
+    pattern: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        if not self.pattern or not any(self.pattern):
+            raise OptionError(
+                "a laser schedule without lasers", remedy="give at least one exposure with a laser"
+            )
+
+    def lasers(self, exposure: int) -> tuple[str, ...]:
+        """Sources that are on in exposure number ``exposure``, counted from 0."""
+        return self.pattern[exposure % len(self.pattern)]
+
+
+THESIS_SCHEDULE = LaserSchedule((("A",), ("B",), ("A", "B")))
+"""Figure 3.2: A alone, B alone, both; four stripes in three exposures, 1.33 of one laser's."""
+
+ALWAYS_BOTH = LaserSchedule((("A", "B"),))
+"""Both lasers on in every exposure."""

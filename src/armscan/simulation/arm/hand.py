@@ -1,0 +1,424 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the head is held and moved: orientation over a surface, poses, the path of a hand with
+tremor, and scan passes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.simulation.arm.arm import COMFORTABLE_RAD, N_JOINTS, ScrewArm, reach
+from armscan.simulation.head import Head, sheet_middle_mm
+
+FACE_DOWN = np.diag([1.0, -1.0, -1.0])
+"""Sensor axes over a face with x to the right and z up: it looks down on it, upright."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadOrientation:
+    """One way of holding the head over a face.
+
+    Parameters
+    ----------
+    tilt_x_deg, tilt_y_deg
+        The head turned from looking straight down, about its own x and y axes; negative
+        ``tilt_x_deg`` brings the laser upright and lays the camera over.
+    roll_deg
+        The head turned about the face's normal first.
+    depth_mm
+        Depth, along the optical axis, of the middle of the stripe.
+    """
+
+    tilt_x_deg: float
+    tilt_y_deg: float
+    roll_deg: float
+    depth_mm: float
+
+    def rotation(self) -> FloatArray:
+        """Rotation (3, 3) ``face_from_sensor``."""
+        roll, about_y, about_x = (
+            rotation_from_vector(np.radians(angle) * np.eye(3)[axis])
+            for angle, axis in ((self.roll_deg, 2), (-self.tilt_y_deg, 1), (-self.tilt_x_deg, 0))
+        )
+        return np.asarray(roll @ FACE_DOWN @ about_x @ about_y)
+
+
+def sensor_over(
+    base_rotation: FloatArray,
+    spot_base_mm: FloatArray,
+    aim: HeadOrientation,
+    stripe_sensor_mm: FloatArray,
+) -> Pose[Base, Sensor]:
+    """``base_from_sensor`` that brings the middle of the stripe to a spot.
+
+    Parameters
+    ----------
+    base_rotation
+        (3, 3) ``base_from_face``: its z axis is the face's normal.
+    spot_base_mm
+        (3,) where the middle of the stripe shall fall.
+    aim
+        How the head is held.
+    stripe_sensor_mm
+        (3,) the middle of the stripe at the aim's depth, in Sensor.
+    """
+    rotation = base_rotation @ aim.rotation()
+    return Pose(rotation, spot_base_mm - rotation @ stripe_sensor_mm)
+
+
+def on_face(face: FloatArray, origin_mm: FloatArray, place_mm: tuple[float, float]) -> FloatArray:
+    """(3,) point beside a face's origin, along its first two axes."""
+    return np.asarray(origin_mm + face[:, :2] @ np.array(place_mm))
+
+
+def leaning(tilt_deg: float, azimuth_deg: float) -> FloatArray:
+    """(3, 3) axes of a face that leans towards an azimuth, without turning about the vertical."""
+    azimuth = np.radians(azimuth_deg)
+    axis = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    return rotation_from_vector(np.radians(tilt_deg) * axis)
+
+
+def quarter_turn() -> FloatArray:
+    """A face whose y axis runs along the x of the one before it."""
+    return np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+DEPTH_MM = 137.0
+"""Middle of the depths that the scanning window sees."""
+_STEREO_DEPTH_MM = 140.0
+"""There the axes of two cameras meet."""
+_STEREO_ROLL_DEG = 92.0
+
+
+def light_upright(head: Head) -> HeadOrientation:
+    """HeadOrientation at which the light falls along the face's normal.
+
+    One sheet: its middle ray stands upright. Two: both sheets do, that is the line in which they
+    meet. More: the middle ray of the middle one.
+    """
+    if len(head.lasers) == 2:
+        along = np.cross(head.lasers[0].normal, head.lasers[1].normal)
+        return _looking_along(head, along * np.sign(along[2]))
+    return _looking_along(head, head.lasers[len(head.lasers) // 2].rays(np.zeros(1))[0])
+
+
+def half_way(head: Head) -> HeadOrientation:
+    """HeadOrientation at which light and camera lie equally far from the face's normal.
+
+    For two cameras it is that at which both of them do.
+    """
+    if len(head.cameras) > 1:
+        return facing_both(head)
+    upright = light_upright(head)
+    return replace(
+        upright, tilt_x_deg=0.5 * upright.tilt_x_deg, tilt_y_deg=0.5 * upright.tilt_y_deg
+    )
+
+
+def facing_both(head: Head) -> HeadOrientation:
+    """HeadOrientation at which a face is seen equally obliquely by all cameras."""
+    return _looking_along(head, _mean_view(head))
+
+
+def viewing_axes(head: Head) -> FloatArray:
+    """(3, 3) axes, in Sensor, of a target that faces all cameras alike: its z points away."""
+    away = _mean_view(head)
+    down = np.array([0.0, 1.0, 0.0]) - away[1] * away
+    down /= np.linalg.norm(down)
+    return np.stack([np.cross(down, away), down, away], axis=1)
+
+
+def aim_point_mm(head: Head, depth_mm: float) -> FloatArray:
+    """(3,) point of Sensor, at a depth along camera 0's axis, that is brought to what is scanned.
+
+    For one camera it is the middle of its light, for two the middle of what both see.
+    """
+    if len(head.cameras) == 1:
+        return sheet_middle_mm(head, depth_mm)
+    away = _mean_view(head)
+    return overlap_middle_mm(head, (depth_mm - _STEREO_DEPTH_MM) / away[2])
+
+
+def overlap_middle_mm(head: Head, farther_mm: float = 0.0) -> FloatArray:
+    """(3,) point of Sensor on which all cameras look, or farther away from them.
+
+    For one camera it is the middle of its light.
+    """
+    if len(head.cameras) > 1:
+        return np.array([0.0, 0.0, _STEREO_DEPTH_MM]) + farther_mm * _mean_view(head)
+    return sheet_middle_mm(head, DEPTH_MM + farther_mm)
+
+
+def _mean_view(head: Head) -> FloatArray:
+    """(3,) unit mean of the cameras' axes."""
+    axes = [mounted.camera_from_sensor.rotation[2] for mounted in head.cameras]
+    total = np.sum(axes, axis=0)
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def _looking_along(head: Head, direction: FloatArray) -> HeadOrientation:
+    """HeadOrientation that turns a direction (3,) of Sensor against the face's normal."""
+    x, y, z = direction / np.linalg.norm(direction)
+    is_stereo = len(head.cameras) > 1
+    return HeadOrientation(
+        float(-np.degrees(np.arcsin(y))),
+        float(np.degrees(np.arctan2(x, z))),
+        _STEREO_ROLL_DEG if is_stereo else 0.0,
+        _STEREO_DEPTH_MM if is_stereo else DEPTH_MM,
+    )
+
+
+_FREQUENCIES_HZ = (0.4, 0.9, 1.7)
+_SHARES = (0.6, 0.3, 0.1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandPath:
+    """Joint angles over time, cubic between knots.
+
+    Parameters
+    ----------
+    t_s
+        (N,) increasing times of the knots, N >= 2.
+    joints_rad
+        (N, 7) true joint angles there.
+    """
+
+    t_s: FloatArray
+    joints_rad: FloatArray
+
+    def __post_init__(self) -> None:
+        times = frozen_floats(self.t_s, (None,), "t_s")
+        joints = frozen_floats(self.joints_rad, (len(times), N_JOINTS), "joints_rad")
+        object.__setattr__(self, "t_s", times)
+        object.__setattr__(self, "joints_rad", joints)
+
+    @staticmethod
+    def through(
+        arm: ScrewArm,
+        tool_from_sensor: Pose[Tool, Sensor],
+        t_s: FloatArray,
+        poses: Sequence[Pose[Base, Sensor]],
+    ) -> HandPath:
+        """Path of a true arm whose sensor passes poses at times (N,), each reached exactly."""
+        sensor_from_tool = tool_from_sensor.inverse()
+        joints = COMFORTABLE_RAD
+        knots = []
+        for pose in poses:
+            joints = reach(arm, pose @ sensor_from_tool, joints)
+            knots.append(joints)
+        return HandPath(t_s, np.array(knots))
+
+    def joints(self, t_s: FloatArray) -> FloatArray:
+        """True joint angles (N, 7) at times (N,) within the knots."""
+        return np.asarray(CubicSpline(self.t_s, self.joints_rad, axis=0)(t_s))
+
+
+@dataclass(frozen=True, slots=True)
+class HandTremor:
+    """How far a hand strays; each a standard deviation over time.
+
+    Parameters
+    ----------
+    tilt_deg
+        About each axis of the head.
+    depth_mm
+        Of the stand-off.
+    aside_mm
+        Across the way.
+    speed
+        Of the speed, over its mean.
+    """
+
+    tilt_deg: float = 1.5
+    depth_mm: float = 1.0
+    aside_mm: float = 1.5
+    speed: float = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sway:
+    """A smooth random function of time: a few slow waves with random phases.
+
+    Parameters
+    ----------
+    phases_rad
+        (3,) phases of the waves.
+    """
+
+    phases_rad: FloatArray
+
+    @staticmethod
+    def draw(rng: np.random.Generator) -> Sway:
+        """Draw the phases."""
+        return Sway(rng.uniform(0.0, 2.0 * np.pi, len(_FREQUENCIES_HZ)))
+
+    def __call__(self, t_s: FloatArray) -> FloatArray:
+        """(N,) values of about unit standard deviation at times (N,)."""
+        angle = 2.0 * np.pi * np.outer(t_s, _FREQUENCIES_HZ) + self.phases_rad
+        scale = np.sqrt(2.0 / np.sum(np.square(_SHARES)))
+        return np.asarray(scale * np.sin(angle) @ np.array(_SHARES))
+
+
+CAMERA_CLOCK_NS = 12_500_000
+_KNOT_S = 0.06
+_MARGIN_S = 0.12
+_FINE_S = 0.002
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedProfile:
+    """How fast the hand goes, and how often the camera looks.
+
+    Parameters
+    ----------
+    slowest_mm_s, fastest_mm_s
+        Of the progress along the stroke.
+    is_burst
+        True if images are taken at successive ticks of the camera's clock, half of them before
+        the middle of the stroke and half after it, wherever the hand is then; False if they are
+        taken from the start of the stroke to its end.
+    """
+
+    slowest_mm_s: float
+    fastest_mm_s: float
+    is_burst: bool = False
+
+
+UNHURRIED = SpeedProfile(24.0, 72.0)
+"""What the hand adds stays within 20-80 mm/s."""
+BURST = SpeedProfile(56.0, 140.0, is_burst=True)
+"""What the hand adds stays within 50-150 mm/s."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPass:
+    """What the person means to do.
+
+    Parameters
+    ----------
+    base_from_face
+        (3, 3) rotation of the face that is scanned; z is its normal.
+    start_mm, end_mm
+        (3,) where the middle of the stripe shall go from and to, in Base.
+    aim
+        How the head is held.
+    speed_mm_s
+        Mean speed.
+    n_exposures
+        Images to keep, evenly from all that the camera's clock gives.
+    pace
+        Slowest and fastest progress, and whether the camera takes every tick of its clock.
+    """
+
+    base_from_face: FloatArray
+    start_mm: FloatArray
+    end_mm: FloatArray
+    aim: HeadOrientation
+    speed_mm_s: float
+    n_exposures: int
+    pace: SpeedProfile = UNHURRIED
+
+    @property
+    def length_mm(self) -> float:
+        """Way of the middle of the stripe."""
+        return float(np.linalg.norm(self.end_mm - self.start_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """What the person did.
+
+    Parameters
+    ----------
+    path
+        True joint angles, from a little before the first exposure to a little after the last;
+        times in s from the start of the stroke.
+    exposure_t_ns
+        (N,) mid-exposure times, ns from the start of the stroke.
+    """
+
+    path: HandPath
+    exposure_t_ns: IntArray
+
+
+def sweep(
+    stroke: ScanPass, head: Head, arm: ScrewArm, hand: HandTremor, rng: np.random.Generator
+) -> Trajectory:
+    """Carry out a stroke with an unsteady hand.
+
+    Raises
+    ------
+    InputError
+        If the stroke is over before the camera has taken all images.
+    EstimationError
+        If the arm does not reach.
+    """
+    times, way = _progress(stroke, hand, rng)
+    if stroke.pace.is_burst:
+        ticks = np.arange(1, stroke.n_exposures + 1, dtype=np.int64)
+        duration = 1e-9 * CAMERA_CLOCK_NS * (stroke.n_exposures + 1)
+        way = way + 0.5 * stroke.length_mm - np.interp(0.5 * duration, times, way)
+    else:
+        duration = float(np.interp(stroke.length_mm, way, times))
+        ticks = _even_ticks(stroke.n_exposures, duration)
+    knots = np.arange(-_MARGIN_S, duration + _MARGIN_S + _KNOT_S, _KNOT_S)
+    sizes = (hand.tilt_deg, hand.tilt_deg, hand.tilt_deg, hand.depth_mm, hand.aside_mm)
+    stray = np.stack([size * Sway.draw(rng)(knots) for size in sizes], axis=1)
+    poses = _poses(stroke, head, np.interp(knots, times, way), stray)
+    path = HandPath.through(arm, head.tool_from_sensor, knots, poses)
+    return Trajectory(path, CAMERA_CLOCK_NS * ticks)
+
+
+def _even_ticks(n_exposures: int, duration_s: float) -> IntArray:
+    """(n,) ticks of the camera's clock from the start of a stroke to its end."""
+    frames = int(duration_s * 1e9) // CAMERA_CLOCK_NS
+    if frames < n_exposures:
+        raise InputError(
+            f"{n_exposures} images in a stroke of {duration_s:.2f} s: the camera takes {frames}",
+            remedy="ask for fewer images or a longer stroke",
+        )
+    return np.rint(np.linspace(1, frames, n_exposures)).astype(np.int64)
+
+
+def _progress(
+    stroke: ScanPass, hand: HandTremor, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Times (N,) in s and the way (N,) in mm gone by then; both begin before the stroke."""
+    pace = stroke.pace
+    burst_s = 1e-9 * CAMERA_CLOCK_NS * stroke.n_exposures if pace.is_burst else 0.0
+    longest = max(stroke.length_mm / pace.slowest_mm_s, burst_s) + 4.0 * _MARGIN_S
+    times = np.arange(-2.0 * _MARGIN_S, longest, _FINE_S)
+    wanted = stroke.speed_mm_s * (1.0 + hand.speed * Sway.draw(rng)(times))
+    speed = np.clip(wanted, pace.slowest_mm_s, pace.fastest_mm_s)
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * _FINE_S)])
+    return times, way - np.interp(0.0, times, way)
+
+
+def _poses(
+    stroke: ScanPass, head: Head, way_mm: FloatArray, stray: FloatArray
+) -> list[Pose[Base, Sensor]]:
+    """Poses of the sensor after ways (N,), with (N, 5) strays of three angles, depth, side."""
+    along = (stroke.end_mm - stroke.start_mm) / stroke.length_mm
+    across = np.cross(stroke.base_from_face[:, 2], along)
+    aim = stroke.aim
+    poses = []
+    for way, (tilt_x, tilt_y, roll, depth, aside) in zip(way_mm, stray, strict=True):
+        held = HeadOrientation(
+            aim.tilt_x_deg + tilt_x,
+            aim.tilt_y_deg + tilt_y,
+            aim.roll_deg + roll,
+            aim.depth_mm + depth,
+        )
+        spot = stroke.start_mm + way * along + aside * across
+        middle = aim_point_mm(head, held.depth_mm)
+        poses.append(sensor_over(stroke.base_from_face, spot, held, middle))
+    return poses

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The simulated camera: projection with distortion, defocus blur, the detector's response and
+its noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, ImageArray
+
+Float = TypeVar("Float", np.float32, np.float64)
+
+_MAX_STEPS = 400
+STEP_TOLERANCE = 1e-13
+_KERNEL_SIGMAS = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class RenderCamera:
+    """A camera to render with.
+
+    Parameters
+    ----------
+    fx, fy, cx, cy
+        Focal lengths and principal point, px.
+    k1, k2, p1, p2, k3
+        Distortion of eq. 2.16.
+    width_px, height_px
+        Size of the full sensor.
+    blur_sigma_px
+        Standard deviation of the lens's Gaussian point spread; the pixel's own square aperture
+        comes on top of it.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    width_px: int = 3072
+    height_px: int = 2048
+    blur_sigma_px: float = 1.0
+
+    def __post_init__(self) -> None:
+        if min(self.fx, self.fy) <= 0.0 or min(self.width_px, self.height_px) < 1:
+            raise InputError("a camera to render with needs a positive focal length and size")
+        if self.blur_sigma_px < 0.0:
+            raise InputError(f"blur of {self.blur_sigma_px} px is negative")
+
+    def project(self, points_camera_mm: FloatArray) -> FloatArray:
+        """Project (..., 3) points in the camera's frame, mm, to (..., 2) pixels.
+
+        A point at or behind the camera gives NaN.
+        """
+        points = np.asarray(points_camera_mm, dtype=np.float64)
+        depth = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
+        x, y = points[..., 0] / depth, points[..., 1] / depth
+        gain, shift_x, shift_y = self._gain_and_shift(x, y)
+        u = self.cx + self.fx * (gain * x + shift_x)
+        v = self.cy + self.fy * (gain * y + shift_y)
+        return np.stack([u, v], axis=-1)
+
+    def cropped(self, x_px: int, y_px: int, width_px: int, height_px: int) -> RenderCamera:
+        """Camera that delivers only the rectangle whose top-left pixel is given."""
+        return replace(
+            self, cx=self.cx - x_px, cy=self.cy - y_px, width_px=width_px, height_px=height_px
+        )
+
+    def rays(self, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE) -> FloatArray:
+        """Return the ideal coordinates ``X/Z, Y/Z`` (..., 2) seen by (..., 2) pixels.
+
+        Parameters
+        ----------
+        pixels_px
+            (..., 2) pixels.
+        tolerance
+            Size of the step after which the search ends; what is left is smaller by far.
+
+        Raises
+        ------
+        InputError
+            If the fixed-point steps do not settle: the distortion folds over inside the image.
+        """
+        pixels = np.asarray(pixels_px, dtype=np.float64)
+        seen_x = (pixels[..., 0] - self.cx) / self.fx
+        seen_y = (pixels[..., 1] - self.cy) / self.fy
+        x, y = seen_x, seen_y
+        for _ in range(_MAX_STEPS):
+            gain, shift_x, shift_y = self._gain_and_shift(x, y)
+            new_x, new_y = (seen_x - shift_x) / gain, (seen_y - shift_y) / gain
+            step = max(_largest(new_x - x), _largest(new_y - y))
+            x, y = new_x, new_y
+            if step < tolerance:
+                return np.stack([x, y], axis=-1)
+        raise InputError(
+            "the rendered camera's distortion cannot be inverted over its image",
+            remedy="use smaller distortion coefficients or a smaller sensor",
+        )
+
+    def _gain_and_shift(
+        self, x: FloatArray, y: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        square = x**2 + y**2
+        gain = 1.0 + square * (self.k1 + square * (self.k2 + square * self.k3))
+        lever = 2.0 * (self.p1 * y + self.p2 * x)
+        return gain, x * lever + self.p2 * square, y * lever + self.p1 * square
+
+
+def blur_image(image: NDArray[Float], sigma_px: float) -> NDArray[Float]:
+    """Convolve a (H, W) or (H, W, 3) image with a Gaussian of ``sigma_px``, repeating borders."""
+    if sigma_px <= 0.0:
+        return image
+    reach = int(np.ceil(_KERNEL_SIGMAS * sigma_px))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
+    kernel /= kernel.sum()
+    blurred = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, dtype=image.dtype)
+
+
+def add_noise(
+    image: FloatArray,
+    rng: np.random.Generator,
+    *,
+    sigma: float = 2.0,
+    electrons_per_level: float | None = None,
+    bits: int = 8,
+) -> ImageArray:
+    """Turn a rendered image into what a camera delivers.
+
+    Parameters
+    ----------
+    image
+        Grey levels of an 8-bit image, whatever ``bits`` is: 255 is full scale.
+    rng
+        Source of the noise.
+    sigma
+        Read noise, in 8-bit grey levels.
+    electrons_per_level
+        Electrons per 8-bit grey level, for shot noise; None for none.
+    bits
+        Significant bits of the result, low aligned: uint8 up to 8 bits, else uint16.
+
+    Returns
+    -------
+    Rounded and clipped image.
+    """
+    if not 1 <= bits <= 16:
+        raise InputError(f"{bits} bits do not fit into 16")
+    variance = np.full(image.shape, sigma**2)
+    if electrons_per_level is not None:
+        variance += np.maximum(image, 0.0) / electrons_per_level
+    noisy = image + np.sqrt(variance) * rng.standard_normal(image.shape)
+    full_scale = (1 << bits) - 1
+    levels: FloatArray = np.clip(np.rint(noisy * (full_scale / 255.0)), 0, full_scale)
+    return levels.astype(np.uint8) if bits <= 8 else levels.astype(np.uint16)
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.abs(values).max(initial=0.0))
+
+
+LEVELS = 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class Detector:
+    """Sensor and amplifier of a camera.
+
+    Parameters
+    ----------
+    is_colour
+        Deliver red, green, blue; else one channel, the first.
+    bits
+        Significant bits; more than 8 are stored in 16.
+    electrons_per_level
+        Electrons per level of an 8-bit image: sets the shot noise.
+    read_noise
+        Noise that does not depend on the light, in levels of an 8-bit image.
+    halo_share, halo_sigma_px
+        Part of strong light that the lens and the cover glass scatter, and how far.
+    """
+
+    is_colour: bool = True
+    bits: int = 8
+    electrons_per_level: float = 60.0
+    read_noise: float = 0.8
+    halo_share: float = 0.05
+    halo_sigma_px: float = 8.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.halo_share < 1.0 or not self.electrons_per_level > 0.0:
+            raise InputError("a detector scatters a part of the light and counts electrons")
+
+    def scatter(self, light: FloatArray) -> FloatArray:
+        """Move the halo's share of light (H, W) away from where it belongs; the sum is kept."""
+        if self.halo_share == 0.0:
+            return light
+        halo = blur_image(light, self.halo_sigma_px)
+        return np.asarray((1.0 - self.halo_share) * light + self.halo_share * halo)
+
+    def expose(self, light: FloatArray, rng: np.random.Generator) -> ImageArray:
+        """Grey levels of light (H, W) or (H, W, 3), given as parts of full scale."""
+        seen = light[..., 0] if light.ndim == 3 and not self.is_colour else light
+        return add_noise(
+            np.asarray(LEVELS * seen),
+            rng,
+            sigma=self.read_noise,
+            electrons_per_level=self.electrons_per_level,
+            bits=self.bits,
+        )
+
+
+Image32 = NDArray[np.float32]
+
+_HALO_CELL_PX = 4
+
+
+def with_halo(light: Image32, share: float, sigma_px: float) -> Image32:
+    """Move a share of light (H, W) into a wide halo; the sum is kept up to the border."""
+    if share == 0.0:
+        return light
+    return np.asarray(light * np.float32(1.0 - share) + np.float32(share) * _wide(light, sigma_px))
+
+
+def with_ghost(light: Image32, share: float, sigma_px: float) -> Image32:
+    """Add a share of light (H, W) mirrored at the image's centre and blurred."""
+    if share == 0.0:
+        return light
+    mirrored = np.ascontiguousarray(light[::-1, ::-1])
+    return np.asarray(light + np.float32(share) * _wide(mirrored, sigma_px))
+
+
+def expose_mono(light: Image32, detector: Detector, rng: np.random.Generator) -> ImageArray:
+    """Grey levels of light (H, W), parts of full scale: shot and read noise, clipping, bits."""
+    if not 1 <= detector.bits <= 16:
+        raise InputError(f"{detector.bits} bits do not fit into 16")
+    levels = light * np.float32(LEVELS)
+    sigma = np.maximum(levels, 0.0, dtype=np.float32)
+    sigma *= np.float32(1.0 / detector.electrons_per_level)
+    sigma += np.float32(detector.read_noise**2)
+    np.sqrt(sigma, out=sigma)
+    sigma *= rng.standard_normal(light.shape, dtype=np.float32)
+    levels += sigma
+    full_scale = (1 << detector.bits) - 1
+    levels *= np.float32(full_scale / LEVELS)
+    np.rint(levels, out=levels)
+    np.clip(levels, 0, full_scale, out=levels)
+    return levels.astype(np.uint8) if detector.bits <= 8 else levels.astype(np.uint16)
+
+
+def _wide(light: Image32, sigma_px: float) -> Image32:
+    """Wide blur on a coarser grid."""
+    height, width = light.shape
+    size = (-(-width // _HALO_CELL_PX), -(-height // _HALO_CELL_PX))
+    coarse = cv2.resize(light, size, interpolation=cv2.INTER_AREA)
+    blurred = blur_image(np.asarray(coarse, dtype=np.float32), sigma_px / _HALO_CELL_PX)
+    return np.asarray(
+        cv2.resize(blurred, (width, height), interpolation=cv2.INTER_LINEAR), dtype=np.float32
+    )

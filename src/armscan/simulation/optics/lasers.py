@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Line lasers: where the light of each goes, how bright and how broad it is, and laser light
+seen from a point of the scene.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
+from armscan.geometry.poses import Pose
+
+RED = (1.0, 0.09, 0.05)
+"""What the three channels of a colour camera answer to a red laser."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineLaser:
+    """A source from which a fan of rays spreads.
+
+    A line lens that is not square to its beam deflects every ray of the fan by the same angle out
+    of the fan plane. The rays then lie on a cone about the fan's normal; on a wall the line is a
+    hyperbola, not straight. With ``skew_rad = 0`` the sheet is a plane through the source.
+
+    Parameters
+    ----------
+    name
+        Name of the light sheet.
+    source_mm
+        (3,) where the fan starts, in the frame of the scene.
+    forward, across
+        (3,) direction of the fan's middle, and the direction in which it spreads; made unit and
+        perpendicular here.
+    half_angle_rad
+        The fan ends at plus and minus this angle.
+    skew_rad
+        Angle between the rays and the fan plane: the cause of the bow.
+    waist_mm, waist_distance_mm, divergence_rad
+        Gaussian sigma of the sheet's thickness at its waist, the distance of the waist from the
+        source, and the far-field growth of sigma with distance.
+    irradiance
+        Irradiance on the fan's middle, on a surface that faces the source at the waist, as the
+        part of the camera's full scale that a white surface then shows.
+    falloff
+        Part of the brightness that is lost from the fan's middle to its ends.
+    colour
+        (3,) response of red, green and blue to this light; mono cameras see the first.
+    source
+        Name of the light source that it is switched with; by default that of the sheet.
+    cubic_rad
+        Bends the sheet further: its centre at the fan angle a is raised by this times ``a**3``.
+    """
+
+    name: str
+    source_mm: FloatArray
+    forward: FloatArray
+    across: FloatArray
+    half_angle_rad: float = 0.6
+    skew_rad: float = 0.0
+    waist_mm: float = 0.25
+    waist_distance_mm: float = 300.0
+    divergence_rad: float = 6e-4
+    irradiance: float = 1.0
+    falloff: float = 0.4
+    colour: tuple[float, float, float] = RED
+    source: str = ""
+    cubic_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source_mm", frozen_floats(self.source_mm, (3,), "source_mm"))
+        forward = np.array(frozen_floats(self.forward, (3,), "forward"))
+        forward /= np.linalg.norm(forward)
+        across = np.array(frozen_floats(self.across, (3,), "across"))
+        across -= (across @ forward) * forward
+        length = float(np.linalg.norm(across))
+        if length < 1e-9:
+            raise InputError("the laser's fan spreads along its own direction", where=self.name)
+        object.__setattr__(self, "forward", frozen_floats(forward, (3,), "forward"))
+        object.__setattr__(self, "across", frozen_floats(across / length, (3,), "across"))
+        if not (self.waist_mm > 0.0 and self.waist_distance_mm > 0.0 and self.half_angle_rad > 0.0):
+            raise InputError("a laser needs a waist and a fan of positive size", where=self.name)
+        object.__setattr__(self, "source", self.source or self.name)
+
+    @property
+    def normal(self) -> FloatArray:
+        """(3,) normal of the fan plane, the axis of the cone."""
+        return np.cross(self.forward, self.across)
+
+    def moved(self, there_from_here: Pose[Any, Any]) -> LineLaser:
+        """The same sheet in another frame, or at another place."""
+        turn = there_from_here.rotation
+        return replace(
+            self,
+            source_mm=turn @ self.source_mm + there_from_here.translation_mm,
+            forward=turn @ self.forward,
+            across=turn @ self.across,
+        )
+
+    def rays(self, fan_angle_rad: FloatArray) -> FloatArray:
+        """(N, 3) unit directions of the sheet's centre at fan angles (N,)."""
+        angle = np.asarray(fan_angle_rad, dtype=np.float64)[:, None]
+        flat = np.cos(angle) * self.forward + np.sin(angle) * self.across
+        centre = self._centre_rad(angle)
+        return np.asarray(np.cos(centre) * flat + np.sin(centre) * self.normal)
+
+    def offset_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Signed distance (N,) of points (N, 3) from the centre of the sheet, along the arc."""
+        forward, across, up, distance = self._local(points_mm)
+        elevation = np.arctan2(up, np.hypot(forward, across))
+        centre = self._centre_rad(np.arctan2(across, forward))
+        return np.asarray(distance * (elevation - centre))
+
+    def thickness_mm(self, distance_mm: FloatArray) -> FloatArray:
+        """Gaussian sigma of the sheet at distances (N,) from the source."""
+        growth = self.divergence_rad * (distance_mm - self.waist_distance_mm)
+        return np.asarray(np.hypot(self.waist_mm, growth))
+
+    def reach_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) from the sheet's centre, in sigmas of its thickness."""
+        distance = np.linalg.norm(points_mm - self.source_mm, axis=1)
+        return self.offset_mm(points_mm) / self.thickness_mm(distance)
+
+    def irradiance_at(self, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
+        """Irradiance (N,) on surface points (N, 3) with unit normals (N, 3); shadows not counted.
+
+        The power of the fan spreads over its width and thickness; the surface takes the cosine.
+        """
+        reach, peak = self.reach_and_peak(points_mm, normals)
+        return np.asarray(peak * np.exp(-0.5 * reach**2))
+
+    def reach_and_peak(
+        self, points_mm: FloatArray, normals: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Distance (N,) from the sheet's centre, in sigmas, and irradiance (N,) if it were zero."""
+        forward, across, up, distance = self._local(points_mm)
+        elevation = np.arctan2(up, np.hypot(forward, across))
+        sigma = self.thickness_mm(distance)
+        angle = np.arctan2(across, forward)
+        reach = distance * (elevation - self._centre_rad(angle)) / sigma
+        spread = self.waist_mm * self.waist_distance_mm / (sigma * distance)
+        fan = angle / self.half_angle_rad
+        along = np.where(np.abs(fan) <= 1.0, 1.0 - self.falloff * fan**2, 0.0)
+        facing = np.einsum("ni,ni->n", self.source_mm - points_mm, normals)
+        cosine = np.maximum(facing / distance, 0.0)
+        return np.asarray(reach), np.asarray(self.irradiance * spread * along * cosine)
+
+    def _centre_rad(self, fan_angle_rad: FloatArray) -> FloatArray | float:
+        """Elevation of the sheet's centre over the fan plane."""
+        if self.cubic_rad == 0.0:
+            return self.skew_rad
+        return np.asarray(self.skew_rad + self.cubic_rad * fan_angle_rad**3)
+
+    def _local(self, points_mm: FloatArray) -> tuple[FloatArray, ...]:
+        """Coordinates along forward, across and normal, and the distance from the source."""
+        v = np.asarray(points_mm, dtype=np.float64) - self.source_mm
+        distance = np.linalg.norm(v, axis=1)
+        return v @ self.forward, v @ self.across, v @ self.normal, distance
+
+
+NARROW_RIM_PX, WIDE_RIM_PX = 1, 4
+
+
+class TracedLight(Protocol):
+    """Light whose brightness is ``peak * exp(-reach**2 / 2)``, both smooth along a surface."""
+
+    @property
+    def rim_px(self) -> int:
+        """How far around it nodes are traced, so that its rim is not taken for an edge."""
+
+    def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Distance (N,) from the nearest centre, in sigmas, and the number of centres below."""
+
+    def reach_and_peak(
+        self, points_mm: FloatArray, normals: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same distance (N,), and irradiance (N,) if it were zero."""
+
+    def source_of_mm(self, points_mm: FloatArray) -> FloatArray:
+        """(3,) or (N, 3) whence the light comes to points (N, 3)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserSource:
+    """One light source; see `TracedLight`.
+
+    Parameters
+    ----------
+    sheets
+        In order across the fan. Where there are several they spread from about one axis, further
+        apart than they are thick, so that no point is lit by two of them.
+    """
+
+    sheets: tuple[LineLaser, ...]
+    _middle: LineLaser = field(init=False, repr=False)
+    _sense: float = field(init=False, repr=False)
+    _between_rad: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not self.sheets:
+            raise InputError("a light source without sheets")
+        middle = self.sheets[len(self.sheets) // 2]
+        object.__setattr__(self, "_middle", middle)
+        rays = np.concatenate([sheet.rays(np.zeros(1)) for sheet in self.sheets])
+        angles = np.arctan2(rays @ middle.normal, rays @ middle.forward)
+        sense = -1.0 if angles[-1] < angles[0] else 1.0
+        angles = sense * angles
+        if bool((np.diff(angles) <= 0.0).any()):
+            raise InputError("sheets are not in order across their fan", where=middle.source)
+        object.__setattr__(self, "_sense", sense)
+        object.__setattr__(self, "_between_rad", 0.5 * (angles[1:] + angles[:-1]))
+
+    @property
+    def rim_px(self) -> int:
+        """As for `TracedLight`: it saves a third of the rays of many sheets, little of one."""
+        return NARROW_RIM_PX if len(self.sheets) == 1 else WIDE_RIM_PX
+
+    def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
+        """As for `TracedLight`."""
+        if len(self.sheets) == 1:
+            reach = self._middle.reach_mm(points_mm)
+            return reach, (reach > 0.0).astype(np.int64)
+        nearest = self._nearest(points_mm)
+        reach = self._gathered(nearest, lambda sheet, at: sheet.reach_mm(points_mm[at]))
+        return reach, nearest + (self._sense * reach > 0.0)
+
+    def reach_and_peak(
+        self, points_mm: FloatArray, normals: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """As for `TracedLight`."""
+        if len(self.sheets) == 1:
+            return self._middle.reach_and_peak(points_mm, normals)
+        both = np.zeros((len(points_mm), 2))
+        for sheet, at in self._parts(self._nearest(points_mm)):
+            both[at] = np.stack(sheet.reach_and_peak(points_mm[at], normals[at]), axis=1)
+        return both[:, 0], both[:, 1]
+
+    def source_of_mm(self, points_mm: FloatArray) -> FloatArray:
+        """As for `TracedLight`."""
+        if len(self.sheets) == 1:
+            return self._middle.source_mm
+        return np.array([sheet.source_mm for sheet in self.sheets])[self._nearest(points_mm)]
+
+    def _nearest(self, points_mm: FloatArray) -> IntArray:
+        """(N,) index of the nearest sheet, by the angle about the axis."""
+        v = points_mm - self._middle.source_mm
+        angle = np.arctan2(v @ self._middle.normal, v @ self._middle.forward)
+        return np.searchsorted(self._between_rad, self._sense * angle).astype(np.int64)
+
+    def _parts(self, nearest: IntArray) -> Iterator[tuple[LineLaser, IntArray]]:
+        for k, sheet in enumerate(self.sheets):
+            at = np.flatnonzero(nearest == k)
+            if len(at):
+                yield sheet, at
+
+    def _gathered(
+        self, nearest: IntArray, value: Callable[[LineLaser, IntArray], FloatArray]
+    ) -> FloatArray:
+        result = np.zeros(len(nearest))
+        for sheet, at in self._parts(nearest):
+            result[at] = value(sheet, at)
+        return result
+
+
+def in_sources(lasers: Sequence[LineLaser]) -> tuple[LaserSource, ...]:
+    """The sheets grouped by their light source, in order."""
+    names = dict.fromkeys(laser.source for laser in lasers)
+    return tuple(LaserSource(tuple(s for s in lasers if s.source == name)) for name in names)

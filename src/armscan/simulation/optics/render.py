@@ -1,0 +1,435 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs of a scene: which point each pixel sees, the image with laser light and speckle,
+image regions, and the true stripes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.devices.sources import Preset
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
+from armscan.simulation.optics.camera import STEP_TOLERANCE, Detector, RenderCamera, blur_image
+from armscan.simulation.optics.lasers import LineLaser
+from armscan.simulation.optics.scene import Hits, Scene
+
+BISECTIONS = 30
+SAME_SURFACE_MM = 3.0
+"""Neighbouring pixels that differ more in distance lie on two sides of a silhouette."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StripeTruth:
+    """True centre points of one laser's stripe, one a row (or a column, if it lies flat).
+
+    Parameters
+    ----------
+    laser
+        Name of the laser.
+    points_px
+        (N, 2) full-sensor pixels.
+    points_mm
+        (N, 3) in the Sensor frame.
+    surface
+        (N,) index into the scene's surfaces, as float64.
+    """
+
+    laser: str
+    points_px: FloatArray
+    points_mm: FloatArray
+    surface: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.points_px)
+        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (n, 2), "points_px"))
+        object.__setattr__(self, "points_mm", frozen_floats(self.points_mm, (n, 3), "points_mm"))
+        object.__setattr__(self, "surface", frozen_floats(self.surface, (n,), "surface"))
+
+
+def camera_rays(
+    camera: RenderCamera, pixels_px: FloatArray, tolerance: float = STEP_TOLERANCE
+) -> FloatArray:
+    """(N, 3) unit directions, in the Sensor frame, of full-sensor pixels (N, 2)."""
+    xy = camera.rays(pixels_px, tolerance)
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def find_stripe(
+    scene: Scene, camera: RenderCamera, laser: LineLaser, band: BoolArray
+) -> StripeTruth:
+    """Find where the sheet's centre crosses the pixel rows or columns within a band.
+
+    Parameters
+    ----------
+    scene, camera, laser
+        What is seen, and by what light.
+    band
+        (H, W) True where the light may reach.
+    """
+    rows, columns = np.nonzero(band)
+    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+    hits = scene.trace(np.zeros(3), camera_rays(camera, pixels))
+    number = np.full(band.shape, -1, dtype=np.int64)
+    number[rows, columns] = np.arange(len(rows))
+    offset = np.full(len(rows), np.nan)
+    is_hit = hits.surface >= 0
+    offset[is_hit] = laser.offset_mm(hits.points_mm[is_hit])
+    across_rows = _crossings(number[:, :-1], number[:, 1:], hits, offset)
+    across_columns = _crossings(number[:-1, :], number[1:, :], hits, offset)
+    pairs = across_rows if len(across_rows) >= len(across_columns) else across_columns
+    return _refine(scene, camera, laser, pixels[pairs[:, 0]], pixels[pairs[:, 1]])
+
+
+def _crossings(first: IntArray, second: IntArray, hits: Hits, offset_mm: FloatArray) -> IntArray:
+    """(K, 2) neighbours on one surface between which the sheet's centre passes."""
+    both = (first >= 0) & (second >= 0)
+    a, b = first[both], second[both]
+    changes = (offset_mm[a] <= 0.0) != (offset_mm[b] <= 0.0)
+    known = np.isfinite(offset_mm[a]) & np.isfinite(offset_mm[b])
+    same = hits.surface[a] == hits.surface[b]
+    a, b = a[changes & known & same], b[changes & known & same]
+    step = np.abs(hits.distance_mm[a] - hits.distance_mm[b])
+    return np.asarray(np.stack([a, b], axis=1)[step < SAME_SURFACE_MM])
+
+
+def _refine(
+    scene: Scene, camera: RenderCamera, laser: LineLaser, low_px: FloatArray, high_px: FloatArray
+) -> StripeTruth:
+    """Halve the interval between two pixels until the sheet's centre is found."""
+    low, high = low_px.copy(), high_px.copy()
+    at_low = scene.trace(np.zeros(3), camera_rays(camera, low))
+    sign_low = laser.offset_mm(at_low.points_mm) <= 0.0
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        hits = scene.trace(np.zeros(3), camera_rays(camera, middle))
+        is_low = (laser.offset_mm(hits.points_mm) <= 0.0) == sign_low
+        low[is_low], high[~is_low] = middle[is_low], middle[~is_low]
+    hits = scene.trace(np.zeros(3), camera_rays(camera, 0.5 * (low + high)))
+    is_lit = scene.laser_light(laser, hits) > 0.0
+    pixels = 0.5 * (low + high)
+    return StripeTruth(
+        laser.name, pixels[is_lit], hits.points_mm[is_lit], hits.surface[is_lit].astype(np.float64)
+    )
+
+
+SUBPIXELS = 2
+BAND_SIGMAS = 5.5
+BLUR_REACH = 6.0
+COARSE_STEP_PX = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Speckle:
+    """Grain of laser light.
+
+    Parameters
+    ----------
+    contrast
+        Standard deviation of the light over its mean, before the lens's blur.
+    grain_px
+        Gaussian sigma of the grain; 0 gives independent samples.
+    """
+
+    contrast: float = 0.2
+    grain_px: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.contrast < 0.0 or self.grain_px < 0.0:
+            raise InputError("speckle contrast and grain cannot be negative")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserImage:
+    """One laser's light in an image.
+
+    Parameters
+    ----------
+    light
+        (H, W) parts of full scale, blurred, neither clipped nor noisy.
+    truth
+        Where the centre of the sheet truly lies.
+    """
+
+    light: FloatArray
+    truth: StripeTruth
+
+
+def render_room(scene: Scene, camera: RenderCamera) -> FloatArray:
+    """(H, W, 3) image under the lamp alone, parts of full scale, blurred; one ray a pixel."""
+    rows, columns = np.indices((camera.height_px, camera.width_px))
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    hits = scene.trace(np.zeros(3), camera_rays(camera, pixels))
+    light = scene.room_light(hits).reshape(camera.height_px, camera.width_px, 3)
+    return blur_image(light, camera.blur_sigma_px)
+
+
+def render_laser(
+    scene: Scene,
+    camera: RenderCamera,
+    laser: LineLaser,
+    speckle: Speckle,
+    rng: np.random.Generator,
+) -> LaserImage:
+    """Render the light of one laser and find the truth of its stripe."""
+    band = laser_band(scene, camera, laser)
+    light = np.zeros(band.shape)
+    if not band.any():
+        return LaserImage(light, find_stripe(scene, camera, laser, band))
+    margin = int(np.ceil(BLUR_REACH * camera.blur_sigma_px)) + 1
+    is_used = np.asarray(band.any(axis=1)), np.asarray(band.any(axis=0))
+    window = _span(is_used[0], margin), _span(is_used[1], margin)
+    fine = _trace_finely(scene, camera, laser, band[window], (window[1].start, window[0].start))
+    fine *= _speckle_field(fine.shape, speckle, rng)
+    blurred = blur_image(fine, SUBPIXELS * camera.blur_sigma_px)
+    height, width = light[window].shape
+    light[window] = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
+    return LaserImage(light, find_stripe(scene, camera, laser, band))
+
+
+def _span(is_used: BoolArray, margin: int) -> slice:
+    """Slice around the True entries (N,), widened by a margin."""
+    used = np.flatnonzero(is_used)
+    return slice(max(int(used[0]) - margin, 0), min(int(used[-1]) + 1 + margin, len(is_used)))
+
+
+def _trace_finely(
+    scene: Scene,
+    camera: RenderCamera,
+    laser: LineLaser,
+    band: BoolArray,
+    corner_px: tuple[int, int],
+) -> FloatArray:
+    """Laser light on the fine grid of a window of the image whose top-left pixel is given."""
+    rows, columns = np.nonzero(band)
+    fine = np.zeros((SUBPIXELS * band.shape[0], SUBPIXELS * band.shape[1]))
+    for b in range(SUBPIXELS):
+        for a in range(SUBPIXELS):
+            shift = (np.array([a, b]) + 0.5) / SUBPIXELS - 0.5 + corner_px
+            rays = camera_rays(camera, np.stack([columns, rows], axis=1) + shift)
+            hits = scene.trace(np.zeros(3), rays)
+            fine[SUBPIXELS * rows + b, SUBPIXELS * columns + a] = scene.laser_light(laser, hits)
+    return fine
+
+
+def laser_band(scene: Scene, camera: RenderCamera, laser: LineLaser) -> BoolArray:
+    """(H, W) True for pixels that the laser's light may reach.
+
+    A coarse grid of rays is traced; a cell belongs to the band if the sheet lies, within its
+    thickness, between the nearest and the farthest of the cell's corners; so do its neighbours.
+    """
+    return next(laser_bands(scene, camera, (laser,)))
+
+
+def laser_bands(
+    scene: Scene, camera: RenderCamera, lasers: Sequence[LineLaser]
+) -> Iterator[BoolArray]:
+    """The band of each laser; the coarse grid is traced once."""
+    u = np.arange(0, camera.width_px + COARSE_STEP_PX, COARSE_STEP_PX)
+    v = np.arange(0, camera.height_px + COARSE_STEP_PX, COARSE_STEP_PX)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(np.float64)
+    hits = scene.trace(np.zeros(3), camera_rays(camera, grid))
+    is_hit = hits.surface >= 0
+    for laser in lasers:
+        reach = np.full(len(grid), np.nan)
+        reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
+        band = pixels_near_sheet(reach.reshape(len(v), len(u)))
+        yield np.asarray(band[: camera.height_px, : camera.width_px])
+
+
+def pixels_near_sheet(reach: FloatArray) -> BoolArray:
+    """(8 (H - 1), 8 (W - 1)) True for pixels next to the sheet, whose reach (H, W) is known.
+
+    The reach, in sigmas, is given on the coarse grid; NaN where nothing is met.
+    """
+    cells = cells_near_sheet(reach, (reach > 0.0).astype(np.float64)).astype(np.uint8)
+    size = (COARSE_STEP_PX * cells.shape[1], COARSE_STEP_PX * cells.shape[0])
+    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST) > 0)
+
+
+def cells_near_sheet(reach: FloatArray, rank: FloatArray) -> BoolArray:
+    """(H - 1, W - 1) True for cells of the coarse grid that a sheet crosses, and their neighbours.
+
+    Parameters
+    ----------
+    reach
+        (H, W) distance of the nodes from the nearest sheet, in sigmas; NaN where nothing is met.
+    rank
+        (H, W) how many of the sheets' centres lie below a node.
+    """
+    corners, ranks = np.abs(_corners(reach)), _corners(rank)
+    is_hit = np.isfinite(corners)
+    nearest = np.where(is_hit, corners, np.inf).min(axis=0)
+    low = np.where(is_hit, ranks, np.inf).min(axis=0)
+    high = np.where(is_hit, ranks, -np.inf).max(axis=0)
+    cells = ((nearest <= BAND_SIGMAS) | (high > low)).astype(np.uint8)
+    return np.asarray(cv2.dilate(cells, np.ones((3, 3), np.uint8)) > 0)
+
+
+def _corners(grid: FloatArray) -> FloatArray:
+    """(4, H - 1, W - 1) values at the corners of each cell."""
+    return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]])
+
+
+def _speckle_field(
+    shape: tuple[int, ...], speckle: Speckle, rng: np.random.Generator
+) -> FloatArray | float:
+    """Positive random factor with mean 1: the logarithm is normal, smoothed to the grain."""
+    if speckle.contrast == 0.0:
+        return 1.0
+    normal = rng.standard_normal(shape, dtype=np.float32)
+    if speckle.grain_px > 0.0:
+        normal = blur_image(normal, SUBPIXELS * speckle.grain_px)
+        normal = normal / normal.std()
+    variance = np.log1p(speckle.contrast**2)
+    return np.asarray(np.exp(np.sqrt(variance) * normal - 0.5 * variance))
+
+
+Image32 = NDArray[np.float32]
+
+MARGIN_PX = 2 * COARSE_STEP_PX
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """Rectangle of full-sensor pixels whose sides are whole cells of the coarse grid."""
+
+    x_px: int
+    y_px: int
+    width_px: int
+    height_px: int
+
+    @staticmethod
+    def around(x_px: int, y_px: int, width_px: int, height_px: int) -> Region:
+        """Smallest region with a margin around a window: blur brings light in from there."""
+        step = COARSE_STEP_PX
+        x, y = (x_px - MARGIN_PX) // step * step, (y_px - MARGIN_PX) // step * step
+        right, bottom = x_px + width_px + MARGIN_PX, y_px + height_px + MARGIN_PX
+        return Region(x, y, -(-(right - x) // step) * step, -(-(bottom - y) // step) * step)
+
+    def nodes_px(self) -> tuple[FloatArray, tuple[int, int]]:
+        """(N, 2) full-sensor pixels of the coarse grid's nodes, and the grid's shape."""
+        u = self.x_px + np.arange(0, self.width_px + 1, COARSE_STEP_PX)
+        v = self.y_px + np.arange(0, self.height_px + 1, COARSE_STEP_PX)
+        grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+        return grid.astype(np.float64), (len(v), len(u))
+
+    def pixels_px(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """(N, 2) full-sensor pixels of rows and columns of the region's image."""
+        pixels = np.stack([columns, rows], axis=1).astype(np.float64)
+        return np.asarray(pixels + np.array([self.x_px, self.y_px]))
+
+
+def between_nodes(nodes: Image32, step_px: int) -> Image32:
+    """(step H, step W) pixels between nodes (H, W), each of which is the pixel of its block."""
+    step = 1.0 / step_px
+    pixels = cv2.warpAffine(
+        nodes,
+        np.array([[step, 0.0, 0.0], [0.0, step, 0.0]]),
+        (step_px * nodes.shape[1], step_px * nodes.shape[0]),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return np.asarray(pixels, dtype=np.float32)
+
+
+def to_pixels(nodes: Image32, region: Region) -> Image32:
+    """(H, W) values of a region's pixels between those of its coarse grid."""
+    return between_nodes(nodes, COARSE_STEP_PX)[: region.height_px, : region.width_px]
+
+
+def enlarged(cells: NDArray[np.uint8], step_px: int) -> NDArray[np.uint8]:
+    """(step H, step W) pixels that bear the value of their cell (H, W)."""
+    size = (step_px * cells.shape[1], step_px * cells.shape[0])
+    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+
+
+_FINE_GRAIN = Speckle(contrast=0.22, grain_px=0.6)
+_MONO = Detector(is_colour=False, halo_share=0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class Imaging:
+    """All that decides how good an image is, save the scene.
+
+    Parameters
+    ----------
+    laser_level
+        Peak of the laser's line on matt white that faces it, as a part of full scale, before the
+        lens's blur.
+    ambient
+        Even light of the room during a scan on white, as a part of full scale.
+    target_light
+        The same while a target is photographed.
+    speckle
+        Grain of laser light.
+    detector
+        Sensor noise, halo, bits.
+    gloss, texture
+        Factors on the gloss and texture of everything in the scene.
+    ghost_share, ghost_sigma_px
+        Part of the light that comes back from the lens mirrored at the image's centre, and how
+        blurred.
+    spot_level, spot_mm
+        Undiffracted beam in the middle of a projector of several lines: its brightness over that
+        of the middle line, and the Gaussian sigma of its round section.
+    stray_share
+        Brightness, over that of the lines, of those that a glossy plate throws back to the head
+        and the head back to the plate, for a plate of gloss 1; projectors of several lines only.
+    """
+
+    laser_level: float = 0.8
+    ambient: float = 0.012
+    target_light: float = 0.9
+    speckle: Speckle = _FINE_GRAIN
+    detector: Detector = _MONO
+    gloss: float = 1.0
+    texture: float = 1.0
+    ghost_share: float = 0.0
+    ghost_sigma_px: float = 5.0
+    spot_level: float = 6.0
+    spot_mm: float = 0.6
+    stray_share: float = 0.12
+
+    def __post_init__(self) -> None:
+        least = min(self.ambient, self.gloss, self.texture, self.ghost_share)
+        least = min(least, self.spot_level, self.stray_share)
+        if least < 0.0 or min(self.laser_level, self.target_light) <= 0.0:
+            raise InputError("light, gloss and texture cannot be negative")
+        if min(self.ghost_sigma_px, self.spot_mm) <= 0.0:
+            raise InputError("a ghost image needs a blur and a spot a size")
+
+
+IMAGING: dict[Preset, Imaging] = {
+    "clean": Imaging(
+        ambient=0.004,
+        speckle=Speckle(contrast=0.01, grain_px=0.6),
+        detector=Detector(
+            is_colour=False, electrons_per_level=2000.0, read_noise=0.2, halo_share=0.0
+        ),
+        gloss=0.0,
+        texture=0.0,
+        spot_level=0.0,
+        stray_share=0.0,
+    ),
+    "thesis": Imaging(),
+    "harsh": Imaging(
+        laser_level=1.3,
+        ambient=0.08,
+        speckle=Speckle(contrast=0.45, grain_px=0.9),
+        detector=Detector(
+            is_colour=False, electrons_per_level=20.0, read_noise=2.0, halo_share=0.06
+        ),
+        gloss=2.5,
+        texture=2.5,
+        ghost_share=0.01,
+        spot_level=15.0,
+        spot_mm=0.8,
+    ),
+}

@@ -1,0 +1,457 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lists of points: probed points and planes, markers, profiles of a sensor that delivers
+points.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.records.points import MarkerSet, ProbedPoints
+from armscan.records.profile import PointProfile
+from armscan.storage.image_paths import expand_paths, natural_key
+from armscan.storage.images import read_bytes, source_names
+from armscan.storage.poses import refuse_beyond_reach
+from armscan.storage.tables import LARGEST_MM, CsvTable, csv_bytes, number_text, parse_csv, read_csv
+
+COORDINATES = ("x_mm", "y_mm", "z_mm")
+PLANE_NAMES = ("a", "b", "c", "d")
+SMALLEST_EXTENT_MM = 2.0
+"""Points that all lie this near to each other are taken for metres: nothing that small is probed
+to place a scanner, and a plate in metres is not larger."""
+
+
+def read_probed_points(path: Path) -> ProbedPoints:
+    """Read points in Base that a probe touched.
+
+    A table ``x_mm,y_mm,z_mm[,feature]``. A comment ``# point = tip-centre, tip_diameter_mm = 6``
+    says that the points are centres of the tip; without it they are on the surface.
+    ``# point = surface, tip_diameter_mm = 6`` keeps the diameter that was compensated for.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is not such a table, holds no point, or is in metres.
+    """
+    return _points(parse_csv(read_bytes(path), str(path)))
+
+
+def probed_points_csv(points: ProbedPoints) -> bytes:
+    """Text of a table of probed points; reads back as the same numbers."""
+    columns: dict[str, tuple[str, ...]] = {
+        name: tuple(number_text(value) for value in points.points_mm[:, k])
+        for k, name in enumerate(COORDINATES)
+    }
+    if points.features:
+        columns["feature"] = points.features
+    kind = "tip-centre" if points.are_tip_centres else "surface"
+    if points.tip_diameter_mm:
+        kind += f", tip_diameter_mm = {points.tip_diameter_mm!r}"
+    return csv_bytes(columns, (f"point = {kind}",))
+
+
+def parse_plane(text: str, where: str = "") -> FloatArray:
+    """Plane (4,) ``A B C D`` with ``A x + B y + C z + D = 0`` from four numbers of any scale.
+
+    Returns
+    -------
+    coefficients
+        (4,) scaled so that the normal has length 1 and D is in mm (eq. 2.55).
+
+    Raises
+    ------
+    OptionError
+        If these are not four finite numbers, or the normal is zero.
+    """
+    words = re.split(r"[\s,]+", text.strip())
+    remedy = "give four numbers A,B,C,D, with D in mm"
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise OptionError(f"'{text.strip()}' is no plane", where=where, remedy=remedy) from error
+    if values.shape != (4,):
+        fact = f"{len(words)} numbers where 4 are needed"
+        raise OptionError(fact, where=where, remedy=remedy)
+    for name, value in zip(PLANE_NAMES, values, strict=True):
+        if not np.isfinite(value):
+            raise OptionError(f"{name.upper()} is {value:g}", where=where, remedy=remedy)
+    length = math.sqrt(float(values[:3] @ values[:3]))
+    if not 0.0 < length < math.inf or abs(float(values[3])) > LARGEST_MM * length:
+        raise OptionError(
+            "the plane's normal A,B,C is zero, or the plane is beyond all reach",
+            where=where,
+            remedy="give a plane's A,B,C,D",
+        )
+    return np.asarray(values / length)
+
+
+def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
+    """Read probed points, or a plane's four numbers with or without the header ``A,B,C,D``.
+
+    Returns
+    -------
+    points or coefficients
+        As `read_probed_points` or `parse_plane` give them.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is neither.
+    """
+    data = read_bytes(path)
+    words = _plane_words(data)
+    if words is None:
+        return _points(parse_csv(data, str(path)))
+    try:
+        return parse_plane(words, str(path))
+    except OptionError as error:
+        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+
+
+def _plane_words(data: bytes) -> str | None:
+    """The numbers of a file that holds a plane and nothing else; None for any other file."""
+    text = data.decode("utf-8-sig", errors="replace")
+    lines = [line.strip() for line in text.splitlines()]
+    lines = [line for line in lines if line and not line.startswith("#")]
+    if len(lines) == 2 and tuple(re.split(r"[\s,]+", lines[0].lower())) == PLANE_NAMES:
+        return lines[1]
+    if len(lines) == 1 and re.fullmatch(r"[-+\d.eE]+(?:[\s,]+[-+\d.eE]+){3}", lines[0]):
+        return lines[0]
+    return None
+
+
+def _points(table: CsvTable) -> ProbedPoints:
+    _refuse_metres_by_name(table)
+    table.require(COORDINATES)
+    points = table.floats(COORDINATES)
+    if not len(points):
+        raise FileFormatError(
+            "the table holds no point", where=table.where, remedy="probe the surface first"
+        )
+    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    if len(points) >= 3 and 0.0 < extent < SMALLEST_EXTENT_MM:
+        raise FileFormatError(
+            f"all {len(points)} points lie within {extent:.3g} mm: these look like metres",
+            where=table.where,
+            remedy="multiply x_mm, y_mm and z_mm by 1000",
+        )
+    tip_diameter_mm, is_compensated = _tip(table)
+    try:
+        return ProbedPoints(
+            points,
+            tip_diameter_mm,
+            table.columns.get("feature", ()),
+            table.where,
+            is_compensated=is_compensated,
+        )
+    except InputError as error:
+        raise FileFormatError(error.what, where=table.where, remedy=error.remedy) from error
+
+
+def _refuse_metres_by_name(table: CsvTable) -> None:
+    if {"x_m", "y_m", "z_m"} <= set(table.columns):
+        raise FileFormatError(
+            "the columns x_m, y_m, z_m are in metres",
+            where=table.where,
+            remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
+        )
+
+
+def _tip(table: CsvTable) -> tuple[float, bool]:
+    """Diameter that a comment gives, 0 for none; whether the points are on the surface."""
+    stated: dict[str, str] = {}
+    for comment in table.comments:
+        stated |= {
+            key: value.strip()
+            for key, value in re.findall(r"(point|tip_diameter_mm)\s*=\s*([^,;]+)", comment)
+        }
+    kind = stated.get("point", "tip-centre" if "tip_diameter_mm" in stated else "surface")
+    is_surface = kind == "surface"
+    if is_surface and "tip_diameter_mm" not in stated:
+        return 0.0, True
+    if kind not in ("surface", "tip-centre"):
+        raise FileFormatError(
+            f"'point = {kind}' is not known",
+            where=table.where,
+            remedy="write surface or tip-centre",
+        )
+    try:
+        diameter_mm = float(stated.get("tip_diameter_mm", ""))
+    except ValueError:
+        diameter_mm = 0.0
+    if not 0.0 < diameter_mm < math.inf:
+        what = "on the surface" if is_surface else "centres of the tip"
+        raise FileFormatError(
+            f"the points are {what}, but the tip's diameter is not given as a number of mm",
+            where=table.where,
+            remedy=f"write the line '# point = {kind}, tip_diameter_mm = 6'",
+        )
+    return diameter_mm, is_surface
+
+
+COVARIANCES = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_mm2", "cov_zz_mm2")
+ASSUMED_SIGMA_MM = 0.02
+"""Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
+ring's centre measured by two cameras."""
+
+"""Markers that all lie this near to each other are taken for metres."""
+FRAME = "frame ="
+METRES = ("x_m", "y_m", "z_m")
+_UPPER = np.triu_indices(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerList:
+    """A list as read.
+
+    Parameters
+    ----------
+    markers
+        The markers; without a column ``id`` they are numbered from 1 in the order of the rows.
+    path
+        The file.
+    has_ids
+        True if the list numbers its markers itself.
+    is_sigma_assumed
+        True if the list holds no covariance.
+    """
+
+    markers: MarkerSet
+    path: Path
+    has_ids: bool
+    is_sigma_assumed: bool
+
+
+def markers_csv(markers: MarkerSet) -> bytes:
+    """Text of a table of markers; `read_marker_list` reads it back as the same numbers.
+
+    Columns ``id,x_mm,y_mm,z_mm`` and the six different elements of the covariance; a comment
+    ``# frame = Sensor`` names the coordinate frame.
+    """
+    upper = markers.covariance_mm2[:, _UPPER[0], _UPPER[1]]
+    columns = {"id": tuple(str(number) for number in markers.ids)}
+    columns |= _texts(COORDINATES, markers.points_mm) | _texts(COVARIANCES, upper)
+    return csv_bytes(columns, (f"{FRAME} {markers.frame}",))
+
+
+def _texts(names: tuple[str, ...], values: FloatArray) -> dict[str, tuple[str, ...]]:
+    return {
+        name: tuple(number_text(value) for value in values[:, k]) for k, name in enumerate(names)
+    }
+
+
+def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:
+    """Read a table ``x_mm,y_mm,z_mm`` with, if you like, ``id`` and the six covariances.
+
+    A comment ``# frame = Base`` names the frame. Tables of probed points are such lists; points
+    are taken as they stand, centres of a tip included.
+
+    Parameters
+    ----------
+    path
+        The file.
+    frame
+        Frame of the markers where the list names none.
+    sigma_mm
+        Standard deviation an axis where the list gives no covariance.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is no such table, holds no marker, is in metres, an id or a place occurs twice,
+        or a covariance is none.
+    """
+    table = read_csv(path)
+    if set(METRES) <= set(table.columns):
+        raise FileFormatError(
+            "the columns x_m, y_m, z_m are in metres",
+            where=table.where,
+            remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
+        )
+    table.require(COORDINATES)
+    points = table.floats(COORDINATES)
+    if not len(points):
+        raise FileFormatError(
+            "the table holds no marker", where=table.where, remedy="measure the markers first"
+        )
+    _check_places(table, points)
+    has_covariance = any(name in table for name in COVARIANCES)
+    try:
+        markers = MarkerSet(
+            _ids(table),
+            points,
+            _covariance(table, sigma_mm, has_covariance=has_covariance),
+            _frame(table, frame),
+            str(path),
+        )
+    except InputError as error:
+        raise FileFormatError(
+            error.what, where=table.where, remedy="correct the table, or measure again"
+        ) from error
+    return MarkerList(markers, path, "id" in table, not has_covariance)
+
+
+def _ids(table: CsvTable) -> IntArray:
+    if "id" not in table:
+        return np.arange(1, len(table) + 1)
+    ids = table.ints("id")
+    values, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        twice = int(values[np.argmax(counts > 1)])
+        raise FileFormatError(
+            f"the id {twice} occurs {counts.max()} times",
+            where=table.where,
+            remedy="number each marker once",
+        )
+    return ids
+
+
+def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> FloatArray:
+    if not has_covariance:
+        return np.tile(sigma_mm**2 * np.eye(3), (len(table), 1, 1))
+    table.require(COVARIANCES)
+    rows, columns = _UPPER
+    covariance = np.zeros((len(table), 3, 3))
+    covariance[:, rows, columns] = table.floats(COVARIANCES)
+    covariance[:, columns, rows] = covariance[:, rows, columns]
+    least = np.linalg.eigvalsh(covariance)[:, 0]
+    if least.min() <= 0.0:
+        raise FileFormatError(
+            "the six covariances make no covariance matrix (it is not positive definite)",
+            where=table.place(int(np.argmin(least))),
+            remedy="give variances above 0, or leave the six columns out",
+        )
+    return covariance
+
+
+def _frame(table: CsvTable, frame: str) -> str:
+    named = [text[len(FRAME) :].strip() for text in table.comments if text.startswith(FRAME)]
+    return named[0] if named else frame
+
+
+def _check_places(table: CsvTable, points: FloatArray) -> None:
+    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+    if len(points) >= 3 and 0.0 < extent < SMALLEST_EXTENT_MM:
+        raise FileFormatError(
+            f"all {len(points)} markers lie within {extent:.3g} mm: these look like metres",
+            where=table.where,
+            remedy="multiply x_mm, y_mm and z_mm by 1000",
+        )
+    _, first, counts = np.unique(points, axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        raise FileFormatError(
+            "two markers have the same place",
+            where=table.place(int(first[np.argmax(counts > 1)])),
+            remedy="list each marker once",
+        )
+
+
+PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})
+SCAN_LINE = re.compile(r"^\s*scan_line\s*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
+YAML_WORDS = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}
+
+
+def read_profiles(paths: Sequence[Path | str]) -> tuple[PointProfile, ...]:
+    """Read profiles, one a file, in the order given.
+
+    CSV has the columns ``x_mm,z_mm`` or ``x_mm,y_mm,z_mm``; without ``y_mm`` the points lie in the
+    plane y = 0. YAML has the list ``scan_line`` of x, y, z one after the other. A place with an
+    empty or NaN coordinate is a gap and left out.
+
+    Parameters
+    ----------
+    paths
+        Files or quoted patterns; a folder stands for the profiles in it. Folders and patterns give
+        natural order (p2 before p10).
+
+    Raises
+    ------
+    FileFormatError
+        If a file is missing, cut, no such profile, or holds no point.
+    """
+    files = [file for path in paths for file in _files(Path(path))]
+    names = source_names(files)
+    return tuple(_read(file, name) for file, name in zip(files, names, strict=True))
+
+
+def _files(path: Path) -> list[Path]:
+    if not path.is_dir():
+        return list(expand_paths([path]))
+    found = [
+        item
+        for item in path.iterdir()
+        if item.suffix.lower() in PROFILE_SUFFIXES and _looks_like_profile(item)
+    ]
+    if not found:
+        raise FileFormatError(
+            "the folder holds no profile", where=str(path), remedy="name the profiles' YAML or CSV"
+        )
+    return sorted(found, key=lambda item: natural_key(item.name))
+
+
+def _looks_like_profile(path: Path) -> bool:
+    start = path.read_bytes()[:2000].decode("utf-8-sig", errors="replace")
+    return SCAN_LINE.search(start) is not None or "x_mm" in start
+
+
+def _read(path: Path, name: str) -> PointProfile:
+    data = read_bytes(path)
+    text = data.decode("utf-8-sig", errors="replace")
+    is_yaml = path.suffix.lower() in (".yml", ".yaml") or text.startswith("%YAML")
+    values = _from_yaml(text, str(path)) if is_yaml else _from_csv(data, str(path))
+    is_known = np.isfinite(values).all(axis=1)
+    refuse_beyond_reach(values[is_known], str(path))
+    if not bool(is_known.any()):
+        raise FileFormatError(
+            f"the profile holds no point ({len(values)} gaps)",
+            where=str(path),
+            remedy="leave this profile and its pose out",
+        )
+    return PointProfile(name, values[is_known], int((~is_known).sum()))
+
+
+def _from_csv(data: bytes, where: str) -> FloatArray:
+    table = parse_csv(data, where)
+    if "y_mm" in table:
+        return table.floats(("x_mm", "y_mm", "z_mm"), may_lack=True)
+    table.require(("x_mm", "z_mm"))
+    flat = table.floats(("x_mm", "z_mm"), may_lack=True)
+    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+
+
+def _from_yaml(text: str, where: str) -> FloatArray:
+    found = SCAN_LINE.search(text)
+    if found is None:
+        raise FileFormatError(
+            "there is no list called scan_line", where=where, remedy="name a profile's YAML or CSV"
+        )
+    if not found[2]:
+        raise FileFormatError("the list scan_line is cut short", where=where, remedy="copy it anew")
+    words = found[1].replace(",", " ").split()
+    if len(words) % 3:
+        raise FileFormatError(
+            f"scan_line holds {len(words)} numbers, not three a point",
+            where=where,
+            remedy="write x, y, z of each point one after the other; the file may be cut",
+        )
+    return np.array([_number(word, where) for word in words]).reshape(-1, 3)
+
+
+def _number(word: str, where: str) -> float:
+    known = YAML_WORDS.get(word.lower())
+    if known is not None:
+        return known
+    try:
+        return float(word)
+    except ValueError as error:
+        raise FileFormatError(
+            f"'{word}' in scan_line is no number", where=where, remedy="write it as -12.5 or .Nan"
+        ) from error

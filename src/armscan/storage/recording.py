@@ -1,0 +1,522 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder recording as a source of a scan: images, poses and one clock for both."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import ArmscanError, FileFormatError, InputError
+from armscan.geometry.arrays import BoolArray, ImageArray, IntArray
+from armscan.models.arm import ArmModel
+from armscan.records.exposure import Exposure
+from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, ArmTable, read_arm_model, read_arm_table
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.images import ImageOptions, read_exposure
+from armscan.storage.recording_session import (
+    EXPOSURES_FILE,
+    SESSION_FILE,
+    SessionFile,
+    check_files,
+    exposure_rows,
+    is_inside,
+    read_session_file,
+    repeated_files,
+)
+from armscan.storage.tables import CsvTable, read_csv
+
+Times: TypeAlias = IntArray | NDArray[np.float64]
+
+SPAN_RATIO = 50
+"""Spans of exposures and arm that differ more than so are suspected of two units."""
+UNIT_FACTORS = (1_000, 1_000_000, 1_000_000_000)
+"""Nanoseconds in a microsecond, a millisecond, a second."""
+CROWD = 3
+"""So many arrangements between two samples of the arm are warned of."""
+
+
+def check_clock(
+    rows: Sequence[ExposureRow], arm: ArmTrack, said: SessionFile, folder: Path
+) -> tuple[list[str], list[str]]:
+    """Refuse a recording whose poses cannot be found.
+
+    Returns
+    -------
+    assumed
+        What is assumed of its clock, in words.
+    warnings
+        What is odd in its times, in words.
+
+    Raises
+    ------
+    FileFormatError
+        If there are neither common trigger ids nor a shared clock, no exposure is within the
+        arm's times, or one table's times are in another unit.
+    """
+    where = str(folder / EXPOSURES_FILE)
+    ids = {row.trigger_id for row in rows} - {None}
+    of_arm = set() if arm.trigger_ids is None else set(arm.trigger_ids.tolist()) - {NO_TRIGGER}
+    if ids & of_arm:
+        return [], []
+    if ids and of_arm:
+        raise FileFormatError(
+            "no trigger_id is in both tables",
+            where=where,
+            remedy="write the number of one trigger into both tables, or leave the columns out",
+        )
+    if said.session.clock == "separate":
+        raise FileFormatError(
+            "cameras and arm have neither a shared clock nor trigger ids, so no pose can be found",
+            where=where,
+            remedy="record trigger ids, or bring the times to one clock and say clock = 'shared'",
+        )
+    times = np.array([row.t_ns for row in rows], dtype=np.int64)
+    warnings = _unit_warning(times, arm.t_ns, len({_arrangement(row) for row in rows}), where)
+    if not _is_within(times, arm.t_ns).any():
+        raise FileFormatError(
+            f"no exposure ({times[0]} to {times[-1]} ns) is within the arm's times "
+            f"({arm.t_ns[0]} to {arm.t_ns[-1]} ns)",
+            where=where,
+            remedy="write both times in nanoseconds of one clock, or record trigger ids",
+        )
+    warnings += _crowd_warning(rows, arm.t_ns, where)
+    return ([] if "time.clock" in said.stated else ["cameras and arm share one clock"]), warnings
+
+
+def _is_within(times: Times, span: Times) -> BoolArray:
+    return np.asarray((times >= span[0]) & (times <= span[-1]))
+
+
+def _arrangement(row: ExposureRow) -> str | int:
+    """Rows of one view or one instant saw one arrangement."""
+    return row.t_ns if row.view is None else row.view
+
+
+def _unit_warning(times: IntArray, arm_ns: IntArray, n_arrangements: int, where: str) -> list[str]:
+    """Refuse times of another unit; a sentence where a short burst of images looks the same."""
+    found = _wrong_unit(times.astype(np.float64), arm_ns.astype(np.float64))
+    if found is None:
+        return []
+    table, factor = found
+    seconds = [float(span[-1] - span[0]) / 1e9 for span in (times, arm_ns)]
+    fact = (
+        f"the exposures span {seconds[0]:.3g} s and the arm's samples {seconds[1]:.3g} s; the "
+        f"exposures would be within the arm's times if t_ns of {table} were {factor:,} times as "
+        "large"
+    )
+    is_burst = table == EXPOSURES_FILE and bool(_is_within(times, arm_ns).any())
+    step_ns = np.median(np.diff(times)) if is_burst else 0.0
+    if is_burst and (n_arrangements < CROWD or step_ns >= np.median(np.diff(arm_ns))):
+        return [f"{where}: {fact}: are both in nanoseconds?"]
+    raise FileFormatError(
+        fact,
+        where=where,
+        remedy="write both times in nanoseconds; if they are, leave out the arm's samples long "
+        "before and after the exposures, or record trigger ids",
+    )
+
+
+def _wrong_unit(times: Times, arm_ns: Times) -> tuple[str, int] | None:
+    """The table whose times need a factor to agree with the other's, and the factor."""
+    span, arm_span = float(times[-1] - times[0]), float(arm_ns[-1] - arm_ns[0])
+    if min(span, arm_span) <= 0.0 or max(span, arm_span) < SPAN_RATIO * min(span, arm_span):
+        return None
+    is_shorter = span < arm_span
+    for factor in UNIT_FACTORS:
+        scaled, reference = (factor * times, arm_ns) if is_shorter else (times, factor * arm_ns)
+        ratio = float((scaled[-1] - scaled[0]) / (reference[-1] - reference[0]))
+        if 1.0 / SPAN_RATIO < ratio < SPAN_RATIO and _is_within(scaled, reference).mean() > 0.5:
+            return (EXPOSURES_FILE if is_shorter else ARM_FILE), factor
+    return None
+
+
+def _crowd_warning(rows: Sequence[ExposureRow], arm_ns: IntArray, where: str) -> list[str]:
+    """A sentence if the arm was sampled far more seldom than images were taken."""
+    times = np.array([row.t_ns for row in rows], dtype=np.int64)
+    step = np.searchsorted(arm_ns, times, side="right")
+    seen = [
+        (int(k), _arrangement(row))
+        for k, row in zip(step, rows, strict=True)
+        if 0 < k < len(arm_ns)
+    ]
+    count = Counter(k for k, _ in set(seen))
+    if not count or max(count.values()) < CROWD:
+        return []
+    first, most = next(item for item in count.items() if item[1] == max(count.values()))
+    return [
+        f"{where}: {most} exposures fall between the same two samples of the arm (t_ns "
+        f"{arm_ns[first - 1]} and {arm_ns[first]}): are both times in nanoseconds, and are all "
+        "samples in the table?"
+    ]
+
+
+PNG_COMPRESSION = 1
+
+
+def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposure:
+    """Read the image of a row; a Bayer pattern is turned into red, green and blue.
+
+    The pattern ``bayer_rggb`` begins with red at the image's top-left pixel, wherever the window
+    lies.
+
+    Raises
+    ------
+    FileFormatError
+        If the image is missing or damaged, or its size or layout is not the camera's.
+    OptionError
+        If pixels exceed the stated bits.
+    """
+    path = folder / row.source
+    options = ImageOptions(setup.bits_used, setup.align)
+    image = read_exposure(path, options, source=row.source)
+    _check_layout(image, setup, path)
+    _check_size(image, setup, path)
+    pixels = image.image if setup.colour != "bayer_rggb" else _demosaiced(image.image)
+    return Exposure(
+        pixels,
+        row.source,
+        bits_used=image.bits_used,
+        window=setup.window,
+        lasers=row.lasers,
+        t_ns=row.t_ns,
+        camera=row.camera,
+        trigger_id=row.trigger_id,
+        view=row.view,
+    )
+
+
+def setup_of_image(path: Path, setup: CameraSetup, lacking: Sequence[str]) -> CameraSetup:
+    """Complete what nobody said about a camera by one of its images.
+
+    Parameters
+    ----------
+    path
+        The image.
+    setup
+        What is known, defaults elsewhere.
+    lacking
+        Names of the fields that nobody said.
+    """
+    bits = None if "bits_used" in lacking else setup.bits_used
+    image = read_exposure(path, ImageOptions(bits, setup.align))
+    found: dict[str, Any] = {key: getattr(image, key) for key in lacking}
+    return replace(setup, **found)
+
+
+def window_note(path: Path, setup: CameraSetup) -> str:
+    """A sentence if an image is smaller than its camera, whose window nobody said; else empty.
+
+    An image that cannot be read is no matter of this note; it is named when it is asked for.
+    """
+    try:
+        image = read_exposure(path)
+    except ArmscanError:
+        return ""
+    size = (setup.width_px or image.width_px, setup.height_px or image.height_px)
+    is_larger = image.width_px > size[0] or image.height_px > size[1]
+    if is_larger or (image.width_px, image.height_px) == size:
+        return ""
+    return (
+        f"{path.name} with {image.width_px} x {image.height_px} px is a window at "
+        f"{setup.window.x_px}, {setup.window.y_px} of the camera's {size[0]} x {size[1]} px; "
+        "window_x_px and window_y_px say where it begins"
+    )
+
+
+def encoded_png(exposure: Exposure, setup: CameraSetup) -> bytes:
+    """PNG of an exposure, little compressed: lossless and quick.
+
+    Raises
+    ------
+    InputError
+        If its bits, layout or window are not those of the camera.
+    """
+    said = (setup.bits_used, setup.colour, setup.window)
+    has = (exposure.bits_used, exposure.colour, exposure.window)
+    if said != has:
+        raise InputError(
+            f"the exposure has bits, colour and window {has}, its camera {said}",
+            where=exposure.source,
+        )
+    pixels: NDArray[Any] = exposure.image
+    stored = pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., ::-1])
+    is_encoded, content = cv2.imencode(
+        ".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    )
+    if not is_encoded:
+        raise InputError("the image cannot be encoded as PNG", where=exposure.source)
+    return bytes(content.tobytes())
+
+
+def _demosaiced(mosaic: ImageArray) -> ImageArray:
+    colour: NDArray[Any] = cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)
+    return colour.astype(np.uint8) if mosaic.dtype == np.uint8 else colour.astype(np.uint16)
+
+
+def _check_layout(image: Exposure, setup: CameraSetup, path: Path) -> None:
+    wanted = "rgb" if setup.colour == "rgb" else "mono"
+    if image.colour != wanted:
+        channels = "three channels" if image.colour == "rgb" else "one channel"
+        raise FileFormatError(
+            f"the image has {channels}, but its camera is '{setup.colour}'",
+            where=str(path),
+            remedy="correct colour under [[camera]] in session.toml",
+        )
+
+
+def _check_size(image: Exposure, setup: CameraSetup, path: Path) -> None:
+    """An image has its camera's size, or is smaller and lies inside it at the window's place."""
+    have = np.array([image.width_px, image.height_px])
+    if setup.width_px is None or setup.height_px is None:
+        return
+    size = np.array([setup.width_px, setup.height_px])
+    corner = np.array([setup.window.x_px, setup.window.y_px])
+    is_whole = bool((have == size).all())
+    is_inside = bool((corner + setup.window.binning * have <= size).all())
+    if not (is_whole or is_inside):
+        place = f" with a window at {corner[0]}, {corner[1]}" if corner.any() else ""
+        raise FileFormatError(
+            f"the image is {have[0]} x {have[1]} px, its camera {size[0]} x {size[1]} px{place}",
+            where=str(path),
+            remedy="correct the sizes in session.toml, or leave images of another camera out",
+        )
+
+
+SIZE_KEYS = ("width_px", "height_px")
+WINDOW_KEYS = ("window_x_px", "window_y_px")
+CAMERA_KEYS = (*SIZE_KEYS, "bits_used", "colour")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FolderRecording:
+    """A folder recording: a `ScanSource` whose images are read when they are asked for.
+
+    Parameters
+    ----------
+    folder
+        Where it lies.
+    session, rows, arm
+        See `ScanSource`.
+    is_simulated
+        True if it, or a mark beside it, says that its images were rendered.
+    warnings
+        What is odd in it, in words.
+    exposure_columns, arm_columns
+        Columns of the tables that are not known, in the order of ``rows`` and of the samples.
+    arm_model
+        Geometry with which joint angles were turned into poses; None where it was not needed.
+    """
+
+    folder: Path
+    session: Session
+    rows: tuple[ExposureRow, ...]
+    arm: ArmTrack | None
+    is_simulated: bool
+    warnings: tuple[str, ...]
+    exposure_columns: Mapping[str, tuple[str, ...]]
+    arm_columns: Mapping[str, tuple[str, ...]]
+    arm_model: ArmModel | None
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self.folder.resolve().name
+
+    def exposure(self, row: int) -> Exposure:
+        """Read the exposure of ``rows[row]`` with its pixels.
+
+        Raises
+        ------
+        FileFormatError
+            If the image is missing or damaged, or its size or layout is not the camera's.
+        """
+        chosen = self.rows[row]
+        return read_recorded(self.folder, chosen, self.session.cameras[chosen.camera])
+
+
+def is_recording(folder: Path) -> bool:
+    """True for a folder that holds the list of a recording's exposures."""
+    return (folder / EXPOSURES_FILE).is_file()
+
+
+def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
+    """Read a folder recording; images are read later, one by one.
+
+    Parameters
+    ----------
+    folder
+        Holds ``exposures.csv``, images, and as a rule ``session.toml`` and ``arm.csv``.
+    arm
+        Turns joint angles into poses; ``arm.toml`` of the recording if None.
+
+    Raises
+    ------
+    FileFormatError
+        If a table is missing, damaged or against a rule of the format.
+    """
+    _check_folder(folder)
+    table = read_csv(folder / EXPOSURES_FILE)
+    rows, unknown = exposure_rows(table)
+    check_files(folder, rows)
+    said, assumed = _said(folder)
+    warnings = [*said.warnings, *_odd(table, unknown)]
+    warnings += [f"{table.where}: {name} is listed again" for name in repeated_files(rows)]
+    track, form, arm_model, arm_unknown = None, said.session.pose_form, None, {}
+    if (folder / ARM_FILE).exists():
+        arm_csv = read_csv(folder / ARM_FILE)
+        arm_model = arm if arm is not None else _own_arm_model(folder)
+        found = _arm_table(arm_csv, said, arm_model)
+        track, form, arm_unknown = found.track, found.form, dict(found.extra)
+        warnings += [*_odd(arm_csv, arm_unknown), *found.warnings]
+        assumed += _assumed_of_arm(found, said)
+        of_clock, odd_times = check_clock(rows, track, said, folder)
+        assumed += of_clock
+        warnings += odd_times
+    cameras, facts = _cameras(folder, rows, said)
+    session = replace(said.session, cameras=cameras, pose_form=form, assumed=(*assumed, *facts))
+    warnings += _odd_head(folder, session.head)
+    return FolderRecording(
+        folder,
+        session,
+        rows,
+        track,
+        session.is_simulated or are_simulated((folder / EXPOSURES_FILE,)),
+        tuple(warnings),
+        unknown,
+        arm_unknown,
+        arm_model,
+    )
+
+
+def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack, tuple[str, ...]]:
+    """Read what the arm reported, from a folder with or without images.
+
+    Parameters
+    ----------
+    folder
+        Holds ``arm.csv``, and as a rule ``session.toml``.
+    arm
+        Turns joint angles into poses; ``arm.toml`` of the folder if None.
+
+    Returns
+    -------
+    track
+        The samples.
+    notes
+        What is odd in the files or was assumed, in words.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is missing, damaged or against a rule of the format.
+    """
+    said, notes = _said(folder)
+    table = read_csv(folder / ARM_FILE)
+    found = _arm_table(table, said, arm if arm is not None else _own_arm_model(folder))
+    notes += [*said.warnings, *_odd(table, found.extra), *found.warnings]
+    return found.track, (*notes, *_assumed_of_arm(found, said))
+
+
+def _said(folder: Path) -> tuple[SessionFile, list[str]]:
+    """The session, and that there is none if there is none."""
+    path = folder / SESSION_FILE
+    if path.exists():
+        return read_session_file(path), []
+    return SessionFile(Session(cameras=())), [f"there is no {SESSION_FILE}"]
+
+
+def _check_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        raise FileFormatError(
+            "there is no such folder", where=str(folder), remedy="name a recording's folder"
+        )
+    if not is_recording(folder):
+        raise FileFormatError(
+            f"the folder holds no {EXPOSURES_FILE}, so it is no recording",
+            where=str(folder),
+            remedy="name the folder that holds it, or list the images in one",
+        )
+
+
+def _own_arm_model(folder: Path) -> ArmModel | None:
+    path = folder / ARM_MODEL_FILE
+    return read_arm_model(path) if path.exists() else None
+
+
+def _arm_table(table: CsvTable, said: SessionFile, arm: ArmModel | None) -> ArmTable:
+    form = said.session.pose_form if "pose.form" in said.stated else None
+    return read_arm_table(table, form, said.session.rotation, arm)
+
+
+def _assumed_of_arm(found: ArmTable, said: SessionFile) -> list[str]:
+    facts = []
+    if "pose.form" not in said.stated:
+        facts.append(f"the arm's poses are of the form '{found.form}', by their columns")
+    if found.form == "euler" and "pose.rotation" not in said.stated:
+        facts.append(f"Euler angles are '{said.session.rotation}'")
+    return facts
+
+
+def _odd_head(folder: Path, head: str | None) -> list[str]:
+    where = str(folder / SESSION_FILE)
+    if head is None or (is_inside(head) and (folder / head).is_file()):
+        return []
+    if not is_inside(head):
+        raise FileFormatError(
+            f"head is '{head}', no path inside the recording",
+            where=where,
+            remedy="copy the file into the recording and name it relative to that",
+        )
+    return [f"{where}: there is no file {head}"]
+
+
+def _odd(table: CsvTable, unknown: Mapping[str, tuple[str, ...]]) -> list[str]:
+    found = []
+    if unknown:
+        found.append(f"{table.where}: columns not known, kept: {', '.join(unknown)}")
+    if table.is_cut:
+        found.append(
+            f"{table.where}: the last line does not end with a line break, so the file may be cut"
+        )
+    return found
+
+
+def _cameras(
+    folder: Path, rows: Sequence[ExposureRow], said: SessionFile
+) -> tuple[tuple[CameraSetup, ...], list[str]]:
+    """Setups of all cameras as said, what nobody said by the first image of each; and that."""
+    count = max(row.camera for row in rows) + 1
+    setups = said.session.cameras
+    if setups and count > len(setups):
+        raise FileFormatError(
+            f"camera {count - 1} is not among the {len(setups)} cameras of {SESSION_FILE}",
+            where=str(folder / EXPOSURES_FILE),
+            remedy="count cameras from 0, and describe each under [[camera]]",
+        )
+    cameras, facts = [], []
+    for number in range(len(setups) or count):
+        setup = setups[number] if setups else CameraSetup()
+        prefix = f"camera.{number}."
+        stated = frozenset(
+            key.removeprefix(prefix) for key in said.stated if key.startswith(prefix)
+        )
+        first = next((row for row in rows if row.camera == number), None)
+        # a camera that is described takes the format's defaults, one that is not its images'
+        lacking = [key for key in (CAMERA_KEYS if not setups else SIZE_KEYS) if key not in stated]
+        if first is not None and lacking:
+            setup = setup_of_image(folder / first.source, setup, lacking)
+            values = ", ".join(f"{key} {getattr(setup, key)}" for key in lacking)
+            facts.append(f"camera {number} has {values}, as {first.source}")
+        if first is not None and not lacking and not stated.issuperset(WINDOW_KEYS):
+            note = window_note(folder / first.source, setup)
+            facts += [f"camera {number}: {note}"] if note else []
+        cameras.append(setup)
+    return tuple(cameras), facts

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Ring markers in images: found, filtered, and their centres measured."""

@@ -1,0 +1,418 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The image in which a stripe is sought: grey or colour, laser-off subtracted, gated by colour."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from armscan.records.exposure import Exposure
+from armscan.vision.stripe.ridge import mean_along, strong_median
+
+StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
+LaserColour = Literal[
+    "auto",
+    "red",
+    "green",
+    "blue",
+    "grey",
+    "red-excess",
+    "green-excess",
+    "blue-excess",
+    "red-green",
+    "red-blue",
+    "green-red",
+    "green-blue",
+    "blue-red",
+    "blue-green",
+]
+SIGMA_RANGE_PX = (0.6, 10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class StripeOptions:
+    """Options of `extract_stripes`.
+
+    Parameters
+    ----------
+    method
+        ``fit`` (noise-weighted profile fit, smoothed along the line) or one of the thesis's four.
+    laser_colour
+        What of a colour image shows the line: a channel of the laser's colour; ``grey``, the mean
+        of all; an excess, a channel less the mean of the two others (``green-excess``); or a
+        difference of two (``green-red`` is green less red). ``auto`` finds it.
+    line_sigma_px
+        Sigma of the line's cross-section, or None to find it.
+    threshold
+        Least height of a line above its background in grey levels, or None to set it from the
+        image's noise.
+    shortest_px
+        Segments shorter than this are flagged as no stripe.
+    smoothing_px
+        Largest half window of the smoothing along the line; 0 switches it off.
+    neighbour_sigmas
+        A line within this many sigmas of another is flagged.
+    background_step
+        A background step of more than this share of the line's amplitude is flagged.
+    faintest_share
+        Segments fainter than this share of the bright ones are taken for reflections and left out.
+    """
+
+    method: StripeMethod = "fit"
+    laser_colour: LaserColour = "auto"
+    line_sigma_px: float | None = None
+    threshold: float | None = None
+    shortest_px: float = 15.0
+    smoothing_px: float = 12.0
+    neighbour_sigmas: float = 4.5
+    background_step: float = 0.2
+    faintest_share: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, choices in (("method", StripeMethod), ("laser_colour", LaserColour)):
+            value = getattr(self, name)
+            if value not in get_args(choices):
+                raise OptionError(
+                    f"{name} '{value}' is not known",
+                    remedy=f"choose one of: {', '.join(get_args(choices))}",
+                )
+        low, high = SIGMA_RANGE_PX
+        if self.line_sigma_px is not None and not low <= self.line_sigma_px <= high:
+            raise OptionError(
+                f"line_sigma_px is {self.line_sigma_px}",
+                remedy=f"give {low} to {high} px, or leave it out to have it found",
+            )
+        if self.threshold is not None and not 0.0 < self.threshold < math.inf:
+            raise OptionError(
+                f"threshold is {self.threshold}", remedy="give a positive count of grey levels"
+            )
+        for name in (
+            "shortest_px",
+            "smoothing_px",
+            "neighbour_sigmas",
+            "background_step",
+            "faintest_share",
+        ):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise OptionError(
+                    f"{name} is {getattr(self, name)}", remedy="give a number that is not negative"
+                )
+
+
+SAMPLE_STEP_PX = 4
+ROUNDS = 4
+TRIM_SIGMAS = 2.5
+GAIN_LIMITS = (0.05, 20.0)
+
+
+def check_background(exposure: Exposure, background: Exposure) -> None:
+    """Raise `InputError` unless both exposures show the same pixels in the same format."""
+    if exposure.image.shape != background.image.shape or exposure.window != background.window:
+        raise InputError(
+            f"the background image is {background.image.shape} at {background.window}, the stripe "
+            f"image {exposure.image.shape} at {exposure.window}",
+            where=background.source,
+            remedy="take both with the same camera settings",
+        )
+
+
+def subtract(
+    lit: NDArray[np.float32], dark: NDArray[np.float32], full_scale: float
+) -> NDArray[np.float32]:
+    """Subtract the dark view after matching its brightness.
+
+    Gain and offset come from a trimmed line fit over a sample of unsaturated pixels, so that a
+    lamp that flickers between the two images leaves no ghost, and the laser's own pixels do not
+    count.
+
+    Parameters
+    ----------
+    lit, dark
+        (H, W) float32, laser on and off.
+    full_scale
+        Grey level of saturation.
+    """
+    x = dark[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
+    y = lit[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
+    use = (x < 0.98 * full_scale) & (y < 0.98 * full_scale)
+    gain, offset = 1.0, 0.0
+    for _ in range(ROUNDS):
+        if use.sum() < 16:
+            break
+        middle = x[use].mean()
+        spread = float(((x[use] - middle) ** 2).sum())
+        if spread > use.sum():
+            slope = float(((x[use] - middle) * y[use]).sum()) / spread
+            gain = float(np.clip(slope, *GAIN_LIMITS))
+        offset = float(np.median(y[use] - gain * x[use]))
+        rest = np.abs(y - gain * x - offset)
+        use = rest <= TRIM_SIGMAS * max(1.4826 * float(np.median(rest)), 0.5)
+    return np.asarray(lit - np.float32(gain) * dark - np.float32(offset), dtype=np.float32)
+
+
+NORMAL_SCALE = 255.0
+"""Grey levels are scaled to 8 bits, so that no constant depends on the camera's depth."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StripePlane:
+    """One channel of an exposure, ready for extraction.
+
+    Parameters
+    ----------
+    image
+        (H, W) float32, full scale 255 before background subtraction.
+    clipped
+        (H, W) uint8, 1 where ``image`` says nothing because the camera saturated; (1, 1) if
+        nowhere.
+    saturated
+        (H, W) uint8, 1 where the laser's own channel saturated; (1, 1) if nowhere.
+    grey_levels_per_unit
+        Factor from ``image`` to the exposure's own grey levels.
+    gate
+        (H, W) float32 how much the pixel has the laser's colour, or None for grey images.
+    unknown
+        (H, W) uint8, 1 where the view without laser saturated already; (1, 1) if nowhere; None
+        without such a view.
+    """
+
+    image: NDArray[np.float32]
+    clipped: NDArray[np.uint8]
+    saturated: NDArray[np.uint8]
+    grey_levels_per_unit: float
+    gate: NDArray[np.float32] | None = None
+    unknown: NDArray[np.uint8] | None = None
+
+
+def saturated_mask(channel: ImageArray, full_scale: int) -> NDArray[np.uint8]:
+    """Mask (H, W) of clipped pixels, or (1, 1) zeros if there are none."""
+    if int(channel.max()) < full_scale:
+        return np.zeros((1, 1), np.uint8)
+    return np.ascontiguousarray(channel >= full_scale).view(np.uint8)
+
+
+def to_units(channel: ImageArray, full_scale: int) -> NDArray[np.float32]:
+    """Scale grey levels so that full scale is 255."""
+    return channel.astype(np.float32) * np.float32(NORMAL_SCALE / full_scale)
+
+
+def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
+    """Plane of a grey exposure, less the background."""
+    scale = exposure.full_scale
+    image = to_units(exposure.image, scale)
+    unknown = None
+    if background is not None:
+        unknown = saturated_mask(background.image, background.full_scale)
+        image = subtract(image, to_units(background.image, background.full_scale), NORMAL_SCALE)
+    clipped = saturated_mask(exposure.image, scale)
+    return StripePlane(image, clipped, clipped, scale / NORMAL_SCALE, unknown=unknown)
+
+
+CHANNELS = ("red", "green", "blue")
+COLOURS: tuple[LaserColour, ...] = ("red", "green", "blue")
+RIDGE_STEP_PX = 14
+RIDGE_QUANTILE = 0.9995
+LEAST_COLOUR_SHARE = 0.25
+"""A laser's colour shows at least this share of the grey contrast, else the line is grey."""
+SATURATED_SHARE = 0.12
+"""With more clipped pixels on the line than this, another channel is consulted."""
+LEAST_CORE_HEIGHT = 8.0
+"""A channel shows the core if it rises by this much above its surroundings there."""
+LINE_SHARE = 0.4
+NOWHERE = np.zeros((1, 1), np.uint8)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColourImages:
+    """Channels of a colour exposure after background subtraction.
+
+    Parameters
+    ----------
+    channels
+        Red, green, blue: (H, W) float32.
+    clipped
+        The mask of saturated pixels of each.
+    """
+
+    channels: tuple[NDArray[np.float32], ...]
+    clipped: tuple[NDArray[np.uint8], ...]
+
+
+def split_channels(exposure: Exposure, background: Exposure | None) -> ColourImages:
+    """Red, green and blue of an exposure, less the background."""
+    scale = exposure.full_scale
+    channels, clipped = [], []
+    for k in range(3):
+        raw = _channel(exposure, k)
+        channel = to_units(raw, scale)
+        if background is not None:
+            dark = to_units(_channel(background, k), background.full_scale)
+            channel = subtract(channel, dark, NORMAL_SCALE)
+        channels.append(channel)
+        clipped.append(saturated_mask(raw, scale))
+    return ColourImages(tuple(channels), tuple(clipped))
+
+
+def _channel(exposure: Exposure, k: int) -> ImageArray:
+    image = exposure.image
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image[:, :, k], dtype=np.uint8)
+    return np.ascontiguousarray(image[:, :, k], dtype=np.uint16)
+
+
+def colour_excess(images: ColourImages, colour: str) -> NDArray[np.float32]:
+    """How much stronger the laser's colour is than the mean of the two others, (H, W)."""
+    k = CHANNELS.index(colour)
+    others = [images.channels[m] for m in range(3) if m != k]
+    return np.asarray(images.channels[k] - np.float32(0.5) * (others[0] + others[1]))
+
+
+def ridge_height(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Height (H - 2 s, W - 2 s) above both neighbours at distance s, along rows or columns."""
+    s = RIDGE_STEP_PX
+    if min(image.shape) <= 2 * s:
+        return np.zeros((0, 0), np.float32)
+    middle = image[s:-s, s:-s]
+    along_row = middle - np.maximum(image[s:-s, : -2 * s], image[s:-s, 2 * s :])
+    down_column = middle - np.maximum(image[: -2 * s, s:-s], image[2 * s :, s:-s])
+    return np.asarray(np.maximum(along_row, down_column))
+
+
+def _strength(image: NDArray[np.float32]) -> float:
+    ridge = ridge_height(image)
+    return float(np.quantile(ridge, RIDGE_QUANTILE)) if ridge.size else 0.0
+
+
+def find_laser_colour(images: ColourImages) -> LaserColour:
+    """Colour whose excess forms the strongest thin lines; grey if none stands out."""
+    strengths = [_strength(colour_excess(images, colour)) for colour in COLOURS]
+    grey = _strength(np.asarray(sum(images.channels) / np.float32(3.0)))
+    best = int(np.argmax(strengths))
+    return COLOURS[best] if strengths[best] > LEAST_COLOUR_SHARE * grey else "grey"
+
+
+def colour_plane(
+    exposure: Exposure, background: Exposure | None, colour: LaserColour
+) -> StripePlane:
+    """The plane of a colour exposure in which the stripe is sought.
+
+    Of ``auto``, the colour is found in this one image. For a colour, the laser's own channel is
+    used; where its core is saturated, the least saturated channel that still shows the core is
+    added: it rises where the first has reached its limit, while the halo and dim parts of the line
+    stay with the laser's colour; only ridges with the laser's colour around them count. For a
+    difference, what the channels have in common, the room's light on a printed pattern, cancels.
+    """
+    images = split_channels(exposure, background)
+    factor = exposure.full_scale / NORMAL_SCALE
+    if colour == "auto":
+        colour = find_laser_colour(images)
+    if colour == "grey":
+        mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
+        clipped = _any_clipped(images.clipped)
+        return StripePlane(mean, clipped, clipped, factor)
+    own = CHANNELS.index(colour.partition("-")[0])
+    unknown = None
+    if background is not None:
+        unknown = saturated_mask(_channel(background, own), background.full_scale)
+    if colour not in CHANNELS:
+        clipped = images.clipped[own]
+        return StripePlane(_difference(images, colour), clipped, clipped, factor, unknown=unknown)
+    excess = colour_excess(images, colour)
+    core = _core_channel(images, excess, own)
+    image, clipped = images.channels[own], images.clipped[own]
+    if core is not None:
+        image, clipped = image + images.channels[core], images.clipped[core]
+    return StripePlane(image, clipped, images.clipped[own], factor, excess, unknown)
+
+
+def _difference(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
+    """One channel less another one, or less the mean of both others."""
+    first, _, second = colour.partition("-")
+    if second == "excess":
+        return colour_excess(images, first)
+    return images.channels[CHANNELS.index(first)] - images.channels[CHANNELS.index(second)]
+
+
+def _any_clipped(masks: tuple[NDArray[np.uint8], ...]) -> NDArray[np.uint8]:
+    found = [mask for mask in masks if mask.size > 1]
+    return np.maximum.reduce(found) if found else NOWHERE
+
+
+def _core_channel(images: ColourImages, excess: NDArray[np.float32], own: int) -> int | None:
+    """The channel that shows a core in which the laser's own is saturated; None if none is."""
+    s = RIDGE_STEP_PX
+    ridge = ridge_height(excess)
+    if not ridge.size or images.clipped[own].size == 1:
+        return None
+    line = ridge > LINE_SHARE * float(np.quantile(ridge, RIDGE_QUANTILE))
+    core = line & (images.clipped[own][s:-s, s:-s] > 0)
+    if core.sum() <= SATURATED_SHARE * line.sum():
+        return None
+    heights = [float(np.median(ridge_height(c)[core])) for c in images.channels]
+    shares = [float(m[s:-s, s:-s][core].mean()) if m.size > 1 else 0.0 for m in images.clipped]
+    others = [k for k in range(3) if k != own and heights[k] > LEAST_CORE_HEIGHT]
+    return min(others, key=lambda k: (shares[k], -heights[k])) if others else None
+
+
+CORE_SIGMAS = 3.0
+BESIDE_SIGMAS = (5.0, 8.0)
+LEAST_CORE_PX = 3.0
+HALF = 4
+NOISE_FACTOR = 4.0
+LEAST_SHARE = 0.25
+
+
+def has_laser_colour(
+    gate: NDArray[np.float32], table: FloatArray, chain: IntArray, line_sigma_px: float
+) -> BoolArray:
+    """(N,) True where the colour excess near the ridge stands out from both sides.
+
+    The core of a saturated line is white; its halo keeps the colour. So the strongest excess within
+    three sigmas is compared with the excess farther out, averaged along the line.
+
+    Parameters
+    ----------
+    gate
+        (H, W) colour excess.
+    table, chain
+        Ridge points and their chains.
+    line_sigma_px
+        Typical sigma of the lines.
+    """
+    core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
+    inside = _across(gate, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1)
+    far = np.linspace(BESIDE_SIGMAS[0], BESIDE_SIGMAS[1], 4) * max(line_sigma_px, 1.0)
+    beside = np.maximum(
+        np.median(_across(gate, table, -far), axis=1), np.median(_across(gate, table, far), axis=1)
+    )
+    ones = np.ones(len(table))
+    contrast = mean_along(inside - beside, ones, chain, HALF)
+    step = np.abs(np.diff(gate[::7, :], axis=1))
+    noise = 1.05 * float(np.median(step)) if step.size else 0.0
+    typical = strong_median(np.maximum(contrast, 0.0))
+    return np.asarray(contrast > max(NOISE_FACTOR * noise, LEAST_SHARE * typical))
+
+
+def is_on_known_ground(
+    unknown: NDArray[np.uint8], table: FloatArray, line_sigma_px: float
+) -> BoolArray:
+    """(N,) False where the view without laser was saturated within three sigmas of the ridge."""
+    if unknown.size == 1:
+        return np.ones(len(table), dtype=np.bool_)
+    core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
+    return np.asarray(_across(unknown, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1) == 0)
+
+
+def _across(
+    gate: NDArray[np.float32] | NDArray[np.uint8], table: FloatArray, offsets: FloatArray
+) -> FloatArray:
+    height, width = gate.shape
+    x = np.rint(table[:, :1] + table[:, 2:3] * offsets).astype(np.int64)
+    y = np.rint(table[:, 1:2] + table[:, 3:4] * offsets).astype(np.int64)
+    return gate[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)].astype(np.float64)

@@ -1,0 +1,263 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smoothing along the line, with the sigma that correlated neighbours leave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.kernels.smooth import (
+    BEND,
+    BEND_SIGMA,
+    PREDICTED,
+    PREDICTED_SIGMA,
+    SHIFT,
+    SIGMA,
+    SLOPE,
+    smooth_chains,
+)
+
+SMALLEST_WINDOW_PX = 3.2
+WINDOW_RATIO = 1.6
+CONFIDENCE = 2.2
+LAGS = 6
+RESULT_COLUMNS = 8
+SCATTER_HALVES = (30, 16, 8)
+"""Wide windows show slow noise too, but need long chains."""
+UNKNOWN_SCATTER_PX = 0.5
+"""Assumed where chains are too short to show their scatter."""
+SIGNIFICANT_CORRELATION = 2.5
+BEND_WINDOWS_PX = np.array([7.5, 12.0, 19.0, 30.0])
+LEAST_PAIRS = 200
+LEAST_HALF = 8
+OUTLIER_SIGMAS = 6.0
+RESIDUAL_WIDENING = 1.5
+"""A wider parabola takes less of the noise with it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Course:
+    """Centres in the order of their chains.
+
+    Parameters
+    ----------
+    points, normals
+        (N, 2) image pixels and unit normals.
+    sigma
+        (N,) standard deviation along the normal as the fit predicts it.
+    chain
+        (N,) chain numbers.
+    is_used
+        (N,) False for points that must not pull their neighbours.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    sigma: FloatArray
+    chain: IntArray
+    is_used: BoolArray
+
+    def __len__(self) -> int:
+        """Count of points."""
+        return len(self.points)
+
+    def run(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
+        """Result (N, 8) of the smoothing kernel with these half windows."""
+        result = np.zeros((len(self), RESULT_COLUMNS))
+        smooth_chains(
+            self.points,
+            self.normals,
+            self.sigma,
+            self.is_used.astype(np.int64),
+            self.chain,
+            windows_px,
+            inflation,
+            CONFIDENCE,
+            result,
+        )
+        return result
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedCentres:
+    """Centres after smoothing.
+
+    Parameters
+    ----------
+    points
+        (N, 2) image pixels.
+    normals
+        (N, 2) unit normals.
+    sigma
+        (N,) standard deviation along the normal.
+    is_outlier
+        (N,) True where the raw centre disagrees with its neighbours' course.
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    sigma: FloatArray
+    is_outlier: BoolArray
+
+
+def windows(largest_px: float) -> FloatArray:
+    """Half windows from small to ``largest_px``, growing by a constant ratio."""
+    steps = max(round(np.log(largest_px / SMALLEST_WINDOW_PX) / np.log(WINDOW_RATIO)), 0)
+    return np.geomspace(min(SMALLEST_WINDOW_PX, largest_px), largest_px, steps + 1)
+
+
+def smooth(course: Course, largest_px: float) -> SmoothedCentres:
+    """Smooth centres along their chains and give each its standard deviation.
+
+    The noise of neighbours is measured from the residuals, not assumed: its size corrects the
+    sigmas, and its correlation widens those of the smoothed centres.
+
+    Parameters
+    ----------
+    course
+        The centres.
+    largest_px
+        Largest half window; 0 only measures the noise.
+    """
+    half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
+    rough = course.run(half, np.ones(len(half)))
+    score = np.abs(rough[:, PREDICTED]) / np.hypot(rough[:, PREDICTED_SIGMA], course.sigma)
+    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * _scale(score))
+    course = replace(course, is_used=course.is_used & ~is_outlier)
+    correlation = noise_correlation(course, half[-1])
+    course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
+    if largest_px <= 0.0:
+        return SmoothedCentres(course.points, course.normals, course.sigma, is_outlier)
+    result = course.run(half, np.array([_inflation(correlation, h) for h in half]))
+    used, normals = course.is_used, course.normals
+    shift = np.where(used, result[:, SHIFT], 0.0)
+    slope = np.where(used, result[:, SLOPE], 0.0)
+    tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
+    turned = normals - slope[:, None] * tangents
+    return SmoothedCentres(
+        course.points + shift[:, None] * normals,
+        turned / np.linalg.norm(turned, axis=1, keepdims=True),
+        np.where(used, result[:, SIGMA], course.sigma),
+        is_outlier,
+    )
+
+
+def curvature(course: Course) -> FloatArray:
+    """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
+
+    Shrunk towards zero by its own noise, so that straight lines are not disturbed.
+    """
+    result = course.run(BEND_WINDOWS_PX, np.ones(len(BEND_WINDOWS_PX)))
+    square = result[:, BEND] ** 2
+    noise = result[:, BEND_SIGMA] ** 2
+    return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
+
+
+def _scale(score: FloatArray) -> float:
+    """Typical size of scores that should have unit variance; at least 1."""
+    return max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
+
+
+def _weights(half: int) -> FloatArray:
+    """Weights (2 half + 1,) of a uniform local quadratic at its centre."""
+    k = np.arange(-half, half + 1, dtype=np.float64)
+    design = np.stack([np.ones_like(k), k, k * k], axis=1)
+    return np.asarray(np.linalg.pinv(design)[0])
+
+
+def _inflation(correlation: FloatArray, half_px: float) -> float:
+    """Variance of a uniform local quadratic's centre, divided by its value for white noise."""
+    weights = _weights(max(int(half_px), 2))
+    overlap = np.correlate(weights, weights, "full")[len(weights) - 1 :][:LAGS]
+    factor = np.where(np.arange(len(overlap)) == 0, 1.0, 2.0)
+    shape = correlation[: len(overlap)] / correlation[0]
+    return max(float((factor * overlap * shape).sum() / overlap[0]), 0.3)
+
+
+def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
+    """Standard deviation of the points across a smooth course of their own, in px."""
+    n = len(points)
+    course = Course(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
+    for half in SCATTER_HALVES:
+        residual = _filter_residuals(course, half)
+        if np.isfinite(residual).sum() >= LEAST_PAIRS:
+            share = 1.0 - _weights(half)[half]
+            return float(np.sqrt(np.nanmean(residual**2) / share))
+    return UNKNOWN_SCATTER_PX
+
+
+def noise_correlation(course: Course, half_px: float) -> FloatArray:
+    """Covariance (LAGS,) of normalised raw centres at distances 0, 1, ... along the chain.
+
+    Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
+    it, the measured covariances are a known linear mixture of the true ones, which is inverted.
+    Without a significant correlation of nearest neighbours the noise is taken as white.
+    """
+    white = np.zeros(LAGS)
+    white[0] = 1.0
+    half = max(int(RESIDUAL_WIDENING * half_px), LEAST_HALF)
+    residual = _filter_residuals(course, half)
+    measured = _lag_products(residual, course.chain)
+    while measured is None and half > LEAST_HALF:
+        # A line that is often interrupted, as by the marks of a board, has no room for more.
+        half = max(int(half / WINDOW_RATIO), LEAST_HALF)
+        residual = _filter_residuals(course, half)
+        measured = _lag_products(residual, course.chain)
+    if measured is None:
+        return white
+    kernel = -_weights(half)
+    kernel[half] += 1.0
+    spread = np.correlate(kernel, kernel, "full")
+    middle = len(spread) // 2
+    mixture = np.zeros((LAGS, LAGS))
+    for lag in range(LAGS):
+        for m in range(LAGS):
+            for signed in {m, -m}:
+                at = middle + lag - signed
+                if 0 <= at < len(spread):
+                    mixture[lag, m] += spread[at]
+    scale = max(measured[0] / mixture[0, 0], 0.05)
+    surplus = measured[1:] - scale * mixture[1:, 0]
+    limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
+    if (surplus[:2] < limit).all():
+        return np.asarray(scale * white)
+    solved, _ = nnls(mixture, measured)
+    solved[0] = max(solved[0], 0.05)
+    return np.asarray(solved)
+
+
+def _lag_products(residual: FloatArray, chain: IntArray) -> FloatArray | None:
+    """Mean product (LAGS,) of residuals at each distance; None where there are too few pairs."""
+    measured = np.zeros(LAGS)
+    for lag in range(LAGS):
+        a, b = residual[: len(residual) - lag], residual[lag:]
+        same = np.isfinite(a) & np.isfinite(b) & (chain[: len(chain) - lag] == chain[lag:])
+        if same.sum() < LEAST_PAIRS:
+            return None
+        measured[lag] = (a[same] * b[same]).mean()
+    return measured
+
+
+def _filter_residuals(course: Course, half: int) -> FloatArray:
+    """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
+    points, normals, chain = course.points, course.normals, course.chain
+    n = len(points)
+    size = 2 * half + 1
+    if n < size:
+        return np.full(n, np.nan)
+    span = np.lib.stride_tricks.sliding_window_view
+    inside = (chain[: n - size + 1] == chain[size - 1 :]) & span(course.is_used, size).all(axis=1)
+    weights = _weights(half)
+    smooth_x = span(points[:, 0], size) @ weights
+    smooth_y = span(points[:, 1], size) @ weights
+    middle = slice(half, n - half)
+    offset = (points[middle, 0] - smooth_x) * normals[middle, 0]
+    offset += (points[middle, 1] - smooth_y) * normals[middle, 1]
+    residual = np.full(n, np.nan)
+    residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
+    limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
+    residual[np.abs(residual) > limit * 1.4826] = np.nan
+    return residual

@@ -1,0 +1,391 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blobs that may be circles, a lattice grown over them, and the numbers of its cells.
+
+Both kinds of circle grid are square lattices (the asymmetric one turned by 45 degrees). The
+ellipse into which a circle is seen gives the local affine map up to a rotation; in
+coordinates
+that make it round again, the four nearest neighbours are equally far and at right angles, at
+any
+tilt.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.vision.targets.grey import Grey8
+from armscan.vision.targets.target import CircleGrid, TargetOptions
+
+BLOCK_FRACTIONS = (1 / 40, 1 / 12, 1 / 4)
+"""Sides of the squares over which a threshold is the local mean, as fractions of the image."""
+MAX_ROUNDNESS_ERROR = 0.12
+"""Largest deviation of a contour from its ellipse of inertia, as a fraction of the radius."""
+MIN_AXIS_RATIO = 0.25
+SAME_LOG_AREA = 1.0
+"""Blobs around one place whose areas differ by less than this, in logarithm, are one blob found at
+several thresholds; a target's circles never nest."""
+_PIXEL_ERROR = 1.0
+_NOISE_SIGMAS = 5.0
+_PARENT = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blobs:
+    """Ellipse-shaped blobs.
+
+    Parameters
+    ----------
+    centres_px
+        (N, 2) centres, image pixels.
+    shapes_px2
+        (N, 2, 2) matrices S with ``d' S^-1 d = 1`` on the rim, ``d`` from the centre.
+    is_light
+        (N,) True for a light blob on a dark ground.
+    """
+
+    centres_px: FloatArray
+    shapes_px2: FloatArray
+    is_light: BoolArray
+
+    def __len__(self) -> int:
+        """Count of blobs."""
+        return len(self.centres_px)
+
+    def subset(self, chosen: BoolArray) -> Blobs:
+        """Return the chosen blobs."""
+        return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
+
+
+def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA) -> Blobs:
+    """Return every contour that is an ellipse within the range of sizes, once.
+
+    A blob found at several threshold scales is kept where its contour is roundest.
+
+    Parameters
+    ----------
+    grey8
+        The image.
+    options
+        Sizes and contrast.
+    same_log_area
+        Where circles nest, less than `SAME_LOG_AREA`, so that their rims stay apart.
+    """
+    rows: list[tuple[float, ...]] = []
+    margin = max(255.0 * options.min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
+    for fraction in BLOCK_FRACTIONS:
+        block = max(11, round(fraction * max(grey8.shape)) | 1)
+        mean = cv2.boxFilter(grey8, -1, (block, block), borderType=cv2.BORDER_REPLICATE)
+        for is_light in (True, False):
+            difference = cv2.subtract(grey8, mean) if is_light else cv2.subtract(mean, grey8)
+            _, binary = cv2.threshold(difference, margin, 255, cv2.THRESH_BINARY)
+            contours, hierarchy = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+            rows += [
+                (*ellipse, float(is_light))
+                for contour, links in zip(contours, _links(hierarchy), strict=True)
+                if links[_PARENT] < 0
+                and (ellipse := _ellipse_of(np.asarray(contour), options)) is not None
+            ]
+    table = np.array(rows).reshape(-1, 7)
+    table = table[np.argsort(table[:, 5], kind="stable")]
+    table = table[_first_of_each(table, same_log_area)]
+    shapes = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    return Blobs(table[:, :2].copy(), shapes, table[:, 6] > 0.5)
+
+
+def _links(hierarchy: object) -> IntArray:
+    """OpenCV's contour hierarchy as (N, 4); empty if there is no contour."""
+    return np.zeros((0, 4), np.int64) if hierarchy is None else np.asarray(hierarchy)[0]
+
+
+def _noise(grey8: Grey8) -> float:
+    """Standard deviation of the pixel noise, from second differences along rows."""
+    rows = grey8[::8].astype(np.float64)
+    second = rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]
+    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
+
+
+def _ellipse_of(
+    contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], options: TargetOptions
+) -> tuple[float, float, float, float, float, float] | None:
+    """Centre u, v, shape uu, uv, vv and roundness error of a contour, if it is an ellipse."""
+    if len(contour) < 2.0 * options.min_circle_px:
+        return None
+    low = contour.reshape(-1, 2).min(axis=0)
+    high = contour.reshape(-1, 2).max(axis=0)
+    extent = float((high - low).max())
+    if not options.min_circle_px - 2.0 <= extent <= options.max_circle_px:
+        return None
+    moments = cv2.moments(contour)
+    area = moments["m00"]
+    if area < 0.4 * options.min_circle_px**2:
+        return None
+    centre = np.array([moments["m10"], moments["m01"]]) / area
+    inertia = (
+        4.0
+        / area
+        * np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]])
+    )
+    eigenvalues = np.linalg.eigvalsh(inertia)
+    if eigenvalues[0] < MIN_AXIS_RATIO**2 * eigenvalues[1] or eigenvalues[0] < 4.0:
+        return None
+    offset = contour.reshape(-1, 2) - centre
+    radius = np.sqrt(np.einsum("ki,ij,kj->k", offset, np.linalg.inv(inertia), offset))
+    error = float(np.abs(radius - 1.0).max())
+    if error > MAX_ROUNDNESS_ERROR + _PIXEL_ERROR / np.sqrt(eigenvalues[0]):
+        return None
+    # The contour runs through the centres of border pixels: half a pixel inside the rim.
+    grown = inertia * (1.0 + 0.5 / np.sqrt(eigenvalues.mean())) ** 2
+    return centre[0], centre[1], grown[0, 0], grown[0, 1], grown[1, 1], error
+
+
+def _first_of_each(table: FloatArray, same_log_area: float) -> BoolArray:
+    """Keep the first of all blobs whose centres lie within a third of its short half axis."""
+    kept = np.ones(len(table), dtype=np.bool_)
+    if not len(table):
+        return kept
+    tree = cKDTree(table[:, :2])
+    area = np.sqrt(np.maximum(table[:, 2] * table[:, 4] - table[:, 3] ** 2, 0.0))
+    for k, row in enumerate(table):
+        if not kept[k]:
+            continue
+        near = np.array(tree.query_ball_point(row[:2], 0.35 * np.sqrt(area[k])), dtype=np.int64)
+        same = (near > k) & (table[near, 6] == row[6])
+        same &= np.abs(np.log(area[near] / area[k])) < same_log_area
+        kept[near[same]] = False
+    return kept
+
+
+Cell = tuple[int, int]
+Lattice = dict[Cell, int]
+
+_MAX_SEEDS = 60
+_NEIGHBOURS = 9
+_POSITION_TOLERANCE = 0.28
+_MAX_AREA_RATIO = 1.9
+_SIDES: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
+
+
+def grow_lattices(blobs: Blobs) -> Iterator[Lattice]:
+    """Yield lattices (cell to blob index), grown from seeds that no earlier lattice holds.
+
+    The cells' first axis a and second axis b lie in the image so that b is clockwise of a.
+    """
+    if len(blobs) < 4:
+        return
+    grower = _Grower(blobs)
+    used: set[int] = set()
+    for seed in grower.seeds():
+        if seed in used:
+            continue
+        lattice = grower.grow(seed)
+        if len(lattice) >= 4:
+            used.update(lattice.values())
+            yield lattice
+
+
+class _Grower:
+    def __init__(self, blobs: Blobs) -> None:
+        self._centres = blobs.centres_px
+        self._shapes = blobs.shapes_px2
+        self._log_area = 0.5 * np.log(np.linalg.det(blobs.shapes_px2))
+        self._tree = cKDTree(self._centres)
+        self._count = len(blobs)
+
+    def seeds(self) -> list[int]:
+        """Blobs nearest to the middle of all blobs first: the middle has most neighbours."""
+        middle = np.median(self._centres, axis=0)
+        order = np.argsort(((self._centres - middle) ** 2).sum(axis=1), kind="stable")
+        spread = np.unique(np.linspace(0, self._count - 1, _MAX_SEEDS).astype(np.int64))
+        return [int(k) for k in order[spread]]
+
+    def grow(self, seed: int) -> Lattice:
+        """Lattice from a seed, breadth first; each cell hands its basis to its neighbours."""
+        basis = self._basis(seed)
+        if basis is None:
+            return {}
+        lattice: Lattice = {(0, 0): seed}
+        taken = {seed}
+        bases = {(0, 0): basis}
+        queue: deque[Cell] = deque([(0, 0)])
+        while queue:
+            cell = queue.popleft()
+            for side in _SIDES:
+                beside = (cell[0] + side[0], cell[1] + side[1])
+                if beside in lattice:
+                    continue
+                found = self._neighbour(lattice[cell], bases[cell], side)
+                if found is None or found in taken:
+                    continue
+                lattice[beside] = found
+                taken.add(found)
+                bases[beside] = self._carried(lattice[cell], found, bases[cell], side)
+                queue.append(beside)
+        return lattice
+
+    def _basis(self, seed: int) -> FloatArray | None:
+        """Two lattice steps (2, 2), rows, at a seed, from its neighbours in rounded coordinates."""
+        distance, index = self._tree.query(self._centres[seed], min(self._count, 3 * _NEIGHBOURS))
+        near = np.asarray(index)[np.isfinite(distance)][1:]
+        similar = np.abs(self._log_area[near] - self._log_area[seed]) < np.log(_MAX_AREA_RATIO)
+        near = near[similar]
+        offset = self._centres[near] - self._centres[seed]
+        rounded = np.linalg.solve(np.linalg.cholesky(self._shapes[seed]), offset.T).T
+        length = np.hypot(rounded[:, 0], rounded[:, 1])
+        order = np.argsort(length, kind="stable")[:_NEIGHBOURS]
+        for first in order[:2]:
+            for second in order:
+                cross = (
+                    rounded[first, 0] * rounded[second, 1] - rounded[first, 1] * rounded[second, 0]
+                )
+                sine = cross / (length[first] * length[second])
+                ratio = length[second] / length[first]
+                if sine > 0.94 and 0.75 < ratio < 1.33:
+                    return np.stack([offset[first], offset[second]])
+        return None
+
+    def _neighbour(self, at: int, basis: FloatArray, side: Cell) -> int | None:
+        step = side[0] * basis[0] + side[1] * basis[1]
+        distance, found = self._tree.query(self._centres[at] + step)
+        if distance > _POSITION_TOLERANCE * np.hypot(*step):
+            return None
+        if abs(self._log_area[found] - self._log_area[at]) > np.log(_MAX_AREA_RATIO):
+            return None
+        return int(found)
+
+    def _carried(self, at: int, found: int, basis: FloatArray, side: Cell) -> FloatArray:
+        """The basis at the neighbour: the step just made, and the other axis as before."""
+        axis = 0 if side[0] else 1
+        carried = basis.copy()
+        carried[axis] = (self._centres[found] - self._centres[at]) * (side[0] + side[1])
+        # The side step changes with distance too: scale it by the circle's own size.
+        carried[1 - axis] *= np.exp(0.5 * (self._log_area[found] - self._log_area[at]))
+        return carried
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NumberedGrid:
+    """Blobs with the numbers of their circles.
+
+    Parameters
+    ----------
+    point_index
+        (M,) index into the target's points, ascending.
+    blob_index
+        (M,) blob of each.
+    """
+
+    point_index: IntArray
+    blob_index: IntArray
+
+
+def is_symmetric(target: CircleGrid) -> bool:
+    """Tell whether the grid looks the same after half a turn.
+
+    A symmetric grid always does; an asymmetric one does if its count of rows is even.
+    """
+    return not target.is_asymmetric or target.rows % 2 == 0
+
+
+def number_grid(
+    lattice: Lattice, centres_px: FloatArray, target: CircleGrid, min_fraction: float
+) -> NumberedGrid | None:
+    """Lay the target over a lattice.
+
+    Parameters
+    ----------
+    lattice
+        Cell to blob.
+    centres_px
+        (N, 2) blob centres.
+    target
+        The grid.
+    min_fraction
+        Least fraction of its circles that must be there; its four border lines must be.
+
+    Returns
+    -------
+    The numbering whose x points most to the right; None if the lattice is not this grid.
+    """
+    wanted = _target_cells(target)
+    have = np.array(list(lattice), dtype=np.int64)
+    blobs = np.array(list(lattice.values()), dtype=np.int64)
+    best: tuple[float, NumberedGrid] | None = None
+    for quarter_turns in range(4):
+        placed = _placed(_turned(have, quarter_turns), blobs, wanted, target.is_asymmetric)
+        if placed is None or len(placed.point_index) < min_fraction * len(wanted):
+            continue
+        rightness = _rightness(placed, centres_px, target)
+        if best is None or rightness > best[0]:
+            best = rightness, placed
+    return None if best is None else best[1]
+
+
+def lattice_size(lattice: Lattice, is_asymmetric: bool) -> tuple[int, int]:
+    """Columns and rows that a lattice spans, of a symmetric grid the larger first: for messages."""
+    cells = np.array(list(lattice), dtype=np.int64)
+    if is_asymmetric:
+        across, along = (
+            int(span) + 1 for span in np.ptp(_border(cells, is_asymmetric=True), axis=0)
+        )
+        # A row of C circles spans 2 C places of the turned lattice, since each second is shifted.
+        sizes = [((u + 1) // 2, v) for u, v in ((across, along), (along, across))]
+        return min(sizes, key=lambda size: abs(size[0] * size[1] - len(cells)))
+    spans = np.ptp(cells, axis=0) + 1
+    return int(spans.max()), int(spans.min())
+
+
+def _target_cells(target: CircleGrid) -> IntArray:
+    """Lattice cells (N, 2) of the target's points; y is clockwise of x, b of a."""
+    unit = np.rint(target.points_board_mm[:, :2] / target.pitch_mm).astype(np.int64)
+    if not target.is_asymmetric:
+        return unit
+    # Steps of the turned lattice: a = (1, 1) and b = (-1, 1) pitches.
+    return np.stack([unit[:, 0] + unit[:, 1], unit[:, 1] - unit[:, 0]], axis=-1) // 2
+
+
+def _turned(cells: IntArray, quarter_turns: int) -> IntArray:
+    turned = cells
+    for _ in range(quarter_turns):
+        turned = np.stack([-turned[:, 1], turned[:, 0]], axis=-1)
+    return turned
+
+
+def _placed(
+    cells: IntArray, blobs: IntArray, wanted: IntArray, is_asymmetric: bool
+) -> NumberedGrid | None:
+    """Shift the cells onto the target; None unless the borders agree and no cell is left over."""
+    have, want = (_border(c, is_asymmetric) for c in (cells, wanted))
+    if not np.array_equal(np.ptp(have, axis=0), np.ptp(want, axis=0)):
+        return None
+    shift = want.min(axis=0) - have.min(axis=0)
+    if is_asymmetric:
+        if (shift[0] + shift[1]) % 2:
+            return None
+        shift = np.array([shift[0] + shift[1], shift[1] - shift[0]]) // 2
+    number = {(int(a), int(b)): k for k, (a, b) in enumerate(wanted)}
+    points = [number.get((int(a), int(b)), -1) for a, b in cells + shift]
+    if min(points) < 0:
+        return None
+    order = np.argsort(points)
+    return NumberedGrid(np.array(points, dtype=np.int64)[order], blobs[order])
+
+
+def _border(cells: IntArray, is_asymmetric: bool) -> IntArray:
+    """Coordinates in which the target's border is a rectangle."""
+    if not is_asymmetric:
+        return cells
+    return np.stack([cells[:, 0] - cells[:, 1], cells[:, 0] + cells[:, 1]], axis=-1)
+
+
+def _rightness(placed: NumberedGrid, centres_px: FloatArray, target: CircleGrid) -> float:
+    board = target.points_board_mm[placed.point_index, :2]
+    design = np.column_stack([board, np.ones(len(board))])
+    affine = np.linalg.lstsq(design, centres_px[placed.blob_index], rcond=None)[0]
+    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))

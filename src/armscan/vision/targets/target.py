@@ -1,0 +1,347 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibration targets: what they are, how they are named, what is known of one in an exposure."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.estimate import FitFailure
+
+
+@dataclass(frozen=True, slots=True)
+class CircleGrid:
+    """Grid of circles; ``is_asymmetric`` shifts every second row by half a pitch (as OpenCV)."""
+
+    columns: int
+    rows: int
+    pitch_mm: float
+    is_asymmetric: bool = False
+
+    @property
+    def points_board_mm(self) -> FloatArray:
+        """(columns * rows, 3) circle centres in the Board frame, row by row."""
+        j, i = np.mgrid[: self.rows, : self.columns]
+        x = (2 * i + j % 2) * self.pitch_mm if self.is_asymmetric else i * self.pitch_mm
+        return np.stack([x, j * self.pitch_mm, 0.0 * x], axis=-1).reshape(-1, 3)
+
+    @property
+    def size_mm(self) -> float:
+        """The length whose wrong value scales every result."""
+        return self.pitch_mm
+
+
+@dataclass(frozen=True, slots=True)
+class Chessboard:
+    """Chessboard, counted in inner corners."""
+
+    columns: int
+    rows: int
+    square_mm: float
+
+    @property
+    def points_board_mm(self) -> FloatArray:
+        """(columns * rows, 3) inner corners in the Board frame, row by row."""
+        j, i = np.mgrid[: self.rows, : self.columns]
+        return np.stack([i, j, 0 * i], axis=-1).reshape(-1, 3) * self.square_mm
+
+    @property
+    def size_mm(self) -> float:
+        """The length whose wrong value scales every result."""
+        return self.square_mm
+
+
+@dataclass(frozen=True, slots=True)
+class Charuco:
+    """ChArUco board, counted in squares; its points are the inner corners."""
+
+    columns: int
+    rows: int
+    square_mm: float
+    marker_mm: float
+    dictionary: str
+
+    @property
+    def points_board_mm(self) -> FloatArray:
+        """((columns - 1) * (rows - 1), 3) inner corners in the Board frame, row by row."""
+        j, i = np.mgrid[1 : self.rows, 1 : self.columns]
+        return np.stack([i, j, 0 * i], axis=-1).reshape(-1, 3) * self.square_mm
+
+    @property
+    def size_mm(self) -> float:
+        """The length whose wrong value scales every result."""
+        return self.square_mm
+
+
+Target: TypeAlias = CircleGrid | Chessboard | Charuco
+
+
+EXAMPLES = {
+    "circle-grid": "circle-grid:11x9:3.75",
+    "asymmetric-circle-grid": "asymmetric-circle-grid:4x11:5",
+    "chessboard": "chessboard:11x6:13",
+    "charuco": "charuco:10x7:4:3:DICT_4X4_50",
+}
+"""A right specification of each kind of target."""
+
+SMALLEST_UNASKED_MM = 0.1
+"""A smaller length without a unit is asked about: it was likely meant in metres."""
+_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+_MIN_COUNT = {"circle-grid": 3, "asymmetric-circle-grid": 2, "chessboard": 3, "charuco": 3}
+
+
+def parse_target(text: str) -> Target:
+    """Read a target's specification.
+
+    Parameters
+    ----------
+    text
+        ``circle-grid:COLSxROWS:PITCH_MM``, ``asymmetric-circle-grid:COLSxROWS:PITCH_MM``,
+        ``chessboard:COLSxROWS:SQUARE_MM`` (inner corners) or
+        ``charuco:COLSxROWS:SQUARE_MM:MARKER_MM:DICTIONARY`` (squares). A length is in mm unless it
+        bears a unit: ``13``, ``13mm``, ``1.3cm``, ``0.013m``.
+
+    Raises
+    ------
+    OptionError
+        If the text is none of these; the message shows a right example.
+    """
+    kind, *fields = text.strip().split(":")
+    if kind not in _PARSERS:
+        known = ", ".join(EXAMPLES)
+        raise OptionError(
+            f"'{kind}' is no kind of target; known are {known}",
+            where=f"target '{text}'",
+            remedy=f"write for example {EXAMPLES['chessboard']}",
+        )
+    n_fields = 4 if kind == "charuco" else 2
+    if len(fields) != n_fields:
+        raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
+    return _PARSERS[kind](text, kind, fields)
+
+
+def format_target(target: Target) -> str:
+    """The specification that `parse_target` reads as this target."""
+    counts = f"{target.columns}x{target.rows}"
+    if isinstance(target, Charuco):
+        name = target.dictionary
+        return f"charuco:{counts}:{target.square_mm:.12g}:{target.marker_mm:.12g}:{name}"
+    if isinstance(target, CircleGrid):
+        kind = "asymmetric-circle-grid" if target.is_asymmetric else "circle-grid"
+        return f"{kind}:{counts}:{target.pitch_mm:.12g}"
+    return f"chessboard:{counts}:{target.square_mm:.12g}"
+
+
+def describe_target(target: Target) -> str:
+    """The target in words, with its size in mm, so that a wrong length or unit is noticed."""
+    width, height = target.points_board_mm[-1, :2] - target.points_board_mm[0, :2]
+    if isinstance(target, CircleGrid):
+        reach = target.points_board_mm.max(axis=0)
+        what = "circles, first to last centre"
+        return f"{target.columns} x {target.rows} {what} {reach[0]:.4g} x {reach[1]:.4g} mm"
+    what = "inner corners, first to last"
+    n = (target.columns, target.rows)
+    if isinstance(target, Charuco):
+        n = (target.columns - 1, target.rows - 1)
+    return f"{n[0]} x {n[1]} {what} {width:.4g} x {height:.4g} mm"
+
+
+def _circle_grid(text: str, kind: str, fields: list[str]) -> Target:
+    columns, rows = _counts(text, kind, fields[0])
+    is_asymmetric = kind == "asymmetric-circle-grid"
+    return CircleGrid(columns, rows, _length_mm(text, kind, "pitch", fields[1]), is_asymmetric)
+
+
+def _chessboard(text: str, kind: str, fields: list[str]) -> Target:
+    columns, rows = _counts(text, kind, fields[0])
+    return Chessboard(columns, rows, _length_mm(text, kind, "square", fields[1]))
+
+
+def _charuco(text: str, kind: str, fields: list[str]) -> Target:
+    columns, rows = _counts(text, kind, fields[0])
+    square_mm = _length_mm(text, kind, "square", fields[1])
+    marker_mm = _length_mm(text, kind, "marker", fields[2])
+    if marker_mm >= square_mm:
+        raise _wrong(text, kind, f"a marker of {marker_mm:g} mm does not fit into its square")
+    name = fields[3].upper()
+    name = name if name.startswith("DICT_") else f"DICT_{name}"
+    code = getattr(cv2.aruco, name, None)
+    if not isinstance(code, int):
+        raise _wrong(text, kind, f"'{fields[3]}' is no ArUco dictionary")
+    n_markers = columns * rows // 2
+    n_known = len(cv2.aruco.getPredefinedDictionary(code).bytesList)
+    if n_markers > n_known:
+        raise _wrong(text, kind, f"the board needs {n_markers} markers, {name} has {n_known}")
+    return Charuco(columns, rows, square_mm, marker_mm, name)
+
+
+_PARSERS: dict[str, Callable[[str, str, list[str]], Target]] = {
+    "circle-grid": _circle_grid,
+    "asymmetric-circle-grid": _circle_grid,
+    "chessboard": _chessboard,
+    "charuco": _charuco,
+}
+
+
+def _counts(text: str, kind: str, field: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,4})[xX](\d{1,4})", field)
+    if match is None:
+        raise _wrong(text, kind, f"'{field}' is not COLUMNSxROWS")
+    columns, rows = int(match[1]), int(match[2])
+    if min(columns, rows) < _MIN_COUNT[kind]:
+        raise _wrong(text, kind, f"{columns} x {rows} is too few: at least {_MIN_COUNT[kind]} each")
+    return columns, rows
+
+
+def _length_mm(text: str, kind: str, name: str, field: str) -> float:
+    number = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?(mm|cm|m)?", field)
+    length_mm = float(number[1]) * _UNITS_MM[number[2] or "mm"] if number else math.nan
+    if not 0.0 < length_mm < math.inf:
+        raise _wrong(text, kind, f"'{field}' is no {name}: give mm, or a unit as in 13mm, 1.3cm")
+    if number and number[2] is None and length_mm < SMALLEST_UNASKED_MM:
+        raise OptionError(
+            f"a {name} of {field} mm: is it metres",
+            where=f"target '{text}'",
+            remedy=f"write {field}m if it is {1000.0 * length_mm:g} mm, {field}mm if it is not",
+        )
+    return length_mm
+
+
+def _wrong(text: str, kind: str, what: str) -> OptionError:
+    return OptionError(what, where=f"target '{text}'", remedy=f"write for example {EXAMPLES[kind]}")
+
+
+@dataclass(frozen=True, slots=True)
+class TargetOptions:
+    """How targets are looked for.
+
+    Parameters
+    ----------
+    search_size_px
+        Larger images are reduced to this size for the search of chessboards; the corners are then
+        measured in the full image.
+    min_circle_px, max_circle_px
+        Range of the circles' diameters in the image.
+    min_contrast
+        Least contrast of a circle or square, as a fraction of full scale.
+    min_circles_fraction
+        Least fraction of a grid's circles that must be found; each border row must be among them.
+    """
+
+    search_size_px: int = 1400
+    min_circle_px: float = 8.0
+    max_circle_px: float = 400.0
+    min_contrast: float = 0.02
+    min_circles_fraction: float = 0.8
+
+    def __post_init__(self) -> None:
+        if self.search_size_px < 100:
+            raise OptionError(f"search_size_px = {self.search_size_px} is below 100")
+        if not 6.0 <= self.min_circle_px < self.max_circle_px:
+            raise OptionError(
+                f"circles of {self.min_circle_px} to {self.max_circle_px} px across: the smallest "
+                "must be at least 6 px and below the largest"
+            )
+        if not 0.0 < self.min_contrast < 1.0:
+            raise OptionError(f"min_contrast = {self.min_contrast} is not between 0 and 1")
+        if not 0.5 <= self.min_circles_fraction <= 1.0:
+            raise OptionError(
+                f"min_circles_fraction = {self.min_circles_fraction} is not between 0.5 and 1"
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CircleEdges:
+    """Sub-pixel edge points of circles, kept so that centres can be recomputed with intrinsics.
+
+    Parameters
+    ----------
+    points_px
+        (K, 2) edge points, full-sensor pixels.
+    circle
+        (K,) row of the `TargetView`'s arrays to which an edge point belongs.
+    sigma_px
+        (K,) standard deviation along the edge's normal.
+    """
+
+    points_px: FloatArray
+    circle: IntArray
+    sigma_px: FloatArray
+
+    def __post_init__(self) -> None:
+        k = len(self.points_px)
+        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (k, 2), "edges (px)"))
+        object.__setattr__(self, "circle", frozen_ints(self.circle, (k,), "circle"))
+        object.__setattr__(self, "sigma_px", frozen_floats(self.sigma_px, (k,), "sigma_px"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetView:
+    """Target points found in one exposure.
+
+    Parameters
+    ----------
+    source
+        The exposure's source name.
+    width_px, height_px
+        Size of the image, in full-sensor pixels.
+    point_index
+        (M,) index into the target's points.
+    points_px
+        (M, 2) image points, full-sensor pixels.
+    covariance_px2
+        (M, 2, 2) covariance of each image point.
+    points_board_mm
+        (M, 3) the same points in the Board frame.
+    edges
+        Edge points, for circle targets.
+    is_ambiguous
+        True if the target looks the same turned by half a turn, so that the numbering may be too.
+    """
+
+    source: str
+    width_px: int
+    height_px: int
+    point_index: IntArray
+    points_px: FloatArray
+    covariance_px2: FloatArray
+    points_board_mm: FloatArray
+    edges: CircleEdges | None = None
+    is_ambiguous: bool = False
+
+    def __post_init__(self) -> None:
+        m = len(self.points_px)
+        object.__setattr__(self, "point_index", frozen_ints(self.point_index, (m,), "point_index"))
+        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (m, 2), "points_px"))
+        object.__setattr__(
+            self, "points_board_mm", frozen_floats(self.points_board_mm, (m, 3), "points_board_mm")
+        )
+        object.__setattr__(
+            self, "covariance_px2", frozen_floats(self.covariance_px2, (m, 2, 2), "covariance_px2")
+        )
+        if m and float(np.linalg.eigvalsh(self.covariance_px2).min()) <= 0.0:
+            raise InputError("covariance_px2 is not positive definite", where=self.source)
+
+    def __len__(self) -> int:
+        """Count of points found."""
+        return len(self.points_px)
+
+
+@dataclass(frozen=True, slots=True)
+class OtherCountSeen(FitFailure):
+    """No such target is in view, but a full lattice of another count: ``columns`` x ``rows``.
+
+    It may be part of the target, the rest being hidden; where several images show the same one, the
+    count that was asked for is wrong.
+    """
+
+    columns: int = 0
+    rows: int = 0

@@ -18,8 +18,8 @@ import numpy as np
 KEPT_WHOLE = 40
 N_SAMPLES = 12
 VOLATILE = re.compile(
-    r"(^|_)(created|created_utc|time_utc|date|version|host|hostname|python|platform|elapsed|"
-    r"elapsed_s|duration_s|seconds|sha256|hash|document_id|parent_ids|command|id|hashes|written_by|"
+    r"(^|_)(created|created_utc|time_utc|date|armscan_version|host|hostname|python|platform|elapsed|"
+    r"elapsed_s|duration_s|seconds|sha256|hash|document_id|parent_ids|command|hashes|written_by|"
     r"image_hashes|digest|size_bytes|bytes)$"
 )
 MASKS = (
@@ -195,7 +195,9 @@ def differences(
         for key in old:
             place = f"{where}/{key}"
             if key not in new:
-                yield Difference(place, old[key], "(gone)", is_prose or key.startswith("~"))
+                # which options are written down may change; what they were may not
+                is_free = "~" in place or "/provenance/options/" in place
+                yield Difference(place, old[key], "(gone)", is_free)
                 continue
             own = sigma or known_sigma(old, key)
             yield from differences(old[key], new[key], limits, place, scale=scale, sigma=own)

@@ -10,15 +10,13 @@ import pytest
 
 import placing_rig as rig
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
-    BaseBox,
     arm_covariance,
-    parse_volume,
     place_delivered_points,
     place_with_jacobian,
     prepare_placing,
@@ -207,12 +205,12 @@ def test_a_covariance_that_is_none_is_refused() -> None:
 
 
 def test_volume() -> None:
-    box = parse_volume("0,10,-5,5,2,3")
+    box = Box.parse("0,10,-5,5,2,3", "--volume")
     inside = box.holds(np.array([[0.0, -5, 2], [10, 5, 3], [10.1, 0, 2.5], [5, 0, 1.9]]))
     assert inside.tolist() == [True, True, False, False]
-    assert str(parse_volume(str(box))) == str(box)
+    assert str(Box.parse(str(box), "--volume")) == str(box)
     for wrong in ("0,10,5,-5,2,3", "1,2,3", "a,b,c,d,e,f", "0,nan,0,1,0,1"):
         with pytest.raises(OptionError):
-            parse_volume(wrong)
+            Box.parse(wrong, "--volume")
     with pytest.raises(OptionError):
-        BaseBox(np.zeros(3), np.zeros(3))
+        Box(np.zeros(3), np.zeros(3))

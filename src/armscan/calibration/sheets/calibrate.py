@@ -545,9 +545,9 @@ def calibrate_sheets(
 
     The stripe points are carried to the board (`intersect_board`), sorted into straight stripes,
     named over the images, and fitted: generalised least squares of the residuals across the
-    stripe in the image, with the stripe's sigma of each point, and with the errors of the boards' poses
-    and of the cameras as common unknowns of known covariance. A bow is added where the lack-of-fit
-    test asks for it and the boards support it.
+    stripe in the image, with the stripe's sigma of each point, and with the errors of the boards'
+    poses and of the cameras as common unknowns of known covariance. A bow is added where the
+    lack-of-fit test asks for it and the boards support it.
 
     Parameters
     ----------

@@ -35,9 +35,9 @@ from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import PointPairs, closed_form_pose, register_points
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.markers.join_views import JoinedViews, join_views
-from armscan.markers.thesis import match_after_thesis
 from armscan.pipeline.register import register_place
 from armscan.storage.points import MarkerList
+from armscan.thesis.marker_rules import match_after_thesis
 from marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))

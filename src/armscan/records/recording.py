@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats, ints
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import EulerConvention
@@ -164,33 +164,3 @@ class ArmTrack(RowRecord):
         if not self.is_known[row]:
             raise InputError(f"the arm gave no pose at sample {row}")
         return Pose(self.rotations[row], self.translations_mm[row])
-
-
-@dataclass(frozen=True, slots=True)
-class LaserSchedule:
-    """Lasers that are on, exposure by exposure, over and over.
-
-    Parameters
-    ----------
-    pattern
-        Names of the sources that are on in each exposure of a period.
-    """
-
-    pattern: tuple[tuple[str, ...], ...]
-
-    def __post_init__(self) -> None:
-        if not self.pattern or not any(self.pattern):
-            raise OptionError(
-                "a laser schedule without lasers", remedy="give at least one exposure with a laser"
-            )
-
-    def lasers(self, exposure: int) -> tuple[str, ...]:
-        """Sources that are on in exposure number ``exposure``, counted from 0."""
-        return self.pattern[exposure % len(self.pattern)]
-
-
-THESIS_SCHEDULE = LaserSchedule((("A",), ("B",), ("A", "B")))
-"""Figure 3.2: A alone, B alone, both; four stripes in three exposures, 1.33 of one laser's."""
-
-ALWAYS_BOTH = LaserSchedule((("A", "B"),))
-"""Both lasers on in every exposure."""

@@ -140,7 +140,15 @@ def _inspected(
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
     return PlaneInspection(
-        plane, reference, feature, is_fitted, counts, fitted, nominal, offset, tilt
+        plane=plane,
+        reference=reference,
+        rows=feature,
+        is_fitted=is_fitted,
+        counts=counts,
+        fitted=fitted,
+        nominal=nominal,
+        offset=offset,
+        tilt_mrad=tilt,
     )
 
 

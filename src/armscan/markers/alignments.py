@@ -14,7 +14,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
 from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import closed_form_pose, spread_mm
 from armscan.records.points import MarkerSet
@@ -65,8 +73,7 @@ class MarkerMatchOptions:
                 raise OptionError(f"{name} is {getattr(self, name)}", remedy="give a number > 0")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
+class Alignment(RowRecord):
     """A rigid motion that carries markers of the second set onto markers of the first.
 
     Parameters
@@ -77,16 +84,12 @@ class Alignment:
         The motion, unweighted; `armscan.geometry.registration` gives the weighted one.
     """
 
-    pairs: IntArray
+    pairs: IntArray = ints("N", 2)
     first_from_second: Pose[Frame, Frame]
 
     def __post_init__(self) -> None:
-        pairs = self.pairs[self.pairs[:, 0].argsort()]
-        object.__setattr__(self, "pairs", frozen_ints(pairs, (None, 2), "pairs of markers"))
-
-    def __len__(self) -> int:
-        """Count of markers explained."""
-        return len(self.pairs)
+        object.__setattr__(self, "pairs", self.pairs[self.pairs[:, 0].argsort()])
+        super().__post_init__()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +148,7 @@ class NoMatch:
 MatchResult: TypeAlias = Matched | NotUnique | NoMatch
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledMarkers:
+class LabelledMarkers(RowRecord):
     """Markers with their mutual distances.
 
     Parameters
@@ -161,14 +163,10 @@ class LabelledMarkers:
         (N, N - 1) distances of each marker to all others, the shortest first: its label V.
     """
 
-    points_mm: FloatArray
-    sigma_mm: FloatArray
-    distance_mm: FloatArray
-    labels_mm: FloatArray
-
-    def __len__(self) -> int:
-        """Count of markers."""
-        return len(self.points_mm)
+    points_mm: FloatArray = floats("N", 3)
+    sigma_mm: FloatArray = floats("N")
+    distance_mm: FloatArray = floats("N", "N")
+    labels_mm: FloatArray = floats("N", None)
 
 
 def label_markers(markers: MarkerSet) -> LabelledMarkers:
@@ -184,7 +182,12 @@ def label_points(points_mm: FloatArray, sigma_mm: FloatArray) -> LabelledMarkers
     distance = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
     n = len(points_mm)
     others = distance[~np.eye(n, dtype=bool)].reshape(n, max(n - 1, 0))
-    return LabelledMarkers(points_mm, sigma_mm, distance, np.sort(others, axis=1))
+    return LabelledMarkers(
+        points_mm=points_mm,
+        sigma_mm=sigma_mm,
+        distance_mm=distance,
+        labels_mm=np.sort(others, axis=1),
+    )
 
 
 def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float) -> int:
@@ -204,8 +207,7 @@ def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float
     return count
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelVotes:
+class LabelVotes(ArrayRecord):
     """How well the labels of two sets agree.
 
     Parameters
@@ -220,8 +222,8 @@ class LabelVotes:
         Pairs of distances that agree, each counted from both its ends in either set: four times.
     """
 
-    count: IntArray
-    weight: FloatArray
+    count: IntArray = ints("N", "M")
+    weight: FloatArray = floats("N", "M")
     n_agreeing: int
 
 
@@ -234,7 +236,7 @@ def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> Labe
     n, m = len(first), len(second)
     count, weight = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
     if n < 2 or m < 2:
-        return LabelVotes(count, weight, 0)
+        return LabelVotes(count=count, weight=weight, n_agreeing=0)
     owner, other = np.nonzero(~np.eye(m, dtype=bool))
     distances = second.distance_mm[owner, other]
     order = np.argsort(distances, kind="stable")
@@ -256,7 +258,7 @@ def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> Labe
         share = agrees.sum(axis=1) / m
         count[i] = agrees.sum(axis=0)
         weight[i] = -np.log(np.clip(share, 1.0 / m, 1.0 - 0.5 / m)) @ agrees
-    return LabelVotes(count, weight, hits)
+    return LabelVotes(count=count, weight=weight, n_agreeing=hits)
 
 
 LEAST_HEIGHT_SIGMAS = 15.0
@@ -445,7 +447,7 @@ class MarkerPlacement:
             if np.array_equal(again, pairs):
                 break
             pairs = again
-        return Alignment(pairs, pose)
+        return Alignment(pairs=pairs, first_from_second=pose)
 
     def are_same(self, one: Alignment, other: Alignment) -> bool:
         """True if both carry all markers that they explain to the same places, or one is a part."""

@@ -5,12 +5,19 @@ the options of stereo matching.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import (
     TwoViews,
@@ -132,8 +139,7 @@ _FIRST_LOOK_PX = 30.0
 """Pairs further than this from the epipolar constraint are not looked at more closely."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CandidatePairs:
+class CandidatePairs(RowRecord):
     """K pairs of a left and a right ring that satisfy the epipolar constraint.
 
     Parameters
@@ -151,21 +157,13 @@ class CandidatePairs:
         (K,) how large it would be: geometric mean of what the two images show.
     """
 
-    left: IntArray
-    right: IntArray
-    distance_px: FloatArray
-    sigma_px: FloatArray
-    points_mm: FloatArray
-    covariance_mm2: FloatArray
-    diameter_mm: FloatArray
-
-    def __len__(self) -> int:
-        """Count of pairs."""
-        return len(self.left)
-
-    def subset(self, chosen: BoolArray | IntArray) -> CandidatePairs:
-        """Return some of the pairs."""
-        return CandidatePairs(*(getattr(self, field.name)[chosen] for field in fields(self)))
+    left: IntArray = ints("N")
+    right: IntArray = ints("N")
+    distance_px: FloatArray = floats("N")
+    sigma_px: FloatArray = floats("N")
+    points_mm: FloatArray = floats("N", 3)
+    covariance_mm2: FloatArray = floats("N", 3, 3)
+    diameter_mm: FloatArray = floats("N")
 
 
 def find_candidates(
@@ -215,8 +213,16 @@ def find_candidates(
     is_near &= _is_in_depth(shown, views, options)
     is_near &= _is_of_one_size(in_left, in_right, options)
     diameter = np.sqrt(in_left * in_right)
-    pairs = CandidatePairs(rows, columns, distance, sigma, shown, points.noise_mm2, diameter)
-    return pairs.subset(is_near)
+    pairs = CandidatePairs(
+        left=rows,
+        right=columns,
+        distance_px=distance,
+        sigma_px=sigma,
+        points_mm=shown,
+        covariance_mm2=points.noise_mm2,
+        diameter_mm=diameter,
+    )
+    return pairs.select(is_near)
 
 
 def _misclosure(

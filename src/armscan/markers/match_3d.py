@@ -167,7 +167,9 @@ def _swapped(result: MatchResult) -> MatchResult:
 
 
 def _inverse(alignment: Alignment) -> Alignment:
-    return Alignment(alignment.pairs[:, ::-1], alignment.first_from_second.inverse())
+    return Alignment(
+        pairs=alignment.pairs[:, ::-1], first_from_second=alignment.first_from_second.inverse()
+    )
 
 
 def _unless_symmetric(
@@ -186,7 +188,7 @@ def _unless_symmetric(
     sigma = np.concatenate([first.sigma_mm, second.sigma_mm[lonely]])
     both = label_points(points, sigma)
     everything = np.tile(np.arange(len(points))[:, None], (1, 2))
-    itself = Alignment(everything, Pose(np.eye(3), np.zeros(3)))
+    itself = Alignment(pairs=everything, first_from_second=Pose(np.eye(3), np.zeros(3)))
     onto_itself = MarkerPlacement(both, both, options.position_sigmas)
     votes = vote(both, both, options.distance_sigmas)
     found = find_alignments(onto_itself, votes, options, known=(itself,))

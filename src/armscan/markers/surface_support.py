@@ -5,13 +5,19 @@ depth of the surroundings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bools,
+    floats,
+)
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.candidates import CandidatePairs, RingMatchOptions
 from armscan.records.points import RingImages
@@ -27,8 +33,7 @@ taken for collinear."""
 _REFITS = 5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HomographyConsensus:
+class HomographyConsensus(ArrayRecord):
     """A homography and the pairs that agree with it.
 
     Parameters
@@ -42,8 +47,8 @@ class HomographyConsensus:
         pairs fit exactly: 0 says nothing then.
     """
 
-    matrix: FloatArray
-    is_inlier: BoolArray
+    matrix: FloatArray = floats(3, 3)
+    is_inlier: BoolArray = bools(None)
     rms_px: float
 
 
@@ -143,7 +148,7 @@ def _refined(
         if np.array_equal(before, inlier):
             break
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2)))
-    return HomographyConsensus(matrix, inlier, rms)
+    return HomographyConsensus(matrix=matrix, is_inlier=inlier, rms_px=rms)
 
 
 def _samples(n: int, seed: int) -> IntArray:

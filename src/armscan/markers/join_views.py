@@ -216,9 +216,7 @@ class JoinedViews:
         result = []
         for k, view in enumerate(self.placed):
             points = views[view].points_mm
-            one, other = self.chain[k], self.map.part_from_view[k]
-            apart = points @ (one.rotation - other.rotation).T
-            apart = apart + one.translation_mm - other.translation_mm
+            apart = self.chain[k].apply(points) - self.map.part_from_view[k].apply(points)
             result.append(float(np.sqrt((apart**2).sum(axis=1).mean())))
         return np.array(result)
 
@@ -281,8 +279,8 @@ class _GrowingMap:
         self.is_known = np.zeros(n_markers, dtype=bool)
 
     def add(self, view: MarkerSet, numbers: IntArray, pose: Pose[Part, Sensor]) -> None:
-        points = view.points_mm @ pose.rotation.T + pose.translation_mm
-        inverse = np.linalg.inv(pose.rotation @ view.covariance_mm2 @ pose.rotation.T)
+        points = pose.apply(view.points_mm)
+        inverse = np.linalg.inv(pose.rotate_covariance(view.covariance_mm2))
         self._information[numbers] += inverse
         self._weighted[numbers] += np.einsum("nij,nj->ni", inverse, points)
         self.is_known[numbers] = True

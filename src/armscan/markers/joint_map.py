@@ -20,7 +20,7 @@ from armscan.geometry.arrays import (
     ints,
 )
 from armscan.geometry.poses import Part, Pose, Sensor
-from armscan.geometry.rotations import rotation_from_vector, skew
+from armscan.geometry.rotations import skew
 
 MAX_ROUNDS = 30
 SETTLED = 1e-10
@@ -202,10 +202,7 @@ class _Problem:
 
     def moved(self, steps: FloatArray, shift_mm: FloatArray) -> _Problem:
         """The problem after a step of the poses (V - 1, 6) and the markers (M, 3)."""
-        poses: list[Pose[Part, Sensor]] = [
-            Pose(rotation_from_vector(step[:3]) @ pose.rotation, pose.translation_mm + step[3:])
-            for pose, step in zip(self.poses[1:], steps, strict=True)
-        ]
+        poses = [pose.retract(step) for pose, step in zip(self.poses[1:], steps, strict=True)]
         return replace(self, poses=(self.poses[0], *poses), markers_mm=self.markers_mm + shift_mm)
 
     def covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -373,6 +373,8 @@ def write_case(folder: Path, reader: Reader, number: int, seed: int) -> None:
     for name, content in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
+        if place == 6 and len(files) == 1:
+            path = path.with_name(f"na\udcefve\n{path.suffix}")
         if name != chosen or place >= 5:
             path.write_bytes(content)
         elif place == 0:
@@ -755,8 +757,9 @@ def _documents() -> dict[str, Reader]:
 
 
 def _single(files: Sequence[Files], read: Callable[[Path], object], **options: Any) -> Reader:
-    """Reader of the only file of a folder."""
-    return Reader(files, lambda folder: read(next(folder.iterdir())), **options)
+    """Reader of the only file of a folder; without one, of a name that no system takes."""
+    absent = "absent" * 60
+    return Reader(files, lambda folder: read(next(folder.iterdir(), folder / absent)), **options)
 
 
 def readers() -> dict[str, Reader]:

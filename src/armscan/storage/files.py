@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-from armscan.errors import FileFormatError, OutputError
+from armscan.errors import FileFormatError, InputError, OutputError
 
 try:
     import fcntl
@@ -61,6 +61,15 @@ def read_bytes(path: Path) -> bytes:
             "the file is empty (0 bytes)", where=where, remedy="copy the file again"
         )
     return data
+
+
+@contextmanager
+def told_of(where: str, *, remedy: str = "") -> Iterator[None]:
+    """Say of an `InputError` in which file the input stands."""
+    try:
+        yield
+    except InputError as error:
+        raise FileFormatError(error.what, where=where, remedy=remedy or error.remedy) from error
 
 
 def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> None:

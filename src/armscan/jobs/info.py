@@ -513,7 +513,6 @@ NEEDED = (
     "scipy",
     "numba",
     "opencv-python-headless",
-    "pydantic",
     "typer",
     "rich",
     "jinja2",

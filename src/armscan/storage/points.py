@@ -20,7 +20,6 @@ from armscan.records.profile import PointProfile
 from armscan.storage.files import path_text, read_bytes, told_of
 from armscan.storage.image_paths import expand_paths, natural_key
 from armscan.storage.images import source_names
-from armscan.storage.poses import refuse_beyond_reach
 from armscan.storage.tables import (
     COORDINATES,
     LARGEST_MM,
@@ -29,6 +28,7 @@ from armscan.storage.tables import (
     number_columns,
     parse_csv,
     read_csv,
+    refuse_beyond_reach,
 )
 
 PLANE_NAMES = ("a", "b", "c", "d")

@@ -372,3 +372,21 @@ def _wrong_length(
         where=f"{where}, line {number}",
         remedy=remedy,
     )
+
+
+def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
+    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass.
+
+    Raises
+    ------
+    FileFormatError
+        If one lies beyond `LARGEST_MM`.
+    """
+    beyond = np.abs(points_mm) > LARGEST_MM
+    if beyond.any():
+        row, column = (int(value) for value in np.argwhere(beyond)[0])
+        raise FileFormatError(
+            f"coordinate {points_mm[row, column]:g} mm (entry {row + 1}) is beyond all reach",
+            where=where,
+            remedy="correct it, or leave the entry out",
+        )

@@ -38,6 +38,8 @@ DISTORTION_PARAMETERS: dict[DistortionModel, tuple[str, ...]] = {
 """Free coefficients of each distortion model; those not named are zero."""
 
 MIN_VIEWS = 3
+MIN_VIEW_POINTS = 6
+"""Fewest points with which a view is used: two more than a pose needs."""
 MAX_STEPS = 200
 """A wide lens whose distortion nearly folds over needs more than 60."""
 
@@ -66,8 +68,6 @@ class CameraOptions:
     n_folds
         Folds of the cross-validation over views; 0 switches it off. With fewer views than folds
         each view is a fold of its own.
-    min_points
-        Fewest points with which a view is used.
     max_steps
         Most iterations of one adjustment; a solution that needs more is returned with a warning.
     """
@@ -79,7 +79,6 @@ class CameraOptions:
     leave_out: tuple[str, ...] = ()
     leave_out_misfits: bool = False
     n_folds: int = 5
-    min_points: int = 6
     max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
@@ -90,10 +89,6 @@ class CameraOptions:
             )
         if self.n_folds < 0 or self.n_folds == 1:
             raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")
-        if self.min_points < 4:
-            raise OptionError(
-                f"min_points is {self.min_points}", remedy="a pose needs at least 4 points"
-            )
         if self.max_steps < 1:
             raise OptionError(f"max_steps is {self.max_steps}", remedy="give at least 1")
 

@@ -14,7 +14,6 @@ from typing import get_args
 import numpy as np
 import pytest
 
-import fake_twin
 from armscan.cli.simulate import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
@@ -28,7 +27,8 @@ from armscan.storage import atomic
 from armscan.storage.arm import read_probe_tip
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_arm_track, read_recording
-from recording_folders import memory_scan, pixels
+from rigs import fake_twin
+from rigs.recording_folders import memory_scan, pixels
 
 HEAD = "thesis-single"
 

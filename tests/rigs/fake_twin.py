@@ -14,7 +14,7 @@ import pytest
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack
-from recording_folders import MemoryScan, memory_scan
+from rigs.recording_folders import MemoryScan, memory_scan
 
 N_IMAGES = 6
 

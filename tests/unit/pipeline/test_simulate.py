@@ -23,7 +23,7 @@ from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan_part import FewerViews
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene, truth_path
-from armscan.storage import atomic
+from armscan.storage import files
 from armscan.storage.arm import read_probe_tip
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_arm_track, read_recording
@@ -90,7 +90,7 @@ def test_no_recording_is_seen_without_its_truth(
     def full(contents: object, **_: object) -> None:
         raise OutputError("no space")
 
-    monkeypatch.setattr(atomic, "write_files", full)
+    monkeypatch.setattr(files, "write_files", full)
     with pytest.raises(OutputError, match="no space"):
         simulate_scene(tmp_path / "scan", HEAD, scene, SimulateOptions(processes=1))
     assert list(tmp_path.iterdir()) == []

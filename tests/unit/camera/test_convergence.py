@@ -11,7 +11,7 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions, advise
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
-from camera_scene import CAMERA, Scene, make_views
+from rigs.camera_scene import CAMERA, Scene, make_views
 
 STOPPED = "stopped before it reached the best fit"
 NOT_BEST = "did not converge to the best fit"

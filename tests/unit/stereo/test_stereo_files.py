@@ -18,7 +18,7 @@ from armscan.storage.documents import (
     read_stereo_calibration,
     stereo_document,
 )
-from stereo_rig import CONVERGING, LEFT, RIGHT, held
+from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, held
 
 
 def calibration() -> StereoCalibration:

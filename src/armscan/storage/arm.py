@@ -114,7 +114,7 @@ def arm_model_toml(arm: ArmModel) -> bytes:
 
 
 ARM_FILE = "arm.csv"
-JOINT = re.compile(r"j(\d+)_rad")
+JOINT = re.compile(r"j([0-9]{1,2})_rad")
 WARN_TURNS_RAD = 2.0 * np.pi
 REFUSE_TURNS_RAD = 4.0 * np.pi
 FORMS_AGREE_DEG = 0.02

@@ -30,7 +30,7 @@ Tree = Mapping[str, Any]
 
 MOST_BYTES, MOST_VALUES = 64 * 2**20, 1_000_000
 """Of a document. The largest of armscan's has some ten thousand values."""
-MOST_TOML_BYTES = 2**20
+MOST_TOML_BYTES, MOST_TOML_TABLES = 2**18, 1000
 MOST_DIGITS = 40
 """Of a whole number: more than any that is meant."""
 LARGEST, LARGEST_SIZE_PX = 1e15, 100_000
@@ -126,9 +126,10 @@ def parse_toml(data: bytes, where: str, remedy: str) -> dict[str, Any]:
         If it is no TOML, too large or nested too deep.
     """
     try:
-        if len(data) <= MOST_TOML_BYTES:
+        n_tables = data.count(b"\n[")
+        if len(data) <= MOST_TOML_BYTES and n_tables <= MOST_TOML_TABLES:
             return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
-        fault = f"it has {len(data)} bytes"
+        fault = f"it has {len(data)} bytes and {n_tables} tables"
     except RecursionError:
         fault = "it is nested too deep"
     except ValueError as error:
@@ -359,9 +360,10 @@ class RecordCodec:
         for name in tree:
             if name not in used:
                 near = get_close_matches(name[:60], used, 1)
-                fact = "is not known" + (f"; '{near[0]}' is" if near else "")
+                hint = f"; '{near[0]}' is" if near else ""
                 if self.unknown is None:
-                    raise MismatchError(_join(key, name), fact)
+                    raise MismatchError(_join(key, name), f"is not known{hint}")
+                fact = f"is not known and has no effect{hint}"
                 self.unknown.append(str(MismatchError(_join(key, name), fact)))
         return record
 

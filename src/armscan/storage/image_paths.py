@@ -5,15 +5,15 @@ were rendered.
 
 from __future__ import annotations
 
-import json
 import re
-import tomllib
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
+from armscan.storage.codec import parse_json, parse_toml
+from armscan.storage.files import read_bytes
 
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
 
@@ -136,15 +136,13 @@ def are_simulated(paths: Iterable[Path]) -> bool:
 
 def _has_mark(path: Path) -> bool:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return parse_json(read_bytes(path), path.name).get("simulated") is True
+    except FileFormatError:
         return False
-    return isinstance(content, dict) and content.get("simulated") is True
 
 
 def _says_simulated(path: Path) -> bool:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError):
+        return parse_toml(read_bytes(path), path.name, "").get("simulated") is True
+    except FileFormatError:
         return False
-    return content.get("simulated") is True

@@ -143,7 +143,8 @@ def _kept(kind: type[Any]) -> dict[str, Any]:
 
 def _packed(word: str, records: Sequence[Any]) -> dict[str, NDArray[Any]]:
     arrays: dict[str, NDArray[Any]] = {
-        f"{word}_n_points": np.array([len(record) for record in records], dtype=np.int64)
+        f"{word}_n_points": np.array([len(record) for record in records], dtype=np.int64),
+        f"{word}_source": np.array([record.source for record in records], dtype=np.str_),
     }
     for name, hint in _kept(type(records[0])).items() if records else ():
         values = [getattr(record, name) for record in records]

@@ -124,7 +124,7 @@ def read_session_file(path: Path) -> SessionFile:
         head=keys.head,
         is_simulated=keys.simulated,
     )
-    odd = tuple(f"{path.name}: the key {fact}; it has no effect" for fact in unknown)
+    odd = tuple(f"{path.name}: the key {fact}" for fact in unknown)
     return SessionFile(session, frozenset(_stated(content)), odd)
 
 
@@ -153,6 +153,7 @@ def _stated(content: Mapping[str, Any]) -> Iterator[str]:
 
 
 EXPOSURES_FILE = "exposures.csv"
+MOST_CAMERAS = 100
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
 DRIVE = re.compile(r"[A-Za-z]:")
@@ -241,7 +242,7 @@ def _check(rows: Sequence[ExposureRow], table: CsvTable) -> None:
     seen: dict[tuple[str, int, int], int] = {}
     for k, row in enumerate(rows):
         where = table.place(k)
-        if row.camera < 0:
+        if not 0 <= row.camera < MOST_CAMERAS:
             raise FileFormatError(
                 f"camera {row.camera}", where=where, remedy="count cameras from 0"
             )

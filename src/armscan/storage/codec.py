@@ -52,7 +52,8 @@ def json_bytes(value: Any) -> bytes:
     ValueError
         If a float is not finite.
     """
-    return (_encode(value, "") + "\n").encode()
+    # bytes of names that are no text become JSON's own escapes
+    return (_encode(value, "") + "\n").encode(errors="backslashreplace")
 
 
 def _encode(value: Any, indent: str) -> str:

@@ -605,7 +605,7 @@ def new_provenance(
         document_id=str(uuid4()),
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         armscan_version=version("armscan"),
-        command=tuple(command),
+        command=tuple(path_text(word) for word in command),
         inputs=tuple(fingerprint(path) for path in inputs),
         parent_ids=tuple(parent.document_id for parent in parents),
         options=tuple(entry for group in options for entry in _entries(group)),

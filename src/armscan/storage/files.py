@@ -26,7 +26,8 @@ STALE_SECONDS = 86_400.0
 
 def path_text(path: Path | str) -> str:
     """The path with ``/``; bytes of a name that are not UTF-8 are told as ``\\xef``."""
-    return os.fsencode(Path(path).as_posix()).decode("utf-8", "backslashreplace")
+    text = path.as_posix() if isinstance(path, Path) else path
+    return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
 def read_bytes(path: Path) -> bytes:

@@ -93,6 +93,15 @@ def _is_named(name: str, pattern: str) -> bool:
 
 
 def _expand(pattern: str) -> list[Path]:
+    try:
+        return _found(pattern)
+    except OSError as error:
+        raise FileFormatError(
+            f"the path cannot be read ({error.strerror})", where=pattern, remedy="check the path"
+        ) from error
+
+
+def _found(pattern: str) -> list[Path]:
     path = Path(pattern)
     if path.is_dir():
         images = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_SUFFIXES]

@@ -26,7 +26,7 @@ from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import ImageArray, IntArray
 from armscan.kernels.jpeg_entropy import WHOLE, walk_scan
 from armscan.records.exposure import Exposure
-from armscan.storage.files import read_bytes
+from armscan.storage.files import path_text, read_bytes
 
 Alignment = Literal["low", "high"]
 
@@ -454,7 +454,7 @@ def read_exposure(
         If pixels exceed the stated bits.
     """
     path = Path(path)
-    name = path.name if source is None else source
+    name = path_text(path.name) if source is None else source
     data = read_bytes(path)
     kind = image_format(data)
     if kind is None:
@@ -516,7 +516,7 @@ def check_same_size(exposures: Sequence[Exposure]) -> None:
 
 def source_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """Names of files for messages: the file name, with folders where file names repeat."""
-    tails = [list(reversed(path.as_posix().split("/"))) for path in paths]
+    tails = [list(reversed(path_text(path).split("/"))) for path in paths]
     names = [tail[0] for tail in tails]
     for depth in range(2, max(map(len, tails), default=0) + 1):
         repeated = {name for name, count in Counter(names).items() if count > 1}

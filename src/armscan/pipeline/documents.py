@@ -59,14 +59,20 @@ def sensor_calibration(fit: LaserFit, provenance: Provenance) -> SensorCalibrati
             replace(sheet.calibration, diagnostics=_sheet_diagnostics(sheet))
             for sheet in fit.sheets
         ),
-        diagnostics=SensorDiagnostics(fit.noise_factor, fit.correlation_points, fit.naming),
+        diagnostics=SensorDiagnostics(
+            noise_factor=fit.noise_factor,
+            correlation_points=fit.correlation_points,
+            naming=fit.naming,
+        ),
     )
 
 
 def _bowed_board(warp: BoardWarp) -> WarpedBoard:
     bow_x, bow_y = warp.bow_mm.tolist()
     sigma_x, sigma_y = warp.sigma_mm.tolist()
-    test = FTest(warp.f_statistic, len(warp.bow_mm), warp.p_value)
+    test = FTest(
+        f_ratio=warp.f_statistic, degrees_of_freedom=len(warp.bow_mm), p_value=warp.p_value
+    )
     return WarpedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)
 
 
@@ -83,4 +89,6 @@ def _sheet_diagnostics(fit: SheetFit) -> SheetDiagnostics:
 
 
 def _test(found: LackOfFit) -> FTest:
-    return FTest(found.f_ratio, found.degrees_of_freedom, found.p_value)
+    return FTest(
+        f_ratio=found.f_ratio, degrees_of_freedom=found.degrees_of_freedom, p_value=found.p_value
+    )

@@ -55,7 +55,9 @@ class HeadCameras:
         """The cameras of a calibration of one or of two."""
         if isinstance(calibration, CameraCalibration):
             return HeadCameras(calibration, None, calibration.covariance)
-        second = SecondCamera(calibration.right, calibration.right_from_left)
+        second = SecondCamera(
+            camera=calibration.right, right_from_sensor=calibration.right_from_left
+        )
         return HeadCameras(calibration.left, second, calibration.covariance)
 
     @property

@@ -155,11 +155,11 @@ def lack_of_fit(
     noise. Board and camera errors are free within their covariance, and cost what that says.
     """
     if freedom <= 0:
-        return FTest(0.0, 0, 1.0)
+        return FTest(f_ratio=0.0, degrees_of_freedom=0, p_value=1.0)
     share = (noise.sigma_factor / (sigma_factor or noise.sigma_factor)) ** 2
     ratio = max(chi2 - noise.effective_freedom * share, 0.0) / freedom
     p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
-    return FTest(ratio, freedom, p_value)
+    return FTest(f_ratio=ratio, degrees_of_freedom=freedom, p_value=p_value)
 
 
 def shape_freedom(observations: SheetObservations, n_parameters: int) -> int:

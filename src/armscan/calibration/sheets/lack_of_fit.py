@@ -144,27 +144,24 @@ def _correlation(rest: list[FloatArray]) -> float:
 
 def lack_of_fit(
     chi2: float,
-    freedom: int,
+    n_stripes: int,
+    n_parameters: int,
     noise: StripeNoise,
     sigma_factor: float | None = None,
 ) -> FTest:
     """Test a solution that was weighted with ``noise.sigma_factor``, or with a larger one.
 
     Of each stripe the first four shape terms (offset, slope, curvature, twist) are compared with
-    the model, which leaves ``freedom`` of them (`shape_freedom`); what scatters around them is the
-    noise. Board and camera errors are free within their covariance, and cost what that says.
+    the model; what scatters around them is the noise. Board and camera errors are free within
+    their covariance, and cost what that covariance says.
     """
+    freedom = N_SHAPE * n_stripes - n_parameters
     if freedom <= 0:
         return FTest(f_ratio=0.0, degrees_of_freedom=0, p_value=1.0)
     share = (noise.sigma_factor / (sigma_factor or noise.sigma_factor)) ** 2
     ratio = max(chi2 - noise.effective_freedom * share, 0.0) / freedom
     p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
     return FTest(f_ratio=ratio, degrees_of_freedom=freedom, p_value=p_value)
-
-
-def shape_freedom(observations: SheetObservations, n_parameters: int) -> int:
-    """Shape terms of all stripes less the model's parameters."""
-    return N_SHAPE * len(np.unique(observations.stripe)) - n_parameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,5 +264,5 @@ def _probability_without(
     common = normal.step[normal.n_sheet :]
     chi2 = float((whole.weight[rest] * remaining**2).sum() + common @ common)
     share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
-    freedom = shape_freedom(observations.select(rest), whole.n_parameters)
-    return lack_of_fit(chi2, freedom, share).p_value
+    n_stripes = len(np.unique(observations.stripe[rest]))
+    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value

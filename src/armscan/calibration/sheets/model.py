@@ -22,7 +22,6 @@ from armscan.calibration.sheets.lack_of_fit import (
     StripeNoise,
     board_scatter,
     lack_of_fit,
-    shape_freedom,
     stripe_noise,
 )
 from armscan.calibration.sheets.result import LACK_OF_FIT_P, PlaneComparison, PlaneMethod
@@ -260,8 +259,8 @@ class _OneSheet:
     def lack_of_fit(
         self, solution: SheetSolution, noise: StripeNoise, sigma_factor: float | None = None
     ) -> FTest:
-        freedom = shape_freedom(self.points, solution.n_parameters)
-        return lack_of_fit(solution.chi2, freedom, noise, sigma_factor)
+        n_stripes = len(np.unique(self.points.stripe))
+        return lack_of_fit(solution.chi2, n_stripes, solution.n_parameters, noise, sigma_factor)
 
     def board_scatter(self, solution: SheetSolution, noise: StripeNoise) -> BoardScatter:
         return board_scatter(self.points, solution, self.errors, noise)

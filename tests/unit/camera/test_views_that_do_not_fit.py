@@ -174,8 +174,6 @@ def test_wrong_requests_are_refused() -> None:
         CameraOptions(distortion="fisheye")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="n_folds"):
         CameraOptions(n_folds=1)
-    with pytest.raises(OptionError, match="min_points"):
-        CameraOptions(min_points=3)
 
 
 def test_scattered_points_are_no_board() -> None:

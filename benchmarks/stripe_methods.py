@@ -24,7 +24,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_image import (
+from stripe_image import (
     CircleCurve,
     SimulatedStripe,
     StraightCurve,

@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_image import SimulatedStripe, StraightCurve, StripeScene
+from stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -236,6 +236,13 @@ class Head:
     def sources(self) -> tuple[str, ...]:
         """Names of the light sources, in the order of their first sheets."""
         return tuple(dict.fromkeys(laser.source for laser in self.lasers))
+
+    @property
+    def kind(self) -> Literal["one_line", "crossed", "many"]:
+        """What the plans of scenes go by."""
+        if len(self.cameras) > 1:
+            return "many"
+        return "one_line" if len(self.sources) == 1 else "crossed"
 
     def sheets_of(self, sources: tuple[str, ...]) -> tuple[LineLaser, ...]:
         """All sheets that light up when these sources are switched on.

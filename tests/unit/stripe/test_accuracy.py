@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_image import (
+from stripe_image import (
     NO_NOISE,
     CircleCurve,
     SimulatedStripe,

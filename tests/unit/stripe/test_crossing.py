@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.simulation.stripe_image import (
+from stripe_image import (
     NO_NOISE,
     SimulatedStripe,
     StraightCurve,

@@ -6,7 +6,7 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.records.exposure import Exposure
-from armscan.simulation.stripe_image import StripeScene
+from stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 from stripe_scenes import line

@@ -6,7 +6,7 @@ import pytest
 
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.simulation.stripe_image import StripeScene
+from stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from stripe_scenes import line
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.records.profile import StripeFlag
-from armscan.simulation.stripe_image import SimulatedStripe, StraightCurve, StripeScene
+from stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.flags import close_gaps
 from armscan.vision.stripe.image import StripeOptions

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
+from stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import measure_level

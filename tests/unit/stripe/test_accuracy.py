@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from armscan.vision.stripe.image import StripeOptions
 from stripe_image import (
     NO_NOISE,
     CircleCurve,
@@ -13,7 +14,6 @@ from stripe_image import (
     StripeScene,
     WaveCurve,
 )
-from armscan.vision.stripe.image import StripeOptions
 from stripe_scenes import line, score
 
 NOISE_LIMIT_PX = 0.045

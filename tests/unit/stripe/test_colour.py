@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from armscan.records.exposure import Exposure
-from stripe_image import StripeNoise, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
+from stripe_image import StripeNoise, StripeScene
 from stripe_scenes import line
 
 SCENE = StripeScene((line(75.0),), 320, 240)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
+from armscan.vision.stripe.extract import extract_stripes
 from stripe_image import (
     NO_NOISE,
     SimulatedStripe,
@@ -14,7 +15,6 @@ from stripe_image import (
     StripeNoise,
     StripeScene,
 )
-from armscan.vision.stripe.extract import extract_stripes
 
 ANGLES_DEG = (-50.0, 55.0)
 SIGMA_PX = 3.0

@@ -52,6 +52,7 @@ TwinScene = Literal[
     "markers",
     "markers-moved",
     "probing",
+    "still-part",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
 

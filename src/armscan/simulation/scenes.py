@@ -149,6 +149,16 @@ def still_step_scene(instrument: Instrument, rng: np.random.Generator) -> Record
     return _recorded(instrument, instrument.fixtures.with_steps(), [("still", pose, light)], rng)
 
 
+def still_part_scene(instrument: Instrument, rng: np.random.Generator) -> Recorded:
+    """The part as somebody without an arm photographs it: with the laser, and without."""
+    head, fixtures = instrument.head, instrument.fixtures
+    held = scan_passes("part", head, fixtures)[1]
+    spot, middle = 0.5 * (held.start_mm + held.end_mm), aim_point_mm(head, held.aim.depth_mm)
+    pose = sensor_over(held.base_from_face, spot, held.aim, middle)
+    stills = [("still", pose, light) for light in (Light(head.sources), Light())]
+    return _recorded(instrument, fixtures.with_part(), stills, rng)
+
+
 def marker_scene(instrument: Instrument, is_moved: bool, rng: np.random.Generator) -> Recorded:
     """Stills of a part with ring markers, from place to place as it is held by hand.
 

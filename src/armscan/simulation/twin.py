@@ -33,6 +33,7 @@ from armscan.simulation.scenes import (
     laser_shots,
     marker_scene,
     scan_scene,
+    still_part_scene,
     still_step_scene,
 )
 from armscan.simulation.shots import TwinScan
@@ -262,6 +263,8 @@ class SimulatedInstrument:
             return hand_eye_scene(tools, rng)
         if scene == "still-step":
             return still_step_scene(tools, rng)
+        if scene == "still-part":
+            return still_part_scene(tools, rng)
         if scene in ("markers", "markers-moved"):
             return marker_scene(tools, scene == "markers-moved", rng)
         return scan_scene(tools, cast(SweptScene, scene), rng)

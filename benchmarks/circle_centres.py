@@ -13,21 +13,25 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from pathlib import Path
 
 import cv2
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
 from armscan.simulation.objects.boards import CirclePattern
-from armscan.simulation.optics.camera import RenderCamera, add_noise
+from armscan.simulation.optics.camera import RenderCamera
 from armscan.thesis.ellipse import thesis_centres
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
+from slow_renderer import add_noise
 
 TARGET = CircleGrid(13, 9, 3.75)
 DISTORTION = np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0])
@@ -108,7 +112,15 @@ def accuracy() -> None:
         )
     ]
     k = DISTORTION
-    model = CameraModel(FOCAL_PX, FOCAL_PX, 1535.5, 1023.5, k, WIDTH_PX, HEIGHT_PX)
+    model = CameraModel(
+        fx_px=FOCAL_PX,
+        fy_px=FOCAL_PX,
+        cx_px=1535.5,
+        cy_px=1023.5,
+        distortion=k,
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+    )
     errors: dict[tuple[str, float], list[FloatArray]] = defaultdict(list)
     for seed, (tilt, azimuth, blur, gradient, is_light) in enumerate(conditions):
         rotation, translation = pose(tilt, azimuth, 17.0 * seed)

@@ -239,7 +239,12 @@ def place_of(old: FloatArray, new: FloatArray, sigma: float) -> Estimate[AnyPose
     i, k = place.pairs[:, 0], place.pairs[:, 1]
     a, b = lists[0].markers, lists[1].markers
     fit: Estimate[AnyPose] | FitFailure = register_points(
-        PointPairs(a.points_mm[i], b.points_mm[k], a.covariance_mm2[i], b.covariance_mm2[k])
+        PointPairs(
+            points_a_mm=a.points_mm[i],
+            points_b_mm=b.points_mm[k],
+            covariance_a_mm2=a.covariance_mm2[i],
+            covariance_b_mm2=b.covariance_mm2[k],
+        )
     )
     return None if isinstance(fit, FitFailure) else fit
 

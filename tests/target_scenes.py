@@ -12,8 +12,10 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
-from armscan.simulation.objects.boards import ChessboardPattern, FlatPattern
-from armscan.simulation.optics.camera import RenderCamera, add_noise
+from armscan.simulation.objects.boards import FlatPattern
+from armscan.simulation.optics.camera import RenderCamera
+from flat_prints import ChessboardPattern
+from slow_renderer import add_noise
 
 NOISE = 2.0
 DISTORTION = (-0.1, 0.05, 1e-3, -5e-4, 0.0)
@@ -26,7 +28,15 @@ def camera(blur_sigma_px: float = 1.0, distorted: bool = False) -> RenderCamera:
 
 def model(distorted: bool = False) -> CameraModel:
     k = DISTORTION if distorted else (0.0,) * 5
-    return CameraModel(2000.0, 2000.0, 600.4, 449.7, np.array(k), 1200, 900)
+    return CameraModel(
+        fx_px=2000.0,
+        fy_px=2000.0,
+        cx_px=600.4,
+        cy_px=449.7,
+        distortion=np.array(k),
+        width_px=1200,
+        height_px=900,
+    )
 
 
 def render(

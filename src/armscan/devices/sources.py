@@ -132,6 +132,9 @@ class SimulatedScan(ScanSource, Protocol):
     def true_stripes(self, row: int) -> Sequence[TrueStripe]:
         """The stripes of all lasers of the head in the exposure of a row, on or off."""
 
+    def true_pose(self, row: int) -> Pose[Base, Sensor]:
+        """Where the head truly is in the middle of an exposure."""
+
     def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
         """The exposure of a row with other lasers on than its row says, as a live rig takes it."""
 

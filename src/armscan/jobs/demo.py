@@ -62,10 +62,13 @@ from armscan.report.demo import (
 )
 from armscan.report.page import footer, render_page
 from armscan.report.quantity import Summary, Table, sentence, significant, summary_json, with_sigma
-from armscan.storage.atomic import write_files
 from armscan.storage.clouds import ply_bytes, read_ply
-from armscan.storage.documents import read_scanner_calibration, read_sensor_calibration
-from armscan.storage.json_text import new_provenance
+from armscan.storage.documents import (
+    new_provenance,
+    read_scanner_calibration,
+    read_sensor_calibration,
+)
+from armscan.storage.files import write_files
 from armscan.storage.recording import FolderRecording, read_recording
 
 Result = TypeVar("Result")
@@ -205,6 +208,7 @@ class _Run:
             processes=self.request.processes,
             progress=self.progress,
         )
+        record_touches(self.place("probing"), self.twin)
 
     def scanned(self, scene: TwinScene, scanner: ScannerCalibration) -> FolderRecording:
         """Read a recording, or make it now, with lasers chosen by the labelling."""
@@ -277,6 +281,13 @@ def _check_head(request: DemoRequest) -> None:
     request.twin.build()
 
 
+def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:
+    """Record what the calibrations of a head rest on, and run their commands."""
+    run = _Run(request, folder, request.twin.build(), progress, request.command("photos"))
+    run.record(CALIBRATION_SCENES)
+    return _calibrated(run)
+
+
 def make_head_demo(
     request: DemoRequest, folder: Path, progress: Progress = silent
 ) -> tuple[Summary, HeadDemo]:
@@ -290,7 +301,6 @@ def make_head_demo(
     # a head of several sources chooses its lasers while it scans; a still has all of them on
     known = () if len(twin.sources) > 1 else scans
     run.timed("render", partial(run.record, (*CALIBRATION_SCENES, *known, "still-step")))
-    record_touches(run.place("probing"), twin)
     instrument = _calibrated(run)
     demo = _measured(run, scans, instrument)
     return _written(run, demo, instrument.warnings), demo
@@ -544,10 +554,9 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
 
 
 def _photo_errors(run: _Run, sensor: SensorCalibration, cloud: PointCloud) -> dict[str, Any]:
-    """Errors of the whole chain; where the head was is taken from the arm's own pose."""
-    truth, recording = run.twin.truth, read_recording(run.place("still-part"))
-    arm = exposure_poses(recording.rows, recording.arm, recording.session.clock)
-    part = part_errors(cloud, truth, arm.pose(0) @ truth.tool_from_sensor)
+    """Errors of the whole chain against the truth."""
+    truth = run.twin.truth
+    part = part_errors(cloud, truth, run.twin.scan("still-part").true_pose(0))
     (camera,), (sheet,) = calibration_errors(sensor, truth)
     return {
         "focal_px": camera.focal_px,

@@ -403,9 +403,7 @@ def head_demo_page(
                 "Where the sensor sits on the arm",
                 (
                     Facts(hand_eye_facts(demo.scanner)),
-                    Text(
-                        "scanner.html tells how it was found: postures, residuals, left-out postures."
-                    ),
+                    Text("scanner.html tells how it was found, posture by posture."),
                 ),
             ),
             Section("The plate, the ball and the blocks", (_histograms(demo),)),

@@ -138,7 +138,6 @@ def _draw_laser(
         waist_distance_mm=float(np.linalg.norm(aim - source)),
         divergence_rad=_BLUE_DIVERGENCE_RAD * (printed.wavelength_mm / BLUE_MM),
         irradiance=printed.brightness * level,
-        colour=(1.0, 1.0, 1.0),
         source=printed.source,
         cubic_rad=cubic,
     )

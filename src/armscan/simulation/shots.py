@@ -118,6 +118,10 @@ class TwinScan:
             view=shot.row.view,
         )
 
+    def true_pose(self, row: int) -> Pose[Base, Sensor]:
+        """Where the head truly is in the middle of an exposure."""
+        return self.shots[row].base_from_sensor
+
     def true_stripes(self, row: int) -> tuple[TrueStripe, ...]:
         """Where all sheets' centres truly lie in one exposure, at its middle, on or off.
 
@@ -209,10 +213,10 @@ def instant_shots(
     for camera, mounted in enumerate(head.cameras):
         folder = f"{CAMERA_FOLDERS[camera]}/" if len(head.cameras) > 1 else ""
         row = ExposureRow(
-            first_index + camera,
-            moment.t_ns,
-            camera,
-            f"images/{folder}{moment.file}",
+            index=first_index + camera,
+            t_ns=moment.t_ns,
+            camera=camera,
+            source=f"images/{folder}{moment.file}",
             lasers=light.lasers,
             trigger_id=moment.trigger_id,
             view=moment.view,

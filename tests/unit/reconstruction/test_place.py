@@ -97,7 +97,9 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
         placing,
         scanner=replace(
             placing.scanner,
-            hand_eye=replace(placing.scanner.hand_eye, arm_noise=ArmNoise(0.0, 0.0)),
+            hand_eye=replace(
+                placing.scanner.hand_eye, arm_noise=ArmNoise(position_mm=0.0, rotation_rad=0.0)
+            ),
         ),
     )
     cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, quiet)
@@ -161,7 +163,9 @@ def test_covariance_is_that_of_repeats() -> None:
 
 def test_the_arm_errs_least_at_the_scan_point() -> None:
     """By hand: 100 mm along x, rotation s adds (100 s)^2 across and nothing along."""
-    noise = ArmNoise(0.01, 1e-4, 0.02, 2e-4)
+    noise = ArmNoise(
+        position_mm=0.01, rotation_rad=1e-4, exposure_position_mm=0.02, exposure_rotation_rad=2e-4
+    )
     at, beside = arm_covariance(np.array([[0.0, 0, 0], [100.0, 0, 0]]), np.zeros(3), noise)
     np.testing.assert_allclose(at, np.eye(3) * 5e-4)
     turned = 100.0**2 * 5e-8

@@ -22,8 +22,7 @@ from armscan.simulation.plans import PLANS
 from armscan.simulation.scenes import hand_eye_poses, marker_poses
 from armscan.simulation.shots import RenderRequest, TwinScan
 from armscan.simulation.twin import build_twin
-from armscan.storage.recording import read_recording
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import read_recording, write_recording
 
 SEEDS = range(1, 11)
 N_PLACES = len(PLANS["markers"]["places"])

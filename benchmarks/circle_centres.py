@@ -13,12 +13,9 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
-from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
@@ -31,7 +28,7 @@ from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
-from slow_renderer import add_noise
+from rigs.slow_renderer import add_noise
 
 TARGET = CircleGrid(13, 9, 3.75)
 DISTORTION = np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0])

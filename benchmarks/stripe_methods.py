@@ -21,14 +21,12 @@ from typing import get_args
 import cv2
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions
-from stripe_image import (
+from rigs.stripe_image import (
     CircleCurve,
     SimulatedStripe,
     StraightCurve,

@@ -12,19 +12,16 @@ import sys
 import time
 from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 
 import cv2
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from armscan.kernels.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import find_candidates, measure_level, trace_ridges
-from stripe_image import SimulatedStripe, StripeScene, WaveCurve
+from rigs.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 
 SIGMA_PX = 3.0
 

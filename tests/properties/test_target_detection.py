@@ -10,9 +10,9 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
-from flat_prints import ChessboardPattern
-from slow_renderer import add_noise
-from target_scenes import render
+from rigs.flat_prints import ChessboardPattern
+from rigs.slow_renderer import add_noise
+from rigs.target_scenes import render
 
 CIRCLES = CircleGrid(5, 3, 3.75, is_asymmetric=True)
 BOARD = Chessboard(7, 4, 3.0)

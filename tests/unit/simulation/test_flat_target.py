@@ -14,7 +14,7 @@ from armscan.simulation.objects.board_image import (
 )
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.optics.camera import RenderCamera
-from flat_prints import ChessboardPattern
+from rigs.flat_prints import ChessboardPattern
 
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
 TILTED = cv2.Rodrigues(np.array([0.5, -0.4, 0.2]))[0]

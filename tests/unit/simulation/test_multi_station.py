@@ -24,7 +24,7 @@ from armscan.simulation.station import (
     seen_from,
     true_stripes,
 )
-from slow_renderer import render_laser
+from rigs.slow_renderer import render_laser
 
 MATT = Material()
 WINDOW = Window(1150, 750, 700, 500)

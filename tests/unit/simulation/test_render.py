@@ -15,7 +15,7 @@ from armscan.simulation.optics.camera import Detector, RenderCamera, expose_mono
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.render import Speckle, camera_rays
 from armscan.simulation.optics.scene import Floor, RoomLight, Scene, Sphere
-from slow_renderer import laser_band, render_laser, render_room
+from rigs.slow_renderer import laser_band, render_laser, render_room
 
 WHITE = (1.0, 1.0, 1.0)
 NO_SPECKLE = Speckle(contrast=0.0)

@@ -28,7 +28,7 @@ from armscan.simulation.station import (
     true_stripes,
 )
 from armscan.vision.stripe.extract import extract_stripes
-from slow_renderer import render_laser
+from rigs.slow_renderer import render_laser
 
 MATT = Material()
 GROUND = SceneObject("ground", FlatPlate(np.array([200.0, 150.0])), MATT)

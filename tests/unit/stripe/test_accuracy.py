@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from armscan.vision.stripe.image import StripeOptions
-from stripe_image import (
+from rigs.stripe_image import (
     NO_NOISE,
     CircleCurve,
     SimulatedStripe,
@@ -14,7 +14,7 @@ from stripe_image import (
     StripeScene,
     WaveCurve,
 )
-from stripe_scenes import line, score
+from rigs.stripe_scenes import line, score
 
 NOISE_LIMIT_PX = 0.045
 BIAS_LIMIT_PX = 0.01

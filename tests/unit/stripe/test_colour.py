@@ -7,8 +7,8 @@ import pytest
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
-from stripe_image import StripeNoise, StripeScene
-from stripe_scenes import line
+from rigs.stripe_image import StripeNoise, StripeScene
+from rigs.stripe_scenes import line
 
 SCENE = StripeScene((line(75.0),), 320, 240)
 ROLL = {"red": 0, "green": 1, "blue": 2}

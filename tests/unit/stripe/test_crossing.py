@@ -8,7 +8,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.vision.stripe.extract import extract_stripes
-from stripe_image import (
+from rigs.stripe_image import (
     NO_NOISE,
     SimulatedStripe,
     StraightCurve,

@@ -8,8 +8,8 @@ from armscan.errors import InputError, OptionError
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
-from stripe_image import StripeScene
-from stripe_scenes import line
+from rigs.stripe_image import StripeScene
+from rigs.stripe_scenes import line
 
 METHODS = ("fit", "threshold", "centroid", "template", "hessian")
 

@@ -6,8 +6,8 @@ import numpy as np
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
-from stripe_image import StripeScene
-from stripe_scenes import line
+from rigs.stripe_image import StripeScene
+from rigs.stripe_scenes import line
 
 
 def thick_line(seed: int, sigma_px: float) -> np.ndarray:

@@ -11,8 +11,8 @@ from armscan.simulation.objects.board_image import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView
-from flat_prints import CharucoPattern, ChessboardPattern
-from target_scenes import exposure, nees, render
+from rigs.flat_prints import CharucoPattern, ChessboardPattern
+from rigs.target_scenes import exposure, nees, render
 
 BOARD = Chessboard(7, 4, 3.0)
 PATTERN = ChessboardPattern(7, 4, 3.0)

@@ -13,8 +13,8 @@ from armscan.records.exposure import Exposure
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
-from flat_prints import ChessboardPattern
-from target_scenes import (
+from rigs.flat_prints import ChessboardPattern
+from rigs.target_scenes import (
     BareChessboard,
     exposure,
     line_distance,

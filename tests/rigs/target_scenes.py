@@ -14,8 +14,8 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
 from armscan.simulation.objects.boards import FlatPattern
 from armscan.simulation.optics.camera import RenderCamera
-from flat_prints import ChessboardPattern
-from slow_renderer import add_noise
+from rigs.flat_prints import ChessboardPattern
+from rigs.slow_renderer import add_noise
 
 NOISE = 2.0
 DISTORTION = (-0.1, 0.05, 1e-3, -5e-4, 0.0)

@@ -27,12 +27,12 @@ def skew(vector: FloatArray) -> FloatArray:
 
 def rotation_from_vector(rotation_vector_rad: FloatArray) -> FloatArray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, one or many."""
-    return np.asarray(Rotation.from_rotvec(rotation_vector_rad).as_matrix())
+    return np.asarray(Rotation.from_rotvec(np.array(rotation_vector_rad)).as_matrix())
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
     """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
+    return np.asarray(Rotation.from_matrix(np.array(rotation)).as_rotvec())
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -6,19 +6,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_IN,
-    INTS_IN,
-    INTS_OUT,
     ROW,
-    TABLE_IN,
-    TABLE_OUT,
-    Float64Array,
-    Int64Array,
-    MapArray,
+    Floats,
+    Ints,
+    IntsOut,
+    MapOut,
+    Table,
+    TableOut,
+    compiled,
 )
 
 REACH_PX = 2.9
@@ -28,11 +26,9 @@ SAME_PX = 1.0
 LEAST_COSINE = 0.77
 NONE = -1
 
-MAP_OUT = types.Array(types.int32, 2, "C")
 
-
-@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT), cache=True, nogil=True)
-def place_points(points: Float64Array, owner: MapArray, is_kept: Int64Array) -> None:
+@compiled
+def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
     Parameters
@@ -68,10 +64,8 @@ def place_points(points: Float64Array, owner: MapArray, is_kept: Int64Array) -> 
                 is_kept[i] = 0
 
 
-@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
-def find_neighbours(
-    points: Float64Array, owner: MapArray, ahead: Int64Array, behind: Int64Array
-) -> None:
+@compiled
+def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
     """Best continuation of each point to both sides along its tangent.
 
     Parameters
@@ -114,8 +108,8 @@ def find_neighbours(
                     behind[i] = j
 
 
-@njit(types.int64(INTS_OUT, INTS_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
-def walk_chains(ahead: Int64Array, behind: Int64Array, order: Int64Array, chain: Int64Array) -> int:
+@compiled
+def walk_chains(ahead: IntsOut, behind: IntsOut, order: IntsOut, chain: IntsOut) -> int:
     """Order the points along their chains, ends first, then loops; lone points are left out.
 
     Parameters
@@ -170,31 +164,17 @@ OWN_SPAN = 3.0
 """Along its own chain a point is another line's only after this many times the reach."""
 
 
-@njit(
-    types.void(
-        TABLE_IN,
-        INTS_IN,
-        INTS_IN,
-        INTS_IN,
-        INTS_IN,
-        types.int64,
-        types.int64,
-        types.float64,
-        TABLE_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def find_other_lines(
-    points: Float64Array,
-    chain: Int64Array,
-    start: Int64Array,
-    stop: Int64Array,
-    is_line: Int64Array,
+    points: Table,
+    chain: Ints,
+    start: Ints,
+    stop: Ints,
+    is_line: Ints,
     height: int,
     width: int,
     reach: float,
-    distance: Float64Array,
+    distance: TableOut,
 ) -> None:
     """Find the nearest point of another line, or of a far part of the same, on both sides.
 
@@ -267,8 +247,8 @@ def find_other_lines(
                     j = following[j]
 
 
-@njit(types.void(TABLE_IN, FLOATS_IN, INTS_OUT), cache=True, nogil=True)
-def best_states(scores: Float64Array, change_cost: Float64Array, state: Int64Array) -> None:
+@compiled
+def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
     """Sequence of states with the greatest sum of scores less the costs of its changes.
 
     Parameters

@@ -9,27 +9,18 @@ counted (ITU T.81, annex F.2.2).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
 
-from armscan.kernels.arrays import Int64Array, MaskArray
+from armscan.kernels.arrays import Bytes, IntTable, compiled
 
 WHOLE, NO_CODE, TOO_SHORT, OUT_OF_BLOCK, NO_RESTART = range(5)
 BLOCK = 64
-BYTES_IN = types.Array(types.uint8, 1, "C", readonly=True)
-TABLES_IN = types.Array(types.int64, 2, "C", readonly=True)
 
 
-@njit(
-    types.Tuple((types.int64, types.int64))(  # type: ignore[no-untyped-call]
-        BYTES_IN, TABLES_IN, TABLES_IN, types.int64, types.int64
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def walk_scan(
-    data: MaskArray,
-    tables: Int64Array,
-    table_of_block: Int64Array,
+    data: Bytes,
+    tables: IntTable,
+    table_of_block: IntTable,
     n_units: int,
     restart: int,
 ) -> tuple[int, int]:

@@ -6,19 +6,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_IN,
-    FLOATS_OUT,
-    IMAGE_IN,
-    MASK_IN,
-    TABLE_IN,
-    TABLE_OUT,
-    Float32Array,
-    Float64Array,
-    MaskArray,
+    Floats,
+    FloatsOut,
+    Image,
+    Mask,
+    Table,
+    TableOut,
+    compiled,
+    compiled_ieee,
 )
 
 REACH_SIGMAS = 2.7
@@ -33,10 +31,8 @@ CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(
 """Columns of a fit result."""
 
 
-@njit(types.void(IMAGE_IN, TABLE_IN, FLOATS_IN, TABLE_OUT), cache=True, nogil=True)
-def read_sides(
-    image: Float32Array, points: Float64Array, sigma_px: Float64Array, sides: Float64Array
-) -> None:
+@compiled
+def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -> None:
     """Mean grey level beside the line, on the side of smaller and of larger coordinate.
 
     Parameters
@@ -76,8 +72,8 @@ def read_sides(
             sides[i, 2 * side + 1] = n
 
 
-@njit(types.float64(TABLE_IN, types.int64, types.float64, types.float64), cache=True, nogil=True)
-def start_amplitude(profile: Float64Array, n: int, offset: float, sigma: float) -> float:
+@compiled
+def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> float:
     """Unweighted height of a Gaussian ``offset`` pixels from the profile's first pixel."""
     top = norm = 0.0
     for k in range(n):
@@ -88,18 +84,13 @@ def start_amplitude(profile: Float64Array, n: int, offset: float, sigma: float) 
     return top / norm if norm > 0.0 else 0.0
 
 
-@njit(
-    types.void(TABLE_IN, types.int64, FLOATS_IN, FLOATS_IN, FLOATS_OUT),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@compiled_ieee
 def accumulate(
-    profile: Float64Array,
+    profile: Table,
     n: int,
-    state: Float64Array,
-    noise: Float64Array,
-    sums: Float64Array,
+    state: Floats,
+    noise: Floats,
+    sums: FloatsOut,
 ) -> None:
     """Weighted sums of one Gauss-Newton step.
 
@@ -150,8 +141,8 @@ def accumulate(
         sums[12] += w * j0 * m * u * u * u
 
 
-@njit(types.float64(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
-def solve_step(sums: Float64Array, steps: Float64Array) -> float:
+@compiled
+def solve_step(sums: Floats, steps: FloatsOut) -> float:
     """Solve the normal equations into ``steps`` (3,); return the centre's variance, or 0."""
     h00, h01, h02, h11, h12, h22 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     b0, b1, b2 = sums[6], sums[7], sums[8]
@@ -170,21 +161,16 @@ def solve_step(sums: Float64Array, steps: Float64Array) -> float:
     return float(c00 / determinant)
 
 
-@njit(
-    types.void(IMAGE_IN, MASK_IN, TABLE_IN, FLOATS_IN, TABLE_IN, FLOATS_IN, FLOATS_IN, TABLE_OUT),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@compiled_ieee
 def fit_profiles(
-    image: Float32Array,
-    clipped: MaskArray,
-    points: Float64Array,
-    sigma_px: Float64Array,
-    sides: Float64Array,
-    noise: Float64Array,
-    reach: Float64Array,
-    result: Float64Array,
+    image: Image,
+    clipped: Mask,
+    points: Table,
+    sigma_px: Floats,
+    sides: Table,
+    noise: Floats,
+    reach: Floats,
+    result: TableOut,
 ) -> None:
     """Fit centre, amplitude and width by Gauss-Newton steps with weights from the noise model.
 

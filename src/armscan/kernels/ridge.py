@@ -6,28 +6,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_OUT,
-    IMAGE_IN,
     ROW,
-    ROW_OUT,
-    TABLE_IN,
-    TABLE_OUT,
-    TAPS_IN,
-    TAPS_OUT,
-    Float32Array,
-    Float64Array,
+    FloatsOut,
+    Image,
+    ImageOut,
+    RowOut,
+    Table,
+    TableOut,
+    compiled,
 )
 
 VALLEY_RATIO = 0.5
 """A dip below this share of the peak splits a run into two lines."""
 
 
-@njit(types.void(IMAGE_IN, types.int64, types.int64, ROW_OUT), cache=True, nogil=True)
-def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Array) -> None:
+@compiled
+def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
     """Write row ``i`` of the grid, interpolated linearly between cell centres, to ``row`` (W,)."""
     columns = grid.shape[1]
     for x in range(row.shape[0]):
@@ -37,21 +34,15 @@ def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Ar
         row[x] = grid[i, k] + (u - k) * (grid[i, m] - grid[i, k])
 
 
-@njit(types.float64(IMAGE_IN, types.int64, types.int64, types.int64), cache=True, nogil=True)
-def level_at(image: Float32Array, axis: int, line: int, k: int) -> float:
+@compiled
+def level_at(image: Image, axis: int, line: int, k: int) -> float:
     """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
     return float(image[k, line] if axis == COLUMN else image[line, k])
 
 
-@njit(
-    types.float64(
-        IMAGE_IN, types.int64, types.int64, types.int64, types.int64, types.float64, types.float64
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def hump_centre(
-    image: Float32Array,
+    image: Image,
     axis: int,
     line: int,
     first: int,
@@ -69,30 +60,16 @@ def hump_centre(
     return moment / weight if weight > 0.0 else 0.5 * (first + last)
 
 
-@njit(
-    types.int64(
-        IMAGE_IN,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.float64,
-        types.float64,
-        TABLE_OUT,
-        types.int64,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def split_run(
-    image: Float32Array,
+    image: Image,
     axis: int,
     line: int,
     first: int,
     last: int,
     background: float,
     rise: float,
-    runs: Float64Array,
+    runs: TableOut,
     count: int,
 ) -> int:
     """Append the centre of each hump of one run; return the new count.
@@ -143,18 +120,14 @@ def split_run(
     return count
 
 
-@njit(
-    types.int64(IMAGE_IN, IMAGE_IN, types.int64, types.float64, types.int64, TABLE_OUT),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def find_runs(
-    image: Float32Array,
-    background: Float32Array,
+    image: Image,
+    background: Image,
     cell_px: int,
     rise: float,
     longest_px: int,
-    runs: Float64Array,
+    runs: TableOut,
 ) -> int:
     """Find runs of pixels more than ``rise`` above the background in one pass over the image.
 
@@ -233,7 +206,7 @@ REPEAT_PX = 1.5
 ROUNDS = 3
 
 
-def gaussian_taps(sigma_px: float) -> Float32Array:
+def gaussian_taps(sigma_px: float) -> Image:
     """Sampled Gaussian and its first two derivatives, (3, 2 r + 1) with r = 3.5 sigma.
 
     Scaled so that a constant, a ramp and a parabola give their exact derivatives.
@@ -249,19 +222,14 @@ def gaussian_taps(sigma_px: float) -> Float32Array:
     return np.stack([smooth, slope, bend]).astype(np.float32)
 
 
-@njit(
-    types.void(IMAGE_IN, types.int64, types.int64, TAPS_IN, TAPS_OUT, FLOATS_OUT),
-    cache=True,
-    nogil=True,
-    fastmath=True,
-)
+@compiled
 def derivatives_at(
-    image: Float32Array,
+    image: Image,
     x: int,
     y: int,
-    taps: Float32Array,
-    columns: Float32Array,
-    result: Float64Array,
+    taps: Image,
+    columns: ImageOut,
+    result: FloatsOut,
 ) -> None:
     """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
 
@@ -321,21 +289,15 @@ def derivatives_at(
     result[4] = gyy
 
 
-@njit(
-    types.boolean(
-        IMAGE_IN, types.float64, types.float64, TAPS_IN, TAPS_OUT, FLOATS_OUT, FLOATS_OUT
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def step_to_ridge(
-    image: Float32Array,
+    image: Image,
     x_px: float,
     y_px: float,
-    taps: Float32Array,
-    scratch: Float32Array,
-    derivatives: Float64Array,
-    result: Float64Array,
+    taps: Image,
+    scratch: ImageOut,
+    derivatives: FloatsOut,
+    result: FloatsOut,
 ) -> bool:
     """Walk from a start to the nearest ridge; False if there is none.
 
@@ -389,18 +351,14 @@ def step_to_ridge(
     return False
 
 
-@njit(
-    types.int64(IMAGE_IN, TABLE_IN, types.int64, TAPS_IN, types.float64, TABLE_OUT),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def refine_candidates(
-    image: Float32Array,
-    runs: Float64Array,
+    image: Image,
+    runs: Table,
     n_runs: int,
-    taps: Float32Array,
+    taps: Image,
     least_bend: float,
-    points: Float64Array,
+    points: TableOut,
 ) -> int:
     """Ridge point in the column or row of each candidate.
 

@@ -6,17 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
-from armscan.kernels.arrays import (
-    FLOATS_IN,
-    FLOATS_OUT,
-    INTS_IN,
-    TABLE_IN,
-    TABLE_OUT,
-    Float64Array,
-    Int64Array,
-)
+from armscan.kernels.arrays import Floats, FloatsOut, Ints, Table, TableOut, compiled
 
 SHIFT, SLOPE, BEND, BEND_SIGMA, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 """Columns of a smoothing result."""
@@ -26,8 +17,8 @@ COUNT = 8
 """Place of the count of points among the moments."""
 
 
-@njit(types.boolean(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
-def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
+@compiled
+def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
     """Fit a weighted parabola; False if it is not determined.
 
     Parameters
@@ -59,33 +50,18 @@ def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
     return True
 
 
-@njit(
-    types.int64(
-        TABLE_IN,
-        TABLE_IN,
-        FLOATS_IN,
-        INTS_IN,
-        INTS_IN,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.float64,
-        FLOATS_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def gather(
-    points: Float64Array,
-    normals: Float64Array,
-    sigma_px: Float64Array,
-    is_used: Int64Array,
-    chain: Int64Array,
+    points: Table,
+    normals: Table,
+    sigma_px: Floats,
+    is_used: Ints,
+    chain: Ints,
     i: int,
     j: int,
     direction: int,
     reach: float,
-    moments: Float64Array,
+    moments: FloatsOut,
 ) -> int:
     """Add the neighbours of point ``i`` from place ``j`` on to the moments; return where it ended.
 
@@ -116,31 +92,17 @@ def gather(
     return j
 
 
-@njit(
-    types.void(
-        TABLE_IN,
-        TABLE_IN,
-        FLOATS_IN,
-        INTS_IN,
-        INTS_IN,
-        FLOATS_IN,
-        FLOATS_IN,
-        types.float64,
-        TABLE_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled
 def smooth_chains(
-    points: Float64Array,
-    normals: Float64Array,
-    sigma_px: Float64Array,
-    is_used: Int64Array,
-    chain: Int64Array,
-    windows_px: Float64Array,
-    inflation: Float64Array,
+    points: Table,
+    normals: Table,
+    sigma_px: Floats,
+    is_used: Ints,
+    chain: Ints,
+    windows_px: Floats,
+    inflation: Floats,
     confidence: float,
-    result: Float64Array,
+    result: TableOut,
 ) -> None:
     """Smooth every point along its chain by a local quadratic in its own tangent frame.
 

@@ -54,18 +54,25 @@ ROW = 1
 """A point at an integer row: its centre was sought along that row."""
 
 
-def compiled(kernel: F) -> F:
-    """Compile a kernel for the types that its annotations name (the aliases of this module)."""
-    return _compiled(kernel, "python")
+def compiled(
+    *, fastmath: bool = False, error_model: Literal["python", "numpy"] = "python"
+) -> Callable[[F], F]:
+    """Compile a kernel for the types that its annotations name (the aliases of this module).
 
+    Parameters
+    ----------
+    fastmath
+        Sums may be taken in another order.
+    error_model
+        ``numpy``: a division by zero gives infinity or NaN instead of an exception.
+    """
 
-def compiled_ieee(kernel: F) -> F:
-    """As `compiled`; a division by zero gives infinity or NaN instead of an exception."""
-    return _compiled(kernel, "numpy")
+    def compile_kernel(kernel: F) -> F:
+        named = dict(kernel.__annotations__)
+        signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
+        found: F = njit(
+            signature, cache=True, nogil=True, fastmath=fastmath, error_model=error_model
+        )(kernel)
+        return found
 
-
-def _compiled(kernel: F, error_model: Literal["python", "numpy"]) -> F:
-    named = dict(kernel.__annotations__)
-    signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
-    found: F = njit(signature, cache=True, nogil=True, error_model=error_model)(kernel)
-    return found
+    return compile_kernel

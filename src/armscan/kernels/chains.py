@@ -27,7 +27,7 @@ LEAST_COSINE = 0.77
 NONE = -1
 
 
-@compiled
+@compiled()
 def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
@@ -64,7 +64,7 @@ def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
                 is_kept[i] = 0
 
 
-@compiled
+@compiled()
 def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
     """Best continuation of each point to both sides along its tangent.
 
@@ -108,7 +108,7 @@ def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOu
                     behind[i] = j
 
 
-@compiled
+@compiled()
 def walk_chains(ahead: IntsOut, behind: IntsOut, order: IntsOut, chain: IntsOut) -> int:
     """Order the points along their chains, ends first, then loops; lone points are left out.
 
@@ -164,7 +164,7 @@ OWN_SPAN = 3.0
 """Along its own chain a point is another line's only after this many times the reach."""
 
 
-@compiled
+@compiled()
 def find_other_lines(
     points: Table,
     chain: Ints,
@@ -247,7 +247,7 @@ def find_other_lines(
                     j = following[j]
 
 
-@compiled
+@compiled()
 def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
     """Sequence of states with the greatest sum of scores less the costs of its changes.
 

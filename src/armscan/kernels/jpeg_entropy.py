@@ -16,7 +16,7 @@ WHOLE, NO_CODE, TOO_SHORT, OUT_OF_BLOCK, NO_RESTART = range(5)
 BLOCK = 64
 
 
-@compiled
+@compiled()
 def walk_scan(
     data: Bytes,
     tables: IntTable,

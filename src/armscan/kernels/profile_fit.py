@@ -16,7 +16,6 @@ from armscan.kernels.arrays import (
     Table,
     TableOut,
     compiled,
-    compiled_ieee,
 )
 
 REACH_SIGMAS = 2.7
@@ -31,7 +30,7 @@ CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(
 """Columns of a fit result."""
 
 
-@compiled
+@compiled()
 def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -> None:
     """Mean grey level beside the line, on the side of smaller and of larger coordinate.
 
@@ -72,7 +71,7 @@ def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -
             sides[i, 2 * side + 1] = n
 
 
-@compiled
+@compiled()
 def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> float:
     """Unweighted height of a Gaussian ``offset`` pixels from the profile's first pixel."""
     top = norm = 0.0
@@ -84,7 +83,7 @@ def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> floa
     return top / norm if norm > 0.0 else 0.0
 
 
-@compiled_ieee
+@compiled(error_model="numpy")
 def accumulate(
     profile: Table,
     n: int,
@@ -141,7 +140,7 @@ def accumulate(
         sums[12] += w * j0 * m * u * u * u
 
 
-@compiled
+@compiled()
 def solve_step(sums: Floats, steps: FloatsOut) -> float:
     """Solve the normal equations into ``steps`` (3,); return the centre's variance, or 0."""
     h00, h01, h02, h11, h12, h22 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
@@ -161,7 +160,7 @@ def solve_step(sums: Floats, steps: FloatsOut) -> float:
     return float(c00 / determinant)
 
 
-@compiled_ieee
+@compiled(error_model="numpy")
 def fit_profiles(
     image: Image,
     clipped: Mask,

@@ -23,7 +23,7 @@ VALLEY_RATIO = 0.5
 """A dip below this share of the peak splits a run into two lines."""
 
 
-@compiled
+@compiled()
 def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
     """Write row ``i`` of the grid, interpolated linearly between cell centres, to ``row`` (W,)."""
     columns = grid.shape[1]
@@ -34,13 +34,13 @@ def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
         row[x] = grid[i, k] + (u - k) * (grid[i, m] - grid[i, k])
 
 
-@compiled
+@compiled()
 def level_at(image: Image, axis: int, line: int, k: int) -> float:
     """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
     return float(image[k, line] if axis == COLUMN else image[line, k])
 
 
-@compiled
+@compiled()
 def hump_centre(
     image: Image,
     axis: int,
@@ -60,7 +60,7 @@ def hump_centre(
     return moment / weight if weight > 0.0 else 0.5 * (first + last)
 
 
-@compiled
+@compiled()
 def split_run(
     image: Image,
     axis: int,
@@ -120,7 +120,7 @@ def split_run(
     return count
 
 
-@compiled
+@compiled()
 def find_runs(
     image: Image,
     background: Image,
@@ -222,7 +222,7 @@ def gaussian_taps(sigma_px: float) -> Image:
     return np.stack([smooth, slope, bend]).astype(np.float32)
 
 
-@compiled
+@compiled(fastmath=True)
 def derivatives_at(
     image: Image,
     x: int,
@@ -289,7 +289,7 @@ def derivatives_at(
     result[4] = gyy
 
 
-@compiled
+@compiled()
 def step_to_ridge(
     image: Image,
     x_px: float,
@@ -351,7 +351,7 @@ def step_to_ridge(
     return False
 
 
-@compiled
+@compiled()
 def refine_candidates(
     image: Image,
     runs: Table,

@@ -17,7 +17,7 @@ COUNT = 8
 """Place of the count of points among the moments."""
 
 
-@compiled
+@compiled()
 def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
     """Fit a weighted parabola; False if it is not determined.
 
@@ -50,7 +50,7 @@ def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
     return True
 
 
-@compiled
+@compiled()
 def gather(
     points: Table,
     normals: Table,
@@ -92,7 +92,7 @@ def gather(
     return j
 
 
-@compiled
+@compiled()
 def smooth_chains(
     points: Table,
     normals: Table,

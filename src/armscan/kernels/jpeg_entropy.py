@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Walk through the entropy-coded data of a sequential JPEG without making a picture of it.
 
-Decoders fill what is missing with grey and say so on stderr at most; here the codes
-themselves are
+Decoders fill what is missing with grey and say so on stderr at most; here the codes themselves are
 counted (ITU T.81, annex F.2.2).
 """
 

@@ -38,7 +38,7 @@ from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, LaserColour, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
-from armscan.vision.targets.target import Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Target, TargetView
 
 SAMPLE = 8
 """Photographs on which every channel is tried, evenly spread over the set."""
@@ -218,7 +218,6 @@ def find_placements(
     pairs: Sequence[ExposurePair],
     target: Target,
     cameras: HeadCameras,
-    options: TargetOptions,
     cache: DetectionCache | None = None,
 ) -> Iterator[Placement]:
     """Look for the board in each placement, one after the other; ``cache`` knows earlier finds.
@@ -235,7 +234,7 @@ def find_placements(
             images.append(tried)
     for name, by_camera in groups.items():
         seen = {
-            camera: _see(camera, images, target, cameras, options, cache=cache)
+            camera: _see(camera, images, target, cameras, cache=cache)
             for camera, images in sorted(by_camera.items())
         }
         yield _placed(name, seen, target, cameras)
@@ -246,14 +245,13 @@ def _see(
     images: Sequence[Exposure],
     target: Target,
     cameras: HeadCameras,
-    options: TargetOptions,
     *,
     cache: DetectionCache | None,
 ) -> SeenBoard | FitFailure:
     """The board in the first image that shows it, or why the first does not."""
     failures: list[FitFailure] = []
     for image in images:
-        view = cached_target(image, target, options, cache)
+        view = cached_target(image, target, cache)
         found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
         if not isinstance(found, FitFailure):
             return found
@@ -319,9 +317,8 @@ LEAST_WIDTHS = 3
 
 @dataclass(frozen=True, slots=True)
 class LaserOptions:
-    """Options of the three stages: target, stripes, sheets."""
+    """Options of the stages: stripes, sheets."""
 
-    target: TargetOptions = field(default_factory=TargetOptions)
     stripes: StripeOptions = field(default_factory=StripeOptions)
     sheets: SheetOptions = field(default_factory=SheetOptions)
 
@@ -523,7 +520,7 @@ def _found_placements(
 ) -> Iterator[Placement]:
     """Look for the board in each placement, telling of each."""
     n_places = len({placement_of(pair) for pair in pairs})
-    found = find_placements(pairs, target, cameras, options.target, cache)
+    found = find_placements(pairs, target, cameras, cache)
     for done, placement in enumerate(found):
         progress(ProgressEvent(BOARDS_STAGE, done + 1, n_places, placement.name))
         yield placement
@@ -611,9 +608,9 @@ def look_at_pairs(
     for done, (exposure, background) in enumerate(pairs):
         progress(ProgressEvent(STAGE, done, len(pairs), exposure.source))
         tried = exposure if background is None else background
-        board = cached_target(tried, target, options.target, cache)
+        board = cached_target(tried, target, cache)
         if isinstance(board, FitFailure) and tried is not exposure:
-            again = cached_target(exposure, target, options.target, cache)
+            again = cached_target(exposure, target, cache)
             if not isinstance(again, FitFailure):
                 board, tried = again, exposure
         lit, dark = exposure, background

@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rims of rings on raw pixels, and the image of a ring's centre from its two rims.
 
-The centre of an ellipse is not the image of the circle's centre. With the homography H of
-the
-ring's plane, the rims are ``Q_k ~ H^-T diag(1, 1, -r_k^2) H^-1``, so that ``Q_2^-1 Q_1`` is
-similar
+The centre of an ellipse is not the image of the circle's centre. With the homography H of the
+ring's plane, the rims are ``Q_k ~ H^-T diag(1, 1, -r_k^2) H^-1``, so that ``Q_2^-1 Q_1`` is similar
 to ``diag(1, 1, r_1^2 / r_2^2)``: a double eigenvalue, whose eigenvectors lie on the plane's
 vanishing line, and a single one, whose eigenvector is the image of the common centre.
 
-To first order this is ``(c_2 - q c_1) / (1 - q)`` with the ellipses' centres c and ``q =
-(r_2 /
-r_1)^2``: the shift between the centres, continued to radius 0. It uses all that two circles
-say
+To first order this is ``(c_2 - q c_1) / (1 - q)`` with the ellipses' centres c and ``q = (r_2 /
+r_1)^2``: the shift between the centres, continued to radius 0. It uses all that two circles say
 about the centre: what else the rims determine (size, axes) is common to both to that order.
 """
 

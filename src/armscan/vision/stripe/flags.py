@@ -9,12 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX
 from armscan.kernels.profile_fit import AMPLITUDE, REACH_SIGMAS, SKEW, SKEW_NORM
 from armscan.vision.stripe.fit import ProfileFits, axis_component
-from armscan.vision.stripe.ridge import chain_bounds, chain_lengths_px, mean_along, sum_along
+from armscan.vision.stripe.ridge import (
+    SHORTEST_PX,
+    chain_bounds,
+    chain_lengths_px,
+    mean_along,
+    sum_along,
+)
 
 SIGNIFICANT = 5.0
+BACKGROUND_STEP = 0.2
+"""Smallest step that matters, as a share of the line's amplitude."""
+NEIGHBOUR_SIGMAS = 4.5
+"""Another line within this many sigmas pulls the centre."""
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
 SKEW_HALF = 4
@@ -24,21 +35,14 @@ SKEW_PX = 0.3
 """The part in px that counts on narrow lines, which few pixels describe."""
 
 
-def is_background_step(fits: ProfileFits, least_share: float) -> BoolArray:
+def is_background_step(fits: ProfileFits) -> BoolArray:
     """(N,) True where the two sides differ enough to move the centre.
 
     A step of height d beside a line of amplitude A and sigma s moves every method by about s d / A.
-
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    least_share
-        Smallest step that matters, as a share of the line's amplitude.
     """
     step = np.abs(fits.sides[:, 1] - fits.sides[:, 0])
     is_certain = step > SIGNIFICANT * fits.side_sigma
-    return np.asarray(is_certain & (step > least_share * fits.values[:, AMPLITUDE]))
+    return np.asarray(is_certain & (step > BACKGROUND_STEP * fits.values[:, AMPLITUDE]))
 
 
 def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
@@ -75,10 +79,8 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
     return found
 
 
-def is_near_other_line(
-    distance: FloatArray, chain: IntArray, width_px: FloatArray, sigmas: float
-) -> BoolArray:
-    """(N,) True where another line is within ``sigmas`` widths, and where two lines have merged.
+def is_near_other_line(distance: FloatArray, chain: IntArray, width_px: FloatArray) -> BoolArray:
+    """(N,) True where another line is within `NEIGHBOUR_SIGMAS`, and where two lines have merged.
 
     Parameters
     ----------
@@ -88,10 +90,8 @@ def is_near_other_line(
         (N,) chain numbers.
     width_px
         (N,) sigma of the line.
-    sigmas
-        Distance that matters.
     """
-    near = np.asarray(distance.min(axis=1) < sigmas * width_px)
+    near = np.asarray(distance.min(axis=1) < NEIGHBOUR_SIGMAS * width_px)
     if not near.any():
         return near
     return close_gaps(near, chain, MERGED_SIGMAS * width_px)
@@ -107,9 +107,9 @@ def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray
     return np.asarray(flags | (is_between & (after - before <= span)))
 
 
-def is_short(points: FloatArray, chain: IntArray, shortest_px: float) -> BoolArray:
-    """(N,) True where the point's chain is shorter than ``shortest_px``."""
-    return np.asarray(chain_lengths_px(points, chain) < shortest_px)
+def is_short(points: FloatArray, chain: IntArray) -> BoolArray:
+    """(N,) True where the point's chain is shorter than `SHORTEST_PX`."""
+    return np.asarray(chain_lengths_px(points, chain) < SHORTEST_PX)
 
 
 HALF = 4
@@ -233,4 +233,4 @@ def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
 
 def _spread(values: FloatArray) -> float:
     """Standard deviation of most of the values."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return robust_sigma(values - np.median(values))

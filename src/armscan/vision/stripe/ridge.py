@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, walk_chains
 from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates
@@ -20,7 +21,6 @@ SQRT2 = math.sqrt(2.0)
 SAMPLE_STEP_PX = 4
 CLUTTER_LAG_PX = 12
 BACKGROUND_QUANTILE = 0.4
-MAD_TO_SIGMA = 1.4826
 LEAST_NOISE = 0.35
 """Rounding to whole grey levels hides smaller noise."""
 THRESHOLD_SIGMAS = 6.0
@@ -89,7 +89,7 @@ def _noise(image: NDArray[np.float32], lag: int) -> float:
     if rows.shape[1] <= lag:
         return LEAST_NOISE
     step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
-    typical = float(np.median(step)) * MAD_TO_SIGMA
+    typical = robust_sigma(step)
     trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * math.sqrt(math.pi / 2.0)
     return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2
 
@@ -236,6 +236,10 @@ def _first_below(side: FloatArray, level: FloatArray) -> FloatArray:
 
 
 LONGEST_RUN_PX = 90
+SHORTEST_PX = 15.0
+"""A shorter chain is no stripe."""
+FAINTEST_SHARE = 0.1
+"""Chains with less of the strong ones' curvature are reflections."""
 HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
 
 
@@ -337,12 +341,12 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     return RidgePoints(points[order[:count]], chain[:count])
 
 
-def is_bright(ridge: RidgePoints, least_share: float) -> NDArray[np.bool_]:
-    """(N,) False for the chains whose median curvature is below a share of the strong ones'."""
+def is_bright(ridge: RidgePoints) -> NDArray[np.bool_]:
+    """(N,) False for the chains whose median curvature is below `FAINTEST_SHARE`."""
     if not len(ridge):
         return np.zeros(0, dtype=np.bool_)
     bend = ridge.table[:, 4]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(ridge.chain) != 0]))
     sizes = np.diff(np.concatenate([starts, [len(ridge)]]))
     medians = np.array([np.median(bend[a : a + n]) for a, n in zip(starts, sizes, strict=True)])
-    return np.asarray(np.repeat(medians, sizes) >= least_share * strong_median(bend))
+    return np.asarray(np.repeat(medians, sizes) >= FAINTEST_SHARE * strong_median(bend))

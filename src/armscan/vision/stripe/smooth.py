@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.kernels.smooth import (
     BEND,
     BEND_SIGMA,
@@ -259,5 +260,5 @@ def _filter_residuals(course: Course, half: int) -> FloatArray:
     residual = np.full(n, np.nan)
     residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
     limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
-    residual[np.abs(residual) > limit * 1.4826] = np.nan
+    residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

@@ -1,24 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chessboards: a lattice of crossings, numbered by count, ends and tone, on raw pixels.
 
-The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a
-table:
-one tone. Where that is seen along a side, the outermost corners are the board's own, and the
-count is known although another side is hidden or out of view. A hand or a sheet of paper
-that covers corners does not end along a line of the squares and gives no such evidence.
+The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a table: one
+tone. Where that is seen along a side, the outermost corners are the board's own, and the count is
+known although another side is hidden or out of view. A hand or a sheet of paper that covers corners
+does not end along a line of the squares and gives no such evidence.
 
-The camera looks at the front of a print, so that in the image the board's y lies clockwise
-of
-its x. Where several numberings remain, the one whose x points most to the right is taken.
+The camera looks at the front of a print, so that in the image the board's y lies clockwise of its
+x. Where several numberings remain, the one whose x points most to the right is taken.
 
-A flat board seen through any lens is a homography followed by a smooth field: a polynomial
-of
-third degree over the image holds distortion and a bow. A corner that a light stripe or a
-shadow
-pulled lies off it by many times the scatter of the rest.
+A flat board seen through any lens is a homography followed by a smooth field: a polynomial of third
+degree over the image holds distortion and a bow. A corner that a light stripe or a shadow pulled
+lies off it by many times the scatter of the rest.
 
-The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board
-is
+The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board is
 enough where its ends tell which part it is.
 """
 
@@ -42,9 +37,9 @@ from armscan.vision.targets.crossings import (
     find_lattices,
     predict_cells,
 )
-from armscan.vision.targets.grey import Grey32, RawGrey, grey_channels, sample
+from armscan.vision.targets.grey import MIN_CONTRAST, Grey32, RawGrey, grey_channels, sample
 from armscan.vision.targets.saddle import fit_saddles
-from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetOptions, TargetView
+from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
 
 Side = Literal["ends", "may end", "continues", "unknown"]
 """What is seen beyond the outermost corners; "may end" where too few of them tell."""
@@ -340,6 +335,8 @@ def _terms(image: FloatArray) -> FloatArray:
     return np.stack(terms[:1], axis=-1)
 
 
+SEARCH_SIZE_PX = 1400
+"""Larger images are reduced to this size for the search; corners are measured in the full one."""
 MIN_SEEN_FRACTION = 0.4
 """Least fraction of a board's corners that makes a view."""
 MIN_GOOD_FRACTION = 0.7
@@ -372,9 +369,7 @@ class _Corners:
     step_px: float
 
 
-def detect_chessboard(
-    exposure: Exposure, target: Chessboard, options: TargetOptions
-) -> TargetView | FitFailure:
+def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | FitFailure:
     """Find a chessboard and measure its corners.
 
     Returns
@@ -382,12 +377,12 @@ def detect_chessboard(
     The view, with the corners that the fit on raw pixels accepted; or why there is none.
     """
     channels = grey_channels(exposure)
-    min_contrast = options.min_contrast * exposure.full_scale
+    min_contrast = MIN_CONTRAST * exposure.full_scale
     why: FitFailure | None = None
     seen: list[Extent] = []
     for number, grey in enumerate(channels):
         others = channels[:number] + channels[number + 1 :]
-        for numbered in _numbered(grey, target, options.search_size_px, min_contrast, seen):
+        for numbered in _numbered(grey, target, min_contrast, seen):
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
             if refusal is None:
@@ -404,12 +399,11 @@ def is_symmetric(target: Chessboard) -> bool:
 def _numbered(
     grey: RawGrey,
     target: Chessboard,
-    size_px: int,
     min_contrast: float,
     seen: list[Extent],
 ) -> Iterator[NumberedCorners]:
     """Yield boards of the right count in one channel; other lattices are noted in ``seen``."""
-    small, factor = _search_image(grey, size_px)
+    small, factor = _search_image(grey)
     crossings = find_crossings(small, min_contrast)
     fewest = MIN_SEEN_FRACTION * target.columns * target.rows
     for lattice in find_lattices(crossings):
@@ -427,10 +421,10 @@ def _numbered(
                 yield NumberedCorners(choices[0].cells, points, choices[0].quarter_turns)
 
 
-def _search_image(grey: RawGrey, size_px: int) -> tuple[Grey32, float]:
-    """The image, reduced to at most ``size_px``, and the factor back to full size."""
+def _search_image(grey: RawGrey) -> tuple[Grey32, float]:
+    """The image, reduced to at most `SEARCH_SIZE_PX`, and the factor back to full size."""
     image = np.ascontiguousarray(grey, dtype=np.float32)
-    factor = max(image.shape) / size_px
+    factor = max(image.shape) / SEARCH_SIZE_PX
     if factor <= 1.0:
         return image, 1.0
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))

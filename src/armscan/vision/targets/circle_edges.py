@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Edge points of circles by least squares on raw pixels, starting from rough ellipses.
 
-Each rim is cut into sectors. In a sector the level depends on the distance d to the rim as
-``I = inner + (outer - inner) Phi((d - shift) / blur)`` with Phi the normal distribution (an
-erf
-edge). Inner level, outer level and shift belong to the sector, the blur to the circle; no
-pixel
-is shared, so that the shifts of sectors are independent and their sigma follows from the
-fit.
+Each rim is cut into sectors. In a sector the level depends on the distance d to the rim as ``I =
+inner + (outer - inner) Phi((d - shift) / blur)`` with Phi the normal distribution (an erf edge).
+Inner level, outer level and shift belong to the sector, the blur to the circle; no pixel is shared,
+so that the shifts of sectors are independent and their sigma follows from the fit.
 """
 
 from __future__ import annotations

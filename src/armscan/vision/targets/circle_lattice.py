@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blobs that may be circles, a lattice grown over them, and the numbers of its cells.
 
-Both kinds of circle grid are square lattices (the asymmetric one turned by 45 degrees). The
-ellipse into which a circle is seen gives the local affine map up to a rotation; in
-coordinates
-that make it round again, the four nearest neighbours are equally far and at right angles, at
-any
-tilt.
+Both kinds of circle grid are square lattices (the asymmetric one turned by 45 degrees). The ellipse
+into which a circle is seen gives the local affine map up to a rotation; in coordinates that make it
+round again, the four nearest neighbours are equally far and at right angles, at any tilt.
 """
 
 from __future__ import annotations
@@ -20,9 +17,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.vision.targets.grey import Grey8
-from armscan.vision.targets.target import CircleGrid, TargetOptions
+from armscan.vision.targets.grey import MIN_CONTRAST, Grey8
+from armscan.vision.targets.target import CircleGrid
 
+MIN_CIRCLE_PX, MAX_CIRCLE_PX = 8.0, 400.0
+"""Diameters of a target's circles in the image."""
 BLOCK_FRACTIONS = (1 / 40, 1 / 12, 1 / 4)
 """Sides of the squares over which a threshold is the local mean, as fractions of the image."""
 MAX_ROUNDNESS_ERROR = 0.12
@@ -63,7 +62,14 @@ class Blobs:
         return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
 
 
-def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA) -> Blobs:
+def find_blobs(
+    grey8: Grey8,
+    *,
+    smallest_px: float = MIN_CIRCLE_PX,
+    largest_px: float = MAX_CIRCLE_PX,
+    min_contrast: float = MIN_CONTRAST,
+    same_log_area: float = SAME_LOG_AREA,
+) -> Blobs:
     """Return every contour that is an ellipse within the range of sizes, once.
 
     A blob found at several threshold scales is kept where its contour is roundest.
@@ -72,13 +78,15 @@ def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME
     ----------
     grey8
         The image.
-    options
-        Sizes and contrast.
+    smallest_px, largest_px
+        Range of the diameters.
+    min_contrast
+        Least contrast, as a fraction of full scale.
     same_log_area
         Where circles nest, less than `SAME_LOG_AREA`, so that their rims stay apart.
     """
     rows: list[tuple[float, ...]] = []
-    margin = max(255.0 * options.min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
+    margin = max(255.0 * min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
     for fraction in BLOCK_FRACTIONS:
         block = max(11, round(fraction * max(grey8.shape)) | 1)
         mean = cv2.boxFilter(grey8, -1, (block, block), borderType=cv2.BORDER_REPLICATE)
@@ -90,7 +98,8 @@ def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME
                 (*ellipse, float(is_light))
                 for contour, links in zip(contours, _links(hierarchy), strict=True)
                 if links[_PARENT] < 0
-                and (ellipse := _ellipse_of(np.asarray(contour), options)) is not None
+                and (ellipse := _ellipse_of(np.asarray(contour), smallest_px, largest_px))
+                is not None
             ]
     table = np.array(rows).reshape(-1, 7)
     table = table[np.argsort(table[:, 5], kind="stable")]
@@ -112,19 +121,19 @@ def _noise(grey8: Grey8) -> float:
 
 
 def _ellipse_of(
-    contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], options: TargetOptions
+    contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], smallest_px: float, largest_px: float
 ) -> tuple[float, float, float, float, float, float] | None:
     """Centre u, v, shape uu, uv, vv and roundness error of a contour, if it is an ellipse."""
-    if len(contour) < 2.0 * options.min_circle_px:
+    if len(contour) < 2.0 * smallest_px:
         return None
     low = contour.reshape(-1, 2).min(axis=0)
     high = contour.reshape(-1, 2).max(axis=0)
     extent = float((high - low).max())
-    if not options.min_circle_px - 2.0 <= extent <= options.max_circle_px:
+    if not smallest_px - 2.0 <= extent <= largest_px:
         return None
     moments = cv2.moments(contour)
     area = moments["m00"]
-    if area < 0.4 * options.min_circle_px**2:
+    if area < 0.4 * smallest_px**2:
         return None
     centre = np.array([moments["m10"], moments["m01"]]) / area
     inertia = (

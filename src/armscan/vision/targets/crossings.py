@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Crossings of two edges with alternating sectors, and the lattices they form: chessboards.
 
-The blurred image has a saddle there, whatever the contrast. On a ring around a crossing
-opposite
-sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the
-outer
+The blurred image has a saddle there, whatever the contrast. On a ring around a crossing opposite
+sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the outer
 corner of a square or a blob lose it), and it changes its tone twice: the two edges.
 
-From a corner of a chessboard four edges run to its four neighbours, and each neighbour has
-light
-and dark sectors swapped. Crossings that are the nearest such neighbours of each other are
-linked;
+From a corner of a chessboard four edges run to its four neighbours, and each neighbour has light
+and dark sectors swapped. Crossings that are the nearest such neighbours of each other are linked;
 what hangs together is a lattice. Cells in which no crossing was found (a light stripe, a
 reflection, a finger) are bridged by a homography of the cells around them.
 """

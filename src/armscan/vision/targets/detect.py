@@ -23,7 +23,6 @@ from armscan.vision.targets.target import (
     Chessboard,
     CircleGrid,
     Target,
-    TargetOptions,
     TargetView,
 )
 
@@ -32,9 +31,7 @@ MIN_CORNERS = 6
 _CLEARANCE = 0.85
 
 
-def detect_charuco(
-    exposure: Exposure, target: Charuco, options: TargetOptions
-) -> TargetView | FitFailure:
+def detect_charuco(exposure: Exposure, target: Charuco) -> TargetView | FitFailure:
     """Find a ChArUco board, whole or in part; the markers number its corners."""
     detector = cv2.aruco.CharucoDetector(_board(target))
     n_markers = 0
@@ -111,9 +108,7 @@ def _failure(exposure: Exposure, target: Charuco, n_markers: int, n_corners: int
 SMALLEST_IMAGE_PX = 32
 
 
-def detect_target(
-    exposure: Exposure, target: Target, options: TargetOptions | None = None
-) -> TargetView | FitFailure:
+def detect_target(exposure: Exposure, target: Target) -> TargetView | FitFailure:
     """Find a target and measure its points (section 2.3.1.1).
 
     Parameters
@@ -122,14 +117,11 @@ def detect_target(
         Grey or colour, 8 to 16 bit, any sensor window.
     target
         What to look for.
-    options
-        How; None for the defaults.
 
     Returns
     -------
     The points in full-sensor pixels with their covariance, or the reason why there are none.
     """
-    chosen = TargetOptions() if options is None else options
     if min(exposure.width_px, exposure.height_px) < SMALLEST_IMAGE_PX:
         return FitFailure(
             f"{exposure.source}: an image of {exposure.width_px} x {exposure.height_px} px is too "
@@ -137,10 +129,10 @@ def detect_target(
             "give the full image",
         )
     if isinstance(target, CircleGrid):
-        return detect_circle_grid(exposure, target, chosen)
+        return detect_circle_grid(exposure, target)
     if isinstance(target, Chessboard):
-        return detect_chessboard(exposure, target, chosen)
-    return detect_charuco(exposure, target, chosen)
+        return detect_chessboard(exposure, target)
+    return detect_charuco(exposure, target)
 
 
 QUARTER_TURNS = {

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ellipses through edge points with the covariance of each conic, and the pixels along their
-rims.
+"""Ellipses through edge points with the covariance of each conic, and the pixels along their rims.
 
-A conic is a symmetric matrix Q with ``[u v 1] Q [u v 1]' = 0``. Each ellipse is fitted in
-its own
-coordinates, shifted to ``origin`` and divided by ``scale``, where the conic's last element
-is -1;
+A conic is a symmetric matrix Q with ``[u v 1] Q [u v 1]' = 0``. Each ellipse is fitted in its own
+coordinates, shifted to ``origin`` and divided by ``scale``, where the conic's last element is -1;
 this cannot fail for an ellipse, because the origin lies inside it.
 """
 

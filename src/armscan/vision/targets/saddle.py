@@ -3,11 +3,9 @@
 
 Near a corner the image is the product of two blurred edges that cross,
 
-``I = m + g . (q - q0) + c erf(d1 / (sqrt 2 s)) erf(d2 / (sqrt 2 s))``, ``dk = nk . (q -
-q0)``,
+``I = m + g . (q - q0) + c erf(d1 / (sqrt 2 s)) erf(d2 / (sqrt 2 s))``, ``dk = nk . (q - q0)``,
 
-so the corner q0, the two edge directions, the blur s, contrast and a linear illumination
-follow
+so the corner q0, the two edge directions, the blur s, contrast and a linear illumination follow
 from one fit. White pixel noise then gives the covariance of q0 without further assumption.
 """
 

@@ -31,14 +31,8 @@ NONE = -1
 def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
-    Parameters
-    ----------
-    points
-        (N, 6) from `refine_candidates`.
-    owner
-        (H, W) int32, filled with -1; receives the index of the point in each pixel.
-    is_kept
-        (N,) output, 1 or 0.
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32, filled with -1; receives
+    the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
     """
     height, width = owner.shape
     for side in range(2):
@@ -68,14 +62,9 @@ def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
 def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
     """Best continuation of each point to both sides along its tangent.
 
-    Parameters
-    ----------
-    points
-        (N, 6) from `refine_candidates`.
-    owner
-        (H, W) map from `place_points`.
-    ahead, behind
-        (N,) output: index of the neighbour, or -1. The tangent is the normal turned by a quarter.
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) map from `place_points`.
+    ``ahead``, ``behind``: (N,) output: index of the neighbour, or -1. The tangent is the normal
+    turned by a quarter.
     """
     height, width = owner.shape
     for i in range(points.shape[0]):
@@ -112,17 +101,10 @@ def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOu
 def walk_chains(ahead: IntsOut, behind: IntsOut, order: IntsOut, chain: IntsOut) -> int:
     """Order the points along their chains, ends first, then loops; lone points are left out.
 
-    Parameters
-    ----------
-    ahead, behind
-        (N,) from `find_neighbours`; links that are not mutual are cut here.
-    order, chain
-        (N,) output: index of the k-th point, and the number of its chain.
+    ``ahead``, ``behind``: (N,) from `find_neighbours`; links that are not mutual are cut here.
+    ``order``, ``chain``: (N,) output: index of the k-th point, and the number of its chain.
 
-    Returns
-    -------
-    int
-        Count of points in chains.
+    Returns count of points in chains.
     """
     n = ahead.shape[0]
     for i in range(n):
@@ -181,24 +163,13 @@ def find_other_lines(
     Points are sorted into square cells; a cell that holds only a point's own part of its chain is
     passed over, so that the cost is in crossings alone.
 
-    Parameters
-    ----------
-    points
-        (N, 6) ridge points, ordered along chains.
-    chain
-        (N,) chain numbers.
-    start, stop
-        (N,) first index, and index after the last, of each point's chain; the two ends of a chain
-        count as neighbours, because it may be a loop.
-    is_line
-        (N,) 0 for points that do not count as a line to others.
-    height, width
-        Size of the image.
-    reach
-        Largest distance that matters, and the side of a cell.
-    distance
-        (N, 2) output: distance to the nearest other line on the side of smaller and of larger
-        coordinate along the point's column or row; infinite where there is none within reach.
+    ``points``: (N, 6) ridge points, ordered along chains. ``chain``: (N,) chain numbers. ``start``,
+    ``stop``: (N,) first index, and index after the last, of each point's chain; the two ends of a
+    chain count as neighbours, because it may be a loop. ``is_line``: (N,) 0 for points that do not
+    count as a line to others. ``height``, ``width``: Size of the image. ``reach``: Largest distance
+    that matters, and the side of a cell. ``distance``: (N, 2) output: distance to the nearest other
+    line on the side of smaller and of larger coordinate along the point's column or row; infinite
+    where there is none within reach.
     """
     n = points.shape[0]
     rows = int(height / reach) + 1
@@ -251,14 +222,9 @@ def find_other_lines(
 def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
     """Sequence of states with the greatest sum of scores less the costs of its changes.
 
-    Parameters
-    ----------
-    scores
-        (N, S) log-likelihood of each state at each place.
-    change_cost
-        (N,) cost of another state at a place than at the one before; 0 at the first of a stripe.
-    state
-        (N,) output.
+    ``scores``: (N, S) log-likelihood of each state at each place. ``change_cost``: (N,) cost of
+    another state at a place than at the one before; 0 at the first of a stripe. ``state``: (N,)
+    output.
     """
     n, s = scores.shape
     if n == 0:

@@ -25,24 +25,14 @@ def walk_scan(
 ) -> tuple[int, int]:
     """Decode all codes of one scan.
 
-    Parameters
-    ----------
-    data
-        (N,) from behind the scan's header to the marker that ends it.
-    tables
-        (T, 65536) of each Huffman table, by the next 16 bits: 256 times the length of the code
-        plus its value; 0 where there is no such code.
-    table_of_block
-        (B, 2) rows of ``tables`` of the DC and AC codes of each block of a unit (MCU).
-    n_units
-        Units of the picture.
-    restart
-        Units between restart markers; 0 for none.
+    ``data``: (N,) from behind the scan's header to the marker that ends it. ``tables``: (T, 65536)
+    of each Huffman table, by the next 16 bits: 256 times the length of the code plus its value; 0
+    where there is no such code. ``table_of_block``: (B, 2) rows of ``tables`` of the DC and AC
+    codes of each block of a unit (MCU). ``n_units``: Units of the picture. ``restart``: Units
+    between restart markers; 0 for none.
 
-    Returns
-    -------
-    defect, left
-        `WHOLE` and the bytes that were left over, or the defect and the units that are missing.
+    Returns ``defect``, ``left``: `WHOLE` and the bytes that were left over, or the defect and the
+    units that are missing.
     """
     n = len(data)
     position, bits, n_bits, borrowed = 0, np.int64(0), 0, 0

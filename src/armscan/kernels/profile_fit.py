@@ -34,17 +34,9 @@ CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(
 def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -> None:
     """Mean grey level beside the line, on the side of smaller and of larger coordinate.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    points
-        (N, 6) from `refine_candidates`.
-    sigma_px
-        (N,) line sigma along the point's column or row.
-    sides
-        (N, 4) output: mean and pixel count of the lower side, then of the upper side; a side that
-        lies outside the image has count 0.
+    ``image``: (H, W) grey levels. ``points``: (N, 6) from `refine_candidates`. ``sigma_px``: (N,)
+    line sigma along the point's column or row. ``sides``: (N, 4) output: mean and pixel count of
+    the lower side, then of the upper side; a side that lies outside the image has count 0.
     """
     height, width = image.shape
     for i in range(points.shape[0]):
@@ -93,20 +85,12 @@ def accumulate(
 ) -> None:
     """Weighted sums of one Gauss-Newton step.
 
-    Parameters
-    ----------
-    profile
-        (3, >= n) grey level less background, background, and 1 where the pixel counts.
-    n
-        Pixels of the profile.
-    state
-        (3,) centre from the first pixel, amplitude, sigma.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
-    sums
-        (13,) output: normal matrix of (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its
-        right-hand side, then the residual against the skew term, the skew term's norm, its product
-        with the centre's derivative, and the same product for a term ``u^3``.
+    ``profile``: (3, >= n) grey level less background, background, and 1 where the pixel counts.
+    ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
+    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
+    (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side, then the residual
+    against the skew term, the skew term's norm, its product with the centre's derivative, and the
+    same product for a term ``u^3``.
     """
     sums[:] = 0.0
     # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
@@ -177,24 +161,14 @@ def fit_profiles(
     own grey level. Clipped pixels are left out and the window grows by their width, so that a
     saturated line is fitted on its flanks.
 
-    Parameters
-    ----------
-    image, points
-        As for `read_sides`.
-    clipped
-        (H, W) 1 where a pixel is saturated; (1, 1) if none is.
-    sigma_px
-        (N,) start value of the sigma along the column or row.
-    sides
-        (N, 2) background on the lower and upper side; interpolated linearly across the line.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
-    reach
-        (N,) half width of the fitted window in sigmas.
-    result
-        (N, 8) output: centre, amplitude, sigma, variance of the centre (0: the fit failed), skew
-        score, its norm, count of clipped pixels, and by how much a term ``u^3`` in the profile's
-        exponent moves the centre, in sigmas (for the correction on bent lines).
+    ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
+    (1, 1) if none is. ``sigma_px``: (N,) start value of the sigma along the column or row.
+    ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
+    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``reach``: (N,) half width of the fitted
+    window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma, variance of the centre
+    (0: the fit failed), skew score, its norm, count of clipped pixels, and by how much a term
+    ``u^3`` in the profile's exponent moves the centre, in sigmas (for the correction on bent
+    lines).
     """
     height, width = image.shape
     profile = np.zeros((3, max(height, width)))

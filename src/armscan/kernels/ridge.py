@@ -77,18 +77,10 @@ def split_run(
     A run is split where the three-pixel mean dips below half of the peaks on both sides, so that
     two lines that share a foot become two candidates.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    axis, line, first, last
-        The run: pixels ``first..last`` of column (axis 0) or row (axis 1) ``line``.
-    background, rise
-        Local background, and the height above it at which the run was cut.
-    runs
-        (capacity, 3) output rows ``x, y, axis``; rows beyond the capacity are counted only.
-    count
-        Rows used so far.
+    ``image``: (H, W) grey levels. ``axis``, ``line``, ``first``, ``last``: The run: pixels
+    ``first..last`` of column (axis 0) or row (axis 1) ``line``. ``background``, ``rise``: Local
+    background, and the height above it at which the run was cut. ``runs``: (capacity, 3) output
+    rows ``x, y, axis``; rows beyond the capacity are counted only. ``count``: Rows used so far.
     """
     peak = 0.0
     low = np.inf
@@ -131,26 +123,13 @@ def find_runs(
 ) -> int:
     """Find runs of pixels more than ``rise`` above the background in one pass over the image.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    background
-        (rows, columns) background per cell of ``cell_px`` pixels, interpolated in between.
-    cell_px
-        Side of a background cell.
-    rise
-        Height above the background.
-    longest_px
-        Longer runs are no cross-sections of a line and are left out.
-    runs
-        (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and the axis
-        (0: the run goes down a column, 1: along a row).
+    ``image``: (H, W) grey levels. ``background``: (rows, columns) background per cell of
+    ``cell_px`` pixels, interpolated in between. ``cell_px``: Side of a background cell. ``rise``:
+    Height above the background. ``longest_px``: Longer runs are no cross-sections of a line and are
+    left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and
+    the axis (0: the run goes down a column, 1: along a row).
 
-    Returns
-    -------
-    int
-        Count of candidates; more than the capacity if the output was too short.
+    Returns count of candidates; more than the capacity if the output was too short.
     """
     height, width = image.shape
     floor = np.zeros(width, np.float32)
@@ -233,18 +212,8 @@ def derivatives_at(
 ) -> None:
     """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    x, y
-        Pixel.
-    taps
-        (3, m) from `gaussian_taps`.
-    columns
-        (3, m) scratch.
-    result
-        (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
+    ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`.
+    ``columns``: (3, m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
     """
     height, width = image.shape
     m = taps.shape[1]
@@ -305,16 +274,9 @@ def step_to_ridge(
     polynomial has its maximum at ``t = -(g . n) / (n' H n)``. The expansion point is moved while
     the step leaves its pixel.
 
-    Parameters
-    ----------
-    image, taps, scratch
-        As for `derivatives_at`.
-    x_px, y_px
-        Start.
-    derivatives
-        (5,) scratch.
-    result
-        (5,) output: x, y, normal x, normal y, negative second derivative along the normal.
+    ``image``, ``taps``, ``scratch``: As for `derivatives_at`. ``x_px``, ``y_px``: Start.
+    ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal y, negative
+    second derivative along the normal.
     """
     height, width = image.shape
     x = math.floor(x_px + 0.5)
@@ -365,26 +327,13 @@ def refine_candidates(
     A column candidate is kept where the line is rather horizontal, a row candidate where it is
     rather vertical, with some overlap around the diagonal so that none is lost there.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    runs
-        (>= n_runs, 3) from `find_runs`.
-    n_runs
-        Candidates to use.
-    taps
-        (3, m) from `gaussian_taps`.
-    least_bend
-        Smallest negative second derivative across the line.
-    points
-        (>= n_runs, 6) output rows: x, y, normal x, normal y, negative second derivative, axis.
-        The coordinate along the axis 0 (column) or 1 (row) that names the pixel line is whole.
+    ``image``: (H, W) grey levels. ``runs``: (>= n_runs, 3) from `find_runs`. ``n_runs``: Candidates
+    to use. ``taps``: (3, m) from `gaussian_taps`. ``least_bend``: Smallest negative second
+    derivative across the line. ``points``: (>= n_runs, 6) output rows: x, y, normal x, normal y,
+    negative second derivative, axis. The coordinate along the axis 0 (column) or 1 (row) that names
+    the pixel line is whole.
 
-    Returns
-    -------
-    int
-        Count of points.
+    Returns count of points.
     """
     height, width = image.shape
     scratch = np.zeros((3, taps.shape[1]), np.float32)

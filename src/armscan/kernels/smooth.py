@@ -21,14 +21,9 @@ COUNT = 8
 def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
     """Fit a weighted parabola; False if it is not determined.
 
-    Parameters
-    ----------
-    moments
-        (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of points.
-
-    solved
-        (5,) output: value, slope and second derivative at 0, then the variances of the value and of
-        the second derivative.
+    ``moments``: (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of
+    points. ``solved``: (5,) output: value, slope and second derivative at 0, then the variances of
+    the value and of the second derivative.
     """
     s0, s1, s2, s3, s4 = moments[0], moments[1], moments[2], moments[3], moments[4]
     c00 = s2 * s4 - s3 * s3
@@ -109,27 +104,15 @@ def smooth_chains(
     Windows grow while their estimates agree within the noise (intersection of confidence
     intervals): a bend stops the growth before its bias exceeds the noise.
 
-    Parameters
-    ----------
-    points, normals
-        (N, 2) centres and unit normals, ordered along the chains.
-    sigma_px
-        (N,) standard deviation along the normal.
-    is_used
-        (N,) 0 for points that must not pull their neighbours.
-    chain
-        (N,) chain number of each point; a chain is consecutive.
-    windows_px
-        (K,) half widths along the tangent, increasing.
-    inflation
-        (K,) factor on the variance of each window because neighbours' noise is correlated.
-    confidence
-        Half width of the confidence intervals in sigmas.
-    result
-        (N, 8) output: shift along the normal, slope of the line against the tangent, its second
-        derivative (curvature) and that one's sigma, sigma of the shift, half window (0: not
-        smoothed), prediction of the point's shift by its neighbours alone, and that prediction's
-        sigma (0: there is none).
+    ``points``, ``normals``: (N, 2) centres and unit normals, ordered along the chains.
+    ``sigma_px``: (N,) standard deviation along the normal. ``is_used``: (N,) 0 for points that must
+    not pull their neighbours. ``chain``: (N,) chain number of each point; a chain is consecutive.
+    ``windows_px``: (K,) half widths along the tangent, increasing. ``inflation``: (K,) factor on
+    the variance of each window because neighbours' noise is correlated. ``confidence``: Half width
+    of the confidence intervals in sigmas. ``result``: (N, 8) output: shift along the normal, slope
+    of the line against the tangent, its second derivative (curvature) and that one's sigma, sigma
+    of the shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
+    alone, and that prediction's sigma (0: there is none).
     """
     n = points.shape[0]
     moments = np.zeros(9)

@@ -129,10 +129,7 @@ _MIN_RADIUS_RATIO = 1.1
 def concentric_pairs(blobs: Blobs) -> tuple[IntArray, IntArray]:
     """Rows of the blobs of each pair that nests, the outer one first, of any polarity.
 
-    Parameters
-    ----------
-    blobs
-        N blobs.
+    ``blobs``: N blobs.
     """
     if len(blobs) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -56,18 +56,9 @@ def estimate_noise(
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    points
-        (N, 6) ridge points.
-    sides
-        (N, 2) background on both sides.
-    fits
-        (N, 8) from the profile fit with any sensible weights.
-    fallback
-        (3,) what to return if there are too few residuals.
+    ``image``: (H, W) float32. ``points``: (N, 6) ridge points. ``sides``: (N, 2) background on both
+    sides. ``fits``: (N, 8) from the profile fit with any sensible weights. ``fallback``: (3,) what
+    to return if there are too few residuals.
     """
     good = fits[:, VARIANCE] > 0.0
     if good.sum() < LEAST_PER_BIN:
@@ -141,20 +132,11 @@ LEAST_REACH_SIGMAS = 1.4
 class ProfileFits:
     """Result of fitting the cross-section at each ridge point.
 
-    Parameters
-    ----------
-    ridge
-        The ridge points, only those whose fit succeeded.
-    values
-        (N, 8) columns as named in `armscan.kernels.profile_fit`.
-    sides
-        (N, 2) background on the lower and upper side, averaged along the line.
-    side_sigma
-        (N,) standard deviation of the difference of the two sides.
-    neighbour
-        (N, 2) distance to the nearest other line on the lower and upper side, in px.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
+    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 8) columns as named
+    in `armscan.kernels.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
+    averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
+    sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
+    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``.
     """
 
     ridge: RidgePoints

@@ -51,12 +51,7 @@ def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
     The part is ``c m (u^3 - 3 u)`` beside the Gaussian ``m``; it moves the centre by about 0.6 c
     sigmas.
 
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    width_px
-        (N,) sigma of the line.
+    ``fits``: Fitted profiles. ``width_px``: (N,) sigma of the line.
     """
     both = np.stack([fits.values[:, SKEW], fits.values[:, SKEW_NORM]], axis=1)
     total = sum_along(both, fits.ridge.chain, SKEW_HALF)
@@ -82,14 +77,8 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
 def is_near_other_line(distance: FloatArray, chain: IntArray, width_px: FloatArray) -> BoolArray:
     """(N,) True where another line is within `NEIGHBOUR_SIGMAS`, and where two lines have merged.
 
-    Parameters
-    ----------
-    distance
-        (N, 2) to the nearest other line on both sides.
-    chain
-        (N,) chain numbers.
-    width_px
-        (N,) sigma of the line.
+    ``distance``: (N, 2) to the nearest other line on both sides. ``chain``: (N,) chain numbers.
+    ``width_px``: (N,) sigma of the line.
     """
     near = np.asarray(distance.min(axis=1) < NEIGHBOUR_SIGMAS * width_px)
     if not near.any():
@@ -152,21 +141,13 @@ def is_cut_off(
     """(N,) True where a line's end inside the image truncates the fitted column or row.
 
     Where an edge cuts a slanted line, part of the profile lies beyond the cut: it is narrower than
-    the line farther in or leans, and its centre follows the edge. From each end these
-    signs are followed inwards, at least as far as a cut at right angles to the line takes effect
-    (2.7 sigma times the slant's tangent) and at most as far as one along the rows or columns.
-    Ends at the image's border and closed loops have none.
+    the line farther in or leans, and its centre follows the edge. From each end these signs are
+    followed inwards, at least as far as a cut at right angles to the line takes effect (2.7 sigma
+    times the slant's tangent) and at most as far as one along the rows or columns. Ends at the
+    image's border and closed loops have none.
 
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    points
-        (N, 2) fitted centres, image pixels.
-    width_px
-        (N,) sigma of the line.
-    shape
-        Rows and columns of the image.
+    ``fits``: Fitted profiles. ``points``: (N, 2) fitted centres, image pixels. ``width_px``: (N,)
+    sigma of the line. ``shape``: Rows and columns of the image.
     """
     chain = fits.ridge.chain
     found = np.zeros(len(chain), dtype=np.bool_)

@@ -107,16 +107,10 @@ def check_background(exposure: Exposure, background: Exposure) -> None:
 def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage:
     """Subtract the dark view after matching its brightness.
 
-    Gain and offset come from a trimmed line fit over a sample of unsaturated pixels, so that a
-    lamp that flickers between the two images leaves no ghost, and the laser's own pixels do not
-    count.
+    Gain and offset come from a trimmed line fit over a sample of unsaturated pixels, so that a lamp
+    that flickers between the two images leaves no ghost, and the laser's own pixels do not count.
 
-    Parameters
-    ----------
-    lit, dark
-        (H, W) float32, laser on and off.
-    full_scale
-        Grey level of saturation.
+    ``lit``, ``dark``: (H, W) float32, laser on and off. ``full_scale``: Grey level of saturation.
     """
     x = dark[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
     y = lit[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
@@ -144,20 +138,12 @@ NORMAL_SCALE = 255.0
 class StripePlane:
     """One channel of an exposure, ready for extraction; a mask is (1, 1) if it holds nowhere.
 
-    Parameters
-    ----------
-    image
-        (H, W), full scale 255 before background subtraction.
-    clipped
-        (H, W) 1 where ``image`` says nothing because the camera saturated.
-    saturated
-        (H, W) 1 where the laser's own channel saturated.
-    grey_levels_per_unit
-        Factor from ``image`` to the exposure's own grey levels.
-    gate
-        (H, W) how much the pixel has the laser's colour, or None for grey images.
-    unknown
-        (H, W) 1 where the view without laser saturated already; None without such a view.
+    ``image``: (H, W), full scale 255 before background subtraction. ``clipped``: (H, W) 1 where
+    ``image`` says nothing because the camera saturated. ``saturated``: (H, W) 1 where the laser's
+    own channel saturated. ``grey_levels_per_unit``: Factor from ``image`` to the exposure's own
+    grey levels. ``gate``: (H, W) how much the pixel has the laser's colour, or None for grey
+    images. ``unknown``: (H, W) 1 where the view without laser saturated already; None without such
+    a view.
     """
 
     image: FloatImage
@@ -348,14 +334,8 @@ def has_laser_colour(
     The core of a saturated line is white; its halo keeps the colour. So the strongest excess within
     three sigmas is compared with the excess farther out, averaged along the line.
 
-    Parameters
-    ----------
-    gate
-        (H, W) colour excess.
-    table, chain
-        Ridge points and their chains.
-    line_sigma_px
-        Typical sigma of the lines.
+    ``gate``: (H, W) colour excess. ``table``, ``chain``: Ridge points and their chains.
+    ``line_sigma_px``: Typical sigma of the lines.
     """
     core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
     inside = _across(gate, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1)

@@ -33,17 +33,11 @@ PEAK_QUANTILE = 0.999
 class ImageLevel:
     """What the pixels beside the lines look like.
 
-    Parameters
-    ----------
-    background
-        (rows, columns) float32 background level per cell of `CELL_PX` pixels.
-    noise
-        Standard deviation of a background pixel against its neighbour.
-    clutter
-        The same at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and
-        surface texture show; never less than ``noise``.
-    rise
-        Height above the background at which a line begins.
+    ``background``: (rows, columns) float32 background level per cell of `CELL_PX` pixels.
+    ``noise``: Standard deviation of a background pixel against its neighbour. ``clutter``: The same
+    at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and surface
+    texture show; never less than ``noise``. ``rise``: Height above the background at which a line
+    begins.
     """
 
     background: NDArray[np.float32]
@@ -55,12 +49,8 @@ class ImageLevel:
 def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    threshold
-        Least height of a line above the background, or None to set it from the noise.
+    ``image``: (H, W) float32. ``threshold``: Least height of a line above the background, or None
+    to set it from the noise.
     """
     background = _cell_quantiles(image)
     noise = _noise(image, 1)
@@ -154,14 +144,8 @@ LOPSIDED = 1.8
 def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
     """Median sigma of the brighter lines from their full width at half height, in px.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    runs
-        (N, 3) candidates; a sample of them is measured across the local ridge direction.
-    level
-        Background and threshold.
+    ``image``: (H, W) float32. ``runs``: (N, 3) candidates; a sample of them is measured across the
+    local ridge direction. ``level``: Background and threshold.
     """
     points = _strongest(image, runs)
     if not len(points):
@@ -247,13 +231,9 @@ HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
 class RidgePoints:
     """Points on ridges, ordered along chains.
 
-    Parameters
-    ----------
-    table
-        (N, 6) x, y, normal x, normal y (image pixels), negative second derivative across the line,
-        axis (0: at an integer column, 1: at an integer row).
-    chain
-        (N,) number of the chain; a chain's points are consecutive.
+    ``table``: (N, 6) x, y, normal x, normal y (image pixels), negative second derivative across the
+    line, axis (0: at an integer column, 1: at an integer row). ``chain``: (N,) number of the chain;
+    a chain's points are consecutive.
     """
 
     table: FloatArray
@@ -300,16 +280,8 @@ def trace_ridges(
 ) -> RidgePoints:
     """Ridge points at the candidates, linked into chains.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    runs
-        (N, 3) from `find_candidates`.
-    line_sigma_px
-        Typical sigma of the lines.
-    rise
-        Least height of a line above its background.
+    ``image``: (H, W) float32. ``runs``: (N, 3) from `find_candidates`. ``line_sigma_px``: Typical
+    sigma of the lines. ``rise``: Least height of a line above its background.
     """
     scale = hessian_sigma(line_sigma_px)
     found = np.zeros((max(len(runs), 1), 6))
@@ -321,12 +293,7 @@ def trace_ridges(
 def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     """Order points (N, 6) along chains; points without a neighbour are dropped.
 
-    Parameters
-    ----------
-    points
-        Rows as in `RidgePoints.table`.
-    shape
-        Rows and columns of the image.
+    ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
     """
     n = len(points)
     owner = np.full(shape, -1, np.int32)

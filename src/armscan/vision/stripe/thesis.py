@@ -31,12 +31,8 @@ SHORTEST_RUN_PX = 2
 class StripeCentres:
     """Centre points without order.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) image pixels.
-    normals
-        (N, 2) unit vectors across the line, of either sign.
+    ``points_px``: (N, 2) image pixels. ``normals``: (N, 2) unit vectors across the line, of either
+    sign.
     """
 
     points_px: FloatArray
@@ -52,16 +48,9 @@ class StripeCentres:
 class Runs:
     """Stretches of pixels above the threshold, all down the columns or all along the rows.
 
-    Parameters
-    ----------
-    is_down
-        True if the runs go down the columns.
-    lines
-        (N,) column or row of each run.
-    first, stop
-        (N,) first pixel of each run and the one after its last.
-    heights
-        (lines, pixels) image less background, rows are the columns or rows of the image.
+    ``is_down``: True if the runs go down the columns. ``lines``: (N,) column or row of each run.
+    ``first``, ``stop``: (N,) first pixel of each run and the one after its last. ``heights``:
+    (lines, pixels) image less background, rows are the columns or rows of the image.
     """
 
     is_down: bool
@@ -120,14 +109,8 @@ def hessian_centres(
     The image is convolved with the derivatives of a Gaussian (eq. 2.41; Steger 1998); the
     eigenvector of the eigenvalue of largest curvature is the normal.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold; pixels below it are not looked at.
-    line_sigma_px
-        Typical sigma of the lines, also that of the Gaussian.
+    ``image``: (H, W) float32. ``level``: Background and threshold; pixels below it are not looked
+    at. ``line_sigma_px``: Typical sigma of the lines, also that of the Gaussian.
     """
     scale = hessian_sigma(line_sigma_px)
     gx, gy, gxx, gxy, gyy = derivative_images(image, scale)
@@ -189,14 +172,8 @@ def threshold_centres(
 
     Simple, whole half pixels only, and as good as the line's edges are.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Typical sigma of the lines, for the normals.
+    ``image``: (H, W) float32. ``level``: Background and threshold. ``line_sigma_px``: Typical sigma
+    of the lines, for the normals.
     """
     runs = find_thesis_runs(image, level)
     points = runs.points(np.asarray(0.5 * (runs.first + runs.stop - 1), dtype=np.float64))
@@ -208,14 +185,8 @@ def centroid_centres(
 ) -> StripeCentres:
     """Centre of gravity of the grey levels above the background in each run (eq. 3.1).
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Typical sigma of the lines, for the normals.
+    ``image``: (H, W) float32. ``level``: Background and threshold. ``line_sigma_px``: Typical sigma
+    of the lines, for the normals.
     """
     runs = find_thesis_runs(image, level)
     heights = runs.heights.astype(np.float64)
@@ -246,14 +217,8 @@ def template_centres(
 
     Withstands noise and bridges small breaks, to whole pixels (section 2.3.2.1, third method).
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Sigma across the templates.
+    ``image``: (H, W) float32. ``level``: Background and threshold. ``line_sigma_px``: Sigma across
+    the templates.
     """
     answers = np.stack(
         [cv2.filter2D(image, -1, direction_template(a, line_sigma_px)) for a in ANGLES_DEG]

@@ -68,17 +68,9 @@ _SUSPECT = 0.4
 class Extent:
     """A rectangle of corners, as they lie in the image.
 
-    Parameters
-    ----------
-    cells
-        (N, 2) cells (a, b) of the corners found, from (0, 0); b lies clockwise of a.
-    points_px
-        (N, 2) their image points.
-    size
-        Counts along a and b.
-    sides
-        What is beyond: before the first and after the last a, before the first and after
-        the last b.
+    ``cells``: (N, 2) cells (a, b) of the corners found, from (0, 0); b lies clockwise of a.
+    ``points_px``: (N, 2) their image points. ``size``: Counts along a and b. ``sides``: What is
+    beyond: before the first and after the last a, before the first and after the last b.
     """
 
     cells: IntArray
@@ -102,14 +94,8 @@ class Extent:
 def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
     """Yield the rectangle of a lattice, then those without its sparse outermost rows.
 
-    Parameters
-    ----------
-    grey
-        (H, W) levels of the image in which the crossings were found.
-    crossings
-        All of the image.
-    lattice
-        Those that make a lattice.
+    ``grey``: (H, W) levels of the image in which the crossings were found. ``crossings``: All of
+    the image. ``lattice``: Those that make a lattice.
     """
     cells, index = cell_arrays(lattice)
     while len(cells) and (np.ptp(cells, axis=0) + 1).min() >= SMALLEST:
@@ -198,14 +184,8 @@ def _difference(
 class NumberedCorners:
     """Corners with their places on the board.
 
-    Parameters
-    ----------
-    cells
-        (N, 2) column and row of each.
-    points_px
-        (N, 2) image points.
-    quarter_turns
-        How far the board's x is turned against the lattice's a.
+    ``cells``: (N, 2) column and row of each. ``points_px``: (N, 2) image points. ``quarter_turns``:
+    How far the board's x is turned against the lattice's a.
     """
 
     cells: IntArray
@@ -276,23 +256,12 @@ def off_lattice(
 ) -> tuple[BoolArray, float]:
     """Tell which of N corners are off the lattice that the others make.
 
-    Parameters
-    ----------
-    board
-        (N, 2) places on the board, any unit.
-    points_px
-        (N, 2) image points.
-    least_sigma_px
-        (N,) their standard deviations; the scatter found is not taken to be smaller.
-    tolerance_px
-        What a print's own errors may be; corners that are off by less stay.
+    ``board``: (N, 2) places on the board, any unit. ``points_px``: (N, 2) image points.
+    ``least_sigma_px``: (N,) their standard deviations; the scatter found is not taken to be
+    smaller. ``tolerance_px``: What a print's own errors may be; corners that are off by less stay.
 
-    Returns
-    -------
-    is_off
-        (N,) True for corners to leave out.
-    scatter_px
-        Robust standard deviation, per axis, of the rest; infinite if there is no homography.
+    Returns ``is_off``: (N,) True for corners to leave out. ``scatter_px``: Robust standard
+    deviation, per axis, of the rest; infinite if there is no homography.
     """
     weights = np.ones(len(board))
     size = scatter = np.full(len(board), np.inf)
@@ -372,9 +341,7 @@ class _Corners:
 def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | FitFailure:
     """Find a chessboard and measure its corners.
 
-    Returns
-    -------
-    The view, with the corners that the fit on raw pixels accepted; or why there is none.
+    Returns the view, with the corners that the fit on raw pixels accepted; or why there is none.
     """
     channels = grey_channels(exposure)
     min_contrast = MIN_CONTRAST * exposure.full_scale

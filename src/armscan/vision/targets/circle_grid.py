@@ -81,17 +81,11 @@ def centres_of_circles(
 ) -> tuple[FloatArray, FloatArray]:
     """Images of the centres of coplanar circles, and their covariance.
 
-    Parameters
-    ----------
-    ellipses
-        N conics, free of distortion.
-    points_board_mm
-        (N, 2) or (N, 3) centres on the board.
+    ``ellipses``: N conics, free of distortion. ``points_board_mm``: (N, 2) or (N, 3) centres on the
+    board.
 
-    Returns
-    -------
-    centres_px, covariance_px2
-        (N, 2) and (N, 2, 2); with fewer than four circles those of the ellipses.
+    Returns ``centres_px``, ``covariance_px2``: (N, 2) and (N, 2, 2); with fewer than four circles
+    those of the ellipses.
     """
     centres, covariance = ellipses.centres()
     board = np.asarray(points_board_mm, dtype=np.float64)[:, :2]
@@ -167,9 +161,7 @@ class _Candidate:
 def detect_circle_grid(exposure: Exposure, target: CircleGrid) -> TargetView | FitFailure:
     """Find a circle grid and measure its circles.
 
-    Returns
-    -------
-    The view, centres corrected for eccentricity without intrinsics; or why there is none.
+    Returns the view, centres corrected for eccentricity without intrinsics; or why there is none.
     """
     best_seen = (0, (0, 0))
     for grey in grey_channels(exposure):

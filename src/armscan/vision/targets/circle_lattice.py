@@ -39,14 +39,9 @@ _PARENT = 3
 class Blobs:
     """Ellipse-shaped blobs.
 
-    Parameters
-    ----------
-    centres_px
-        (N, 2) centres, image pixels.
-    shapes_px2
-        (N, 2, 2) matrices S with ``d' S^-1 d = 1`` on the rim, ``d`` from the centre.
-    is_light
-        (N,) True for a light blob on a dark ground.
+    ``centres_px``: (N, 2) centres, image pixels. ``shapes_px2``: (N, 2, 2) matrices S with ``d'
+    S^-1 d = 1`` on the rim, ``d`` from the centre. ``is_light``: (N,) True for a light blob on a
+    dark ground.
     """
 
     centres_px: FloatArray
@@ -74,16 +69,9 @@ def find_blobs(
 
     A blob found at several threshold scales is kept where its contour is roundest.
 
-    Parameters
-    ----------
-    grey8
-        The image.
-    smallest_px, largest_px
-        Range of the diameters.
-    min_contrast
-        Least contrast, as a fraction of full scale.
-    same_log_area
-        Where circles nest, less than `SAME_LOG_AREA`, so that their rims stay apart.
+    ``grey8``: The image. ``smallest_px``, ``largest_px``: Range of the diameters. ``min_contrast``:
+    Least contrast, as a fraction of full scale. ``same_log_area``: Where circles nest, less than
+    `SAME_LOG_AREA`, so that their rims stay apart.
     """
     rows: list[tuple[float, ...]] = []
     margin = max(255.0 * min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
@@ -282,12 +270,8 @@ class _Grower:
 class NumberedGrid:
     """Blobs with the numbers of their circles.
 
-    Parameters
-    ----------
-    point_index
-        (M,) index into the target's points, ascending.
-    blob_index
-        (M,) blob of each.
+    ``point_index``: (M,) index into the target's points, ascending. ``blob_index``: (M,) blob of
+    each.
     """
 
     point_index: IntArray
@@ -307,20 +291,11 @@ def number_grid(
 ) -> NumberedGrid | None:
     """Lay the target over a lattice.
 
-    Parameters
-    ----------
-    lattice
-        Cell to blob.
-    centres_px
-        (N, 2) blob centres.
-    target
-        The grid.
-    min_fraction
-        Least fraction of its circles that must be there; its four border lines must be.
+    ``lattice``: Cell to blob. ``centres_px``: (N, 2) blob centres. ``target``: The grid.
+    ``min_fraction``: Least fraction of its circles that must be there; its four border lines must
+    be.
 
-    Returns
-    -------
-    The numbering whose x points most to the right; None if the lattice is not this grid.
+    Returns the numbering whose x points most to the right; None if the lattice is not this grid.
     """
     wanted = _target_cells(target)
     have = np.array(list(lattice), dtype=np.int64)

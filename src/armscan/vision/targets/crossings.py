@@ -40,15 +40,10 @@ _LEVELS = (1.0, 2.0, 4.0)
 class Crossings:
     """Crossings of two edges.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) places, image pixels, to about half a pixel.
-    rising_rad, falling_rad
-        (N,) directions of the edges, from u towards v: turning further that way, the image gets
-        lighter at the rising one and darker at the falling one. Modulo half a turn.
-    contrast
-        (N,) difference in level between light and dark sectors.
+    ``points_px``: (N, 2) places, image pixels, to about half a pixel. ``rising_rad``,
+    ``falling_rad``: (N,) directions of the edges, from u towards v: turning further that way, the
+    image gets lighter at the rising one and darker at the falling one. Modulo half a turn.
+    ``contrast``: (N,) difference in level between light and dark sectors.
     """
 
     points_px: FloatArray
@@ -215,16 +210,9 @@ def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
 def predict_cells(cells: IntArray, points_px: FloatArray, wanted: IntArray) -> FloatArray:
     """Image points (M, 2) of ``wanted`` cells (M, 2), each from the known cells nearest to it.
 
-    Parameters
-    ----------
-    cells, points_px
-        (N, 2) known cells and their image points.
-    wanted
-        (M, 2) cells.
+    ``cells``, ``points_px``: (N, 2) known cells and their image points. ``wanted``: (M, 2) cells.
 
-    Returns
-    -------
-    (M, 2) image points; NaN where the cells around do not fix a homography.
+    Returns (M, 2) image points; NaN where the cells around do not fix a homography.
     """
     _, near = _nearest(cells, wanted, min(_NEAR_CELLS, len(cells)))
     return _mapped_by_homography(

@@ -146,14 +146,9 @@ QUARTER_TURNS = {
 class Numbering:
     """Another numbering of a target's points.
 
-    Parameters
-    ----------
-    quarter_turns
-        How far the target is turned, 0 to 3.
-    new_index
-        (N,) number that each of the target's points bears now.
-    new_from_found
-        Maps places on the board as it was found numbered to places by the new numbers.
+    ``quarter_turns``: How far the target is turned, 0 to 3. ``new_index``: (N,) number that each of
+    the target's points bears now. ``new_from_found``: Maps places on the board as it was found
+    numbered to places by the new numbers.
     """
 
     quarter_turns: int

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 
+_SMALL_ANGLE_RAD = 1e-6
+
 
 def skew(vector: FloatArray) -> FloatArray:
     """Return the matrix ``[v]x`` with ``[v]x w = v x w``; (3,) -> (3, 3), (N, 3) -> (N, 3, 3)."""
@@ -26,13 +28,35 @@ def skew(vector: FloatArray) -> FloatArray:
 
 
 def rotation_from_vector(rotation_vector_rad: FloatArray) -> FloatArray:
-    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad, one or many."""
-    return np.asarray(Rotation.from_rotvec(np.array(rotation_vector_rad)).as_matrix())
+    """Rodrigues' formula: (3,) rotation vector in rad to a (3, 3) rotation matrix."""
+    v = np.asarray(rotation_vector_rad, dtype=np.float64)
+    angle = float(np.linalg.norm(v))
+    cross = skew(v)
+    if angle < _SMALL_ANGLE_RAD:
+        return np.eye(3) + cross + 0.5 * cross @ cross
+    a = np.sin(angle) / angle
+    b = (1.0 - np.cos(angle)) / angle**2
+    return np.asarray(np.eye(3) + a * cross + b * cross @ cross)
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3) in rad, angle in [0, pi], of rotation matrices (..., 3, 3)."""
-    return np.asarray(Rotation.from_matrix(np.array(rotation)).as_rotvec())
+    """Return the rotation vector in rad, angle in [0, pi], of a (3, 3) rotation matrix."""
+    r = np.asarray(rotation, dtype=np.float64)
+    axis = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    sine = float(np.linalg.norm(axis))
+    cosine = 0.5 * (float(np.trace(r)) - 1.0)
+    angle = float(np.arctan2(sine, cosine))
+    if sine > _SMALL_ANGLE_RAD:
+        return np.asarray(axis * (angle / sine))
+    if cosine > 0.0:
+        return axis
+    # Near half a turn the skew part vanishes; the symmetric part holds the axis.
+    outer = 0.25 * (r + r.T) + 0.5 * np.eye(3)
+    k = int(np.argmax(np.diag(outer)))
+    direction = outer[:, k] / np.sqrt(outer[k, k])
+    if axis @ direction < 0.0:
+        direction = -direction
+    return np.asarray(angle * direction / np.linalg.norm(direction))
 
 
 def nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -347,20 +347,18 @@ def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | Fi
     min_contrast = MIN_CONTRAST * exposure.full_scale
     why: FitFailure | None = None
     seen: list[Extent] = []
-    for number, grey in enumerate(channels):
-        others = channels[:number] + channels[number + 1 :]
+    for k, grey in enumerate(channels):
+        others = channels[:k] + channels[k + 1 :]
         for numbered in _numbered(grey, target, min_contrast, seen):
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
             if refusal is None:
-                return _view(exposure, target, corners)
+                good = corners.is_good
+                number = corners.cells[good, 1] * target.columns + corners.cells[good, 0]
+                found, covariance = corners.points_px[good], corners.covariance_px2[good]
+                return TargetView.of_image(exposure, target, number, found, covariance)
             why = refusal if why is None else why
     return _not_found(exposure, target, seen) if why is None else why
-
-
-def is_symmetric(target: Chessboard) -> bool:
-    """Tell whether the board looks the same after half a turn (columns + rows even)."""
-    return (target.columns + target.rows) % 2 == 0
 
 
 def _numbered(
@@ -504,22 +502,6 @@ def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFa
             "use a flat board",
         )
     return None
-
-
-def _view(exposure: Exposure, target: Chessboard, corners: _Corners) -> TargetView:
-    good = corners.is_good
-    binning = exposure.window.binning
-    number = corners.cells[good, 1] * target.columns + corners.cells[good, 0]
-    return TargetView(
-        source=exposure.source,
-        width_px=exposure.window.x_px + exposure.width_px * binning,
-        height_px=exposure.window.y_px + exposure.height_px * binning,
-        point_index=number,
-        points_px=exposure.window.to_full_sensor(corners.points_px[good]),
-        covariance_px2=corners.covariance_px2[good] * binning**2,
-        points_board_mm=target.points_board_mm[number],
-        is_ambiguous=is_symmetric(target),
-    )
 
 
 def _not_found(exposure: Exposure, target: Chessboard, extents_seen: list[Extent]) -> FitFailure:

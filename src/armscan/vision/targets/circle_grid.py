@@ -25,7 +25,6 @@ from armscan.vision.targets.circle_lattice import (
     NumberedGrid,
     find_blobs,
     grow_lattices,
-    is_symmetric,
     lattice_size,
     number_grid,
 )
@@ -203,28 +202,15 @@ def _view(
 ) -> TargetView:
     good = np.flatnonzero(circles.is_good)
     used = np.isfinite(circles.sigma_px[good])
-    binning = exposure.window.binning
     centres, covariance = circles.ellipses.centres()
     number = grid.point_index[good]
-    return TargetView(
-        source=exposure.source,
-        width_px=exposure.window.x_px + exposure.width_px * binning,
-        height_px=exposure.window.y_px + exposure.height_px * binning,
-        point_index=number,
-        points_px=exposure.window.to_full_sensor(centres[good]),
-        covariance_px2=covariance[good] * binning**2,
-        points_board_mm=target.points_board_mm[number],
-        edges=CircleEdges(
-            points_px=exposure.window.to_full_sensor(_flat(circles.points_px[good], used)),
-            circle=np.repeat(np.arange(len(good)), used.sum(axis=1)),
-            sigma_px=circles.sigma_px[good][used] * binning,
-        ),
-        is_ambiguous=is_symmetric(target),
+    view = TargetView.of_image(exposure, target, number, centres[good], covariance[good])
+    edges = CircleEdges(
+        points_px=exposure.window.to_full_sensor(circles.points_px[good][used]),
+        circle=np.repeat(np.arange(len(good)), used.sum(axis=1)),
+        sigma_px=circles.sigma_px[good][used] * exposure.window.binning,
     )
-
-
-def _flat(points: FloatArray, used: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray:
-    return np.asarray(points[used])
+    return replace(view, edges=edges)
 
 
 def _failure(

@@ -278,14 +278,6 @@ class NumberedGrid:
     blob_index: IntArray
 
 
-def is_symmetric(target: CircleGrid) -> bool:
-    """Tell whether the grid looks the same after half a turn.
-
-    A symmetric grid always does; an asymmetric one does if its count of rows is even.
-    """
-    return not target.is_asymmetric or target.rows % 2 == 0
-
-
 def number_grid(
     lattice: Lattice, centres_px: FloatArray, target: CircleGrid, min_fraction: float
 ) -> NumberedGrid | None:

@@ -39,7 +39,7 @@ from armscan.vision.targets.crossings import (
 )
 from armscan.vision.targets.grey import MIN_CONTRAST, Grey32, RawGrey, grey_channels, sample
 from armscan.vision.targets.saddle import fit_saddles
-from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
+from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView, rightness
 
 Side = Literal["ends", "may end", "continues", "unknown"]
 """What is seen beyond the outermost corners; "may end" where too few of them tell."""
@@ -214,7 +214,7 @@ def numberings(extent: Extent, columns: int, rows: int) -> list[NumberedCorners]
         cells = np.stack([size[1] - 1 - cells[:, 1], cells[:, 0]], axis=-1)
         size = size[::-1]
         sides = (sides[3], sides[2], sides[0], sides[1])
-    return sorted(found, key=lambda numbered: -_rightness(numbered))
+    return sorted(found, key=lambda n: -rightness(n.cells.astype(np.float64), n.points_px))
 
 
 def is_sure(choices: list[NumberedCorners], *, is_square: bool) -> bool:
@@ -234,12 +234,6 @@ def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | N
     if after == "ends" and before == "unknown":
         return wanted - count
     return None
-
-
-def _rightness(numbered: NumberedCorners) -> float:
-    design = np.column_stack([numbered.cells, np.ones(len(numbered.cells))])
-    affine = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
-    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
 
 
 _OUTLIER_SIGMAS = 6.0

@@ -148,6 +148,13 @@ def parse_target(text: str) -> Target:
     return CircleGrid(columns, rows, _length_mm(text, kind, "pitch", fields[1]), is_asymmetric)
 
 
+def rightness(board: FloatArray, points_px: FloatArray) -> float:
+    """Cosine of the angle between the board's x, places (N, 2), and the image's, points (N, 2)."""
+    design = np.column_stack([board, np.ones(len(board))])
+    affine = np.linalg.lstsq(design, points_px, rcond=None)[0]
+    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
+
+
 def format_target(target: Target) -> str:
     """The specification that `parse_target` reads as this target."""
     counts = f"{target.columns}x{target.rows}"

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -25,6 +24,7 @@ from armscan.kernels.profile_fit import (
 from armscan.vision.stripe.image import StripePlane
 from armscan.vision.stripe.ridge import (
     SHORTEST_PX,
+    FloatImage,
     RidgePoints,
     chain_bounds,
     chain_lengths_px,
@@ -45,7 +45,7 @@ def start_noise(background_noise: float) -> FloatArray:
 
 
 def estimate_noise(
-    image: NDArray[np.float32],
+    image: FloatImage,
     points: FloatArray,
     sides: FloatArray,
     fits: FloatArray,
@@ -87,7 +87,7 @@ def estimate_noise(
 
 
 def _residuals(
-    image: NDArray[np.float32], points: FloatArray, sides: FloatArray, fits: FloatArray
+    image: FloatImage, points: FloatArray, sides: FloatArray, fits: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Model level, model plus background, and residual of every pixel of the fitted profiles."""
     height, width = image.shape

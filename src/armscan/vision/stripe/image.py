@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.ridge import mean_along, strong_median
+from armscan.vision.stripe.ridge import FloatImage, mean_along, strong_median
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
 LaserColour = Literal[
@@ -32,7 +32,6 @@ LaserColour = Literal[
     "blue-red",
     "blue-green",
 ]
-FloatImage: TypeAlias = NDArray[np.float32]
 MaskImage: TypeAlias = NDArray[np.uint8]
 
 SIGMA_RANGE_PX = (0.6, 10.0)

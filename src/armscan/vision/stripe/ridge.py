@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, walk_chains
 from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates
+
+FloatImage: TypeAlias = NDArray[np.float32]
 
 CELL_PX = 64
 SQRT2 = math.sqrt(2.0)
@@ -40,13 +43,13 @@ class ImageLevel:
     begins.
     """
 
-    background: NDArray[np.float32]
+    background: FloatImage
     noise: float
     clutter: float
     rise: float
 
 
-def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageLevel:
+def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
     ``image``: (H, W) float32. ``threshold``: Least height of a line above the background, or None
@@ -62,7 +65,7 @@ def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageL
     return ImageLevel(background, noise, clutter, threshold)
 
 
-def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _cell_quantiles(image: FloatImage) -> FloatImage:
     height, width = image.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     steps = CELL_PX // SAMPLE_STEP_PX
@@ -74,7 +77,7 @@ def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(ordered[:, :, int(BACKGROUND_QUANTILE * steps * steps)])
 
 
-def _noise(image: NDArray[np.float32], lag: int) -> float:
+def _noise(image: FloatImage, lag: int) -> float:
     rows = image[:: 2 * SAMPLE_STEP_PX]
     if rows.shape[1] <= lag:
         return LEAST_NOISE
@@ -141,7 +144,7 @@ ALONG_PX = (-2.0, 0.0, 2.0)
 LOPSIDED = 1.8
 
 
-def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
+def find_line_sigma(image: FloatImage, runs: FloatArray, level: ImageLevel) -> float:
     """Median sigma of the brighter lines from their full width at half height, in px.
 
     ``image``: (H, W) float32. ``runs``: (N, 3) candidates; a sample of them is measured across the
@@ -163,7 +166,7 @@ def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLe
     return float(np.clip(sigma, *SIGMA_LIMITS_PX))
 
 
-def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
+def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
 
     A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
@@ -180,7 +183,7 @@ def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
     return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
 
 
-def _across(image: NDArray[np.float32], points: FloatArray) -> FloatArray:
+def _across(image: FloatImage, points: FloatArray) -> FloatArray:
     """Profiles (N, K) across the ridges, averaged over a few places along them."""
     t = np.arange(-REACH_PX, REACH_PX + STEP_PX, STEP_PX)
     total = np.zeros((len(points), len(t)))
@@ -253,7 +256,7 @@ class RidgePoints:
         return RidgePoints(table, np.concatenate([[0], np.cumsum(is_new)]).astype(np.int64))
 
 
-def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray:
+def find_candidates(image: FloatImage, level: ImageLevel) -> FloatArray:
     """Centroids (N, 3) of the runs above the background: x, y, axis."""
     height, width = image.shape
     capacity = max(1000, height * width // 32)
@@ -276,7 +279,7 @@ def hessian_sigma(line_sigma_px: float) -> float:
 
 
 def trace_ridges(
-    image: NDArray[np.float32], runs: FloatArray, line_sigma_px: float, rise: float
+    image: FloatImage, runs: FloatArray, line_sigma_px: float, rise: float
 ) -> RidgePoints:
     """Ridge points at the candidates, linked into chains.
 

@@ -20,7 +20,7 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
 from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
 from armscan.vision.stripe.image import StripeOptions
-from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
 
 GRID = CircleGrid(5, 4, 10.0)
 BOARD = Chessboard(5, 4, 10.0)
@@ -123,22 +123,21 @@ def other_pixel(exposure: Exposure) -> Exposure:
 )
 def test_another_image_is_another_entry(change: Any) -> None:
     same = replace(circles(), t_ns=7, view="v", trigger_id=1)
-    key = detection_key("target", circles(), (GRID, TargetOptions()))
-    assert detection_key("target", same, (GRID, TargetOptions())) == key
-    assert detection_key("target", change(circles()), (GRID, TargetOptions())) != key
+    key = detection_key("target", circles(), (GRID,))
+    assert detection_key("target", same, (GRID,)) == key
+    assert detection_key("target", change(circles()), (GRID,)) != key
 
 
 def test_other_options_and_other_code_are_other_entries(monkeypatch: pytest.MonkeyPatch) -> None:
     exposure = circles()
     keys = {
-        detection_key("target", exposure, (GRID, TargetOptions())),
-        detection_key("stripes", exposure, (GRID, TargetOptions())),
-        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5), TargetOptions())),
-        detection_key("target", exposure, (GRID, TargetOptions(min_contrast=0.03))),
-        detection_key("target", exposure, (GRID, TargetOptions()), exposure),
+        detection_key("target", exposure, (GRID,)),
+        detection_key("stripes", exposure, (GRID,)),
+        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5),)),
+        detection_key("target", exposure, (GRID,), exposure),
     }
     monkeypatch.setattr(detection_cache, "code_version", lambda: "newer")
-    keys.add(detection_key("target", exposure, (GRID, TargetOptions())))
+    keys.add(detection_key("target", exposure, (GRID,)))
     assert len(keys) == 6
 
 

@@ -16,10 +16,8 @@ within its covariance, beside the sensor that is not; ``both`` the same beside t
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -43,12 +41,9 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
 from armscan.models.camera import CameraModel
-from calibrated_head import CalibratedHead
-from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR
-from sheet_rig import PROVENANCE
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.calibrated_head import CalibratedHead
+from rigs.plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR
+from rigs.sheet_rig import PROVENANCE
 
 OPTIONS = HandEyeOptions()
 N_CAMERA = 9
@@ -96,7 +91,9 @@ def figures(
     error, covariance = head.scan(sensor, hand_eye)
     stated = np.einsum("i,nij,j->n", PLATE_NORMAL, covariance, PLATE_NORMAL)
     points = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
-    spread = ScannerCalibration(sensor, hand_eye, PROVENANCE).covariance[-6:, -6:]
+    spread = ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE).covariance[
+        -6:, -6:
+    ]
     off = hand_eye_difference(hand_eye.tool_from_sensor, TOOL_FROM_SENSOR)
     return [
         float(((error @ PLATE_NORMAL) ** 2).mean()),

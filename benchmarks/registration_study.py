@@ -20,7 +20,6 @@ of one processor. A run fails if a view is not joined, or is wrong by more than 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,10 +37,7 @@ from armscan.markers.join_views import JoinedViews, join_views
 from armscan.pipeline.register import register_place
 from armscan.storage.points import MarkerList
 from armscan.thesis.marker_rules import match_after_thesis
-from marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
 
 AnyPose = Pose[Frame, Frame]
 
@@ -239,7 +235,12 @@ def place_of(old: FloatArray, new: FloatArray, sigma: float) -> Estimate[AnyPose
     i, k = place.pairs[:, 0], place.pairs[:, 1]
     a, b = lists[0].markers, lists[1].markers
     fit: Estimate[AnyPose] | FitFailure = register_points(
-        PointPairs(a.points_mm[i], b.points_mm[k], a.covariance_mm2[i], b.covariance_mm2[k])
+        PointPairs(
+            points_a_mm=a.points_mm[i],
+            points_b_mm=b.points_mm[k],
+            covariance_a_mm2=a.covariance_mm2[i],
+            covariance_b_mm2=b.covariance_mm2[k],
+        )
     )
     return None if isinstance(fit, FitFailure) else fit
 

@@ -25,7 +25,7 @@ from armscan.geometry.shapes import Plane
 from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
-from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
+from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))
@@ -65,13 +65,12 @@ def author() -> FloatArray:
 
 def shifted_pairs(stripes: tuple[PosedStripe, ...]) -> list[tuple[FloatArray, FloatArray]]:
     """Pairs of postures of nearly equal rotation: how the sphere moved in Tool and in Sensor."""
-    options = HandEyeOptions()
     sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
     pairs = []
     for first, last in combinations(sections, 2):
         before, after = first.stripe.base_from_tool, last.stripe.base_from_tool
         turn = vector_from_rotation(nearest_rotation(before.rotation.T @ after.rotation))
-        if np.degrees(np.linalg.norm(turn)) < options.same_rotation_deg:
+        if np.degrees(np.linalg.norm(turn)) < SAME_ROTATION_DEG:
             shift = before.rotation.T @ (before.translation_mm - after.translation_mm)
             pairs.append((shift, last.centre_mm - first.centre_mm))
     return pairs

@@ -47,10 +47,9 @@ from armscan.report.page import Page, Text, render_page
 from armscan.report.quantity import Summary, Table, sentence
 from armscan.report.stripes import MAX_PICTURES, evenly_chosen
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.atomic import write_files
-from armscan.storage.documents import read_sensor_calibration, scanner_document
+from armscan.storage.documents import new_provenance, read_sensor_calibration, scanner_document
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths
-from armscan.storage.json_text import new_provenance
 from armscan.storage.points import parse_plane, read_points_or_plane, read_profiles
 from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
@@ -373,7 +372,9 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
     progress(ProgressEvent("solve", len(inputs.groups) + 1, len(inputs.groups) + 1))
     fit = replace(fit, warnings=(*_input_warnings(inputs), *fit.warnings))
     scanner = ScannerCalibration(
-        inputs.sensor, fit.calibration, _provenance(request, inputs, fit.warnings)
+        sensor=inputs.sensor,
+        hand_eye=fit.calibration,
+        provenance=_provenance(request, inputs, fit.warnings),
     )
     images = tuple(image for _, seen in inputs.groups for image in seen.images)
     page = hand_eye_page(

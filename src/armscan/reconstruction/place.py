@@ -166,16 +166,16 @@ def propagate_to_base(
         covariance[own] = _propagated(by_all[own], factor)
     covariance += _pose_and_noise(placed, stripe.noise_mm, base_from_tool, placing)
     return PointCloud(
-        "Base",
-        placed.points_base_mm,
-        0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        noise_size_mm(stripe.noise_mm),
-        stripe.sheet,
-        tuple(sheet.name for sheet in scanner.sensor.sheets),
-        np.zeros(len(stripe.row), dtype=np.int64),
-        (profile.source,),
-        profile.segment[stripe.row],
-        profile.intensity[stripe.row],
+        frame="Base",
+        points_mm=placed.points_base_mm,
+        covariance_mm2=0.5 * (covariance + covariance.transpose(0, 2, 1)),
+        sigma_noise_mm=noise_size_mm(stripe.noise_mm),
+        sheet=stripe.sheet,
+        sheet_names=tuple(sheet.name for sheet in scanner.sensor.sheets),
+        exposure=np.zeros(len(stripe.row), dtype=np.int64),
+        exposure_sources=(profile.source,),
+        segment=profile.segment[stripe.row],
+        intensity=profile.intensity[stripe.row],
     )
 
 
@@ -283,17 +283,19 @@ def merge_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
         raise InputError("clouds with and without normals do not merge")
     starts = np.cumsum([0, *(len(cloud.exposure_sources) for cloud in clouds)])
     return PointCloud(
-        first.frame,
-        np.concatenate([cloud.points_mm for cloud in clouds]),
-        np.concatenate([cloud.covariance_mm2 for cloud in clouds]),
-        np.concatenate([cloud.sigma_noise_mm for cloud in clouds]),
-        np.concatenate([cloud.sheet for cloud in clouds]),
-        first.sheet_names,
-        np.concatenate([c.exposure + start for c, start in zip(clouds, starts[:-1], strict=True)]),
-        tuple(source for cloud in clouds for source in cloud.exposure_sources),
-        np.concatenate([cloud.segment for cloud in clouds]),
-        np.concatenate([cloud.intensity for cloud in clouds]),
-        np.concatenate(normals) if normals else None,
+        frame=first.frame,
+        points_mm=np.concatenate([cloud.points_mm for cloud in clouds]),
+        covariance_mm2=np.concatenate([cloud.covariance_mm2 for cloud in clouds]),
+        sigma_noise_mm=np.concatenate([cloud.sigma_noise_mm for cloud in clouds]),
+        sheet=np.concatenate([cloud.sheet for cloud in clouds]),
+        sheet_names=first.sheet_names,
+        exposure=np.concatenate(
+            [c.exposure + start for c, start in zip(clouds, starts[:-1], strict=True)]
+        ),
+        exposure_sources=tuple(source for cloud in clouds for source in cloud.exposure_sources),
+        segment=np.concatenate([cloud.segment for cloud in clouds]),
+        intensity=np.concatenate([cloud.intensity for cloud in clouds]),
+        normals=np.concatenate(normals) if normals else None,
     )
 
 

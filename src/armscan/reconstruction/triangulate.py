@@ -100,16 +100,16 @@ def cloud_in_sensor(
         joint = sensor_covariance(sensor, k)
         covariance[own] += stripe.by_sensor[own] @ joint @ stripe.by_sensor[own].transpose(0, 2, 1)
     return PointCloud(
-        "Sensor",
-        stripe.points_mm,
-        0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        noise_size_mm(stripe.noise_mm),
-        stripe.sheet,
-        tuple(sheet.name for sheet in sensor.sheets),
-        np.zeros(len(stripe.row), dtype=np.int64),
-        (profile.source,),
-        profile.segment[stripe.row],
-        profile.intensity[stripe.row],
+        frame="Sensor",
+        points_mm=stripe.points_mm,
+        covariance_mm2=0.5 * (covariance + covariance.transpose(0, 2, 1)),
+        sigma_noise_mm=noise_size_mm(stripe.noise_mm),
+        sheet=stripe.sheet,
+        sheet_names=tuple(sheet.name for sheet in sensor.sheets),
+        exposure=np.zeros(len(stripe.row), dtype=np.int64),
+        exposure_sources=(profile.source,),
+        segment=profile.segment[stripe.row],
+        intensity=profile.intensity[stripe.row],
     )
 
 

@@ -23,8 +23,7 @@ from armscan.geometry.poses import Pose, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.models.arm import AXIS_PARAMETERS, ArmModel, forward
 from armscan.records.recording import NO_TRIGGER, ArmTrack, PoseForm, Session
-from armscan.storage.atomic import new_folder
-from armscan.storage.images import read_bytes
+from armscan.storage.files import new_folder, read_bytes
 from armscan.storage.poses import (
     FORM_COLUMNS,
     METRES_REMEDY,
@@ -224,7 +223,14 @@ def read_arm_table(
         used += (*POSITION, *FORM_COLUMNS[chosen])
         is_known, rotations, positions = _from_poses(table, chosen, rotation)
     _refuse_metres(rotations[is_known], positions[is_known], table.where)
-    track = ArmTrack(times, rotations, positions, is_known, _triggers(table), joints)
+    track = ArmTrack(
+        t_ns=times,
+        rotations=rotations,
+        translations_mm=positions,
+        is_known=is_known,
+        trigger_ids=_triggers(table),
+        joints_rad=joints,
+    )
     extra = {name: cells for name, cells in table.columns.items() if name not in used}
     others = [other for other in complete if other != chosen]
     if form is None:

@@ -27,8 +27,8 @@ from armscan.calibration.hand_eye.search import (
 from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose, Sensor, Tool
-from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
-from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
+from rigs.plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
+from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 FORM_MM = 0.04
 QUICK = HandEyeOptions(per_stripe=10)

@@ -12,7 +12,7 @@ from armscan.calibration.sheets.calibrate import calibrate_sheets, observe_board
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
-from sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
+from rigs.sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
 
 Stripe = tuple[FloatArray, FloatArray]
 

@@ -16,8 +16,8 @@ from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstant
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import ExposureRow
 from armscan.storage.images import ImageOptions
-from armscan.storage.recording_writer import write_recording
-from two_camera_scan import (
+from armscan.storage.recording import write_recording
+from rigs.two_camera_scan import (
     PERIOD_NS,
     SeenAs,
     TwoCameraScan,
@@ -31,7 +31,10 @@ LOST = ((1, 1),)
 
 
 def rows_at(times: list[tuple[int, int]]) -> list[ExposureRow]:
-    return [ExposureRow(k, t_ns, camera, f"{k}.png") for k, (t_ns, camera) in enumerate(times)]
+    return [
+        ExposureRow(index=k, t_ns=t_ns, camera=camera, source=f"{k}.png")
+        for k, (t_ns, camera) in enumerate(times)
+    ]
 
 
 def grouped(times: list[tuple[int, int]]) -> list[tuple[int, ...]]:

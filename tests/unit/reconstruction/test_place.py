@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import placing_rig as rig
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
@@ -24,7 +23,8 @@ from armscan.reconstruction.place import (
     scan_point_mm,
 )
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
-from sheet_rig import thesis_rig
+from rigs import placing_rig as rig
+from rigs.sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
 SHEET_OF = np.array([0, 1, 1])
@@ -97,7 +97,9 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
         placing,
         scanner=replace(
             placing.scanner,
-            hand_eye=replace(placing.scanner.hand_eye, arm_noise=ArmNoise(0.0, 0.0)),
+            hand_eye=replace(
+                placing.scanner.hand_eye, arm_noise=ArmNoise(position_mm=0.0, rotation_rad=0.0)
+            ),
         ),
     )
     cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, quiet)
@@ -161,7 +163,9 @@ def test_covariance_is_that_of_repeats() -> None:
 
 def test_the_arm_errs_least_at_the_scan_point() -> None:
     """By hand: 100 mm along x, rotation s adds (100 s)^2 across and nothing along."""
-    noise = ArmNoise(0.01, 1e-4, 0.02, 2e-4)
+    noise = ArmNoise(
+        position_mm=0.01, rotation_rad=1e-4, exposure_position_mm=0.02, exposure_rotation_rad=2e-4
+    )
     at, beside = arm_covariance(np.array([[0.0, 0, 0], [100.0, 0, 0]]), np.zeros(3), noise)
     np.testing.assert_allclose(at, np.eye(3) * 5e-4)
     turned = 100.0**2 * 5e-8

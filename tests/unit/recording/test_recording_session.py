@@ -15,14 +15,21 @@ from armscan.records.recording import CameraSetup, Session
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import read_session_file, session_toml
-from recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
+from rigs.recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
 
 
 def test_a_session_comes_back(tmp_path: Path) -> None:
     session = Session(
         kind="calibration",
         cameras=(
-            CameraSetup(2658, 800, SensorWindow(203, 617, 2), 12, "high", "rgb"),
+            CameraSetup(
+                width_px=2658,
+                height_px=800,
+                window=SensorWindow(203, 617, 2),
+                bits_used=12,
+                align="high",
+                colour="rgb",
+            ),
             CameraSetup(colour="bayer_rggb"),
         ),
         clock="separate",

@@ -192,12 +192,12 @@ def estimate_board_poses(
             return FitFailure("the points do not determine a pose", "show more of the board")
         found.append(
             Estimate(
-                candidate.sensor_from_board,
-                POSE_PARAMETER_NAMES,
-                _pose_covariance(equations, factor, camera_covariance),
-                residuals_px(observations, state),
-                degrees,
-                candidate.chi2,
+                value=candidate.sensor_from_board,
+                parameter_names=POSE_PARAMETER_NAMES,
+                covariance=_pose_covariance(equations, factor, camera_covariance),
+                residuals=residuals_px(observations, state),
+                degrees_of_freedom=degrees,
+                chi2=candidate.chi2,
             )
         )
     return tuple(found)
@@ -237,7 +237,7 @@ def _refined(
     result = adjust(observations, State.from_poses(shared, [start]), _POSE_ONLY)
     if isinstance(result, FitFailure):
         return result
-    return PoseCandidate(result.state.pose(0), result.equations.chi2)
+    return PoseCandidate(result.state.pose(0), result.system.chi2)
 
 
 def _is_same(a: PoseCandidate, b: PoseCandidate) -> bool:

@@ -27,7 +27,6 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -42,10 +41,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import CameraCalibration
 from armscan.models.two_views import StereoCalibration
-from fan_rig import FanRig, LaserTruth, fan_rig
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.fan_rig import FanRig, LaserTruth, fan_rig
 
 Calibration = CameraCalibration | StereoCalibration
 GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)

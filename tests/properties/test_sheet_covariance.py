@@ -10,7 +10,7 @@ from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.models.light_sheet import LightSheet
-from sheet_rig import SheetRig, thesis_rig
+from rigs.sheet_rig import SheetRig, thesis_rig
 
 N_RUNS = 200
 INSIDE_95 = range(182, 198)

@@ -20,7 +20,7 @@ from armscan.calibration.sheets.solve import (
 )
 from armscan.calibration.sheets.voting import observe_boards
 from armscan.models.light_sheet import LightSheet
-from sheet_rig import SheetRig, placed, thesis_rig
+from rigs.sheet_rig import SheetRig, placed, thesis_rig
 
 SEEDS = range(8)
 N_BOARDS = 14

@@ -12,7 +12,7 @@ from armscan.errors import OptionError
 from armscan.geometry.poses import Pose
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import StripeFlag
-from sheet_rig import (
+from rigs.sheet_rig import (
     THESIS_PLANE,
     SheetRig,
     exact,

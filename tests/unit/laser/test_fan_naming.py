@@ -15,7 +15,7 @@ from armscan.calibration.sheets.result import BoardStripes, SheetOptions
 from armscan.calibration.sheets.stripes_on_board import BoardImage, observe_board_stripes
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
-from fan_rig import MIDDLE_MM, FanRig, fan_rig
+from rigs.fan_rig import MIDDLE_MM, FanRig, fan_rig
 
 Named = FanAssignment | FitFailure
 

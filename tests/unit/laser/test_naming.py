@@ -8,7 +8,7 @@ import numpy as np
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray
-from sheet_rig import SheetRig, SheetTruth, placed, thesis_rig
+from rigs.sheet_rig import SheetRig, SheetTruth, placed, thesis_rig
 
 CROSS_A = np.array([-0.659905, -0.551732, 0.51, -68.7215])
 CROSS_B = np.array([0.76417, -0.543156, 0.34787, -49.616])

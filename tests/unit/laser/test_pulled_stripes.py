@@ -9,7 +9,7 @@ from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse
 from armscan.calibration.sheets.stripes_on_board import PULL_WIDTHS
 from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
-from sheet_rig import SheetRig, thesis_rig
+from rigs.sheet_rig import SheetRig, thesis_rig
 
 PULL_PX = 0.25
 

@@ -9,7 +9,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
-from sheet_rig import exact, placed, project, thesis_rig
+from rigs.sheet_rig import exact, placed, project, thesis_rig
 
 RIG = exact(thesis_rig())
 POSE = RIG.poses[3]

@@ -13,7 +13,7 @@ from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, 
 from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
-from sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
+from rigs.sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
 
 Stripe = tuple[FloatArray, FloatArray]
 

@@ -19,7 +19,7 @@ from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard
-from sheet_rig import PROVENANCE
+from rigs.sheet_rig import PROVENANCE
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = CameraModel(

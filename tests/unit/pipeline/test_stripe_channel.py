@@ -15,7 +15,7 @@ from armscan.pipeline.laser import choose_channel
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import LaserColour, StripeOptions
-from sheet_rig import SheetRig, thesis_rig
+from rigs.sheet_rig import SheetRig, thesis_rig
 
 WIDTH_PX = 2.0
 

@@ -26,8 +26,8 @@ from armscan.report.page import render_page
 from armscan.report.quantity import with_sigma
 from armscan.report.sheets import USE_COLOURS, lack_of_fit_text, laser_page
 from armscan.report.stripes import FLAG_COLOURS
-from camera_scene import Scene, make_views
-from sheet_rig import PROVENANCE, thesis_rig
+from rigs.camera_scene import Scene, make_views
+from rigs.sheet_rig import PROVENANCE, thesis_rig
 
 
 @cache

@@ -20,7 +20,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import TwoViews
 from armscan.simulation.optics.lasers import LineLaser
-from sheet_rig import PROVENANCE
+from rigs.sheet_rig import PROVENANCE
 
 LEFT = CameraModel(
     fx_px=5174.97,

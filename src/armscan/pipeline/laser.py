@@ -187,7 +187,9 @@ def calibrate_sheets_again(
     cameras = HeadCameras.of(sensor)
     boards = []
     for view, profile, context in zip(found.views, found.profiles, found.contexts, strict=True):
-        rims = CircleEdges(np.zeros((0, 2)), np.zeros(0, dtype=np.int64), np.zeros(0))
+        rims = CircleEdges(
+            points_px=np.zeros((0, 2)), circle=np.zeros(0, dtype=np.int64), sigma_px=np.zeros(0)
+        )
         board = replace(view, edges=rims if context.has_rims else None)
         pose = estimate_board_pose(board, cameras.model(context.camera))
         if isinstance(pose, FitFailure):

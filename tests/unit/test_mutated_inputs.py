@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A seeded part of ``benchmarks/mutated_inputs.py``: no reader raises anything but its own errors."""
+"""A seeded part of ``benchmarks/mutated_inputs.py``: readers raise nothing but their own errors."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -21,12 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.sheets.result import LaserFit, PlacedBoard, PointUse
 from armscan.errors import FileFormatError, InputError
+from armscan.geometry.arrays import BoolArray, IntArray
 from armscan.geometry.poses import Pose
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.files import path_text, read_bytes
 from armscan.vision.targets.target import TargetView
 
+LASERS_APART = "\n"
 R = TypeVar("R")
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -45,6 +48,34 @@ DAMAGE = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StripeContext:
+    """What belongs to a stripe image on a board besides its points.
+
+    Parameters
+    ----------
+    lasers
+        Names of the sources that were on.
+    camera
+        0, or 1 for the right camera of a stereo head.
+    placement
+        Images of equal placement saw the board in one place.
+    on_edge
+        (N,) points along an edge of the target's marks; None if the edges are not known.
+    has_rims
+        True for a target of circles whose rims were seen.
+    placed
+        The board's pose in Sensor.
+    """
+
+    lasers: tuple[str, ...]
+    camera: int
+    placement: str
+    on_edge: BoolArray | None
+    has_rims: bool
+    placed: PlacedBoard
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """What images showed.
 
@@ -56,6 +87,8 @@ class Observations:
         Stripe points, one profile a view where there are any.
     sha256
         Hash of the image of each source name.
+    contexts
+        One entry a profile; empty in files of versions before they were kept.
     stripes
         Points of a hand-eye's exposures in the Sensor frame, with the arm's poses and without
         derivatives.
@@ -63,27 +96,75 @@ class Observations:
 
     views: tuple[TargetView, ...] = ()
     profiles: tuple[Profile, ...] = ()
-    sha256: Mapping[str, str] | None = None
+    sha256: Mapping[str, str] = field(default_factory=dict)
+    contexts: tuple[StripeContext, ...] = ()
     stripes: tuple[PosedStripe, ...] = ()
 
 
 def pack_observations(
-    views: Sequence[TargetView] = (),
-    profiles: Sequence[Profile] = (),
-    sha256: Mapping[str, str] | None = None,
-    *,
-    stripes: Sequence[PosedStripe] = (),
+    views: Sequence[TargetView], profiles: Sequence[Profile], sha256: Mapping[str, str]
 ) -> bytes:
-    """Content of the ``.npz`` file; see `Observations`."""
-    hashes = {} if sha256 is None else sha256
-    arrays: dict[str, NDArray[Any]] = {
-        "image_source": np.array(list(hashes), dtype=np.str_),
-        "image_sha256": np.array(list(hashes.values()), dtype=np.str_),
+    """Content of the ``.npz`` file of a camera or a pair; see `Observations`."""
+    return _content(_arrays(views, profiles, sha256))
+
+
+def pack_posed_stripes(stripes: Sequence[PosedStripe], sha256: Mapping[str, str]) -> bytes:
+    """Content of the ``.npz`` file of a hand-eye: points of each exposure and the arm's pose."""
+    return _content(_arrays((), (), sha256) | _packed("stripe", stripes))
+
+
+def pack_board_stripes(fit: LaserFit, sha256: Mapping[str, str]) -> bytes:
+    """Content of the ``.npz`` file of light sheets: all that their calibration was given.
+
+    Points that lie along an edge of the target and are not used for that are flagged.
+
+    Raises
+    ------
+    InputError
+        If the pose of a board in Sensor was not given.
+    """
+    boards, profiles, placed, on_edge = fit.boards, [], [], []
+    for board, image in zip(boards, fit.images, strict=True):
+        is_on_edge = image.use == int(PointUse.ON_EDGE)
+        flags = board.profile.flags | np.where(is_on_edge, int(StripeFlag.TARGET_EDGE), 0)
+        profiles.append(replace(board.profile, flags=flags))
+        known = np.zeros(len(board.profile), dtype=np.bool_)
+        on_edge.append(known if board.on_edge is None else board.on_edge)
+        if board.placed is None:
+            raise InputError(f"{board.view.source}: the board's pose in Sensor is not given")
+        placed.append(board.placed)
+    lasers = [LASERS_APART.join(board.lasers) for board in boards]
+    return _content(
+        _arrays([board.view for board in boards], profiles, sha256)
+        | {
+            "board_lasers": np.array(lasers, dtype=np.str_),
+            "board_camera": np.array([board.camera for board in boards]),
+            "board_placement": np.array([board.placement for board in boards], dtype=np.str_),
+            "profile_on_edge": np.concatenate(on_edge),
+            "board_has_edges": np.array([board.on_edge is not None for board in boards]),
+            "board_has_rims": np.array([board.view.edges is not None for board in boards]),
+            "board_rotation": np.stack([one.sensor_from_board.rotation for one in placed]),
+            "board_translation_mm": np.stack(
+                [one.sensor_from_board.translation_mm for one in placed]
+            ),
+            "board_covariance": np.stack([one.covariance for one in placed]),
+            "board_by_cameras": np.stack([one.by_cameras for one in placed]),
+        }
+    )
+
+
+def _arrays(
+    views: Sequence[TargetView], profiles: Sequence[Profile], sha256: Mapping[str, str]
+) -> dict[str, NDArray[Any]]:
+    return {
+        "image_source": np.array(list(sha256), dtype=np.str_),
+        "image_sha256": np.array(list(sha256.values()), dtype=np.str_),
         **_packed("view", views),
         **_packed("profile", profiles),
     }
-    if stripes:
-        arrays |= _packed("stripe", stripes)
+
+
+def _content(arrays: Arrays) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
@@ -109,6 +190,7 @@ def read_observations(path: Path) -> Observations:
             views=_unpacked(TargetView, "view", arrays),
             profiles=_unpacked(Profile, "profile", arrays),
             sha256={str(source): str(digest) for source, digest in hashes},
+            contexts=_contexts(arrays) if "board_camera" in arrays else (),
             stripes=_unpacked(PosedStripe, "stripe", arrays),
         )
     except DAMAGE as error:
@@ -166,10 +248,16 @@ def _equally_wide(values: list[NDArray[Any]]) -> list[NDArray[Any]]:
     return [np.pad(item, [(0, 0), (0, 0), (0, widest - item.shape[-1])]) for item in values]
 
 
-def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
+def _counts(word: str, arrays: Arrays) -> IntArray:
+    """Rows of each record of a kind."""
     counts = arrays.get(f"{word}_n_points", np.zeros(0, dtype=np.int64))
     if counts.ndim != 1 or len(counts) > MOST_RECORDS or (counts < 0).any():
         raise ValueError("counts of points that are none")
+    return counts
+
+
+def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
+    counts = _counts(word, arrays)
     ends = np.cumsum(counts)
     columns: dict[str, Sequence[Any]] = {}
     for name, hint in _kept(kind).items() if len(counts) else ():
@@ -188,4 +276,26 @@ def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
         raise ValueError("records that do not fit each other")
     return tuple(
         kind(**{name: column[k] for name, column in columns.items()}) for k in range(len(counts))
+    )
+
+
+def _contexts(arrays: Mapping[str, NDArray[Any]]) -> tuple[StripeContext, ...]:
+    counts = _counts("profile", arrays)
+    if len(arrays["profile_on_edge"]) != counts.sum():
+        raise ValueError("edges that are not of the points")
+    on_edge = np.split(arrays["profile_on_edge"], np.cumsum(counts)[:-1])
+    return tuple(
+        StripeContext(
+            lasers=tuple(filter(None, str(arrays["board_lasers"][k]).split(LASERS_APART))),
+            camera=int(arrays["board_camera"][k]),
+            placement=str(arrays["board_placement"][k]),
+            on_edge=on_edge[k] if arrays["board_has_edges"][k] else None,
+            has_rims=bool(arrays["board_has_rims"][k]),
+            placed=PlacedBoard(
+                Pose(arrays["board_rotation"][k], arrays["board_translation_mm"][k]),
+                arrays["board_covariance"][k],
+                arrays["board_by_cameras"][k],
+            ),
+        )
+        for k in range(len(on_edge))
     )

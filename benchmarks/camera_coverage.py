@@ -27,9 +27,23 @@ from camera_scene import CAMERA, Scene, make_views, normalised_error
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 
-WIDE = CameraModel(533.0, 534.0, 342.0, 236.0, np.array([-0.29, 0.11, 1e-3, 0.0, 0.0]), 640, 480)
+WIDE = CameraModel(
+    fx_px=533.0,
+    fy_px=534.0,
+    cx_px=342.0,
+    cy_px=236.0,
+    distortion=np.array([-0.29, 0.11, 1e-3, 0.0, 0.0]),
+    width_px=640,
+    height_px=480,
+)
 HEAD = CameraModel(
-    5150.0, 5152.0, 1540.0, 1020.0, np.array([-0.08, 0.15, 2e-4, -3e-4, 0.0]), 3072, 2048
+    fx_px=5150.0,
+    fy_px=5152.0,
+    cx_px=1540.0,
+    cy_px=1020.0,
+    distortion=np.array([-0.08, 0.15, 2e-4, -3e-4, 0.0]),
+    width_px=3072,
+    height_px=2048,
 )
 GEOMETRIES = {
     "12 views, 11x9 grid, 2048x1536, noise 0.05 px": Scene(),

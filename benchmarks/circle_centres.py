@@ -23,10 +23,10 @@ from armscan.records.exposure import Exposure
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.optics.camera import RenderCamera, add_noise
+from armscan.thesis.ellipse import thesis_centres
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
-from armscan.vision.targets.ellipse_algebraic import thesis_centres
 from armscan.vision.targets.target import CircleGrid, TargetView
 
 TARGET = CircleGrid(13, 9, 3.75)
@@ -108,7 +108,15 @@ def accuracy() -> None:
         )
     ]
     k = DISTORTION
-    model = CameraModel(FOCAL_PX, FOCAL_PX, 1535.5, 1023.5, k, WIDTH_PX, HEIGHT_PX)
+    model = CameraModel(
+        fx_px=FOCAL_PX,
+        fy_px=FOCAL_PX,
+        cx_px=1535.5,
+        cy_px=1023.5,
+        distortion=k,
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
+    )
     errors: dict[tuple[str, float], list[FloatArray]] = defaultdict(list)
     for seed, (tilt, azimuth, blur, gradient, is_light) in enumerate(conditions):
         rotation, translation = pose(tilt, azimuth, 17.0 * seed)

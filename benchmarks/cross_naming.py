@@ -43,7 +43,7 @@ from scipy.special import betaincinv
 
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import LabelledProfile, LabelStatus, StripeLabeller
-from armscan.reconstruction.row_rule import RowLabeller
+from armscan.thesis.row_rule import RowLabeller
 from cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))

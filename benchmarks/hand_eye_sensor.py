@@ -94,7 +94,9 @@ def figures(
     error, covariance = head.scan(sensor, hand_eye)
     stated = np.einsum("i,nij,j->n", PLATE_NORMAL, covariance, PLATE_NORMAL)
     points = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error)
-    spread = ScannerCalibration(sensor, hand_eye, PROVENANCE).covariance[-6:, -6:]
+    spread = ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE).covariance[
+        -6:, -6:
+    ]
     off = hand_eye_difference(hand_eye.tool_from_sensor, TOOL_FROM_SENSOR)
     return [
         float(((error @ PLATE_NORMAL) ** 2).mean()),

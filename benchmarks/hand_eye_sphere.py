@@ -22,10 +22,10 @@ from scipy.stats import chi2
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.sphere_sections import SphereOptions
-from armscan.calibration.hand_eye.thesis import TwoStepHandEye, calibrate_in_two_steps
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
+from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
 from sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))

@@ -119,14 +119,14 @@ def _profile(source: str, stripes: tuple[FloatArray, ...], rng: np.random.Genera
     error = NOISE_PX * rng.standard_normal(n)
     error += np.where(rng.random(n) < OUTLIERS, 5.0 * rng.standard_normal(n), 0.0)
     return Profile(
-        source,
-        pixels + error[:, None] * normals,
-        normals,
-        np.full(n, NOISE_PX),
-        np.full(n, 3.0),
-        np.full(n, 150.0),
-        np.zeros(n, dtype=np.int64),
-        number,
+        source=source,
+        points_px=pixels + error[:, None] * normals,
+        normals_px=normals,
+        sigma_px=np.full(n, NOISE_PX),
+        width_px=np.full(n, 3.0),
+        intensity=np.full(n, 150.0),
+        flags=np.zeros(n, dtype=np.int64),
+        segment=number,
     )
 
 
@@ -391,11 +391,11 @@ def resampled(recording: Recording, rng: np.random.Generator) -> tuple[Recording
     places = arm.translations_mm + ADDED_MM * rng.standard_normal(arm.translations_mm.shape)
     angles = np.round(Rotation.from_matrix(arm.rotations).as_euler("XYZ", degrees=True), decimals)
     track = ArmTrack(
-        arm.t_ns[kept],
-        Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()[kept],
-        np.round(places, decimals)[kept],
-        np.ones(len(kept), dtype=bool),
-        None if kind == "by time" else ids[kept],
+        t_ns=arm.t_ns[kept],
+        rotations=Rotation.from_euler("XYZ", angles, degrees=True).as_matrix()[kept],
+        translations_mm=np.round(places, decimals)[kept],
+        is_known=np.ones(len(kept), dtype=bool),
+        trigger_ids=None if kind == "by time" else ids[kept],
     )
     rows = recording.rows
     if kind == "by time":

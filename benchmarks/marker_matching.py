@@ -24,7 +24,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.markers.alignments import Matched
 from armscan.markers.match_3d import match_markers
-from armscan.markers.thesis import match_after_thesis
+from armscan.thesis.marker_rules import match_after_thesis
 from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))

@@ -47,7 +47,7 @@ def fitted(points: FloatArray) -> LightSheet:
     depth /= np.linalg.norm(depth)
     along = np.cross(depth, normal)
     axes = np.stack([along, np.cross(normal, along), normal])
-    sheet = LightSheet(centre, axes, 30.0, np.zeros(5))
+    sheet = LightSheet(origin_mm=centre, axes=axes, scale_mm=30.0, bow_mm=np.zeros(5))
     for _ in range(4):
         height, _, by_parameters = sheet.height_with_jacobian(points)
         sheet = sheet.updated(np.linalg.lstsq(by_parameters, -height, rcond=None)[0])
@@ -61,19 +61,38 @@ def true_sensor(truth: Any) -> SensorCalibration:
     def camera(parameters: FloatArray) -> CameraCalibration:
         model = CameraModel.from_parameters(parameters, 3072, 2048)
         return CameraCalibration(
-            model, np.zeros((9, 9)), True, 0.07, 0.05, 14, 999, box, PROVENANCE
+            camera=model,
+            covariance=np.zeros((9, 9)),
+            has_covariance=True,
+            rms_px=0.07,
+            sigma_point_px=0.05,
+            n_views=14,
+            n_points=999,
+            covered_px=box,
+            provenance=PROVENANCE,
         )
 
     names = sorted(truth.sheet_points_mm, key=lambda name: int(name.split(".")[1]))
     sheets = tuple(
         SheetCalibration(
-            name, fitted(truth.sheet_points_mm[name]), 0.004, 12, 6000, DEPTHS_MM, True
+            name=name,
+            sheet=fitted(truth.sheet_points_mm[name]),
+            rms_mm=0.004,
+            n_boards=12,
+            n_points=6000,
+            depth_range_mm=DEPTHS_MM,
+            is_redundant=True,
         )
         for name in names
     )
     second = SecondCamera(camera(truth.right_camera_parameters), truth.right_from_sensor)
     return SensorCalibration(
-        camera(truth.camera_parameters), sheets, covariance, PROVENANCE, None, second
+        camera=camera(truth.camera_parameters),
+        sheets=sheets,
+        covariance=covariance,
+        provenance=PROVENANCE,
+        diagnostics=None,
+        second=second,
     )
 
 

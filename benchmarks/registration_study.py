@@ -35,9 +35,9 @@ from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import PointPairs, closed_form_pose, register_points
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.markers.join_views import JoinedViews, join_views
-from armscan.markers.thesis import match_after_thesis
 from armscan.pipeline.register import register_place
 from armscan.storage.points import MarkerList
+from armscan.thesis.marker_rules import match_after_thesis
 from marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
@@ -239,7 +239,12 @@ def place_of(old: FloatArray, new: FloatArray, sigma: float) -> Estimate[AnyPose
     i, k = place.pairs[:, 0], place.pairs[:, 1]
     a, b = lists[0].markers, lists[1].markers
     fit: Estimate[AnyPose] | FitFailure = register_points(
-        PointPairs(a.points_mm[i], b.points_mm[k], a.covariance_mm2[i], b.covariance_mm2[k])
+        PointPairs(
+            points_a_mm=a.points_mm[i],
+            points_b_mm=b.points_mm[k],
+            covariance_a_mm2=a.covariance_mm2[i],
+            covariance_b_mm2=b.covariance_mm2[k],
+        )
     )
     return None if isinstance(fit, FitFailure) else fit
 

@@ -59,7 +59,13 @@ def surface(is_ball: bool) -> FloatArray:
 def track(n: int = 20_000) -> ArmTrack:
     """A moving arm, 1000 samples a second."""
     joints = RNG.uniform(-1.0, 1.0, 7) + 1e-4 * np.cumsum(RNG.normal(size=(n, 7)), axis=0)
-    return ArmTrack(np.arange(n) * 1_000_000, *forward(ARM, joints), np.ones(n, dtype=bool))
+    rotations, translations = forward(ARM, joints)
+    return ArmTrack(
+        t_ns=np.arange(n) * 1_000_000,
+        rotations=rotations,
+        translations_mm=translations,
+        is_known=np.ones(n, dtype=bool),
+    )
 
 
 def main() -> None:
@@ -72,7 +78,9 @@ def main() -> None:
     stripe = triangulate_stripe(profile, sheet, sensor)
     samples = track()
     times = np.sort(RNG.integers(0, int(samples.t_ns[-1]), 2000))
-    rows = [ExposureRow(k, int(t), 0, f"{k}.png") for k, t in enumerate(times)]
+    rows = [
+        ExposureRow(index=k, t_ns=int(t), camera=0, source=f"{k}.png") for k, t in enumerate(times)
+    ]
     joints = RNG.uniform(-3.0, 3.0, (10_000, 7))
     plate, ball = surface(is_ball=False), surface(is_ball=True)
     seen = np.tile([0.0, 0.0, 150.0], (len(plate), 1))

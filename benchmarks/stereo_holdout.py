@@ -86,7 +86,7 @@ def opencv_views(points: Sequence[Points], size: tuple[int, int]) -> TwoViews:
     )
     _, left, left_k, right, right_k, rotation, translation = solved[:7]
     models = [
-        CameraModel(k[0, 0], k[1, 1], k[0, 2], k[1, 2], d.reshape(-1)[:5], *size)
+        CameraModel.from_parameters([k[0, 0], k[1, 1], k[0, 2], k[1, 2], *d.reshape(-1)[:5]], *size)
         for k, d in ((left, left_k), (right, right_k))
     ]
     return TwoViews(models[0], models[1], Pose(rotation, translation.reshape(3)))

@@ -74,10 +74,10 @@ class CalibratedHead:
         fit = calibrate_sheets(rig.boards(camera, rng), rig.calibration(camera))
         assert isinstance(fit, LaserFit), fit
         return SensorCalibration(
-            rig.calibration(camera),
-            tuple(one.calibration for one in fit.sheets),
-            fit.covariance,
-            PROVENANCE,
+            camera=rig.calibration(camera),
+            sheets=tuple(one.calibration for one in fit.sheets),
+            covariance=fit.covariance,
+            provenance=PROVENANCE,
         )
 
     def stripes(self, sensor: SensorCalibration) -> tuple[list[PosedStripe], PlateReference]:
@@ -108,7 +108,9 @@ class CalibratedHead:
         rng = np.random.default_rng([self.seed, 3])
         rig = replace(self.rig, postures=good_postures(n_postures, rng))
         surface = Surface.draw(rng, 0.0)
-        placing = prepare_placing(ScannerCalibration(sensor, hand_eye, PROVENANCE))
+        placing = prepare_placing(
+            ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE)
+        )
         errors, covariances = [], []
         for seen in _seen(rig, surface, rng):
             points = _points(seen, sensor)

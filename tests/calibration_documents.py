@@ -53,7 +53,15 @@ def provenance() -> Provenance:
 
 def camera_calibration() -> CameraCalibration:
     distortion = np.array([0.1, -0.2, 1e-17, 3e-4, 1 / 3])
-    camera = CameraModel(1431.1 / 3, 1430.9 / 7, 479.0 + 1e-13, 639.0 / 1.1, distortion, 960, 1280)
+    camera = CameraModel(
+        fx_px=1431.1 / 3,
+        fy_px=1430.9 / 7,
+        cx_px=479.0 + 1e-13,
+        cy_px=639.0 / 1.1,
+        distortion=distortion,
+        width_px=960,
+        height_px=1280,
+    )
     return CameraCalibration(
         camera=camera,
         covariance=covariance(9, 1),
@@ -82,24 +90,37 @@ def sensor_calibration() -> SensorCalibration:
     sheets = tuple(
         SheetCalibration(
             name=name,
-            sheet=LightSheet(np.array([1.0, 2.0, 300.0]) / 7, axes, 41.3 / 3, np.arange(5) / 70),
+            sheet=LightSheet(
+                origin_mm=np.array([1.0, 2.0, 300.0]) / 7,
+                axes=axes,
+                scale_mm=41.3 / 3,
+                bow_mm=np.arange(5) / 70,
+            ),
             rms_mm=0.03,
             n_boards=3,
             n_points=900,
             depth_range_mm=(212.0 / 3, 290.0 / 3),
             is_redundant=True,
             diagnostics=SheetDiagnostics(
-                0.1 / 3, FTest(9.1, 14, 1e-9), FTest(1.1, 12, 1 / 3), "it pays", 0.01, 0.02, 37.5
+                rms_px=0.1 / 3,
+                plane_test=FTest(9.1, 14, 1e-9),
+                final_test=FTest(1.1, 12, 1 / 3),
+                bow_decision="it pays",
+                coplanarity_mm=0.01,
+                coplanarity_sigma_mm=0.02,
+                board_angle_deg=37.5,
             ),
         )
         for name in ("A", "B")
     )
     return SensorCalibration(
-        camera_calibration(),
-        sheets,
-        covariance(25, 2),
-        provenance(),
-        SensorDiagnostics(1.2, 3.4, "one sheet in each image"),
+        camera=camera_calibration(),
+        sheets=sheets,
+        covariance=covariance(25, 2),
+        provenance=provenance(),
+        diagnostics=SensorDiagnostics(
+            noise_factor=1.2, correlation_points=3.4, naming="one sheet in each image"
+        ),
     )
 
 
@@ -119,27 +140,34 @@ def scanner_calibration(*, has_sensor: bool = True) -> ScannerCalibration:
         tool_from_sensor=pose,
         covariance=covariance(6, 3),
         sensor_coupling=np.arange(150).reshape(6, 25) / 7 if has_sensor else None,
-        arm_noise=ArmNoise(0.02 / 3, 1e-5 / 7, 0.001, 0.0),
+        arm_noise=ArmNoise(
+            position_mm=0.02 / 3,
+            rotation_rad=1e-5 / 7,
+            exposure_position_mm=0.001,
+            exposure_rotation_rad=0.0,
+        ),
         rms_mm=0.1 / 3,
         n_postures=12,
         n_exposures=36,
         n_points=9000,
         plate=Plane(np.array([1.0, 2.0, 300.0]) / 7, axes),
         diagnostics=HandEyeDiagnostics(
-            "plate" if has_sensor else "sphere",
-            6,
-            1e3 / 7,
-            "along the laser line",
-            0.01 / 3,
-            math.nan,
-            True,
-            0.1 / 7,
-            0.2 / 7,
-            1 / 3,
+            method="plate" if has_sensor else "sphere",
+            rank=6,
+            condition=1e3 / 7,
+            weakest="along the laser line",
+            plate_flatness_mm=0.01 / 3,
+            flatness_length_mm=math.nan,
+            is_noise_estimated=True,
+            left_out_rotation_deg=0.1 / 7,
+            left_out_translation_mm=0.2 / 7,
+            chi2_probability=1 / 3,
         ),
     )
     sensor = sensor_calibration() if has_sensor else None
-    return ScannerCalibration(sensor, hand_eye, provenance(), latency_ns=-(10**12 - 1))
+    return ScannerCalibration(
+        sensor=sensor, hand_eye=hand_eye, provenance=provenance(), latency_ns=-(10**12 - 1)
+    )
 
 
 def assert_same(left: Any, right: Any) -> None:

@@ -14,7 +14,13 @@ from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import CircleGrid, Target, TargetView
 
 CAMERA = CameraModel(
-    2300.0, 2310.0, 1010.0, 770.0, np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]), 2048, 1536
+    fx_px=2300.0,
+    fy_px=2310.0,
+    cx_px=1010.0,
+    cy_px=770.0,
+    distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]),
+    width_px=2048,
+    height_px=1536,
 )
 GRID = CircleGrid(11, 9, 15.0)
 

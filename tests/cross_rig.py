@@ -108,7 +108,7 @@ class CrossExposure:
 
 def camera() -> CameraModel:
     """The printed camera."""
-    return CameraModel(*CAMERA, np.array(DISTORTION), *IMAGE_PX)
+    return CameraModel.from_parameters([*CAMERA, *DISTORTION], *IMAGE_PX)
 
 
 def _at_depth(depth_mm: float) -> FloatArray:
@@ -125,7 +125,9 @@ def light_sheet(name: str) -> LightSheet:
     along = np.cross(n, [0.0, 0.0, 1.0])
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(n, along), n])
-    return LightSheet(_at_depth(MIDDLE_DEPTH_MM), axes, 20.0, np.zeros(5))
+    return LightSheet(
+        origin_mm=_at_depth(MIDDLE_DEPTH_MM), axes=axes, scale_mm=20.0, bow_mm=np.zeros(5)
+    )
 
 
 def sensor(sheet_error_mm: FloatArray | None = None) -> SensorCalibration:
@@ -133,14 +135,37 @@ def sensor(sheet_error_mm: FloatArray | None = None) -> SensorCalibration:
     error = np.zeros(2) if sheet_error_mm is None else sheet_error_mm
     box = np.array([0.0, 0.0, IMAGE_PX[0] - 1.0, IMAGE_PX[1] - 1.0])
     calibrated = CameraCalibration(
-        camera(), np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, box, PROVENANCE
+        camera=camera(),
+        covariance=np.zeros((9, 9)),
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=box,
+        provenance=PROVENANCE,
     )
     sheets = []
     for k, name in enumerate(NAMES):
         shift = np.array([0.0, 0.0, error[k], 0.0, 0.0, 0.0, 0.0, 0.0])
         sheet = light_sheet(name).updated(shift)
-        sheets.append(SheetCalibration(name, sheet, 0.01, 8, 900, (112.0, 168.0), True))
-    return SensorCalibration(calibrated, tuple(sheets), np.zeros((25, 25)), PROVENANCE)
+        sheets.append(
+            SheetCalibration(
+                name=name,
+                sheet=sheet,
+                rms_mm=0.01,
+                n_boards=8,
+                n_points=900,
+                depth_range_mm=(112.0, 168.0),
+                is_redundant=True,
+            )
+        )
+    return SensorCalibration(
+        camera=calibrated,
+        sheets=tuple(sheets),
+        covariance=np.zeros((25, 25)),
+        provenance=PROVENANCE,
+    )
 
 
 @dataclass(eq=False)
@@ -323,14 +348,14 @@ def _as_chains(
     flags = np.where(near < NEIGHBOUR_PX, int(StripeFlag.NEIGHBOUR), 0)
     n = len(order)
     profile = Profile(
-        source,
-        noisy[order],
-        normals[order],
-        np.full(n, sigma_px),
-        np.full(n, WIDTH_PX),
-        np.full(n, 150.0),
-        flags[order],
-        segment,
+        source=source,
+        points_px=noisy[order],
+        normals_px=normals[order],
+        sigma_px=np.full(n, sigma_px),
+        width_px=np.full(n, WIDTH_PX),
+        intensity=np.full(n, 150.0),
+        flags=flags[order],
+        segment=segment,
     )
     return profile, truth[order].astype(np.int64)
 

@@ -73,7 +73,10 @@ class FakeTwin:
         n = 4
         positions = np.arange(3.0 * n).reshape(n, 3) + 100.0 * self.seed
         track = ArmTrack(
-            2000 * np.arange(n), np.tile(np.eye(3), (n, 1, 1)), positions, np.ones(n, bool)
+            t_ns=2000 * np.arange(n),
+            rotations=np.tile(np.eye(3), (n, 1, 1)),
+            translations_mm=positions,
+            is_known=np.ones(n, bool),
         )
         return FakeProbing(track, np.array([0.0, 0.5, 60.0]), 6.0)
 

@@ -94,14 +94,14 @@ class FanRig:
         )
         known = self.stereo_covariance
         return StereoCalibration(
-            _calibration(left, known[:9, :9]),
-            _calibration(right, known[9:18, 9:18]),
-            pose,
-            known,
-            0.02,
-            15,
-            1485,
-            PROVENANCE,
+            left=_calibration(left, known[:9, :9]),
+            right=_calibration(right, known[9:18, 9:18]),
+            right_from_left=pose,
+            covariance=known,
+            rms_px=0.02,
+            n_pairs=15,
+            n_points=1485,
+            provenance=PROVENANCE,
         )
 
     def drawn_stereo(self, rng: np.random.Generator) -> StereoCalibration:
@@ -219,7 +219,17 @@ def _is_seen(rig: SheetRig) -> bool:
 
 def _calibration(camera: CameraModel, covariance: FloatArray) -> CameraCalibration:
     box = np.array([0.0, 0.0, SIZE_PX[0] - 1.0, SIZE_PX[1] - 1.0])
-    return CameraCalibration(camera, covariance, True, 0.02, 0.01, 15, 1485, box, PROVENANCE)
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance,
+        has_covariance=True,
+        rms_px=0.02,
+        sigma_point_px=0.01,
+        n_views=15,
+        n_points=1485,
+        covered_px=box,
+        provenance=PROVENANCE,
+    )
 
 
 def fan_rig(seed: int, n_placements: int = 8, n_lines: int = 11) -> FanRig:

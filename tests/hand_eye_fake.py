@@ -34,16 +34,21 @@ def fake_fit(method: str = "plate") -> tuple[HandEyeFit, tuple[PosedStripe, ...]
         postures.append(_posture(name, mean, k, is_plate=method == "plate"))
     plate = Plane(np.zeros(3), np.eye(3)) if method == "plate" else None
     hand_eye = HandEyeCalibration(
-        TOOL_FROM_SENSOR,
-        np.diag([2e-4, 1e-4, 2e-4, 0.015, 0.024, 0.02]) ** 2 + 1e-12,
-        None,
-        ArmNoise(0.005, 2e-5, 0.001, 4e-6),
-        0.0068,
-        N_POSTURES,
-        N_POSTURES * EXPOSURES_OF_POSTURE,
-        sum(len(stripe) for stripe in stripes),
-        plate,
-        _diagnostics(method),
+        tool_from_sensor=TOOL_FROM_SENSOR,
+        covariance=np.diag([2e-4, 1e-4, 2e-4, 0.015, 0.024, 0.02]) ** 2 + 1e-12,
+        sensor_coupling=None,
+        arm_noise=ArmNoise(
+            position_mm=0.005,
+            rotation_rad=2e-5,
+            exposure_position_mm=0.001,
+            exposure_rotation_rad=4e-6,
+        ),
+        rms_mm=0.0068,
+        n_postures=N_POSTURES,
+        n_exposures=N_POSTURES * EXPOSURES_OF_POSTURE,
+        n_points=sum(len(stripe) for stripe in stripes),
+        plate=plate,
+        diagnostics=_diagnostics(method),
     )
     fit = HandEyeFit(
         hand_eye,

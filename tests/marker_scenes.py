@@ -38,7 +38,9 @@ class TwoViews:
 def marker_set(points_mm: FloatArray, sigma_mm: float = NOISE_MM, frame: str = "Base") -> MarkerSet:
     n = len(points_mm)
     covariance = np.tile(sigma_mm**2 * np.eye(3), (n, 1, 1))
-    return MarkerSet(np.arange(1, n + 1), points_mm, covariance, frame)
+    return MarkerSet(
+        ids=np.arange(1, n + 1), points_mm=points_mm, covariance_mm2=covariance, frame=frame
+    )
 
 
 def scattered(

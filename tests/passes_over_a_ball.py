@@ -51,7 +51,9 @@ class BallScan:
     arm: ArmTrack | None
     truth: tuple[Pose[Base, Tool], ...]
     session: Session = field(
-        default_factory=lambda: Session(cameras=(CameraSetup(CAMERA.width_px, CAMERA.height_px),))
+        default_factory=lambda: Session(
+            cameras=(CameraSetup(width_px=CAMERA.width_px, height_px=CAMERA.height_px),)
+        )
     )
     name: str = "ball"
     is_simulated: bool = True
@@ -77,14 +79,22 @@ def ball_scan() -> BallScan:
             tool.append(head_at(turn, lean, along))
             step, rest = divmod(sample - 30, SAMPLES_A_STEP)
             if rest == 0 and 0 <= step < N_STEPS:
-                rows.append(ExposureRow(len(rows), times[-1], 0, f"{len(rows)}.png", ("A",)))
+                rows.append(
+                    ExposureRow(
+                        index=len(rows),
+                        t_ns=times[-1],
+                        camera=0,
+                        source=f"{len(rows)}.png",
+                        lasers=("A",),
+                    )
+                )
                 truth.append(tool[-1])
         start = times[-1] + PAUSE_NS
     track = ArmTrack(
-        np.array(times, dtype=np.int64),
-        np.array([pose.rotation for pose in tool]),
-        np.array([pose.translation_mm for pose in tool]),
-        np.ones(len(times), dtype=bool),
+        t_ns=np.array(times, dtype=np.int64),
+        rotations=np.array([pose.rotation for pose in tool]),
+        translations_mm=np.array([pose.translation_mm for pose in tool]),
+        is_known=np.ones(len(times), dtype=bool),
     )
     return BallScan(tuple(rows), track, tuple(truth))
 
@@ -168,9 +178,15 @@ def _image(source: str, pixels: FloatArray) -> MeasuredProfile:
     zeros: IntArray = np.zeros(n, dtype=np.int64)
     normals = np.tile([0.0, 1.0], (n, 1))
     profile = Profile(
-        source, pixels, normals, np.full(n, NOISE_PX), np.full(n, 3.0), np.full(n, 150.0),
-        zeros, zeros,
-    )  # fmt: skip
+        source=source,
+        points_px=pixels,
+        normals_px=normals,
+        sigma_px=np.full(n, NOISE_PX),
+        width_px=np.full(n, 3.0),
+        intensity=np.full(n, 150.0),
+        flags=zeros,
+        segment=zeros,
+    )
     return MeasuredProfile(profile, np.full(n, int(PointStatus.MEASURED)), zeros, "the only one")
 
 
@@ -180,6 +196,14 @@ def _cloud(points_mm: FloatArray, exposure: IntArray, n_exposures: int) -> Point
     covariance = np.broadcast_to(NOISE_MM**2 * np.eye(3), (n, 3, 3))
     sources = tuple(f"{k}.png" for k in range(n_exposures))
     return PointCloud(
-        "Base", points_mm, covariance, np.full(n, NOISE_MM), zeros, ("A",), exposure, sources,
-        zeros, np.full(n, 150.0),
-    )  # fmt: skip
+        frame="Base",
+        points_mm=points_mm,
+        covariance_mm2=covariance,
+        sigma_noise_mm=np.full(n, NOISE_MM),
+        sheet=zeros,
+        sheet_names=("A",),
+        exposure=exposure,
+        exposure_sources=sources,
+        segment=zeros,
+        intensity=np.full(n, 150.0),
+    )

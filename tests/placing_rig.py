@@ -23,7 +23,9 @@ from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thes
 
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.4, -0.9, -1.9], [41.4, 21.5, 112.3])
 BASE_FROM_TOOL: Pose[Base, Tool] = Pose.from_vectors([1.1, 0.3, -0.6], [420.0, -310.0, 250.0])
-ARM_NOISE = ArmNoise(0.006, 2e-5, 0.004, 1e-5)
+ARM_NOISE = ArmNoise(
+    position_mm=0.006, rotation_rad=2e-5, exposure_position_mm=0.004, exposure_rotation_rad=1e-5
+)
 HAND_EYE_SIGMA = np.array([3e-4, 1.5e-4, 2.5e-4, 0.015, 0.024, 0.02])
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.004, 0.003, 0.004, 0.002, 0.002])
 SIGMA_PX = 0.1
@@ -44,7 +46,12 @@ def sheets() -> tuple[LightSheet, LightSheet]:
     e_u = np.cross(normal, [0.0, 0.0, 1.0])
     e_u /= np.linalg.norm(e_u)
     axes = np.stack([e_u, np.cross(normal, e_u), normal])
-    first = LightSheet(np.array([0.0, 0.0, 135.5]), axes, 20.0, np.array([0.02, 0, 0, 0, 0.01]))
+    first = LightSheet(
+        origin_mm=np.array([0.0, 0.0, 135.5]),
+        axes=axes,
+        scale_mm=20.0,
+        bow_mm=np.array([0.02, 0, 0, 0, 0.01]),
+    )
     return first, first.updated(np.array([1.0, -2.0, 3.0, 0, 0, 0, 0, 0]))
 
 
@@ -52,12 +59,32 @@ def sensor_of(camera: CameraModel, pair: tuple[LightSheet, LightSheet]) -> Senso
     """Camera and sheets with their joint covariance."""
     joint = correlated(np.concatenate([CAMERA_SIGMA, SHEET_SIGMA_MM, 2.0 * SHEET_SIGMA_MM]), 8)
     box = np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0])
-    calibrated = CameraCalibration(camera, joint[:9, :9], True, 0.1, 0.05, 9, 99, box, PROVENANCE)
+    calibrated = CameraCalibration(
+        camera=camera,
+        covariance=joint[:9, :9],
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=box,
+        provenance=PROVENANCE,
+    )
     entries = tuple(
-        SheetCalibration(name, sheet, 0.01, 6, 600, (110.0, 165.0), True)
+        SheetCalibration(
+            name=name,
+            sheet=sheet,
+            rms_mm=0.01,
+            n_boards=6,
+            n_points=600,
+            depth_range_mm=(110.0, 165.0),
+            is_redundant=True,
+        )
         for name, sheet in zip("AB", pair, strict=True)
     )
-    return SensorCalibration(calibrated, entries, joint, PROVENANCE)
+    return SensorCalibration(
+        camera=calibrated, sheets=entries, covariance=joint, provenance=PROVENANCE
+    )
 
 
 def coupling() -> FloatArray:
@@ -70,18 +97,18 @@ def coupling() -> FloatArray:
 def scanner() -> ScannerCalibration:
     """The scanner as its document would say it."""
     return ScannerCalibration(
-        sensor_of(thesis_rig().camera, sheets()),
-        HandEyeCalibration(
-            TOOL_FROM_SENSOR,
-            correlated(HAND_EYE_SIGMA, 11),
-            coupling(),
-            ARM_NOISE,
-            0.007,
-            12,
-            12,
-            8000,
+        sensor=sensor_of(thesis_rig().camera, sheets()),
+        hand_eye=HandEyeCalibration(
+            tool_from_sensor=TOOL_FROM_SENSOR,
+            covariance=correlated(HAND_EYE_SIGMA, 11),
+            sensor_coupling=coupling(),
+            arm_noise=ARM_NOISE,
+            rms_mm=0.007,
+            n_postures=12,
+            n_exposures=12,
+            n_points=8000,
         ),
-        PROVENANCE,
+        provenance=PROVENANCE,
     )
 
 

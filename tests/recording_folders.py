@@ -104,8 +104,16 @@ class MemoryScan:
 
 def memory_scan(n: int = 3, arm: ArmTrack | None = None) -> MemoryScan:
     rows = tuple(
-        ExposureRow(k, 1000 * (k + 1), 0, f"exposure {k}", ("A",) if k % 2 else (), None, f"v{k}")
+        ExposureRow(
+            index=k,
+            t_ns=1000 * (k + 1),
+            camera=0,
+            source=f"exposure {k}",
+            lasers=("A",) if k % 2 else (),
+            trigger_id=None,
+            view=f"v{k}",
+        )
         for k in range(n)
     )
-    session = Session(cameras=(CameraSetup(WIDTH_PX, HEIGHT_PX),))
+    session = Session(cameras=(CameraSetup(width_px=WIDTH_PX, height_px=HEIGHT_PX),))
     return MemoryScan(session, rows, tuple(pixels(k) for k in range(n)), arm)

@@ -53,13 +53,13 @@ def true_views() -> TwoViews:
     )
     centre = BASELINE_MM * np.array([np.cos(half), 0.0, np.sin(half)])
     camera = CameraModel(
-        FOCAL_PX,
-        FOCAL_PX,
-        (WIDTH_PX - 1) / 2.0,
-        (HEIGHT_PX - 1) / 2.0,
-        np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0]),
-        WIDTH_PX,
-        HEIGHT_PX,
+        fx_px=FOCAL_PX,
+        fy_px=FOCAL_PX,
+        cx_px=(WIDTH_PX - 1) / 2.0,
+        cy_px=(HEIGHT_PX - 1) / 2.0,
+        distortion=np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0]),
+        width_px=WIDTH_PX,
+        height_px=HEIGHT_PX,
     )
     return TwoViews(camera, camera, Pose(rotation, -rotation @ centre))
 
@@ -163,14 +163,14 @@ def _images(
     half = axes.S[shown][:, ::-1] + noise_px * rng.standard_normal((n, 2))
     half[:, 1] = half.max(axis=1)
     images = RingImages(
-        "right" if is_right else "left",
-        centres[shown] + noise_px * rng.standard_normal((n, 2)),
-        np.tile(max(noise_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1)),
-        half,
-        0.5 * half,
-        np.arctan2(axes.U[shown, 1, 0], axes.U[shown, 0, 0]),
-        np.full(n, 0.5),
-        2.0 * np.pi * half[:, 1],
-        half[:, 1] / half[:, 0],
+        source="right" if is_right else "left",
+        centres_px=centres[shown] + noise_px * rng.standard_normal((n, 2)),
+        covariance_px2=np.tile(max(noise_px, 1e-3) ** 2 * np.eye(2), (n, 1, 1)),
+        outer_half_px=half,
+        inner_half_px=0.5 * half,
+        direction_rad=np.arctan2(axes.U[shown, 1, 0], axes.U[shown, 0, 0]),
+        contrast=np.full(n, 0.5),
+        perimeter_px=2.0 * np.pi * half[:, 1],
+        roundness=half[:, 1] / half[:, 0],
     )
     return images, shown.astype(np.int64)

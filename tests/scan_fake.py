@@ -26,7 +26,15 @@ from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from sheet_rig import PROVENANCE, THESIS_PLANE
 
-CAMERA = CameraModel(600.0, 600.0, 160.0, 120.0, np.zeros(5), 320, 240)
+CAMERA = CameraModel(
+    fx_px=600.0,
+    fy_px=600.0,
+    cx_px=160.0,
+    cy_px=120.0,
+    distortion=np.zeros(5),
+    width_px=320,
+    height_px=240,
+)
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.0, 0.0, 0.7], [41.0, 20.0, 110.0])
 PEAK, LINE_SIGMA_PX, GREY_NOISE = 180.0, 2.5, 2.0
 PERIOD_NS = 10_000_000
@@ -38,16 +46,50 @@ def scanner(latency_ns: int = 0) -> ScannerCalibration:
     along = np.cross(normal, [0.0, 0.0, 1.0])
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(normal, along), normal])
-    sheet = LightSheet(np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742]), axes, 20.0, np.zeros(5))
+    sheet = LightSheet(
+        origin_mm=np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742]),
+        axes=axes,
+        scale_mm=20.0,
+        bow_mm=np.zeros(5),
+    )
     camera = CameraCalibration(
-        CAMERA, np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, np.array([0, 0, 319.0, 239.0]), PROVENANCE
+        camera=CAMERA,
+        covariance=np.zeros((9, 9)),
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=np.array([0, 0, 319.0, 239.0]),
+        provenance=PROVENANCE,
     )
-    sheets = (SheetCalibration("A", sheet, 0.01, 6, 600, (115.0, 160.0), True),)
+    sheets = (
+        SheetCalibration(
+            name="A",
+            sheet=sheet,
+            rms_mm=0.01,
+            n_boards=6,
+            n_points=600,
+            depth_range_mm=(115.0, 160.0),
+            is_redundant=True,
+        ),
+    )
     hand_eye = HandEyeCalibration(
-        TOOL_FROM_SENSOR, np.zeros((6, 6)), None, ArmNoise(0.005, 2e-5), 0.007, 12, 12, 8000
+        tool_from_sensor=TOOL_FROM_SENSOR,
+        covariance=np.zeros((6, 6)),
+        sensor_coupling=None,
+        arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
+        rms_mm=0.007,
+        n_postures=12,
+        n_exposures=12,
+        n_points=8000,
     )
-    sensor = SensorCalibration(camera, sheets, np.zeros((17, 17)), PROVENANCE)
-    return ScannerCalibration(sensor, hand_eye, PROVENANCE, latency_ns)
+    sensor = SensorCalibration(
+        camera=camera, sheets=sheets, covariance=np.zeros((17, 17)), provenance=PROVENANCE
+    )
+    return ScannerCalibration(
+        sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE, latency_ns=latency_ns
+    )
 
 
 def looking_down(y_mm: float, tilt_rad: float = 0.15) -> Pose[Base, Tool]:
@@ -115,13 +157,19 @@ def fake_scan(n: int = 6, step_mm: float = 1.0) -> FakeScan:
     truth = tuple(looking_down(step_mm * k) for k in range(n))
     samples = [looking_down(step_mm * (k - 0.5)) for k in range(n + 1)]
     track = ArmTrack(
-        1_000_000_000 + np.arange(n + 1) * PERIOD_NS,
-        np.array([pose.rotation for pose in samples]),
-        np.array([pose.translation_mm for pose in samples]),
-        np.ones(n + 1, dtype=bool),
+        t_ns=1_000_000_000 + np.arange(n + 1) * PERIOD_NS,
+        rotations=np.array([pose.rotation for pose in samples]),
+        translations_mm=np.array([pose.translation_mm for pose in samples]),
+        is_known=np.ones(n + 1, dtype=bool),
     )
     rows = tuple(
-        ExposureRow(k, int(track.t_ns[k]) + PERIOD_NS // 2, 0, f"images/{k}.png", ("A",))
+        ExposureRow(
+            index=k,
+            t_ns=int(track.t_ns[k]) + PERIOD_NS // 2,
+            camera=0,
+            source=f"images/{k}.png",
+            lasers=("A",),
+        )
         for k in range(n)
     )
     return FakeScan(rows, track, truth)

@@ -22,7 +22,13 @@ THESIS_PLANE = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
 """The thesis's printed single-line sheet, camera frame, mm."""
 
 CAMERA_SIGMA = np.array([0.6, 0.6, 0.8, 0.8, 1e-3, 4e-3, 5e-5, 5e-5, 5e-3])
-PROVENANCE = Provenance("test", "2026-01-01T00:00:00Z", "0", ("test",), ())
+PROVENANCE = Provenance(
+    document_id="test",
+    created_utc="2026-01-01T00:00:00Z",
+    armscan_version="0",
+    command=("test",),
+    inputs=(),
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,15 @@ class SheetRig:
         """A camera calibration that claims the rig's covariance."""
         box = np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0])
         return CameraCalibration(
-            camera, self.camera_covariance, True, 0.07, 0.05, 20, 1260, box, PROVENANCE
+            camera=camera,
+            covariance=self.camera_covariance,
+            has_covariance=True,
+            rms_px=0.07,
+            sigma_point_px=0.05,
+            n_views=20,
+            n_points=1260,
+            covered_px=box,
+            provenance=PROVENANCE,
         )
 
     def noisy_camera(self, rng: np.random.Generator) -> CameraModel:
@@ -133,14 +147,14 @@ def make_profile(
     points = np.concatenate([q for q, _ in stripes])
     n = len(points)
     return Profile(
-        source,
-        points,
-        np.concatenate([normal for _, normal in stripes]),
-        np.full(n, sigma_px),
-        np.full(n, 3.0),
-        np.full(n, 150.0),
-        np.zeros(n, dtype=np.int64),
-        np.concatenate([np.full(len(q), k) for k, (q, _) in enumerate(stripes)]),
+        source=source,
+        points_px=points,
+        normals_px=np.concatenate([normal for _, normal in stripes]),
+        sigma_px=np.full(n, sigma_px),
+        width_px=np.full(n, 3.0),
+        intensity=np.full(n, 150.0),
+        flags=np.zeros(n, dtype=np.int64),
+        segment=np.concatenate([np.full(len(q), k) for k, (q, _) in enumerate(stripes)]),
     )
 
 
@@ -190,7 +204,13 @@ def placed(
 def thesis_rig(bow_uu_mm: float = 0.0, bow_uv_mm: float = 0.0) -> SheetRig:
     """Six tilted boards in the thesis's printed sheet, a camera of its working distance."""
     camera = CameraModel(
-        2600.0, 2602.0, 1010.0, 745.0, np.array([-0.12, 0.08, 4e-4, -3e-4, 0.02]), 2048, 1536
+        fx_px=2600.0,
+        fy_px=2602.0,
+        cx_px=1010.0,
+        cy_px=745.0,
+        distortion=np.array([-0.12, 0.08, 4e-4, -3e-4, 0.02]),
+        width_px=2048,
+        height_px=1536,
     )
     tilts = (
         (0, 0, 134),

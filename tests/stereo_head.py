@@ -23,22 +23,22 @@ from armscan.simulation.optics.lasers import LineLaser
 from sheet_rig import PROVENANCE
 
 LEFT = CameraModel(
-    5174.97,
-    5175.62,
-    1524.358,
-    1032.405,
-    np.array([-0.1035, 0.3449, 0.000706, -0.00032, -0.139]),
-    3072,
-    2048,
+    fx_px=5174.97,
+    fy_px=5175.62,
+    cx_px=1524.358,
+    cy_px=1032.405,
+    distortion=np.array([-0.1035, 0.3449, 0.000706, -0.00032, -0.139]),
+    width_px=3072,
+    height_px=2048,
 )
 RIGHT = CameraModel(
-    5163.38,
-    5162.49,
-    1563.458,
-    1039.554,
-    np.array([-0.0895, 0.192148, 0.000079, -0.00015, -0.5824]),
-    3072,
-    2048,
+    fx_px=5163.38,
+    fy_px=5162.49,
+    cx_px=1563.458,
+    cy_px=1039.554,
+    distortion=np.array([-0.0895, 0.192148, 0.000079, -0.00015, -0.5824]),
+    width_px=3072,
+    height_px=2048,
 )
 RIGHT_FROM_LEFT: Pose[CameraRight, Sensor] = Pose(
     nearest_rotation(
@@ -106,7 +106,7 @@ def fitted_sheet(laser: LineLaser) -> LightSheet:
     origin = middle - laser.offset_mm(middle[None])[0] * laser.normal
     e_u = laser.across
     axes = np.stack([e_u, np.cross(laser.normal, e_u), laser.normal])
-    sheet = LightSheet(origin, axes, 30.0, np.zeros(5))
+    sheet = LightSheet(origin_mm=origin, axes=axes, scale_mm=30.0, bow_mm=np.zeros(5))
     for _ in range(3):
         height, _, by_parameters = sheet.height_with_jacobian(points)
         sheet = sheet.updated(np.linalg.lstsq(by_parameters, -height, rcond=None)[0])
@@ -227,20 +227,25 @@ class StereoHead:
         )
         sheets = tuple(
             SheetCalibration(
-                laser.name,
-                sheet.updated(e[9 + 8 * k : 17 + 8 * k]),
-                0.004,
-                12,
-                6000,
-                DEPTHS_MM,
-                True,
+                name=laser.name,
+                sheet=sheet.updated(e[9 + 8 * k : 17 + 8 * k]),
+                rms_mm=0.004,
+                n_boards=12,
+                n_points=6000,
+                depth_range_mm=DEPTHS_MM,
+                is_redundant=True,
             )
             for k, (laser, sheet) in enumerate(zip(self.lasers, self.sheets, strict=True))
         )
         cov = self.covariance
         second = SecondCamera(_document(right, cov[n - 15 : n - 6, n - 15 : n - 6]), moved)
         return SensorCalibration(
-            _document(left, cov[:9, :9]), sheets, cov, PROVENANCE, None, second
+            camera=_document(left, cov[:9, :9]),
+            sheets=sheets,
+            covariance=cov,
+            provenance=PROVENANCE,
+            diagnostics=None,
+            second=second,
         )
 
     def drawn_calibration(self, rng: np.random.Generator) -> SensorCalibration:
@@ -256,4 +261,14 @@ def _moved(camera: CameraModel, error: FloatArray) -> CameraModel:
 
 def _document(camera: CameraModel, covariance: FloatArray) -> CameraCalibration:
     box = np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0])
-    return CameraCalibration(camera, covariance, True, 0.07, 0.05, 14, 1386, box, PROVENANCE)
+    return CameraCalibration(
+        camera=camera,
+        covariance=covariance,
+        has_covariance=True,
+        rms_px=0.07,
+        sigma_point_px=0.05,
+        n_views=14,
+        n_points=1386,
+        covered_px=box,
+        provenance=PROVENANCE,
+    )

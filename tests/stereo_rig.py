@@ -18,10 +18,22 @@ from armscan.models.two_views import TwoViews
 from armscan.vision.targets.target import CircleGrid, Target, TargetView
 
 LEFT = CameraModel(
-    2300.0, 2310.0, 1010.0, 770.0, np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]), 2048, 1536
+    fx_px=2300.0,
+    fy_px=2310.0,
+    cx_px=1010.0,
+    cy_px=770.0,
+    distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.02]),
+    width_px=2048,
+    height_px=1536,
 )
 RIGHT = CameraModel(
-    2340.0, 2335.0, 1040.0, 755.0, np.array([-0.1, 0.08, -5e-4, 7e-4, 0.03]), 2048, 1536
+    fx_px=2340.0,
+    fy_px=2335.0,
+    cx_px=1040.0,
+    cy_px=755.0,
+    distortion=np.array([-0.1, 0.08, -5e-4, 7e-4, 0.03]),
+    width_px=2048,
+    height_px=1536,
 )
 CONVERGING: Pose[CameraRight, Sensor] = Pose.from_vectors([0.02, 0.45, -0.01], [-128.0, 2.0, 35.0])
 """The axes meet about 270 mm ahead, 26 degrees apart."""
@@ -140,9 +152,23 @@ def make_pairs(scene: StereoScene, seed: int) -> tuple[list[StereoPair], list[Po
 def held(camera: CameraModel, covariance: FloatArray | None = None) -> CameraCalibration:
     """The camera's calibration by itself, exact unless a covariance (9, 9) is given."""
     known = np.zeros((9, 9)) if covariance is None else covariance
-    origin = Provenance("id", "2026-01-01T00:00:00+00:00", "0", (), ())
+    origin = Provenance(
+        document_id="id",
+        created_utc="2026-01-01T00:00:00+00:00",
+        armscan_version="0",
+        command=(),
+        inputs=(),
+    )
     return CameraCalibration(
-        camera, known, covariance is not None, 0.1, 0.1, 9, 99, np.zeros(4), origin
+        camera=camera,
+        covariance=known,
+        has_covariance=covariance is not None,
+        rms_px=0.1,
+        sigma_point_px=0.1,
+        n_views=9,
+        n_points=99,
+        covered_px=np.zeros(4),
+        provenance=origin,
     )
 
 

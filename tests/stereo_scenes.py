@@ -256,14 +256,14 @@ class _Pieces:
         flags |= np.where(length < SHORTEST_PX, int(StripeFlag.SHORT_SEGMENT), 0)
         n = len(pixels)
         profile = Profile(
-            name,
-            pixels + error[:, None] * across,
-            across,
-            np.full(n, sigma_px),
-            np.full(n, LINE_SIGMA_PX),
-            np.full(n, 150.0),
-            flags,
-            segment,
+            source=name,
+            points_px=pixels + error[:, None] * across,
+            normals_px=across,
+            sigma_px=np.full(n, sigma_px),
+            width_px=np.full(n, LINE_SIGMA_PX),
+            intensity=np.full(n, 150.0),
+            flags=flags,
+            segment=segment,
         )
         return SeenProfile(
             profile, sheet, np.concatenate(gathered(0)), np.concatenate(gathered(2)).astype(bool)

@@ -26,7 +26,15 @@ def camera(blur_sigma_px: float = 1.0, distorted: bool = False) -> RenderCamera:
 
 def model(distorted: bool = False) -> CameraModel:
     k = DISTORTION if distorted else (0.0,) * 5
-    return CameraModel(2000.0, 2000.0, 600.4, 449.7, np.array(k), 1200, 900)
+    return CameraModel(
+        fx_px=2000.0,
+        fy_px=2000.0,
+        cx_px=600.4,
+        cy_px=449.7,
+        distortion=np.array(k),
+        width_px=1200,
+        height_px=900,
+    )
 
 
 def render(

@@ -48,9 +48,16 @@ def plate_profiles(head: StereoHead) -> tuple[Profile, Profile]:
 def stereo_scanner(head: StereoHead) -> ScannerCalibration:
     """The head on an arm."""
     hand_eye = HandEyeCalibration(
-        TOOL_FROM_SENSOR, np.zeros((6, 6)), None, ArmNoise(0.005, 2e-5), 0.007, 12, 12, 8000
+        tool_from_sensor=TOOL_FROM_SENSOR,
+        covariance=np.zeros((6, 6)),
+        sensor_coupling=None,
+        arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
+        rms_mm=0.007,
+        n_postures=12,
+        n_exposures=12,
+        n_points=8000,
     )
-    return ScannerCalibration(head.calibration(), hand_eye, PROVENANCE)
+    return ScannerCalibration(sensor=head.calibration(), hand_eye=hand_eye, provenance=PROVENANCE)
 
 
 @dataclass(frozen=True)
@@ -60,7 +67,9 @@ class TwoCameraScan:
     rows: tuple[ExposureRow, ...]
     arm: ArmTrack | None
     session: Session = field(
-        default_factory=lambda: Session(cameras=(CameraSetup(WIDTH_PX, HEIGHT_PX),) * 2)
+        default_factory=lambda: Session(
+            cameras=(CameraSetup(width_px=WIDTH_PX, height_px=HEIGHT_PX),) * 2
+        )
     )
     name: str = "two cameras"
     is_simulated: bool = False
@@ -82,19 +91,19 @@ def two_camera_scan(
     times = PERIOD_NS * np.arange(1, n + 2)
     poses: list[Pose] = [Pose.from_vectors([2.9, 0.0, 0.0], [float(k), 0, 0]) for k in range(n + 1)]
     arm = ArmTrack(
-        times,
-        np.array([pose.rotation for pose in poses]),
-        np.array([pose.translation_mm for pose in poses]),
-        np.ones(n + 1, dtype=bool),
+        t_ns=times,
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations_mm=np.array([pose.translation_mm for pose in poses]),
+        is_known=np.ones(n + 1, dtype=bool),
     )
     taken = [(k, camera) for k in range(n) for camera in (0, 1) if (k, camera) not in lost]
     rows = tuple(
         ExposureRow(
-            index,
-            int(times[k]) + PERIOD_NS // 2 + camera * late_ns,
-            camera,
-            f"images/{k}{'lr'[camera]}.png",
-            ("A",),
+            index=index,
+            t_ns=int(times[k]) + PERIOD_NS // 2 + camera * late_ns,
+            camera=camera,
+            source=f"images/{k}{'lr'[camera]}.png",
+            lasers=("A",),
         )
         for index, (k, camera) in enumerate(taken)
     )

@@ -56,7 +56,14 @@ def tracks(draw: st.DrawFn, has_triggers: bool) -> ArmTrack:
     first = draw(st.integers(-(2**62), 2**61))
     times = first + np.cumsum(rng.integers(10, 10**9, n))
     ids = rng.permutation(50)[:n] if has_triggers else None
-    return ArmTrack(times, rotations, positions, is_known, ids, measured)
+    return ArmTrack(
+        t_ns=times,
+        rotations=rotations,
+        translations_mm=positions,
+        is_known=is_known,
+        trigger_ids=ids,
+        joints_rad=measured,
+    )
 
 
 @st.composite
@@ -70,7 +77,16 @@ def scans(draw: st.DrawFn) -> MemoryScan:
         bits = draw(st.sampled_from([8, 12, 16]))
         width, height = draw(st.integers(2, 9)), draw(st.integers(2, 9))
         window = SensorWindow(draw(st.integers(0, 3000)), draw(st.integers(0, 3000)))
-        cameras.append(CameraSetup(width, height, window, bits, "low", draw(colours)))
+        cameras.append(
+            CameraSetup(
+                width_px=width,
+                height_px=height,
+                window=window,
+                bits_used=bits,
+                align="low",
+                colour=draw(colours),
+            )
+        )
     start = 0 if track is None else int(track.t_ns[0])
     apart = 1 if track is None else int(track.t_ns[-1] - track.t_ns[0]) // 4
     for k in range(draw(st.integers(1, 4))):
@@ -84,13 +100,13 @@ def scans(draw: st.DrawFn) -> MemoryScan:
         trigger = int(track.trigger_ids[0]) + 50 * k if is_first_known else None
         rows.append(
             ExposureRow(
-                3 * k,
-                start + k * apart,
-                camera,
-                f"images/{k}.png",
-                tuple(lasers),
-                trigger,
-                draw(st.none() | names),
+                index=3 * k,
+                t_ns=start + k * apart,
+                camera=camera,
+                source=f"images/{k}.png",
+                lasers=tuple(lasers),
+                trigger_id=trigger,
+                view=draw(st.none() | names),
             )
         )
     session = Session(

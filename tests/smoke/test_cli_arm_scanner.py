@@ -143,7 +143,9 @@ def test_a_tip_compensated_to_the_wrong_side_is_told_by_its_diameter(
     flat = np.column_stack([x.ravel(), y.ravel(), np.zeros(9)])
     flat[:, 2] = -(flat @ PLATE + PLATE_D_MM) / PLATE[2]
     centres, wrong = tmp_path / "centres.csv", tmp_path / "wrong.csv"
-    centres.write_bytes(probed_points_csv(ProbedPoints(flat + 3.0 * PLATE, 6.0)))
+    centres.write_bytes(
+        probed_points_csv(ProbedPoints(points_mm=flat + 3.0 * PLATE, tip_diameter_mm=6.0))
+    )
     run_probing(ProbeRequest(centres, wrong, options=ProbingOptions(side="-z")))
     words = ["calibrate", "hand-eye", scan, "--sensor", calibrated.sensor, "--plate", wrong]
     said = fails(*words, "-o", tmp_path / "s.json")

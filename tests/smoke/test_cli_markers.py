@@ -49,14 +49,41 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rendered = render(marks, rotation, translation, (WIDTH, HEIGHT), focal_px=FOCAL_PX, rays=4)
         cv2.imwrite(str(path / f"{name}.png"), rendered.exposure(1).image)
     camera = CameraModel(
-        FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2, np.zeros(5), WIDTH, HEIGHT
+        fx_px=FOCAL_PX,
+        fy_px=FOCAL_PX,
+        cx_px=(WIDTH - 1) / 2,
+        cy_px=(HEIGHT - 1) / 2,
+        distortion=np.zeros(5),
+        width_px=WIDTH,
+        height_px=HEIGHT,
     )
-    origin = Provenance("drawn", "2026-01-01T00:00:00+00:00", "0", (), ())
+    origin = Provenance(
+        document_id="drawn",
+        created_utc="2026-01-01T00:00:00+00:00",
+        armscan_version="0",
+        command=(),
+        inputs=(),
+    )
     calibration = CameraCalibration(
-        camera, np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, np.array([0, 0, WIDTH, HEIGHT]), origin
+        camera=camera,
+        covariance=np.zeros((9, 9)),
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=np.array([0, 0, WIDTH, HEIGHT]),
+        provenance=origin,
     )
     stereo = StereoCalibration(
-        calibration, calibration, Pose(turn, shift), np.zeros((24, 24)), 0.1, 9, 99, origin
+        left=calibration,
+        right=calibration,
+        right_from_left=Pose(turn, shift),
+        covariance=np.zeros((24, 24)),
+        rms_px=0.1,
+        n_pairs=9,
+        n_points=99,
+        provenance=origin,
     )
     (path / "stereo.json").write_bytes(stereo_document(stereo))
     return path

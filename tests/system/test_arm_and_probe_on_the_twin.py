@@ -43,7 +43,8 @@ def test_the_probed_plate_is_the_true_one(twin: Twin) -> None:
     probing = twin.probe_plate()
     centres = tip_centres(probing.arm, tool_from_probe(probing.tool_from_probe_mm))
     plate = fit_probed_plate(
-        ProbedPoints(centres, probing.tip_diameter_mm), probing.arm.translations_mm
+        ProbedPoints(points_mm=centres, tip_diameter_mm=probing.tip_diameter_mm),
+        probing.arm.translations_mm,
     )
     assert isinstance(plate, ProbedPlate)
     found, truth = plate.reference.plane, twin.truth.plate_plane

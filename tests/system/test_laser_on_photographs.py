@@ -31,7 +31,13 @@ pytestmark = pytest.mark.skipif(
 )
 BOARD = Chessboard(11, 6, 13.0)
 PLACEMENTS = ("0-255-255-8", "0-255-255-8-x")
-NO_PROVENANCE = Provenance("test", "2026-01-01T00:00:00Z", "0", ("test",), ())
+NO_PROVENANCE = Provenance(
+    document_id="test",
+    created_utc="2026-01-01T00:00:00Z",
+    armscan_version="0",
+    command=("test",),
+    inputs=(),
+)
 STRIPE_PX = 0.7
 """The lines are 3 px wide on paper squares, with speckle, through a webcam's JPEG."""
 
@@ -43,15 +49,15 @@ def laser() -> LaserFit:
     assert isinstance(run, CameraRun), run
     fit = run.fit
     camera = CameraCalibration(
-        fit.camera,
-        fit.covariance,
-        True,
-        fit.rms_px,
-        fit.sigma_point_px,
-        fit.n_views,
-        fit.n_points,
-        fit.coverage.covered_px,
-        NO_PROVENANCE,
+        camera=fit.camera,
+        covariance=fit.covariance,
+        has_covariance=True,
+        rms_px=fit.rms_px,
+        sigma_point_px=fit.sigma_point_px,
+        n_views=fit.n_views,
+        n_points=fit.n_points,
+        covered_px=fit.coverage.covered_px,
+        provenance=NO_PROVENANCE,
     )
     folder = DATA / "laser_pattern"
     found = calibrate_sheets_from_exposures(

@@ -14,7 +14,6 @@ from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
-from armscan.calibration.hand_eye.thesis import TwoStepHandEye, calibrate_in_two_steps
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector_from_rotation
@@ -22,6 +21,7 @@ from armscan.geometry.shapes import Plane
 from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
+from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))

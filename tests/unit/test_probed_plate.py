@@ -39,7 +39,7 @@ def touches(
 
 
 def tip_points(**how: float) -> ProbedPoints:
-    return ProbedPoints(touches(**how), TIP_MM)
+    return ProbedPoints(points_mm=touches(**how), tip_diameter_mm=TIP_MM)
 
 
 def test_the_surface_is_half_a_diameter_below_the_centres() -> None:
@@ -84,7 +84,7 @@ def test_from_the_other_side_the_face_is_the_other_one() -> None:
 
 
 def test_points_on_the_surface_are_left_where_they_are() -> None:
-    surface = ProbedPoints(touches(tip_mm=0.0))
+    surface = ProbedPoints(points_mm=touches(tip_mm=0.0))
     plate = plate_from_probing(surface)
     assert isinstance(plate, PlateReference)
     assert np.abs(plate.plane.distance_mm(surface.points_mm)).max() < 1e-9
@@ -102,13 +102,18 @@ def test_the_users_word_wins_over_the_tool() -> None:
 def test_covariance_is_that_of_repeats() -> None:
     """Touched again 400 times: tilts and offset at the first plate's point scatter as it says."""
     design = touches(12, 0.0, seed=1)
-    first = plate_from_probing(ProbedPoints(design, TIP_MM), FRAME.translation_mm + 99 * NORMAL)
+    first = plate_from_probing(
+        ProbedPoints(points_mm=design, tip_diameter_mm=TIP_MM), FRAME.translation_mm + 99 * NORMAL
+    )
     assert isinstance(first, PlateReference)
     rng = np.random.default_rng(2)
     errors, sigmas = [], []
     for _ in range(400):
         noisy = design + NOISE_MM * rng.normal(size=(12, 1)) * NORMAL
-        plate = plate_from_probing(ProbedPoints(noisy, TIP_MM), FRAME.translation_mm + 99 * NORMAL)
+        plate = plate_from_probing(
+            ProbedPoints(points_mm=noisy, tip_diameter_mm=TIP_MM),
+            FRAME.translation_mm + 99 * NORMAL,
+        )
         assert isinstance(plate, PlateReference)
         assert plate.covariance is not None
         slope = first.plane.axes @ plate.plane.normal
@@ -122,12 +127,13 @@ def test_covariance_is_that_of_repeats() -> None:
 def test_a_touch_that_slipped_is_named_and_left_out_on_demand() -> None:
     points = touches(14, NOISE_MM, seed=3)
     points[5] += 0.15 * NORMAL
-    named = fit_probed_plate(ProbedPoints(points, TIP_MM))
+    named = fit_probed_plate(ProbedPoints(points_mm=points, tip_diameter_mm=TIP_MM))
     assert isinstance(named, ProbedPlate)
     assert named.outliers == (5,)
     assert any("row 6 (+0.1" in warning and "took part" in warning for warning in named.warnings)
     without = fit_probed_plate(
-        ProbedPoints(points, TIP_MM), options=ProbingOptions(leave_out_outliers=True)
+        ProbedPoints(points_mm=points, tip_diameter_mm=TIP_MM),
+        options=ProbingOptions(leave_out_outliers=True),
     )
     assert isinstance(without, ProbedPlate)
     assert without.reference.n_points == 13
@@ -163,13 +169,13 @@ def test_what_determines_no_plate_is_a_failure_in_words() -> None:
         (rough, "scatter"),
         (upright, "--side"),
     ):
-        failure = plate_from_probing(ProbedPoints(points, TIP_MM))
+        failure = plate_from_probing(ProbedPoints(points_mm=points, tip_diameter_mm=TIP_MM))
         assert isinstance(failure, FitFailure)
         assert word in failure.reason + failure.remedy
     inside = plate_from_probing(tip_points(), FRAME.translation_mm + TIP_MM / 2 * NORMAL)
     assert isinstance(inside, FitFailure)
     with pytest.raises(InputError):
-        ProbedPoints(np.full((4, 3), np.nan))
+        ProbedPoints(points_mm=np.full((4, 3), np.nan))
     with pytest.raises(OptionError, match="up"):
         ProbingOptions(side="up")
 
@@ -184,7 +190,7 @@ def test_the_region_of_a_plate_from_few_touches_holds_95_percent(n: int) -> None
     n_inside = 0
     for _ in range(600):
         noisy = flat + options.touch_sigma_mm * rng.normal(size=(n, 1)) * [0.0, 0.0, 1.0]
-        plate = plate_from_probing(ProbedPoints(noisy), options=options)
+        plate = plate_from_probing(ProbedPoints(points_mm=noisy), options=options)
         assert isinstance(plate, PlateReference)
         assert plate.covariance is not None
         x, y, normal = plate.plane.axes
@@ -219,8 +225,8 @@ def test_a_touch_is_named_by_its_row_in_the_table() -> None:
     names = ("block",) * 4 + ("plate",) * 14
     rows = tuple(range(3, 21))
     for probed, row in (
-        (ProbedPoints(both, TIP_MM, names), 10),
-        (ProbedPoints(both, TIP_MM, names, rows=rows), 12),
+        (ProbedPoints(points_mm=both, tip_diameter_mm=TIP_MM, features=names), 10),
+        (ProbedPoints(points_mm=both, tip_diameter_mm=TIP_MM, features=names, rows=rows), 12),
     ):
         plate = fit_probed_plate(probed, options=ProbingOptions(feature="plate"))
         assert isinstance(plate, ProbedPlate)
@@ -229,7 +235,9 @@ def test_a_touch_is_named_by_its_row_in_the_table() -> None:
 
 
 def test_points_on_the_surface_keep_the_tip_that_touched_them() -> None:
-    surface = ProbedPoints(touches(tip_mm=0.0), TIP_MM, is_compensated=True)
+    surface = ProbedPoints(
+        points_mm=touches(tip_mm=0.0), tip_diameter_mm=TIP_MM, is_compensated=True
+    )
     assert not surface.are_tip_centres
     plate = plate_from_probing(surface)
     assert isinstance(plate, PlateReference)
@@ -239,7 +247,9 @@ def test_points_on_the_surface_keep_the_tip_that_touched_them() -> None:
 
 def test_of_several_features_one_must_be_chosen() -> None:
     both = np.concatenate([touches(8), touches(6) + 50.0])
-    probed = ProbedPoints(both, TIP_MM, ("plate",) * 8 + ("block",) * 6)
+    probed = ProbedPoints(
+        points_mm=both, tip_diameter_mm=TIP_MM, features=("plate",) * 8 + ("block",) * 6
+    )
     with pytest.raises(InputError, match="block, plate"):
         plate_from_probing(probed)
     plate = plate_from_probing(probed, options=ProbingOptions(feature="plate"))

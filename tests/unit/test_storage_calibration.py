@@ -58,7 +58,9 @@ def test_floats_of_any_size_survive(tmp_path: Path, seed: int) -> None:
     size = np.abs(numbers)
     usable = numbers[(size > 1e-300) & (size < 1e7)][:5]
     known = camera_calibration()
-    changed = CameraModel(1.0, 1.0, 0.0, 0.0, usable, 1, 1)
+    changed = CameraModel(
+        fx_px=1.0, fy_px=1.0, cx_px=0.0, cy_px=0.0, distortion=usable, width_px=1, height_px=1
+    )
     values = {item.name: getattr(known, item.name) for item in fields(known)} | {"camera": changed}
     path = tmp_path / "camera.json"
     path.write_bytes(camera_document(CameraCalibration(**values)))

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from typing import TypeAlias
+from typing import Any, ClassVar, Self, TypeAlias, dataclass_transform
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,91 +16,331 @@ FloatArray: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 ImageArray: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
+RowChoice: TypeAlias = BoolArray | IntArray | slice
+Shape: TypeAlias = tuple[int | str | None, ...]
+"""An axis of a given length, of a length with a name (the same within a record), or of any."""
+
+ROWS = "N"
+"""Name of the axis that counts the rows of a `RowRecord`."""
 
 
 def frozen_floats(
-    values: ArrayLike, shape: tuple[int | None, ...], name: str, *, allow_nan: bool = False
+    values: ArrayLike,
+    shape: Shape,
+    name: str,
+    *,
+    allow_nan: bool = False,
+    allow_infinite: bool = False,
 ) -> FloatArray:
-    """Return a read-only float64 copy of ``values`` after checking shape and finiteness.
+    """Return a read-only float64 array of ``values`` after checking shape and finiteness.
+
+    It is a copy, unless ``values`` owns its memory and is read-only already.
 
     Parameters
     ----------
     values
         Anything that numpy turns into an array.
     shape
-        Expected shape; ``None`` matches any length on that axis.
+        Expected shape.
     name
         The name that an error message shows, with frame and unit.
     allow_nan
-        Accept NaN (a gap); infinity is refused all the same.
+        Accept NaN (a gap).
+    allow_infinite
+        Accept infinity (no limit).
 
     Raises
     ------
     InputError
         If the shape differs or a value is not finite.
     """
-    array = np.array(values, dtype=np.float64, order="C")
-    _check_shape(array.shape, shape, name)
-    bad = np.isinf(array) if allow_nan else ~np.isfinite(array)
+    array: FloatArray = _frozen(values, np.dtype(np.float64), shape, name)
+    if allow_nan and allow_infinite:
+        return array
+    bad = ~np.isfinite(array)
+    if bad.any() and (allow_nan or allow_infinite):
+        bad = np.isinf(array) if allow_nan else np.isnan(array)
     if bad.any():
         raise InputError(
             f"{name} holds {int(bad.sum())} values that are not finite",
             remedy="remove or mask these entries",
         )
-    array.setflags(write=False)
     return array
 
 
-def frozen_ints(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> IntArray:
-    """Return a read-only int64 copy of ``values`` after checking its shape."""
-    array = np.array(values, dtype=np.int64, order="C")
-    _check_shape(array.shape, shape, name)
-    array.setflags(write=False)
-    return array
+def frozen_ints(values: ArrayLike, shape: Shape, name: str) -> IntArray:
+    """Return a read-only int64 array of ``values`` after checking its shape."""
+    return _frozen(values, np.dtype(np.int64), shape, name)
 
 
-def _check_shape(actual: tuple[int, ...], shape: tuple[int | None, ...], name: str) -> None:
-    matches = len(actual) == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, actual, strict=True)
-    )
-    if not matches:
+def _frozen(values: ArrayLike, dtype: np.dtype[Any], shape: Shape, name: str) -> NDArray[Any]:
+    if (
+        isinstance(values, np.ndarray)
+        and values.dtype == dtype
+        and values.flags.c_contiguous
+        and values.flags.owndata
+        and not values.flags.writeable
+    ):
+        array = values
+    else:
+        array = np.array(values, dtype=dtype, order="C")
+        array.setflags(write=False)
+    actual = array.shape
+    if len(actual) != len(shape) or any(
+        isinstance(want, int) and want != have for want, have in zip(shape, actual, strict=True)
+    ):
         wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
         raise InputError(f"{name} has shape {actual}, expected {wanted}")
+    return array
 
 
-NAMES = ("xmin", "xmax", "ymin", "ymax", "zmin", "zmax")
-REMEDY = f"give {','.join(NAMES)} in mm"
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Column:
+    """What an array field of a record holds; ``dtype`` None stands for a tuple."""
+
+    shape: Shape
+    dtype: np.dtype[Any] | None
+    allow_nan: bool = False
+    allow_infinite: bool = False
 
 
-def box_corners_mm(values: Sequence[float], where: str) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner (3,) of ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm.
+def floats(
+    *shape: int | str | None,
+    default: Any = dataclasses.MISSING,
+    nan: bool = False,
+    infinite: bool = False,
+) -> Any:
+    """Declare a float64 field of an `ArrayRecord`.
+
+    As in ``points_mm: FloatArray = floats("N", 3)``.
 
     Parameters
     ----------
-    values
-        The numbers.
-    where
-        The option that gave them, for messages.
+    *shape
+        Length of each axis: a number, a name for a length that the record's fields share, or None
+        for any. ``"N"`` counts the rows of a `RowRecord`.
+    default
+        Value where none is given, usually None; without it the field must be given.
+    nan, infinite
+        Accept NaN (a gap), infinity (no limit).
+    """
+    column = _Column(shape, np.dtype(np.float64), nan, infinite)
+    return dataclasses.field(default=default, metadata={"column": column})
+
+
+def ints(*shape: int | str | None, default: Any = dataclasses.MISSING) -> Any:
+    """Declare an int64 field of an `ArrayRecord`; parameters as for `floats`."""
+    column = _Column(shape, np.dtype(np.int64))
+    return dataclasses.field(default=default, metadata={"column": column})
+
+
+def bools(*shape: int | str | None, default: Any = dataclasses.MISSING) -> Any:
+    """Declare a boolean field of an `ArrayRecord`; parameters as for `floats`."""
+    column = _Column(shape, np.dtype(np.bool_))
+    return dataclasses.field(default=default, metadata={"column": column})
+
+
+def items(length: int | str = ROWS, *, default: Any = dataclasses.MISSING) -> Any:
+    """Declare a field of an `ArrayRecord` that is a tuple with one entry a row."""
+    return dataclasses.field(default=default, metadata={"column": _Column((length,), None)})
+
+
+@dataclass_transform(
+    frozen_default=True,
+    eq_default=False,
+    kw_only_default=True,
+    field_specifiers=(dataclasses.field, floats, ints, bools, items),
+)
+class ArrayRecord:
+    """Base of records that own arrays: subclasses are frozen dataclasses, built by keyword.
+
+    Fields made with `floats`, `ints`, `bools` and `items` are checked and frozen when the record is
+    built; axes of the same name must have the same length. A subclass that has more to check
+    defines ``__post_init__`` and calls this one first. ``class Pose(ArrayRecord, kw_only=False)``
+    may be built by position.
+
+    Raises
+    ------
+    InputError
+        If a shape differs or a value is not finite.
+    """
+
+    _columns: ClassVar[dict[str, _Column]] = {}
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    def __init_subclass__(cls, *, kw_only: bool = True) -> None:
+        super().__init_subclass__()
+        dataclasses.dataclass(frozen=True, eq=False, kw_only=kw_only)(cls)
+        cls._columns = {
+            entry.name: entry.metadata["column"]
+            for entry in dataclasses.fields(cls)
+            if "column" in entry.metadata
+        }
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, int] = {}
+        for name, column in self._columns.items():
+            value = getattr(self, name)
+            if value is None:
+                continue
+            actual = np.shape(value) if column.dtype is not None else (len(value),)
+            for axis, length in zip(column.shape, actual, strict=False):
+                if isinstance(axis, str):
+                    lengths.setdefault(axis, length)
+            shape = tuple(lengths.get(n, n) if isinstance(n, str) else n for n in column.shape)
+            frozen = _owned(value, column, shape, name)
+            object.__setattr__(self, name, frozen)
+
+
+def _owned(value: Any, column: _Column, shape: Shape, name: str) -> Any:
+    if column.dtype is None:
+        entries = tuple(value)
+        if isinstance(shape[0], int) and len(entries) != shape[0]:
+            raise InputError(f"{name} holds {len(entries)} entries, expected {shape[0]}")
+        return entries
+    if column.dtype == np.float64:
+        return frozen_floats(
+            value,
+            shape,
+            name,
+            allow_nan=column.allow_nan,
+            allow_infinite=column.allow_infinite,
+        )
+    return _frozen(value, column.dtype, shape, name)
+
+
+class RowRecord(ArrayRecord):
+    """An `ArrayRecord` of N rows: fields whose first axis is ``"N"`` hold one entry a row."""
+
+    def __len__(self) -> int:
+        """Count of rows."""
+        return next(
+            len(value)
+            for name, column in self._columns.items()
+            if column.shape[0] == ROWS and (value := getattr(self, name)) is not None
+        )
+
+    def select(self, rows: RowChoice) -> Self:
+        """The rows of a mask (N,), of indices (M,) or of a slice; other fields stay."""
+        chosen: dict[str, Any] = {}
+        for name, column in self._columns.items():
+            value = getattr(self, name)
+            if column.shape[:1] != (ROWS,) or value is None:
+                continue
+            if column.dtype is None:
+                chosen[name] = tuple(value[k] for k in np.arange(len(value))[rows])
+            else:
+                chosen[name] = value[rows]
+        return dataclasses.replace(self, **chosen)
+
+    @classmethod
+    def concat(cls, parts: Sequence[Self], **changes: Any) -> Self:
+        """The rows of all ``parts``, in turn.
+
+        Parameters
+        ----------
+        parts
+            One record at least.
+        changes
+            Fields to set instead, as for `dataclasses.replace`. Fields that do not count rows must
+            otherwise be the same in all parts.
+
+        Raises
+        ------
+        InputError
+            If there is no part, or a field differs.
+        """
+        if not parts:
+            raise InputError(f"no {cls.__name__} to join")
+        values: dict[str, Any] = {}
+        for entry in dataclasses.fields(cls):
+            if entry.name in changes or not entry.init:
+                continue
+            each = [getattr(part, entry.name) for part in parts]
+            column = cls._columns.get(entry.name)
+            is_missing = any(value is None for value in each)
+            if column is None or column.shape[:1] != (ROWS,) or is_missing:
+                if not all(_is_same(value, each[0]) for value in each[1:]):
+                    raise InputError(f"{entry.name} differs between the {cls.__name__} to join")
+                values[entry.name] = each[0]
+            elif column.dtype is None:
+                values[entry.name] = tuple(entry for value in each for entry in value)
+            else:
+                values[entry.name] = np.concatenate(each)
+        return cls(**values, **changes)
+
+
+def _is_same(value: Any, other: Any) -> bool:
+    if value is other:
+        return True
+    if isinstance(value, np.ndarray) or isinstance(other, np.ndarray):
+        return np.array_equal(value, other, equal_nan=True)
+    return bool(value == other)
+
+
+LIMIT_NAMES = ("xmin", "xmax", "ymin", "ymax", "zmin", "zmax")
+BOX_REMEDY = f"give {','.join(LIMIT_NAMES)} in mm"
+
+
+class Box(ArrayRecord, kw_only=False):
+    """A box along the axes of some frame, from the corner ``low_mm`` (3,) to ``high_mm`` (3,).
 
     Raises
     ------
     OptionError
-        Naming the number that is not finite, or the pair that is not in order; or the count.
+        If a lower limit is not below its upper one.
     """
-    if len(values) != len(NAMES):
-        fact = f"{len(values)} numbers where {len(NAMES)} are needed"
-        raise OptionError(fact, where=where, remedy=REMEDY)
-    numbers = np.array(values, dtype=np.float64)
-    for name, value in zip(NAMES, numbers, strict=True):
-        if not np.isfinite(value):
-            raise OptionError(f"{name} is {value:g}", where=where, remedy=REMEDY)
-    low, high = numbers[0::2], numbers[1::2]
-    for axis in range(3):
-        if not low[axis] < high[axis]:
+
+    low_mm: FloatArray = floats(3)
+    high_mm: FloatArray = floats(3)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for axis in np.flatnonzero(~(self.low_mm < self.high_mm)):
+            low, high = LIMIT_NAMES[2 * axis], LIMIT_NAMES[2 * axis + 1]
             raise OptionError(
-                f"{NAMES[2 * axis]} {low[axis]:g} is not below {NAMES[2 * axis + 1]} "
-                f"{high[axis]:g}",
-                where=where,
-                remedy=REMEDY,
+                f"{low} {self.low_mm[axis]:g} is not below {high} {self.high_mm[axis]:g}",
+                remedy=BOX_REMEDY,
             )
-    return low, high
+
+    @staticmethod
+    def from_limits(limits_mm: Sequence[float], where: str) -> Box:
+        """The box of ``xmin, xmax, ymin, ymax, zmin, zmax``; ``where`` names their option.
+
+        Raises
+        ------
+        OptionError
+            If these are not six finite numbers, each lower limit below its upper one.
+        """
+        if len(limits_mm) != len(LIMIT_NAMES):
+            fact = f"{len(limits_mm)} numbers where {len(LIMIT_NAMES)} are needed"
+            raise OptionError(fact, where=where, remedy=BOX_REMEDY)
+        for name, value in zip(LIMIT_NAMES, limits_mm, strict=True):
+            if not np.isfinite(value):
+                raise OptionError(f"{name} is {value:g}", where=where, remedy=BOX_REMEDY)
+        try:
+            return Box(np.asarray(limits_mm[0::2]), np.asarray(limits_mm[1::2]))
+        except OptionError as error:
+            raise OptionError(error.what, where=where, remedy=error.remedy) from error
+
+    @staticmethod
+    def parse(text: str, where: str) -> Box:
+        """The box of six numbers with commas between them, as `from_limits`."""
+        limits = []
+        for word in text.split(","):
+            try:
+                limits.append(float(word))
+            except ValueError as error:
+                fact = f"'{word}' is no number"
+                raise OptionError(fact, where=where, remedy=BOX_REMEDY) from error
+        return Box.from_limits(limits, where)
+
+    def __str__(self) -> str:
+        """The limits as `parse` reads them."""
+        pairs = zip(self.low_mm.tolist(), self.high_mm.tolist(), strict=True)
+        return ",".join(f"{low!r},{high!r}" for low, high in pairs)
+
+    def holds(self, points_mm: FloatArray) -> BoolArray:
+        """(N,) True for those of (N, 3) points that lie inside or on the border."""
+        points = np.asarray(points_mm)
+        return np.asarray(((points >= self.low_mm) & (points <= self.high_mm)).all(axis=1))

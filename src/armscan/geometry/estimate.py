@@ -8,13 +8,13 @@ from typing import Generic, NoReturn, TypeVar
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.errors import InputError
+from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
 
 T = TypeVar("T")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Estimate(Generic[T]):
+class Estimate(ArrayRecord, Generic[T]):
     """An estimated value with its covariance and residuals.
 
     Parameters
@@ -35,14 +35,17 @@ class Estimate(Generic[T]):
 
     value: T
     parameter_names: tuple[str, ...]
-    covariance: FloatArray
+    covariance: FloatArray = floats("P", "P")
     residuals: FloatArray
     degrees_of_freedom: int
     chi2: float
 
     def __post_init__(self) -> None:
-        n = len(self.parameter_names)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
+        super().__post_init__()
+        if len(self.covariance) != len(self.parameter_names):
+            raise InputError(
+                f"covariance of {len(self.covariance)} parameters for {len(self.parameter_names)}"
+            )
         residuals = np.array(self.residuals, dtype=np.float64)
         residuals.setflags(write=False)
         object.__setattr__(self, "residuals", residuals)

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Generic, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, frozen_floats
-from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
+from armscan.geometry.arrays import ArrayRecord, FloatArray, RowRecord, floats, frozen_floats
+from armscan.geometry.rotations import rotation_from_vector, skew, vector_from_rotation
 
 
 class Frame:
@@ -61,22 +60,13 @@ C = TypeVar("C", bound=Frame)
 ORTHONORMAL_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Points(Generic[A]):
+class Points(RowRecord, Generic[A], kw_only=False):
     """Points in the frame ``A``: ``xyz_mm`` of shape (N, 3)."""
 
-    xyz_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "xyz_mm", frozen_floats(self.xyz_mm, (None, 3), "points (mm)"))
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.xyz_mm)
+    xyz_mm: FloatArray = floats("N", 3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pose(Generic[A, B]):
+class Pose(ArrayRecord, Generic[A, B], kw_only=False):
     """Rigid transform that maps coordinates in ``B`` to coordinates in ``A`` (``a_from_b``).
 
     Parameters
@@ -92,22 +82,18 @@ class Pose(Generic[A, B]):
         If the matrix is not a proper rotation within 1e-6.
     """
 
-    rotation: FloatArray
-    translation_mm: FloatArray
+    rotation: FloatArray = floats(3, 3)
+    translation_mm: FloatArray = floats(3)
 
     def __post_init__(self) -> None:
-        rotation = frozen_floats(self.rotation, (3, 3), "rotation")
-        defect = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(rotation) < 0.0:
+        super().__post_init__()
+        defect = float(np.abs(self.rotation @ self.rotation.T - np.eye(3)).max())
+        if defect > ORTHONORMAL_TOLERANCE or np.linalg.det(self.rotation) < 0.0:
             raise InputError(
                 f"matrix is not a rotation: |R R' - 1| = {defect:.2g}, "
-                f"det = {np.linalg.det(rotation):.3f}",
+                f"det = {np.linalg.det(self.rotation):.3f}",
                 remedy="check row/column order and handedness",
             )
-        object.__setattr__(self, "rotation", rotation)
-        object.__setattr__(
-            self, "translation_mm", frozen_floats(self.translation_mm, (3,), "translation_mm")
-        )
 
     @staticmethod
     def from_vectors(rotation_vector_rad: ArrayLike, translation_mm: ArrayLike) -> Pose[A, B]:
@@ -132,6 +118,28 @@ class Pose(Generic[A, B]):
         """Return ``b_from_a``."""
         return Pose(self.rotation.T, -self.rotation.T @ self.translation_mm)
 
+    def apply(self, points_mm: FloatArray) -> FloatArray:
+        """(..., 3) points of B, in A."""
+        return np.asarray(points_mm @ self.rotation.T + self.translation_mm)
+
+    def rotate(self, vectors: FloatArray) -> FloatArray:
+        """(..., 3) directions of B, in A."""
+        return np.asarray(vectors @ self.rotation.T)
+
+    def rotate_covariance(self, covariance: FloatArray) -> FloatArray:
+        """(..., 3, 3) covariances in B, in A."""
+        return np.asarray(self.rotation @ covariance @ self.rotation.T)
+
+    def retract(self, step: FloatArray) -> Pose[A, B]:
+        """The pose after a step (6,): a rotation vector in A from the left, then a translation."""
+        return Pose(rotation_from_vector(step[:3]) @ self.rotation, self.translation_mm + step[3:])
+
+    def jacobian(self, points_mm: FloatArray) -> FloatArray:
+        """(N, 3, 6) derivative of ``apply(points_mm)`` by a step of `retract`; points (N, 3)."""
+        turned = self.rotate(points_mm)
+        shift = np.broadcast_to(np.eye(3), (len(turned), 3, 3))
+        return np.concatenate([-skew(turned), shift], axis=2)
+
     @overload
     def __matmul__(self, other: Pose[B, C]) -> Pose[A, C]: ...
     @overload
@@ -139,7 +147,7 @@ class Pose(Generic[A, B]):
     def __matmul__(self, other: Pose[B, C] | Points[B]) -> Pose[A, C] | Points[A]:
         """Compose with a pose, or map points."""
         if isinstance(other, Points):
-            return Points(other.xyz_mm @ self.rotation.T + self.translation_mm)
+            return Points(self.apply(other.xyz_mm))
         return Pose(
             self.rotation @ other.rotation,
             self.rotation @ other.translation_mm + self.translation_mm,

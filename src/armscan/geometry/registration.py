@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.arrays import FloatArray, RowRecord, floats
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.rotations import rotation_from_vector, skew
@@ -36,8 +36,7 @@ LEAST_SPREAD_SIGMAS = 10.0
 it would be uncertain by more than a tenth of a radian."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointPairs:
+class PointPairs(RowRecord):
     """The same N points in two frames, A and B, each with its covariance.
 
     Parameters
@@ -48,24 +47,10 @@ class PointPairs:
         (N, 3, 3), independent between points and lists; their sum is positive definite.
     """
 
-    points_a_mm: FloatArray
-    points_b_mm: FloatArray
-    covariance_a_mm2: FloatArray
-    covariance_b_mm2: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.points_a_mm)
-        for name, shape in (
-            ("points_a_mm", (n, 3)),
-            ("points_b_mm", (n, 3)),
-            ("covariance_a_mm2", (n, 3, 3)),
-            ("covariance_b_mm2", (n, 3, 3)),
-        ):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.points_a_mm)
+    points_a_mm: FloatArray = floats("N", 3)
+    points_b_mm: FloatArray = floats("N", 3)
+    covariance_a_mm2: FloatArray = floats("N", 3, 3)
+    covariance_b_mm2: FloatArray = floats("N", 3, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,12 +141,12 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
     normal = np.einsum("nji,njk,nkl->il", jacobian, weights, jacobian)
     squares = float(np.einsum("ni,nij,nj->", residuals, weights, residuals))
     return Estimate(
-        pose,
-        REGISTRATION_PARAMETERS,
-        np.linalg.inv(normal),
-        residuals,
-        3 * len(pairs) - 6,
-        squares,
+        value=pose,
+        parameter_names=REGISTRATION_PARAMETERS,
+        covariance=np.linalg.inv(normal),
+        residuals=residuals,
+        degrees_of_freedom=3 * len(pairs) - 6,
+        chi2=squares,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, frozen_floats
 from armscan.geometry.estimate import Estimate, FitFailure
 
 PLANE_PARAMETERS = ("tilt_1_rad", "tilt_2_rad", "offset_mm")
@@ -38,19 +38,14 @@ class Line:
         return np.asarray(np.linalg.norm(across, axis=1))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Plane:
+class Plane(ArrayRecord, kw_only=False):
     """A plane through ``point_mm`` (3,) with rows of ``axes`` (3, 3) along, across and normal.
 
     The first axis is the direction of the widest spread of the points it was fitted to.
     """
 
-    point_mm: FloatArray
-    axes: FloatArray
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "point_mm", frozen_floats(self.point_mm, (3,), "point_mm"))
-        object.__setattr__(self, "axes", frozen_floats(self.axes, (3, 3), "axes"))
+    point_mm: FloatArray = floats(3)
+    axes: FloatArray = floats(3, 3)
 
     @property
     def normal(self) -> FloatArray:
@@ -164,7 +159,12 @@ def fit_plane(
     information = np.array([spread[0] ** 2, spread[1] ** 2, float(n)])
     chi2 = squares / variance if variance > 0.0 else 0.0
     return Estimate(
-        plane, PLANE_PARAMETERS, np.diag(variance / information), residuals, freedom, chi2
+        value=plane,
+        parameter_names=PLANE_PARAMETERS,
+        covariance=np.diag(variance / information),
+        residuals=residuals,
+        degrees_of_freedom=freedom,
+        chi2=chi2,
     )
 
 
@@ -575,12 +575,12 @@ def fit_circle(
         return fit
     freedom = fit.degrees_of_freedom
     return Estimate(
-        Circle(fit.centre, fit.radius),
-        CIRCLE_PARAMETERS,
-        fit.covariance,
-        fit.residuals,
-        freedom,
-        float(freedom),
+        value=Circle(fit.centre, fit.radius),
+        parameter_names=CIRCLE_PARAMETERS,
+        covariance=fit.covariance,
+        residuals=fit.residuals,
+        degrees_of_freedom=freedom,
+        chi2=float(freedom),
     )
 
 
@@ -613,12 +613,12 @@ def fit_space_circle(
         return flat
     centre = middle + flat.value.centre_mm @ axes[:2]
     return Estimate(
-        SpaceCircle(Plane(centre, axes), flat.value.radius_mm),
-        flat.parameter_names,
-        flat.covariance,
-        flat.residuals,
-        flat.degrees_of_freedom,
-        flat.chi2,
+        value=SpaceCircle(Plane(centre, axes), flat.value.radius_mm),
+        parameter_names=flat.parameter_names,
+        covariance=flat.covariance,
+        residuals=flat.residuals,
+        degrees_of_freedom=flat.degrees_of_freedom,
+        chi2=flat.chi2,
     )
 
 
@@ -682,10 +682,10 @@ def fit_sphere(
         return fit
     freedom = fit.degrees_of_freedom
     return Estimate(
-        Sphere(fit.centre, fit.radius),
-        SPHERE_PARAMETERS,
-        fit.covariance,
-        fit.residuals,
-        freedom,
-        float(freedom),
+        value=Sphere(fit.centre, fit.radius),
+        parameter_names=SPHERE_PARAMETERS,
+        covariance=fit.covariance,
+        residuals=fit.residuals,
+        degrees_of_freedom=freedom,
+        chi2=float(freedom),
     )

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, fit_plane
 from armscan.inspection.results import (
@@ -19,7 +19,6 @@ from armscan.inspection.results import (
 from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
     InspectionOptions,
-    Region,
     Selection,
     dominant_flat,
     fit_robustly,
@@ -35,7 +34,7 @@ def inspect_plane(
     reference: Plane | None = None,
     *,
     reference_text: str = "the given plane",
-    region: Region | None = None,
+    region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> PlaneInspection | FitFailure:
     """Inspect a flat face.

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.records.cloud import PointCloud
 
@@ -115,33 +115,6 @@ ROBUST_SIGMA = 1.4826
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Region:
-    """A box along the axes of the cloud's frame.
-
-    Parameters
-    ----------
-    low_mm, high_mm
-        (3,) smallest and largest coordinates.
-    """
-
-    low_mm: FloatArray
-    high_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        for name in ("low_mm", "high_mm"):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (3,), name))
-        if not bool((self.low_mm < self.high_mm).all()):
-            raise OptionError(
-                "the region's lower limits are not all below the upper ones",
-                remedy="give xmin,xmax,ymin,ymax,zmin,zmax in mm",
-            )
-
-    def holds(self, points_mm: FloatArray) -> BoolArray:
-        """(N,) True for points inside."""
-        return np.asarray(((points_mm >= self.low_mm) & (points_mm <= self.high_mm)).all(axis=1))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Selection:
     """Points of a cloud that an inspection looks at.
 
@@ -166,7 +139,7 @@ class Selection:
 
 
 def select(
-    cloud: PointCloud, region: Region | None, options: InspectionOptions, min_points: int
+    cloud: PointCloud, region: Box | None, options: InspectionOptions, min_points: int
 ) -> Selection:
     """Take the points of a cloud inside a region.
 

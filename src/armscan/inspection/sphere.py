@@ -8,14 +8,13 @@ import math
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Sphere, fit_sphere
 from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
 from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
     InspectionOptions,
-    Region,
     Selection,
     find_ball,
     fit_robustly,
@@ -35,7 +34,7 @@ def inspect_sphere(
     cloud: PointCloud,
     diameter_mm: float,
     *,
-    region: Region | None = None,
+    region: Box | None = None,
     options: InspectionOptions | None = None,
 ) -> SphereInspection | FitFailure:
     """Find a ball of known diameter anywhere in a cloud and inspect it.

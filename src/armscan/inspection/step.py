@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import fit_plane
 from armscan.inspection.results import (
@@ -21,7 +21,6 @@ from armscan.inspection.results import (
 )
 from armscan.inspection.selection import (
     InspectionOptions,
-    Region,
     Selection,
     StepOptions,
     dominant_flat,
@@ -265,7 +264,7 @@ def inspect_step(
     height_mm: float,
     *,
     normal: FloatArray | None = None,
-    region: Region | None = None,
+    region: Box | None = None,
     options: InspectionOptions | None = None,
     step_options: StepOptions | None = None,
 ) -> StepInspection | FitFailure:

@@ -277,9 +277,9 @@ def demo_documents(
         right = replace(sensor.second.camera, provenance=base)
         sensor = replace(sensor, second=replace(sensor.second, camera=right))
     scanner = ScannerCalibration(
-        sensor,
-        found.hand_eye.fit.calibration,
-        origin.of_recording(scans["hand-eye"], sensor.provenance),
+        sensor=sensor,
+        hand_eye=found.hand_eye.fit.calibration,
+        provenance=origin.of_recording(scans["hand-eye"], sensor.provenance),
     )
     return {
         **_cameras(found.camera, place, base),

@@ -375,7 +375,9 @@ def run_hand_eye_calibration(request: HandEyeRequest, progress: Progress = silen
     progress(ProgressEvent("solve", len(inputs.groups) + 1, len(inputs.groups) + 1))
     fit = replace(fit, warnings=(*_input_warnings(inputs), *fit.warnings))
     scanner = ScannerCalibration(
-        inputs.sensor, fit.calibration, _provenance(request, inputs, fit.warnings)
+        sensor=inputs.sensor,
+        hand_eye=fit.calibration,
+        provenance=_provenance(request, inputs, fit.warnings),
     )
     images = tuple(image for _, seen in inputs.groups for image in seen.images)
     page = hand_eye_page(

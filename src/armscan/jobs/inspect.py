@@ -17,11 +17,11 @@ from armscan.calibration.hand_eye.probed_plate import (
     plate_from_coefficients,
 )
 from armscan.errors import EstimationError, OptionError
-from armscan.geometry.arrays import FloatArray, box_corners_mm
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
-from armscan.inspection.selection import InspectionOptions, Region, StepOptions
+from armscan.inspection.selection import InspectionOptions, StepOptions
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
 from armscan.models.calibration import Provenance
@@ -217,7 +217,7 @@ def run_step_inspection(
     return _finished(request, cloud, step_report(found, cloud), (request.cloud,), (steps,))
 
 
-def _read(request: InspectRequest) -> tuple[PointCloud, Region | None]:
+def _read(request: InspectRequest) -> tuple[PointCloud, Box | None]:
     if request.output is not None:
         if request.output.suffix.lower() != ".html":
             raise OptionError(
@@ -228,7 +228,7 @@ def _read(request: InspectRequest) -> tuple[PointCloud, Region | None]:
         check_outputs((request.output,), is_overwriting=request.is_overwriting)
     region = None
     if request.region:
-        region = Region(*box_corners_mm(request.region, "--region"))
+        region = Box.from_limits(request.region, "--region")
     return read_cloud(request.cloud), region
 
 

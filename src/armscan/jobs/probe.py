@@ -80,8 +80,8 @@ def run_probing(request: ProbeRequest) -> Summary:
     written: tuple[Path, ...] = ()
     if request.output is not None:
         surface = ProbedPoints(
-            plate.surface_mm[list(plate.is_used)],
-            plate.reference.tip_diameter_mm,
+            points_mm=plate.surface_mm[list(plate.is_used)],
+            tip_diameter_mm=plate.reference.tip_diameter_mm,
             is_compensated=True,
         )
         write_files(
@@ -112,7 +112,9 @@ def read_touches(source: Path, probe: Path | None = None) -> Touches:
     tip = read_probe_tip(probe or source / PROBE_FILE)
     centres = tip_centres(track, tool_from_probe(tip.centre_tool_mm))
     rows = tuple(int(row) + 1 for row in np.flatnonzero(track.is_known))
-    points = ProbedPoints(centres, tip.diameter_mm, source=str(source), rows=rows)
+    points = ProbedPoints(
+        points_mm=centres, tip_diameter_mm=tip.diameter_mm, source=str(source), rows=rows
+    )
     n_gaps = int((~track.is_known).sum())
     gaps = (f"for {n_gaps} of {len(track)} touches the arm gave no pose",) if n_gaps else ()
     return Touches(points, track.translations_mm[track.is_known], (*notes, *gaps))

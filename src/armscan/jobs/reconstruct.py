@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import Box
 from armscan.jobs.job import cloud_outputs
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
@@ -18,7 +19,6 @@ from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, ScanReconstruction, measure_scan
 from armscan.reconstruction.labels import Reconstruction
-from armscan.reconstruction.place import parse_volume
 from armscan.records.exposure import Exposure
 from armscan.report.cloud import cloud_page, fate_table, fate_totals, scan_page
 from armscan.report.page import render_page
@@ -362,7 +362,7 @@ def run_scan(request: CloudRequest, folder: Path, progress: Progress = silent) -
         measured; nothing is written then.
     """
     files = cloud_outputs(request.output, is_overwriting=request.is_overwriting)
-    volume = parse_volume(request.volume) if request.volume else None
+    volume = Box.parse(request.volume, "--volume") if request.volume else None
     scanner = read_scanner_calibration(request.sensor)
     recording = read_recording(folder, None if request.arm is None else read_arm_model(request.arm))
     _check_own_images(request)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from armscan.calibration.hand_eye.probed_plate import ProbeSide
 from armscan.errors import OptionError
-from armscan.geometry.arrays import FloatArray, box_corners_mm
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.inspection.conformity import RULE, Check, Verdict
 from armscan.inspection.results import SphereInspection
-from armscan.inspection.selection import InspectionOptions, Region
+from armscan.inspection.selection import InspectionOptions
 from armscan.jobs.inspect import read_plate
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan import ScanOptions, measure_scan
@@ -165,7 +165,7 @@ def _check(request: VerifyRequest) -> None:
             f"a diameter of {request.ball_mm} mm", where="--ball", remedy="give the diameter in mm"
         )
     if request.region:
-        box_corners_mm(request.region, "--region")
+        Box.from_limits(request.region, "--region")
     if request.scan.is_dir() and request.scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
     if request.output is not None:
@@ -205,7 +205,7 @@ def _inputs(request: VerifyRequest) -> tuple[Path, ...]:
 def _verified(request: VerifyRequest, measured: Measured) -> Verification:
     region = None
     if request.region:
-        region = Region(*box_corners_mm(request.region, "--region"))
+        region = Box.from_limits(request.region, "--region")
     if request.ball_mm is not None:
         return verify_on_ball(
             measured,

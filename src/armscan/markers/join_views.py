@@ -334,10 +334,10 @@ def _placed(view: MarkerSet, numbers: IntArray, known: _GrowingMap) -> Pose[Part
     common = known.is_known[numbers]
     fit: Estimate[Pose[Part, Sensor]] | FitFailure = register_points(
         PointPairs(
-            known.points(numbers[common]),
-            view.points_mm[common],
-            known.covariance(numbers[common]),
-            view.covariance_mm2[common],
+            points_a_mm=known.points(numbers[common]),
+            points_b_mm=view.points_mm[common],
+            covariance_a_mm2=known.covariance(numbers[common]),
+            covariance_b_mm2=view.covariance_mm2[common],
         )
     )
     return None if isinstance(fit, FitFailure) else fit.value

@@ -118,7 +118,13 @@ def _matches(
     n_candidates: int,
     n_planes: int,
 ) -> StereoMatches:
-    markers = MarkerSet(chosen.left, chosen.points_mm, chosen.covariance_mm2, "Sensor", left.source)
+    markers = MarkerSet(
+        ids=chosen.left,
+        points_mm=chosen.points_mm,
+        covariance_mm2=chosen.covariance_mm2,
+        frame="Sensor",
+        source=left.source,
+    )
     return StereoMatches(
         chosen.left,
         chosen.right,

@@ -153,11 +153,11 @@ def thesis_arm(
     offset[0::2] = d
     length[1::2] = -lengths
     return ArmModel(
-        frozen_floats(theta_offset_rad, (7,), "theta_offset_rad"),
-        offset,
-        length,
-        np.array(THESIS_TWISTS_RAD),
-        no_flange() if flange is None else flange,
+        theta_offset_rad=frozen_floats(theta_offset_rad, (7,), "theta_offset_rad"),
+        offset_mm=offset,
+        length_mm=length,
+        twist_rad=np.array(THESIS_TWISTS_RAD),
+        flange=no_flange() if flange is None else flange,
         name=name,
     )
 
@@ -226,7 +226,7 @@ def axis_frames(arm: ArmModel, joints_rad: FloatArray) -> AxisFrames:
     frames[:, 0] = np.eye(4)
     for axis in range(arm.n_axes):
         frames[:, axis + 1] = frames[:, axis] @ links[:, axis]
-    return AxisFrames(frames[:, :, :3, :3], frames[:, :, :3, 3])
+    return AxisFrames(rotations=frames[:, :, :3, :3], origins_mm=frames[:, :, :3, 3])
 
 
 def forward(arm: ArmModel, joints_rad: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
 from armscan.geometry.poses import CameraRight, Pose, Sensor, Tool
 from armscan.geometry.shapes import Plane
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
@@ -203,8 +203,7 @@ class Provenance:
     forced: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraCalibration:
+class CameraCalibration(ArrayRecord):
     """A camera with its uncertainty.
 
     Parameters
@@ -232,20 +231,15 @@ class CameraCalibration:
     """
 
     camera: CameraModel
-    covariance: FloatArray
+    covariance: FloatArray = floats(9, 9)
     has_covariance: bool
     rms_px: float
     sigma_point_px: float
     n_views: int
     n_points: int
-    covered_px: FloatArray
+    covered_px: FloatArray = floats(4)
     provenance: Provenance
     diagnostics: CameraDiagnostics | None = None
-
-    def __post_init__(self) -> None:
-        n = len(CAMERA_PARAMETER_NAMES)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
-        object.__setattr__(self, "covered_px", frozen_floats(self.covered_px, (4,), "covered_px"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,8 +290,7 @@ class SecondCamera:
     right_from_sensor: Pose[CameraRight, Sensor]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SensorCalibration:
+class SensorCalibration(ArrayRecord):
     """Camera or cameras and the light sheets that they see: what turns stripes into points.
 
     Parameters
@@ -323,20 +316,23 @@ class SensorCalibration:
 
     camera: CameraCalibration
     sheets: tuple[SheetCalibration, ...]
-    covariance: FloatArray
+    covariance: FloatArray = floats("P", "P")
     provenance: Provenance
     diagnostics: SensorDiagnostics | None = None
     second: SecondCamera | None = None
     laser_colour: str = "auto"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.sheets:
             raise InputError("a sensor calibration needs at least one light sheet")
         names = [sheet.name for sheet in self.sheets]
         if len(set(names)) != len(names):
             raise InputError(f"light sheets share a name: {', '.join(names)}")
-        n = len(self.parameter_names)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
+        if len(self.covariance) != len(self.parameter_names):
+            raise InputError(
+                f"covariance of {len(self.covariance)} parameters for {len(self.parameter_names)}"
+            )
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -428,8 +424,7 @@ class HandEyeDiagnostics:
     chi2_probability: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeCalibration:
+class HandEyeCalibration(ArrayRecord):
     """Where the sensor sits on the arm's last link.
 
     Parameters
@@ -456,8 +451,8 @@ class HandEyeCalibration:
     """
 
     tool_from_sensor: Pose[Tool, Sensor]
-    covariance: FloatArray
-    sensor_coupling: FloatArray | None
+    covariance: FloatArray = floats(6, 6)
+    sensor_coupling: FloatArray | None = floats(6, None)
     arm_noise: ArmNoise
     rms_mm: float
     n_postures: int
@@ -465,12 +460,6 @@ class HandEyeCalibration:
     n_points: int
     plate: Plane | None = None
     diagnostics: HandEyeDiagnostics | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (6, 6), "covariance"))
-        if self.sensor_coupling is not None:
-            coupling = frozen_floats(self.sensor_coupling, (6, None), "sensor_coupling")
-            object.__setattr__(self, "sensor_coupling", coupling)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

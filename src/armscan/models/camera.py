@@ -6,13 +6,11 @@ Coefficients are ordered ``k1 k2 p1 p2 k3`` as in OpenCV and in the thesis's pri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, frozen_floats
 
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-9
@@ -133,8 +131,7 @@ PARAMETER_NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "
 """Order of the camera's parameters in every covariance and Jacobian."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraModel:
+class CameraModel(ArrayRecord):
     """Intrinsics of the full sensor.
 
     Parameters
@@ -151,12 +148,12 @@ class CameraModel:
     fy_px: float
     cx_px: float
     cy_px: float
-    distortion: FloatArray
+    distortion: FloatArray = floats(5)
     width_px: int
     height_px: int
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "distortion", frozen_floats(self.distortion, (5,), "distortion"))
+        super().__post_init__()
         for name in ("fx_px", "fy_px", "cx_px", "cy_px"):
             object.__setattr__(self, name, float(getattr(self, name)))
         numbers = [self.fx_px, self.fy_px, self.cx_px, self.cy_px]
@@ -169,7 +166,15 @@ class CameraModel:
     def from_parameters(parameters: ArrayLike, width_px: int, height_px: int) -> CameraModel:
         """Build a camera from (9,) parameters in the order of `PARAMETER_NAMES`."""
         p = frozen_floats(parameters, (9,), "camera parameters")
-        return CameraModel(p[0], p[1], p[2], p[3], p[4:], width_px, height_px)
+        return CameraModel(
+            fx_px=p[0],
+            fy_px=p[1],
+            cx_px=p[2],
+            cy_px=p[3],
+            distortion=p[4:],
+            width_px=width_px,
+            height_px=height_px,
+        )
 
     @property
     def parameters(self) -> FloatArray:

@@ -3,12 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats
 
 BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
 """Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; the terms
@@ -22,8 +20,7 @@ NEAREST_SOURCE = 0.2
 """Nearer to the light's source than this part of its distance the sheet is not followed."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LightSheet:
+class LightSheet(ArrayRecord):
     """The surface ``n.(p - o) = bow(u, v)`` in the Sensor frame.
 
     With ``u = (p - o).e_u / scale`` and ``v = (p - o).e_v / scale`` the bow is
@@ -53,22 +50,21 @@ class LightSheet:
         (2,) lean and spread of the light's rays, without unit; known, not fitted with the rest.
     """
 
-    origin_mm: FloatArray
-    axes: FloatArray
+    origin_mm: FloatArray = floats(3)
+    axes: FloatArray = floats(3, 3)
     scale_mm: float
-    bow_mm: FloatArray
-    fan: FloatArray = field(default_factory=lambda: np.zeros(2))
+    bow_mm: FloatArray = floats(5)
+    fan: FloatArray = floats(2, default=(0.0, 0.0))
 
     def __post_init__(self) -> None:
-        axes = frozen_floats(self.axes, (3, 3), "axes")
-        if np.abs(axes @ axes.T - np.eye(3)).max() > 1e-6 or np.linalg.det(axes) < 0.0:
+        super().__post_init__()
+        if (
+            np.abs(self.axes @ self.axes.T - np.eye(3)).max() > 1e-6
+            or np.linalg.det(self.axes) < 0.0
+        ):
             raise InputError("axes of the light sheet are not a right-handed orthonormal triad")
         if not self.scale_mm > 0.0:
             raise InputError(f"scale of the light sheet is {self.scale_mm} mm, not positive")
-        object.__setattr__(self, "axes", axes)
-        object.__setattr__(self, "origin_mm", frozen_floats(self.origin_mm, (3,), "origin_mm"))
-        object.__setattr__(self, "bow_mm", frozen_floats(self.bow_mm, (len(BOW_TERMS),), "bow_mm"))
-        object.__setattr__(self, "fan", frozen_floats(self.fan, (2,), "fan"))
 
     @property
     def plane(self) -> FloatArray:
@@ -197,11 +193,11 @@ class LightSheet:
     def in_frame(self, rotation: FloatArray, translation_mm: FloatArray) -> LightSheet:
         """The same sheet in another frame: ``p_there = R p_here + t``."""
         return LightSheet(
-            rotation @ self.origin_mm + translation_mm,
-            self.axes @ rotation.T,
-            self.scale_mm,
-            self.bow_mm,
-            self.fan,
+            origin_mm=rotation @ self.origin_mm + translation_mm,
+            axes=self.axes @ rotation.T,
+            scale_mm=self.scale_mm,
+            bow_mm=self.bow_mm,
+            fan=self.fan,
         )
 
     def updated(self, step: FloatArray) -> LightSheet:
@@ -220,4 +216,10 @@ class LightSheet:
         e_u = e_u / np.linalg.norm(e_u)
         axes = np.stack([e_u, np.cross(normal, e_u), normal])
         origin = self.origin_mm + step[2] * self.axes[2]
-        return LightSheet(origin, axes, self.scale_mm, self.bow_mm + step[3:], self.fan)
+        return LightSheet(
+            origin_mm=origin,
+            axes=axes,
+            scale_mm=self.scale_mm,
+            bow_mm=self.bow_mm + step[3:],
+            fan=self.fan,
+        )

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats
 from armscan.geometry.poses import CameraRight, Pose, Sensor
 from armscan.geometry.rotations import skew
 from armscan.models.calibration import (
@@ -300,7 +300,13 @@ def triangulate_points(
     gap = ~is_valid
     points, chi2 = np.where(gap[:, None], np.nan, points), np.where(gap, np.nan, chi2)
     noise[gap], carried[gap] = np.nan, np.nan
-    return TriangulatedPoints(points, noise, carried, np.asarray(chi2), is_valid)
+    return TriangulatedPoints(
+        points_sensor_mm=points,
+        noise_mm2=noise,
+        by_parameters=carried,
+        chi2=np.asarray(chi2),
+        is_valid=is_valid,
+    )
 
 
 def _midway(
@@ -392,8 +398,7 @@ class StereoDiagnostics:
     target_error_mm: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StereoCalibration:
+class StereoCalibration(ArrayRecord):
     """A left and a right camera that see one target at one instant.
 
     Parameters
@@ -418,16 +423,12 @@ class StereoCalibration:
     left: CameraCalibration
     right: CameraCalibration
     right_from_left: Pose[CameraRight, Sensor]
-    covariance: FloatArray
+    covariance: FloatArray = floats(24, 24)
     rms_px: float
     n_pairs: int
     n_points: int
     provenance: Provenance
     diagnostics: StereoDiagnostics | None = None
-
-    def __post_init__(self) -> None:
-        n = len(STEREO_PARAMETER_NAMES)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
 
     @property
     def views(self) -> TwoViews:

@@ -59,7 +59,11 @@ def sensor_calibration(fit: LaserFit, provenance: Provenance) -> SensorCalibrati
             replace(sheet.calibration, diagnostics=_sheet_diagnostics(sheet))
             for sheet in fit.sheets
         ),
-        diagnostics=SensorDiagnostics(fit.noise_factor, fit.correlation_points, fit.naming),
+        diagnostics=SensorDiagnostics(
+            noise_factor=fit.noise_factor,
+            correlation_points=fit.correlation_points,
+            naming=fit.naming,
+        ),
     )
 
 

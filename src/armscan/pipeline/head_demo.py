@@ -192,7 +192,9 @@ class RecordedScans:
         return self.recordings[scene]
 
 
-IN_MEMORY = Provenance("in memory", "", "", (), ())
+IN_MEMORY = Provenance(
+    document_id="in memory", created_utc="", armscan_version="", command=(), inputs=()
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,7 +229,9 @@ class Instrument:
     @property
     def scanner(self) -> ScannerCalibration:
         """All together."""
-        return ScannerCalibration(self.sensor, self.hand_eye.fit.calibration, IN_MEMORY)
+        return ScannerCalibration(
+            sensor=self.sensor, hand_eye=self.hand_eye.fit.calibration, provenance=IN_MEMORY
+        )
 
 
 def calibrate_head(
@@ -290,7 +294,9 @@ def plate_of(probing: Probing) -> PlateReference:
     """
     track = probing.arm
     centres = tip_centres(track, tool_from_probe(probing.tool_from_probe_mm))
-    points = ProbedPoints(centres, probing.tip_diameter_mm, source="probing")
+    points = ProbedPoints(
+        points_mm=centres, tip_diameter_mm=probing.tip_diameter_mm, source="probing"
+    )
     return succeeded(
         plate_from_probing(points, track.translations_mm[track.is_known]), points.source
     )

@@ -197,7 +197,10 @@ def _same_ids(old: MarkerList, new: MarkerList) -> IntArray:
 def _pairs(old: MarkerSet, new: MarkerSet, pairs: IntArray) -> PointPairs:
     i, k = pairs[:, 0], pairs[:, 1]
     return PointPairs(
-        old.points_mm[i], new.points_mm[k], old.covariance_mm2[i], new.covariance_mm2[k]
+        points_a_mm=old.points_mm[i],
+        points_b_mm=new.points_mm[k],
+        covariance_a_mm2=old.covariance_mm2[i],
+        covariance_b_mm2=new.covariance_mm2[k],
     )
 
 

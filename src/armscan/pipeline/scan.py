@@ -13,7 +13,7 @@ import numpy as np
 
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ExposurePair, Instant, ScanInstants
@@ -36,7 +36,6 @@ from armscan.pipeline.reconstruct import (
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
 from armscan.reconstruction.labels import MeasuredProfile, PointStatus
 from armscan.reconstruction.place import (
-    BaseBox,
     BaseTransform,
     NormalOptions,
     choose_radius_mm,
@@ -229,7 +228,7 @@ class ScanOptions:
 
     measure: MeasureOptions = field(default_factory=MeasureOptions)
     sync: SyncOptions = field(default_factory=SyncOptions)
-    volume: BaseBox | None = None
+    volume: Box | None = None
     normals: NormalOptions | None = field(default_factory=NormalOptions)
     threads: int = 1
 
@@ -354,7 +353,7 @@ def place_image(
     measured: MeasuredImage,
     base_from_tool: Pose[Base, Tool],
     placing: BaseTransform,
-    volume: BaseBox | None,
+    volume: Box | None,
 ) -> PlacedImage:
     """Place the measured points of one exposure in Base and cut those outside a volume."""
     stripe, image = measured.points, measured.image

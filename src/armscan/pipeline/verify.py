@@ -10,7 +10,7 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.conformity import (
     COVERAGE,
@@ -26,7 +26,7 @@ from armscan.inspection.conformity import (
 )
 from armscan.inspection.plane import inspect_plane, linearised_plane
 from armscan.inspection.results import MeasuredLength, PlaneInspection, SphereInspection
-from armscan.inspection.selection import InspectionOptions, Region
+from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere, linearised_sphere
 from armscan.inspection.uncertainty import FitLinearised, influence_along
 from armscan.models.calibration import ScannerCalibration
@@ -106,7 +106,7 @@ def verify_on_ball(
     diameter_mm: float,
     options: VerifyOptions | None = None,
     *,
-    region: Region | None = None,
+    region: Box | None = None,
     inspection: InspectionOptions | None = None,
 ) -> Verification:
     """Check the diameter of a ball, and whether exposures agree on it.
@@ -145,7 +145,7 @@ def verify_on_plate(
     plate: PlateReference,
     options: VerifyOptions | None = None,
     *,
-    region: Region | None = None,
+    region: Box | None = None,
     inspection: InspectionOptions | None = None,
 ) -> Verification:
     """Check the place of a probed plate, and whether exposures agree on it.
@@ -209,7 +209,7 @@ class _Evidence:
     fit: FitLinearised
     length: MeasuredLength
     standard: _Standard
-    region: Region | None
+    region: Box | None
     inspection: InspectionOptions
 
     @property

@@ -11,12 +11,9 @@ from scipy.spatial import cKDTree
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import (
-    REMEDY,
-    BoolArray,
+    Box,
     FloatArray,
     IntArray,
-    box_corners_mm,
-    frozen_floats,
 )
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import skew
@@ -169,16 +166,16 @@ def propagate_to_base(
         covariance[own] = _propagated(by_all[own], factor)
     covariance += _pose_and_noise(placed, stripe.noise_mm, base_from_tool, placing)
     return PointCloud(
-        "Base",
-        placed.points_base_mm,
-        0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        noise_size_mm(stripe.noise_mm),
-        stripe.sheet,
-        tuple(sheet.name for sheet in scanner.sensor.sheets),
-        np.zeros(len(stripe.row), dtype=np.int64),
-        (profile.source,),
-        profile.segment[stripe.row],
-        profile.intensity[stripe.row],
+        frame="Base",
+        points_mm=placed.points_base_mm,
+        covariance_mm2=0.5 * (covariance + covariance.transpose(0, 2, 1)),
+        sigma_noise_mm=noise_size_mm(stripe.noise_mm),
+        sheet=stripe.sheet,
+        sheet_names=tuple(sheet.name for sheet in scanner.sensor.sheets),
+        exposure=np.zeros(len(stripe.row), dtype=np.int64),
+        exposure_sources=(profile.source,),
+        segment=profile.segment[stripe.row],
+        intensity=profile.intensity[stripe.row],
     )
 
 
@@ -286,65 +283,23 @@ def merge_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
         raise InputError("clouds with and without normals do not merge")
     starts = np.cumsum([0, *(len(cloud.exposure_sources) for cloud in clouds)])
     return PointCloud(
-        first.frame,
-        np.concatenate([cloud.points_mm for cloud in clouds]),
-        np.concatenate([cloud.covariance_mm2 for cloud in clouds]),
-        np.concatenate([cloud.sigma_noise_mm for cloud in clouds]),
-        np.concatenate([cloud.sheet for cloud in clouds]),
-        first.sheet_names,
-        np.concatenate([c.exposure + start for c, start in zip(clouds, starts[:-1], strict=True)]),
-        tuple(source for cloud in clouds for source in cloud.exposure_sources),
-        np.concatenate([cloud.segment for cloud in clouds]),
-        np.concatenate([cloud.intensity for cloud in clouds]),
-        np.concatenate(normals) if normals else None,
+        frame=first.frame,
+        points_mm=np.concatenate([cloud.points_mm for cloud in clouds]),
+        covariance_mm2=np.concatenate([cloud.covariance_mm2 for cloud in clouds]),
+        sigma_noise_mm=np.concatenate([cloud.sigma_noise_mm for cloud in clouds]),
+        sheet=np.concatenate([cloud.sheet for cloud in clouds]),
+        sheet_names=first.sheet_names,
+        exposure=np.concatenate(
+            [c.exposure + start for c, start in zip(clouds, starts[:-1], strict=True)]
+        ),
+        exposure_sources=tuple(source for cloud in clouds for source in cloud.exposure_sources),
+        segment=np.concatenate([cloud.segment for cloud in clouds]),
+        intensity=np.concatenate([cloud.intensity for cloud in clouds]),
+        normals=np.concatenate(normals) if normals else None,
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BaseBox:
-    """A box along the axes of Base from the corner ``low_mm`` (3,) to ``high_mm`` (3,)."""
-
-    low_mm: FloatArray
-    high_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        for name in ("low_mm", "high_mm"):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (3,), name))
-        if not bool((self.low_mm < self.high_mm).all()):
-            raise OptionError(
-                "a lower limit of the volume is not below its upper one",
-                remedy=REMEDY,
-            )
-
-    def holds(self, points_base_mm: FloatArray) -> BoolArray:
-        """(N,) True for those of (N, 3) points that lie inside or on the border."""
-        points = np.asarray(points_base_mm)
-        return np.asarray(((points >= self.low_mm) & (points <= self.high_mm)).all(axis=1))
-
-    def __str__(self) -> str:
-        """The limits as `parse_volume` reads them."""
-        pairs = zip(self.low_mm.tolist(), self.high_mm.tolist(), strict=True)
-        return ",".join(f"{low!r},{high!r}" for low, high in pairs)
-
-
-def parse_volume(text: str, where: str = "--volume") -> BaseBox:
-    """Read ``xmin,xmax,ymin,ymax,zmin,zmax`` in mm, in Base.
-
-    Raises
-    ------
-    OptionError
-        If these are not six finite numbers, each lower limit below its upper one.
-    """
-    values = []
-    for word in text.split(","):
-        try:
-            values.append(float(word))
-        except ValueError as error:
-            raise OptionError(f"'{word}' is no number", where=where, remedy=REMEDY) from error
-    return BaseBox(*box_corners_mm(values, where))
-
-
-def cut_cloud(cloud: PointCloud, box: BaseBox) -> PointCloud:
+def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     """The points of a cloud in Base that lie in the box; lists of names stay as they are.
 
     Raises

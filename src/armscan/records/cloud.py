@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, ints
 
 CloudFrame = Literal["Sensor", "Base", "Part", "Cad"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointCloud:
+class PointCloud(RowRecord):
     """Points in one frame; every point carries its covariance from the first day.
 
     Parameters
@@ -51,58 +49,27 @@ class PointCloud:
     """
 
     frame: CloudFrame
-    points_mm: FloatArray
-    covariance_mm2: FloatArray
-    sigma_noise_mm: FloatArray
-    sheet: IntArray
+    points_mm: FloatArray = floats("N", 3)
+    covariance_mm2: FloatArray = floats("N", 3, 3)
+    sigma_noise_mm: FloatArray = floats("N")
+    sheet: IntArray = ints("N")
     sheet_names: tuple[str, ...]
-    exposure: IntArray
+    exposure: IntArray = ints("N")
     exposure_sources: tuple[str, ...]
-    segment: IntArray
-    intensity: FloatArray
-    normals: FloatArray | None = None
+    segment: IntArray = ints("N")
+    intensity: FloatArray = floats("N")
+    normals: FloatArray | None = floats("N", 3, default=None)
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.points_mm))
-        floats: list[tuple[str, tuple[int | None, ...]]] = [
-            ("points_mm", (n, 3)),
-            ("covariance_mm2", (n, 3, 3)),
-            ("sigma_noise_mm", (n,)),
-            ("intensity", (n,)),
-        ]
-        if self.normals is not None:
-            floats.append(("normals", (n, 3)))
-        for name, shape in floats:
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
-        for name, names in (
-            ("sheet", self.sheet_names),
-            ("exposure", self.exposure_sources),
-            ("segment", None),
+        super().__post_init__()
+        for name, index, names in (
+            ("sheet", self.sheet, self.sheet_names),
+            ("exposure", self.exposure, self.exposure_sources),
         ):
-            index = frozen_ints(getattr(self, name), (n,), name)
-            object.__setattr__(self, name, index)
-            if names is not None and n and not 0 <= index.min() <= index.max() < len(names):
+            if len(index) and not 0 <= index.min() <= index.max() < len(names):
                 raise InputError(f"{name} points outside its list of {len(names)} names")
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.points_mm)
-
-    def select(self, rows: IntArray) -> PointCloud:
-        """The points of these rows (M,); lists of names stay as they are."""
-        return replace(
-            self,
-            points_mm=self.points_mm[rows],
-            covariance_mm2=self.covariance_mm2[rows],
-            sigma_noise_mm=self.sigma_noise_mm[rows],
-            sheet=self.sheet[rows],
-            exposure=self.exposure[rows],
-            segment=self.segment[rows],
-            intensity=self.intensity[rows],
-            normals=None if self.normals is None else self.normals[rows],
-        )
 
     @property
     def sigma_mm(self) -> FloatArray:

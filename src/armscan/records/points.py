@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, frozen_floats, ints
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RingImages:
+class RingImages(RowRecord):
     """Images of N ring markers in one exposure.
 
     Parameters
@@ -37,38 +36,21 @@ class RingImages:
     """
 
     source: str
-    centres_px: FloatArray
-    covariance_px2: FloatArray
-    outer_half_px: FloatArray
-    inner_half_px: FloatArray
-    direction_rad: FloatArray
-    contrast: FloatArray
-    perimeter_px: FloatArray
-    roundness: FloatArray
+    centres_px: FloatArray = floats("N", 2)
+    covariance_px2: FloatArray = floats("N", 2, 2)
+    outer_half_px: FloatArray = floats("N", 2)
+    inner_half_px: FloatArray = floats("N", 2)
+    direction_rad: FloatArray = floats("N")
+    contrast: FloatArray = floats("N")
+    perimeter_px: FloatArray = floats("N")
+    roundness: FloatArray = floats("N")
 
     def __post_init__(self) -> None:
-        n = len(self.centres_px)
-        shapes = {
-            "centres_px": (n, 2),
-            "covariance_px2": (n, 2, 2),
-            "outer_half_px": (n, 2),
-            "inner_half_px": (n, 2),
-            "direction_rad": (n,),
-            "contrast": (n,),
-            "perimeter_px": (n,),
-            "roundness": (n,),
-        }
-        for name, shape in shapes.items():
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
+        super().__post_init__()
         _check_covariances(self.covariance_px2, "covariance_px2", self.source)
 
-    def __len__(self) -> int:
-        """Count of rings."""
-        return len(self.centres_px)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerSet:
+class MarkerSet(RowRecord):
     """Markers as points in space; they carry no code, so an id says nothing outside its set.
 
     Parameters
@@ -86,25 +68,17 @@ class MarkerSet:
         Where they came from, for messages.
     """
 
-    ids: IntArray
-    points_mm: FloatArray
-    covariance_mm2: FloatArray
+    ids: IntArray = ints("N")
+    points_mm: FloatArray = floats("N", 3)
+    covariance_mm2: FloatArray = floats("N", 3, 3)
     frame: str = "Sensor"
     source: str = ""
 
     def __post_init__(self) -> None:
-        n = len(self.points_mm)
-        object.__setattr__(self, "ids", frozen_ints(self.ids, (n,), "marker ids"))
-        object.__setattr__(self, "points_mm", frozen_floats(self.points_mm, (n, 3), "markers (mm)"))
-        covariance = frozen_floats(self.covariance_mm2, (n, 3, 3), "markers' covariance (mm2)")
-        object.__setattr__(self, "covariance_mm2", covariance)
-        if len(np.unique(self.ids)) != n:
+        super().__post_init__()
+        if len(np.unique(self.ids)) != len(self):
             raise InputError("a marker's id occurs twice", where=self.source)
-        _check_covariances(covariance, "markers' covariance (mm2)", self.source)
-
-    def __len__(self) -> int:
-        """Count of markers."""
-        return len(self.points_mm)
+        _check_covariances(self.covariance_mm2, "markers' covariance (mm2)", self.source)
 
 
 def _check_covariances(covariance: FloatArray, name: str, where: str) -> None:

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 
 
 class StripeFlag(IntFlag):
@@ -45,8 +44,7 @@ REJECTING = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Profile:
+class Profile(RowRecord):
     """Stripe centre points of one exposure, ordered along their segments.
 
     Parameters
@@ -70,54 +68,26 @@ class Profile:
     """
 
     source: str
-    points_px: FloatArray
-    normals_px: FloatArray
-    sigma_px: FloatArray
-    width_px: FloatArray
-    intensity: FloatArray
-    flags: IntArray
-    segment: IntArray
+    points_px: FloatArray = floats("N", 2)
+    normals_px: FloatArray = floats("N", 2)
+    sigma_px: FloatArray = floats("N")
+    width_px: FloatArray = floats("N")
+    intensity: FloatArray = floats("N")
+    flags: IntArray = ints("N")
+    segment: IntArray = ints("N")
 
     def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.points_px))
-        for name, shape in (
-            ("points_px", (n, 2)),
-            ("normals_px", (n, 2)),
-            ("sigma_px", (n,)),
-            ("width_px", (n,)),
-            ("intensity", (n,)),
-        ):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
-        object.__setattr__(self, "flags", frozen_ints(self.flags, (n,), "flags"))
-        object.__setattr__(self, "segment", frozen_ints(self.segment, (n,), "segment"))
-        if n and not bool((self.sigma_px > 0).all()):
+        super().__post_init__()
+        if not bool((self.sigma_px > 0.0).all()):
             raise InputError("sigma_px must be positive", where=self.source)
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.points_px)
 
     @property
     def is_accepted(self) -> BoolArray:
         """(N,) True where no rejecting flag is set."""
         return np.asarray((self.flags & int(REJECTING)) == 0)
 
-    def select(self, keep: BoolArray) -> Profile:
-        """Return the points where ``keep`` (N,) is True; segment numbers stay as they are."""
-        return Profile(
-            self.source,
-            self.points_px[keep],
-            self.normals_px[keep],
-            self.sigma_px[keep],
-            self.width_px[keep],
-            self.intensity[keep],
-            self.flags[keep],
-            self.segment[keep],
-        )
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PointProfile:
+class PointProfile(RowRecord):
     """Points of one profile.
 
     Parameters
@@ -131,13 +101,5 @@ class PointProfile:
     """
 
     source: str
-    points_mm: FloatArray
+    points_mm: FloatArray = floats("N", 3)
     n_gaps: int = 0
-
-    def __post_init__(self) -> None:
-        points = frozen_floats(self.points_mm, (None, 3), "profile points (mm)")
-        object.__setattr__(self, "points_mm", points)
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.points_mm)

@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats, ints
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.records.exposure import SensorWindow
@@ -113,8 +113,7 @@ class ExposureRow:
 NO_TRIGGER = -1
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmTrack:
+class ArmTrack(RowRecord):
     """Samples of ``base_from_tool`` in time order; unknown ones are gaps, never bridged.
 
     Parameters
@@ -138,40 +137,21 @@ class ArmTrack:
         If times do not increase or shapes do not fit.
     """
 
-    t_ns: IntArray
-    rotations: FloatArray
-    translations_mm: FloatArray
-    is_known: BoolArray
-    trigger_ids: IntArray | None = None
-    joints_rad: FloatArray | None = None
+    t_ns: IntArray = ints("N")
+    rotations: FloatArray = floats("N", 3, 3)
+    translations_mm: FloatArray = floats("N", 3)
+    is_known: BoolArray = bools("N")
+    trigger_ids: IntArray | None = ints("N", default=None)
+    joints_rad: FloatArray | None = floats("N", None, nan=True, default=None)
 
     def __post_init__(self) -> None:
-        times = frozen_ints(self.t_ns, (None,), "t_ns")
-        n = len(times)
-        if n and not bool((np.diff(times) > 0).all()):
-            row = int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1
+        super().__post_init__()
+        late = np.flatnonzero(np.diff(self.t_ns) <= 0)
+        if len(late):
             raise InputError(
-                f"times of the arm's samples do not increase at sample {row}",
+                f"times of the arm's samples do not increase at sample {int(late[0]) + 1}",
                 remedy="sort the samples by time and remove duplicates",
             )
-        object.__setattr__(self, "t_ns", times)
-        for name, shape in (("rotations", (n, 3, 3)), ("translations_mm", (n, 3))):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
-        known = np.array(self.is_known, dtype=np.bool_)
-        if known.shape != (n,):
-            raise InputError(f"is_known has shape {known.shape}, expected ({n},)")
-        known.setflags(write=False)
-        object.__setattr__(self, "is_known", known)
-        if self.trigger_ids is not None:
-            ids = frozen_ints(self.trigger_ids, (n,), "trigger_ids")
-            object.__setattr__(self, "trigger_ids", ids)
-        if self.joints_rad is not None:
-            joints = frozen_floats(self.joints_rad, (n, None), "joints_rad", allow_nan=True)
-            object.__setattr__(self, "joints_rad", joints)
-
-    def __len__(self) -> int:
-        """Count of samples, unknown ones included."""
-        return len(self.t_ns)
 
     def pose(self, row: int) -> Pose[Base, Tool]:
         """Pose of one known sample.
@@ -184,33 +164,3 @@ class ArmTrack:
         if not self.is_known[row]:
             raise InputError(f"the arm gave no pose at sample {row}")
         return Pose(self.rotations[row], self.translations_mm[row])
-
-
-@dataclass(frozen=True, slots=True)
-class LaserSchedule:
-    """Lasers that are on, exposure by exposure, over and over.
-
-    Parameters
-    ----------
-    pattern
-        Names of the sources that are on in each exposure of a period.
-    """
-
-    pattern: tuple[tuple[str, ...], ...]
-
-    def __post_init__(self) -> None:
-        if not self.pattern or not any(self.pattern):
-            raise OptionError(
-                "a laser schedule without lasers", remedy="give at least one exposure with a laser"
-            )
-
-    def lasers(self, exposure: int) -> tuple[str, ...]:
-        """Sources that are on in exposure number ``exposure``, counted from 0."""
-        return self.pattern[exposure % len(self.pattern)]
-
-
-THESIS_SCHEDULE = LaserSchedule((("A",), ("B",), ("A", "B")))
-"""Figure 3.2: A alone, B alone, both; four stripes in three exposures, 1.33 of one laser's."""
-
-ALWAYS_BOTH = LaserSchedule((("A", "B"),))
-"""Both lasers on in every exposure."""

@@ -392,7 +392,10 @@ def map_markers(joined: JoinedViews, frame: str) -> MarkerSet:
     """Markers of all views in the common frame, numbered from 1."""
     n = len(joined.map.markers_mm)
     return MarkerSet(
-        np.arange(1, n + 1), joined.map.markers_mm, joined.map.marker_covariance_mm2, frame
+        ids=np.arange(1, n + 1),
+        points_mm=joined.map.markers_mm,
+        covariance_mm2=joined.map.marker_covariance_mm2,
+        frame=frame,
     )
 
 

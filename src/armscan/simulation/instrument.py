@@ -36,7 +36,14 @@ def track_of_readings(
     readings = arm.readings(joints_rad, rng)
     rotations, translations = arm.nominal.transforms(readings)
     known = np.ones(len(t_ns), dtype=np.bool_)
-    return ArmTrack(t_ns, rotations, translations, known, trigger_ids, readings)
+    return ArmTrack(
+        t_ns=t_ns,
+        rotations=rotations,
+        translations_mm=translations,
+        is_known=known,
+        trigger_ids=trigger_ids,
+        joints_rad=readings,
+    )
 
 
 def track_of_sweeps(

@@ -209,10 +209,10 @@ def instant_shots(
     for camera, mounted in enumerate(head.cameras):
         folder = f"{CAMERA_FOLDERS[camera]}/" if len(head.cameras) > 1 else ""
         row = ExposureRow(
-            first_index + camera,
-            moment.t_ns,
-            camera,
-            f"images/{folder}{moment.file}",
+            index=first_index + camera,
+            t_ns=moment.t_ns,
+            camera=camera,
+            source=f"images/{folder}{moment.file}",
             lasers=light.lasers,
             trigger_id=moment.trigger_id,
             view=moment.view,

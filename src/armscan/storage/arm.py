@@ -224,7 +224,14 @@ def read_arm_table(
         used += (*POSITION, *FORM_COLUMNS[chosen])
         is_known, rotations, positions = _from_poses(table, chosen, rotation)
     _refuse_metres(rotations[is_known], positions[is_known], table.where)
-    track = ArmTrack(times, rotations, positions, is_known, _triggers(table), joints)
+    track = ArmTrack(
+        t_ns=times,
+        rotations=rotations,
+        translations_mm=positions,
+        is_known=is_known,
+        trigger_ids=_triggers(table),
+        joints_rad=joints,
+    )
     extra = {name: cells for name, cells in table.columns.items() if name not in used}
     others = [other for other in complete if other != chosen]
     if form is None:

@@ -97,7 +97,11 @@ def sensor_diagnostics(body: SensorDiagnosticsBody | None) -> SensorDiagnostics 
     """Diagnostics of all sheets together from their body."""
     if body is None:
         return None
-    return SensorDiagnostics(body.noise_factor, body.correlation_points, body.naming)
+    return SensorDiagnostics(
+        noise_factor=body.noise_factor,
+        correlation_points=body.correlation_points,
+        naming=body.naming,
+    )
 
 
 def _bowed_board(body: BowedBoardBody | None) -> WarpedBoard | None:
@@ -175,13 +179,13 @@ def sensor_from_document(document: SensorDocument) -> SensorCalibration:
     second = None if document.second is None else second_camera_from_body(document.second)
     size = len(document.covariance.parameter_names)
     empty = SensorCalibration(
-        camera,
-        sheets,
-        np.zeros((size, size)),
-        provenance_from_body(document.provenance),
-        sensor_diagnostics(document.diagnostics),
-        second,
-        document.laser_colour,
+        camera=camera,
+        sheets=sheets,
+        covariance=np.zeros((size, size)),
+        provenance=provenance_from_body(document.provenance),
+        diagnostics=sensor_diagnostics(document.diagnostics),
+        second=second,
+        laser_colour=document.laser_colour,
     )
     covariance = covariance_from_body(document.covariance, empty.parameter_names)
     return replace(empty, covariance=covariance)
@@ -285,7 +289,13 @@ def _sheet_from_body(body: SheetBody) -> SheetCalibration:
     fan = np.zeros(2) if body.fan is None else np.array([body.fan.lean, body.fan.spread])
     return SheetCalibration(
         name=body.name,
-        sheet=LightSheet(np.array(body.origin_sensor_mm), axes, body.scale_mm, bow, fan),
+        sheet=LightSheet(
+            origin_mm=np.array(body.origin_sensor_mm),
+            axes=axes,
+            scale_mm=body.scale_mm,
+            bow_mm=bow,
+            fan=fan,
+        ),
         rms_mm=body.rms_mm,
         n_boards=body.n_boards,
         n_points=body.n_points,

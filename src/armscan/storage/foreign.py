@@ -61,13 +61,13 @@ def read_foreign_camera(path: Path) -> CameraCalibration:
     _check_model(tree, where)
     try:
         camera = CameraModel(
-            matrix[0, 0],
-            matrix[1, 1],
-            matrix[0, 2],
-            matrix[1, 2],
-            _distortion(tree, where),
-            width,
-            height,
+            fx_px=matrix[0, 0],
+            fy_px=matrix[1, 1],
+            cx_px=matrix[0, 2],
+            cy_px=matrix[1, 2],
+            distortion=_distortion(tree, where),
+            width_px=width,
+            height_px=height,
         )
     except InputError as error:
         raise FileFormatError(error.what, where=where, remedy=error.remedy) from error

@@ -146,10 +146,10 @@ def _points(table: CsvTable) -> ProbedPoints:
     tip_diameter_mm, is_compensated = _tip(table)
     try:
         return ProbedPoints(
-            points,
-            tip_diameter_mm,
-            table.columns.get("feature", ()),
-            table.where,
+            points_mm=points,
+            tip_diameter_mm=tip_diameter_mm,
+            features=table.columns.get("feature", ()),
+            source=table.where,
             is_compensated=is_compensated,
         )
     except InputError as error:
@@ -286,11 +286,11 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
     has_covariance = any(name in table for name in COVARIANCES)
     try:
         markers = MarkerSet(
-            _ids(table),
-            points,
-            _covariance(table, sigma_mm, has_covariance=has_covariance),
-            _frame(table, frame),
-            str(path),
+            ids=_ids(table),
+            points_mm=points,
+            covariance_mm2=_covariance(table, sigma_mm, has_covariance=has_covariance),
+            frame=_frame(table, frame),
+            source=str(path),
         )
     except InputError as error:
         raise FileFormatError(
@@ -415,7 +415,7 @@ def _read(path: Path, name: str) -> PointProfile:
             where=str(path),
             remedy="leave this profile and its pose out",
         )
-    return PointProfile(name, values[is_known], int((~is_known).sum()))
+    return PointProfile(source=name, points_mm=values[is_known], n_gaps=int((~is_known).sum()))
 
 
 def _from_csv(data: bytes, where: str) -> FloatArray:

@@ -267,15 +267,15 @@ def _filtered(
     centres = window.to_full_sensor(centres)
     long = rims.directions[outer, :, 1]
     rings = RingImages(
-        exposure.source,
-        centres[kept],
-        covariance[kept] * window.binning**2,
-        half[outer][kept],
-        half[inner][kept],
-        np.arctan2(long[:, 1], long[:, 0])[kept],
-        _contrast(rims, inner, exposure)[kept],
-        size[kept],
-        shape[kept],
+        source=exposure.source,
+        centres_px=centres[kept],
+        covariance_px2=covariance[kept] * window.binning**2,
+        outer_half_px=half[outer][kept],
+        inner_half_px=half[inner][kept],
+        direction_rad=np.arctan2(long[:, 1], long[:, 0])[kept],
+        contrast=_contrast(rims, inner, exposure)[kept],
+        perimeter_px=size[kept],
+        roundness=shape[kept],
     )
     return RingDetection(rings, centres[~kept], _reasons(fails, kept))
 

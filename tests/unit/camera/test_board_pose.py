@@ -20,7 +20,15 @@ from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard
 from camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
 
-TELE = CameraModel(9000.0, 9000.0, 1023.5, 767.5, np.zeros(5), 2048, 1536)
+TELE = CameraModel(
+    fx_px=9000.0,
+    fy_px=9000.0,
+    cx_px=1023.5,
+    cy_px=767.5,
+    distortion=np.zeros(5),
+    width_px=2048,
+    height_px=1536,
+)
 SMALL = Chessboard(5, 4, 4.0)
 
 

@@ -17,7 +17,15 @@ from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from camera_scene import CAMERA, Scene, make_views
 
-PINHOLE = CameraModel(2300.0, 2310.0, 1010.0, 770.0, np.zeros(5), 2048, 1536)
+PINHOLE = CameraModel(
+    fx_px=2300.0,
+    fy_px=2310.0,
+    cx_px=1010.0,
+    cy_px=770.0,
+    distortion=np.zeros(5),
+    width_px=2048,
+    height_px=1536,
+)
 EXACT = Scene(camera=PINHOLE, noise_px=0.0)
 
 

@@ -12,7 +12,13 @@ from armscan.vision.targets.target import Chessboard, TargetView
 from camera_scene import Scene, view_of
 
 LENS = CameraModel(
-    620.0, 618.14, 665.6, 376.0, np.array([-0.3, 0.11, 7e-4, -4e-4, -0.004]), 1280, 800
+    fx_px=620.0,
+    fy_px=618.14,
+    cx_px=665.6,
+    cy_px=376.0,
+    distortion=np.array([-0.3, 0.11, 7e-4, -4e-4, -0.004]),
+    width_px=1280,
+    height_px=800,
 )
 SCENE = Scene(camera=LENS, target=Chessboard(10, 7, 20.0), noise_px=0.1)
 SEED = 6

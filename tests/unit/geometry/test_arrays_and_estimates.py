@@ -32,10 +32,24 @@ def test_nan_and_infinity() -> None:
 
 
 def test_estimate_checks_its_covariance_and_gives_sigmas() -> None:
-    estimate = Estimate("value", ("a_mm", "b_mm"), np.diag([4.0, 9.0]), np.zeros(3), 1, 0.0)
+    estimate = Estimate(
+        value="value",
+        parameter_names=("a_mm", "b_mm"),
+        covariance=np.diag([4.0, 9.0]),
+        residuals=np.zeros(3),
+        degrees_of_freedom=1,
+        chi2=0.0,
+    )
     assert estimate.sigma.tolist() == [2.0, 3.0]
     with pytest.raises(InputError, match="covariance"):
-        Estimate("value", ("a_mm",), np.eye(2), np.zeros(3), 1, 0.0)
+        Estimate(
+            value="value",
+            parameter_names=("a_mm",),
+            covariance=np.eye(2),
+            residuals=np.zeros(3),
+            degrees_of_freedom=1,
+            chi2=0.0,
+        )
 
 
 def test_a_failure_is_neither_true_nor_false() -> None:

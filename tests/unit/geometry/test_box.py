@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import box_corners_mm
-from armscan.reconstruction.place import parse_volume
+from armscan.geometry.arrays import Box
 
 
 def test_corners_are_every_second_number() -> None:
-    low, high = box_corners_mm((0, 1, -5, 5, 2, 3), "--region")
-    np.testing.assert_array_equal([low, high], [[0, -5, 2], [1, 5, 3]])
-    np.testing.assert_array_equal(parse_volume("0,1,-5,5,2,3").high_mm, high)
+    box = Box.from_limits((0, 1, -5, 5, 2, 3), "--region")
+    np.testing.assert_array_equal([box.low_mm, box.high_mm], [[0, -5, 2], [1, 5, 3]])
+    np.testing.assert_array_equal(Box.parse("0,1,-5,5,2,3", "--volume").high_mm, box.high_mm)
 
 
 @pytest.mark.parametrize(
@@ -30,5 +29,5 @@ def test_corners_are_every_second_number() -> None:
 )
 def test_what_is_wrong_is_named(text: str, said: str) -> None:
     with pytest.raises(OptionError) as caught:
-        parse_volume(text)
+        Box.parse(text, "--volume")
     assert str(caught.value).startswith(f"--volume: {said}; give xmin,xmax,")

@@ -45,7 +45,9 @@ def noisy(
     a = points @ pose.rotation.T + pose.translation_mm
     e_a = np.einsum("nij,nj->ni", np.linalg.cholesky(c_a), generator.normal(size=(n, 3)))
     e_b = np.einsum("nij,nj->ni", np.linalg.cholesky(c_b), generator.normal(size=(n, 3)))
-    return PointPairs(a + e_a, points + e_b, c_a, c_b)
+    return PointPairs(
+        points_a_mm=a + e_a, points_b_mm=points + e_b, covariance_a_mm2=c_a, covariance_b_mm2=c_b
+    )
 
 
 def fitted(pairs: PointPairs) -> Estimate[Pose[Frame, Frame]]:
@@ -65,7 +67,13 @@ def test_points_without_noise_give_the_motion_exactly() -> None:
     moved = points @ pose.rotation.T + pose.translation_mm
     c = covariances(generator, 5)
     np.testing.assert_allclose(
-        fitted(PointPairs(moved, points, c, c)).value.matrix, pose.matrix, atol=1e-9
+        fitted(
+            PointPairs(
+                points_a_mm=moved, points_b_mm=points, covariance_a_mm2=c, covariance_b_mm2=c
+            )
+        ).value.matrix,
+        pose.matrix,
+        atol=1e-9,
     )
 
 
@@ -74,7 +82,14 @@ def test_equal_weights_agree_with_scipy() -> None:
     points, pose = generator.normal(size=(7, 3)) * SIZE, some_pose(generator)
     pairs = noisy(generator, points, pose)
     unit = np.tile(1e-4 * np.eye(3), (7, 1, 1))
-    found = fitted(PointPairs(pairs.points_a_mm, pairs.points_b_mm, unit, unit)).value
+    found = fitted(
+        PointPairs(
+            points_a_mm=pairs.points_a_mm,
+            points_b_mm=pairs.points_b_mm,
+            covariance_a_mm2=unit,
+            covariance_b_mm2=unit,
+        )
+    ).value
     a = pairs.points_a_mm - pairs.points_a_mm.mean(axis=0)
     b = pairs.points_b_mm - pairs.points_b_mm.mean(axis=0)
     expected, _ = Rotation.align_vectors(a, b)
@@ -133,15 +148,18 @@ def test_moving_either_list_moves_the_answer_with_it() -> None:
     pairs = noisy(generator, points, some_pose(generator))
     x, y = some_pose(generator), some_pose(generator)
     moved = PointPairs(
-        pairs.points_a_mm @ x.rotation.T + x.translation_mm,
-        pairs.points_b_mm @ y.rotation.T + y.translation_mm,
-        x.rotation @ pairs.covariance_a_mm2 @ x.rotation.T,
-        y.rotation @ pairs.covariance_b_mm2 @ y.rotation.T,
+        points_a_mm=pairs.points_a_mm @ x.rotation.T + x.translation_mm,
+        points_b_mm=pairs.points_b_mm @ y.rotation.T + y.translation_mm,
+        covariance_a_mm2=x.rotation @ pairs.covariance_a_mm2 @ x.rotation.T,
+        covariance_b_mm2=y.rotation @ pairs.covariance_b_mm2 @ y.rotation.T,
     )
     expected = x @ fitted(pairs).value @ y.inverse()
     np.testing.assert_allclose(fitted(moved).value.matrix, expected.matrix, atol=1e-7)
     back = PointPairs(
-        pairs.points_b_mm, pairs.points_a_mm, pairs.covariance_b_mm2, pairs.covariance_a_mm2
+        points_a_mm=pairs.points_b_mm,
+        points_b_mm=pairs.points_a_mm,
+        covariance_a_mm2=pairs.covariance_b_mm2,
+        covariance_b_mm2=pairs.covariance_a_mm2,
     )
     limit = 1e-3 * float(fitted(pairs).sigma[:3].min())
     turn = fitted(back).value.rotation @ fitted(pairs).value.rotation
@@ -168,10 +186,10 @@ def test_deleted_residuals_are_those_of_a_fit_without_the_point() -> None:
     for k in range(7):
         kept = np.arange(7) != k
         rest = PointPairs(
-            pairs.points_a_mm[kept],
-            pairs.points_b_mm[kept],
-            pairs.covariance_a_mm2[kept],
-            pairs.covariance_b_mm2[kept],
+            points_a_mm=pairs.points_a_mm[kept],
+            points_b_mm=pairs.points_b_mm[kept],
+            covariance_a_mm2=pairs.covariance_a_mm2[kept],
+            covariance_b_mm2=pairs.covariance_b_mm2[kept],
         )
         pose = fitted(rest).value
         away = pairs.points_a_mm[k] - pose.rotation @ pairs.points_b_mm[k] - pose.translation_mm
@@ -189,7 +207,10 @@ def test_a_point_that_moved_is_named_and_others_are_not() -> None:
         shifted = np.array(pairs.points_a_mm)
         shifted[3] += [0.5, -0.4, 0.3]
         moved = PointPairs(
-            shifted, pairs.points_b_mm, pairs.covariance_a_mm2, pairs.covariance_b_mm2
+            points_a_mm=shifted,
+            points_b_mm=pairs.points_b_mm,
+            covariance_a_mm2=pairs.covariance_a_mm2,
+            covariance_b_mm2=pairs.covariance_b_mm2,
         )
         assert misfits(moved, fitted(moved)).moved(1e-3) == 3
     # five in a hundred are expected, fifteen would be a wrong test
@@ -199,16 +220,42 @@ def test_a_point_that_moved_is_named_and_others_are_not() -> None:
 def test_what_does_not_determine_a_motion_is_refused_with_the_reason() -> None:
     c = np.tile(4e-4 * np.eye(3), (6, 1, 1))
     line = np.outer(np.linspace(0.0, 200.0, 6), [0.6, 0.8, 0.0])
-    failure = register_points(PointPairs(line, line, c, c))
+    failure = register_points(
+        PointPairs(points_a_mm=line, points_b_mm=line, covariance_a_mm2=c, covariance_b_mm2=c)
+    )
     assert isinstance(failure, FitFailure)
     assert "on a line" in failure.reason
-    two = register_points(PointPairs(line[:2], line[:2], c[:2], c[:2]))
+    two = register_points(
+        PointPairs(
+            points_a_mm=line[:2],
+            points_b_mm=line[:2],
+            covariance_a_mm2=c[:2],
+            covariance_b_mm2=c[:2],
+        )
+    )
     assert isinstance(two, FitFailure)
     assert "three points" in two.reason
     corner = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
-    assert isinstance(register_points(PointPairs(corner, corner, c[:3], c[:3])), Estimate)
+    assert isinstance(
+        register_points(
+            PointPairs(
+                points_a_mm=corner,
+                points_b_mm=corner,
+                covariance_a_mm2=c[:3],
+                covariance_b_mm2=c[:3],
+            )
+        ),
+        Estimate,
+    )
     with pytest.raises(InputError, match="not positive definite"):
-        register_points(PointPairs(corner, corner, 0.0 * c[:3], 0.0 * c[:3]))
+        register_points(
+            PointPairs(
+                points_a_mm=corner,
+                points_b_mm=corner,
+                covariance_a_mm2=0.0 * c[:3],
+                covariance_b_mm2=0.0 * c[:3],
+            )
+        )
 
 
 def test_the_covariance_of_a_carried_point_is_that_of_many_registrations() -> None:

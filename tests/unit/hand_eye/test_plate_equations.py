@@ -16,15 +16,15 @@ from armscan.calibration.hand_eye.observations import (
     step_hand_eye,
     straight_stripes,
 )
-from armscan.calibration.hand_eye.thesis import (
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.poses import Base, Points, Pose, Tool
+from armscan.thesis.hand_eye import (
     design_rows,
     hand_eye_unknowns,
     objective,
     plane_in_tool,
     rotation_from_angles,
 )
-from armscan.geometry.arrays import FloatArray
-from armscan.geometry.poses import Base, Points, Pose, Tool
 from plate_rig import PLATE_CENTRE, PLATE_NORMAL, SILENT, TOOL_FROM_SENSOR, PlateRig, good_postures
 
 POSE: Pose[Base, Tool] = Pose.from_vectors([0.4, -0.2, 1.1], [300.0, -120.0, 80.0])

@@ -79,7 +79,16 @@ def test_sound_predictions_are_found_sound_and_bad_ones_named() -> None:
         error = root @ generator.normal(size=6)
         turned = rotation_from_vector(error[:3]) @ true.rotation
         moved = Pose(nearest_rotation(turned), true.translation_mm + error[3:])
-        return HandEyeCalibration(moved, stated, None, ArmNoise(0.01, 1e-5), 0.01, 12, 24, 1000)
+        return HandEyeCalibration(
+            tool_from_sensor=moved,
+            covariance=stated,
+            sensor_coupling=None,
+            arm_noise=ArmNoise(position_mm=0.01, rotation_rad=1e-5),
+            rms_mm=0.01,
+            n_postures=12,
+            n_exposures=24,
+            n_points=1000,
+        )
 
     study = solved(study_repeats([draw(covariance) for _ in range(200)]))
     assert study.ratio is not None
@@ -106,7 +115,14 @@ def test_one_sensors_error_that_moves_the_repeats_apart_is_predicted() -> None:
         moved = Pose(nearest_rotation(turned), TABLE_4_MEAN[3:] + change[3:])
         calibrations.append(
             HandEyeCalibration(
-                moved, 1e-16 * np.eye(6), coupling, ArmNoise(0.01, 1e-5), 0.01, 12, 24, 1000
+                tool_from_sensor=moved,
+                covariance=1e-16 * np.eye(6),
+                sensor_coupling=coupling,
+                arm_noise=ArmNoise(position_mm=0.01, rotation_rad=1e-5),
+                rms_mm=0.01,
+                n_postures=12,
+                n_exposures=24,
+                n_points=1000,
             )
         )
     study = solved(study_repeats(calibrations, np.eye(400)))

@@ -5,16 +5,16 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.sphere_sections import SphereOptions
-from armscan.calibration.hand_eye.thesis import (
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose
+from armscan.geometry.rotations import rotation_from_vector
+from armscan.thesis.hand_eye import (
     TwoStepHandEye,
     calibrate_in_two_steps,
     group_by_rotation,
     rotation_from_shifts,
     translation_from_turns,
 )
-from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Pose
-from armscan.geometry.rotations import rotation_from_vector
 from sphere_rig import DIAMETER_MM, HAND_EYE, SHEET_NORMAL, SphereRig, shifted_poses
 
 SEED = 9

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import Box
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
-from armscan.inspection.selection import InspectionOptions, Region
+from armscan.inspection.selection import InspectionOptions
 from inspection_clouds import cloud_of, random_motion
 
 GRID = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0), [0.0]), axis=-1).reshape(-1, 3)
@@ -93,12 +94,12 @@ def test_the_largest_of_several_faces_is_found_without_a_reference() -> None:
 def test_a_region_leaves_the_rest_out() -> None:
     other = GRID[:150] + np.array([0.0, 0.0, 8.0])
     cloud = cloud_of(np.concatenate([GRID, other]))
-    region = Region(np.array([-1.0, -1.0, 7.0]), np.array([30.0, 30.0, 9.0]))
+    region = Box(np.array([-1.0, -1.0, 7.0]), np.array([30.0, 30.0, 9.0]))
     found = inspected(inspect_plane(cloud, region=region))
     assert found.counts.n_region == 150
     assert found.rows.min() == 200
-    with pytest.raises(OptionError, match="not all below"):
-        Region(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 1.0]))
+    with pytest.raises(OptionError, match="xmin 1 is not below xmax 0"):
+        Box(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 1.0]))
 
 
 def test_the_fitted_normal_points_to_the_scanned_side() -> None:

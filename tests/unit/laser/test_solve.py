@@ -21,7 +21,10 @@ from armscan.models.light_sheet import LightSheet
 N_IMAGES, N_STRIPE = 4, 15
 SIGMA_PX = 0.1
 FLAT = LightSheet(
-    np.array([1.0, -2.0, 100.0]), np.eye(3)[[0, 2, 1]] * [1, 1, -1], 20.0, np.zeros(5)
+    origin_mm=np.array([1.0, -2.0, 100.0]),
+    axes=np.eye(3)[[0, 2, 1]] * [1, 1, -1],
+    scale_mm=20.0,
+    bow_mm=np.zeros(5),
 )
 
 

@@ -18,7 +18,15 @@ from armscan.vision.targets.target import (
     TargetView,
 )
 
-CAMERA = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
+CAMERA = CameraModel(
+    fx_px=1000.0,
+    fy_px=1000.0,
+    cx_px=500.0,
+    cy_px=400.0,
+    distortion=np.zeros(5),
+    width_px=1001,
+    height_px=801,
+)
 HERE: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-50.0, -40.0, 500.0]))
 """A board square to the camera at 2 px/mm, its origin at pixel (400, 320)."""
 WIDTH_PX = 1.5
@@ -31,14 +39,14 @@ def upright(x_px: float, low_px: float, high_px: float) -> Profile:
     n = len(y)
     zeros = np.zeros(n, dtype=np.int64)
     return Profile(
-        "stripe.png",
-        np.stack([np.full(n, x_px), y], axis=1),
-        np.tile([1.0, 0.0], (n, 1)),
-        np.full(n, 0.1),
-        np.full(n, WIDTH_PX),
-        np.full(n, 100.0),
-        zeros,
-        zeros,
+        source="stripe.png",
+        points_px=np.stack([np.full(n, x_px), y], axis=1),
+        normals_px=np.tile([1.0, 0.0], (n, 1)),
+        sigma_px=np.full(n, 0.1),
+        width_px=np.full(n, WIDTH_PX),
+        intensity=np.full(n, 100.0),
+        flags=zeros,
+        segment=zeros,
     )
 
 
@@ -148,7 +156,15 @@ def test_squares_behind_the_camera_are_left_out() -> None:
 
 def test_edges_beyond_the_fold_of_the_lens_are_no_phantoms() -> None:
     """R (1 - 0.5 r^2) is largest at r = 0.816: what lies further out comes back into the image."""
-    lens = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.array([-0.5, 0, 0, 0, 0]), 1001, 801)
+    lens = CameraModel(
+        fx_px=1000.0,
+        fy_px=1000.0,
+        cx_px=500.0,
+        cy_px=400.0,
+        distortion=np.array([-0.5, 0, 0, 0, 0]),
+        width_px=1001,
+        height_px=801,
+    )
     board = Chessboard(5, 4, 200.0)
     near: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-400.0, -300.0, 500.0]))
     edges = find_target_edges(view_of(board), board, near, lens)

@@ -17,7 +17,12 @@ def some_markers(n: int = 4) -> MarkerSet:
     rng = np.random.default_rng(1)
     root = rng.standard_normal((n, 3, 3))
     covariance = root @ root.transpose(0, 2, 1) + np.eye(3)
-    return MarkerSet(np.arange(n) * 3, 30.0 * rng.standard_normal((n, 3)), covariance, "Base")
+    return MarkerSet(
+        ids=np.arange(n) * 3,
+        points_mm=30.0 * rng.standard_normal((n, 3)),
+        covariance_mm2=covariance,
+        frame="Base",
+    )
 
 
 def test_a_table_reads_back_as_the_same_numbers(tmp_path: Path) -> None:
@@ -52,4 +57,4 @@ def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: s
 
 def test_a_covariance_must_be_one() -> None:
     with pytest.raises(InputError, match="not positive definite"):
-        MarkerSet(np.arange(1), np.zeros((1, 3)), -np.eye(3)[None])
+        MarkerSet(ids=np.arange(1), points_mm=np.zeros((1, 3)), covariance_mm2=-np.eye(3)[None])

@@ -97,7 +97,9 @@ def test_a_symmetric_part_is_refused_and_ids_resolve_it() -> None:
     old, back = marker_set(square), pose.inverse()
     order = [2, 0, 3, 1]
     carried = square[order] @ back.rotation.T + back.translation_mm
-    new = MarkerSet(np.array(order) + 1, carried, old.covariance_mm2, "Base")
+    new = MarkerSet(
+        ids=np.array(order) + 1, points_mm=carried, covariance_mm2=old.covariance_mm2, frame="Base"
+    )
     with pytest.raises(EstimationError, match=r"equal distances.*--by-id"):
         register_place(listed(old, "old.csv", has_ids=True), listed(new, "new.csv", has_ids=True))
     by_id = RegisterOptions(is_by_id=True)

@@ -29,11 +29,11 @@ def general_arm(seed: int = 3, n_axes: int = 7) -> ArmModel:
     """An arm with nothing zero: each of its 4 n numbers matters."""
     rng = np.random.default_rng(seed)
     return ArmModel(
-        rng.uniform(-0.5, 0.5, n_axes),
-        rng.uniform(-300.0, 300.0, n_axes),
-        rng.uniform(-300.0, 300.0, n_axes),
-        rng.uniform(-1.5, 1.5, n_axes),
-        Pose.from_vectors([0.3, -0.2, 0.9], [12.0, -7.0, 41.0]),
+        theta_offset_rad=rng.uniform(-0.5, 0.5, n_axes),
+        offset_mm=rng.uniform(-300.0, 300.0, n_axes),
+        length_mm=rng.uniform(-300.0, 300.0, n_axes),
+        twist_rad=rng.uniform(-1.5, 1.5, n_axes),
+        flange=Pose.from_vectors([0.3, -0.2, 0.9], [12.0, -7.0, 41.0]),
     )
 
 
@@ -185,4 +185,9 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(InputError, match="joint 2"):
         ArmModel(*np.zeros((4, 2)), joint_min_rad=[-1.0, 1.0], joint_max_rad=[1.0, 1.0])
     with pytest.raises(InputError, match="length_mm"):
-        ArmModel(np.zeros(2), np.zeros(2), np.zeros(3), np.zeros(2))
+        ArmModel(
+            theta_offset_rad=np.zeros(2),
+            offset_mm=np.zeros(2),
+            length_mm=np.zeros(3),
+            twist_rad=np.zeros(2),
+        )

@@ -87,7 +87,10 @@ def test_turning_about_the_tips_centre_does_not_move_it() -> None:
         [Pose.from_vectors(v, [0, 0, 0]).rotation for v in rng.normal(size=(5, 3))]
     )
     track = ArmTrack(
-        np.arange(5), rotations, touched - rotations @ tip, [True, True, False, True, True]
+        t_ns=np.arange(5),
+        rotations=rotations,
+        translations_mm=touched - rotations @ tip,
+        is_known=[True, True, False, True, True],
     )
     centres = tip_centres(track, tool_from_probe(tip))
     assert centres.shape == (4, 3)

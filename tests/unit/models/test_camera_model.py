@@ -9,7 +9,13 @@ from armscan.errors import InputError
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 
 CAMERA = CameraModel(
-    1430.0, 1425.0, 478.0, 642.0, np.array([-0.2, 0.08, 6e-4, -4e-4, 0.01]), 960, 1280
+    fx_px=1430.0,
+    fy_px=1425.0,
+    cx_px=478.0,
+    cy_px=642.0,
+    distortion=np.array([-0.2, 0.08, 6e-4, -4e-4, 0.01]),
+    width_px=960,
+    height_px=1280,
 )
 TELE_PX_OF_DOUBLE = 1e-9
 """Rounding of a pixel coordinate after a few dozen operations at 2000 px."""
@@ -31,7 +37,15 @@ def test_projection_is_that_of_opencv() -> None:
 
 
 def test_pixel_zero_is_the_centre_of_the_first_pixel() -> None:
-    centred = CameraModel(100.0, 100.0, 0.0, 0.0, np.zeros(5), 10, 8)
+    centred = CameraModel(
+        fx_px=100.0,
+        fy_px=100.0,
+        cx_px=0.0,
+        cy_px=0.0,
+        distortion=np.zeros(5),
+        width_px=10,
+        height_px=8,
+    )
     assert centred.project(np.array([[0.0, 0.0, 5.0]])).tolist() == [[0.0, 0.0]]
     edges = np.array([[-0.5, -0.5], [-0.51, 0.0], [9.5, 7.5], [9.51, 0.0], [0.0, 7.51]])
     assert centred.is_inside(edges).tolist() == [True, False, True, False, False]
@@ -100,7 +114,15 @@ def test_points_behind_the_camera_have_no_pixel() -> None:
 
 
 def test_fold_inside_the_image_is_found() -> None:
-    folding = CameraModel(500.0, 500.0, 319.5, 239.5, np.array([-0.6, 0, 0, 0, 0]), 640, 480)
+    folding = CameraModel(
+        fx_px=500.0,
+        fy_px=500.0,
+        cx_px=319.5,
+        cy_px=239.5,
+        distortion=np.array([-0.6, 0, 0, 0, 0]),
+        width_px=640,
+        height_px=480,
+    )
     border = folding.folded_border()
     assert len(border) > 0
     assert np.abs(border - [319.5, 239.5]).max() > 200

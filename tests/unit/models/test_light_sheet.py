@@ -21,7 +21,9 @@ rounding of 1e2 mm over STEP gives 1e-8."""
 
 def bowed_sheet(bow_mm: FloatArray = BOW_MM) -> LightSheet:
     axes = rotation_from_vector(np.array([0.8, 0.1, -0.2]))
-    return LightSheet(np.array([3.0, -2.0, 135.0]), axes, 20.0, bow_mm)
+    return LightSheet(
+        origin_mm=np.array([3.0, -2.0, 135.0]), axes=axes, scale_mm=20.0, bow_mm=bow_mm
+    )
 
 
 def thesis_sheet() -> LightSheet:
@@ -29,7 +31,12 @@ def thesis_sheet() -> LightSheet:
     e_u = np.cross(normal, [0.0, 0.0, 1.0])
     e_u = e_u / np.linalg.norm(e_u)
     origin = np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742])
-    return LightSheet(origin, np.stack([e_u, np.cross(normal, e_u), normal]), 20.0, np.zeros(5))
+    return LightSheet(
+        origin_mm=origin,
+        axes=np.stack([e_u, np.cross(normal, e_u), normal]),
+        scale_mm=20.0,
+        bow_mm=np.zeros(5),
+    )
 
 
 def test_the_printed_plane_meets_the_optical_axis_at_135_mm() -> None:
@@ -48,7 +55,7 @@ def test_plane_property_returns_the_printed_coefficients() -> None:
 
 def test_bow_by_hand() -> None:
     """At u = 1, v = -1: every even product is +, v's odd powers flip the sign."""
-    sheet = LightSheet(np.zeros(3), np.eye(3), 10.0, BOW_MM)
+    sheet = LightSheet(origin_mm=np.zeros(3), axes=np.eye(3), scale_mm=10.0, bow_mm=BOW_MM)
     height, _, _ = sheet.height_with_jacobian(np.array([[10.0, -10.0, 1.0]]))
     np.testing.assert_allclose(height, 1.0 - (0.3 + 0.2 + 0.15 + 0.05 + 0.1), rtol=1e-12)
 
@@ -98,7 +105,9 @@ def test_a_cone_is_met_exactly_by_a_fan_and_not_by_powers() -> None:
     left = []
     for spread in (0.0, 1.0 / distance):
         fan = np.array([0.0, spread])
-        sheet = LightSheet(np.zeros(3), np.eye(3), scale, np.zeros(5), fan)
+        sheet = LightSheet(
+            origin_mm=np.zeros(3), axes=np.eye(3), scale_mm=scale, bow_mm=np.zeros(5), fan=fan
+        )
         off, _, by_parameters = sheet.height_with_jacobian(points)
         left.append(off - by_parameters @ np.linalg.lstsq(by_parameters, off, rcond=None)[0])
     assert np.abs(left[1]).max() < 1e-9
@@ -164,10 +173,10 @@ def test_intersection_derivatives_by_differences() -> None:
 
 def test_rays_along_or_away_from_the_sheet_are_invalid() -> None:
     sheet = LightSheet(
-        np.array([0.0, 10.0, 0.0]),
-        np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
-        10.0,
-        np.zeros(5),
+        origin_mm=np.array([0.0, 10.0, 0.0]),
+        axes=np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
+        scale_mm=10.0,
+        bow_mm=np.zeros(5),
     )
     points, is_met = sheet.intersect(np.array([[0.0, 0.0], [0.0, -0.1], [0.0, 0.1]]))
     assert is_met.tolist() == [False, False, True]
@@ -182,7 +191,12 @@ def test_a_ray_that_passes_by_a_strong_bow_is_invalid() -> None:
     middle of the sheet is met.
     """
     axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    sheet = LightSheet(np.array([0.0, 10.0, 100.0]), axes, 10.0, np.array([0.0, 0, 3.0, 0, 0]))
+    sheet = LightSheet(
+        origin_mm=np.array([0.0, 10.0, 100.0]),
+        axes=axes,
+        scale_mm=10.0,
+        bow_mm=np.array([0.0, 0, 3.0, 0, 0]),
+    )
     slopes = np.array([0.1, 0.05, 0.15, 0.2, 0.25, 0.3])
     points, is_met = sheet.intersect(np.column_stack([0.0 * slopes, slopes]))
     assert is_met.tolist() == [True, True, False, False, False, False]
@@ -201,4 +215,4 @@ def test_update_keeps_the_triad_orthonormal_for_large_steps() -> None:
 )
 def test_bad_triads_and_scales_are_refused(axes: FloatArray, scale_mm: float) -> None:
     with pytest.raises(InputError):
-        LightSheet(np.zeros(3), axes, scale_mm, np.zeros(5))
+        LightSheet(origin_mm=np.zeros(3), axes=axes, scale_mm=scale_mm, bow_mm=np.zeros(5))

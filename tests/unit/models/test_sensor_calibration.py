@@ -15,15 +15,27 @@ from armscan.models.calibration import (
 from armscan.models.light_sheet import LightSheet
 from sheet_rig import PROVENANCE, thesis_rig
 
-SHEET = LightSheet(np.array([0.0, 0.0, 135.0]), np.eye(3), 20.0, np.zeros(5))
-ENTRY = SheetCalibration("A", SHEET, 0.01, 6, 600, (120.0, 150.0), True)
+SHEET = LightSheet(
+    origin_mm=np.array([0.0, 0.0, 135.0]), axes=np.eye(3), scale_mm=20.0, bow_mm=np.zeros(5)
+)
+ENTRY = SheetCalibration(
+    name="A",
+    sheet=SHEET,
+    rms_mm=0.01,
+    n_boards=6,
+    n_points=600,
+    depth_range_mm=(120.0, 150.0),
+    is_redundant=True,
+)
 RIG = thesis_rig()
 CAMERA = RIG.calibration(RIG.camera)
 
 
 def test_names_and_slices_follow_the_covariance() -> None:
     entries = (ENTRY, replace(ENTRY, name="B"))
-    sensor = SensorCalibration(CAMERA, entries, np.zeros((25, 25)), PROVENANCE)
+    sensor = SensorCalibration(
+        camera=CAMERA, sheets=entries, covariance=np.zeros((25, 25)), provenance=PROVENANCE
+    )
     assert len(sensor.parameter_names) == 25
     assert sensor.parameter_names[:2] == ("fx_px", "fy_px")
     own = sensor.parameter_names[sensor.sheet_parameter_slice(1)]
@@ -32,8 +44,17 @@ def test_names_and_slices_follow_the_covariance() -> None:
 
 def test_what_does_not_fit_together_is_refused() -> None:
     with pytest.raises(InputError, match="at least one"):
-        SensorCalibration(CAMERA, (), np.zeros((9, 9)), PROVENANCE)
+        SensorCalibration(
+            camera=CAMERA, sheets=(), covariance=np.zeros((9, 9)), provenance=PROVENANCE
+        )
     with pytest.raises(InputError, match="share a name: A, A"):
-        SensorCalibration(CAMERA, (ENTRY, ENTRY), np.zeros((25, 25)), PROVENANCE)
-    with pytest.raises(InputError, match=r"\(17, 17\)"):
-        SensorCalibration(CAMERA, (ENTRY,), np.zeros((25, 25)), PROVENANCE)
+        SensorCalibration(
+            camera=CAMERA,
+            sheets=(ENTRY, ENTRY),
+            covariance=np.zeros((25, 25)),
+            provenance=PROVENANCE,
+        )
+    with pytest.raises(InputError, match="25 parameters for 17"):
+        SensorCalibration(
+            camera=CAMERA, sheets=(ENTRY,), covariance=np.zeros((25, 25)), provenance=PROVENANCE
+        )

@@ -32,7 +32,7 @@ BOTH = ("A", "B")
 
 def rows() -> tuple[ExposureRow, ...]:
     return tuple(
-        ExposureRow(k, t_ns, 0, f"{k}.png", lasers=BOTH, trigger_id=k + 1)
+        ExposureRow(index=k, t_ns=t_ns, camera=0, source=f"{k}.png", lasers=BOTH, trigger_id=k + 1)
         for k, t_ns in enumerate(TIMES_NS)
     )
 
@@ -54,7 +54,13 @@ class DarkScan:
         place = np.tile(BASE_FROM_TOOL.translation_mm, (n, 1))
         known = np.arange(n) != 2
         ids = np.arange(1, n + 1)
-        return ArmTrack(np.array(TIMES_NS), pose, place, known, ids)
+        return ArmTrack(
+            t_ns=np.array(TIMES_NS),
+            rotations=pose,
+            translations_mm=place,
+            is_known=known,
+            trigger_ids=ids,
+        )
 
     def exposure(self, row: int) -> Exposure:
         return self.expose(row, self.rows[row].lasers)

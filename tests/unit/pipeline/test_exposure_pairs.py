@@ -9,7 +9,15 @@ from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import check_sizes, pair_exposures
 from armscan.records.exposure import Exposure, SensorWindow
 
-CAMERA = CameraModel(100.0, 100.0, 20.0, 15.0, np.zeros(5), 40, 30)
+CAMERA = CameraModel(
+    fx_px=100.0,
+    fy_px=100.0,
+    cx_px=20.0,
+    cy_px=15.0,
+    distortion=np.zeros(5),
+    width_px=40,
+    height_px=30,
+)
 
 
 def image(source: str, shape: tuple[int, int] = (30, 40), **more: SensorWindow) -> Exposure:

@@ -35,23 +35,53 @@ LINE_SIGMA_PX = 2.0
 DEPTH_PER_PX_MM = 0.19
 """Of the light sheet at 140 mm, with this camera."""
 CENTRE_NOISE_PX = 0.1
-BY_HAND = Provenance("by hand", "", "", (), ())
+BY_HAND = Provenance(
+    document_id="by hand", created_utc="", armscan_version="", command=(), inputs=()
+)
 RIG = PlateRig(good_postures(8, np.random.default_rng(1)), SILENT)
 
 
 def _sensor() -> SensorCalibration:
-    model = CameraModel(FOCAL_PX, FOCAL_PX, 319.5, 239.5, np.zeros(5), WIDTH, HEIGHT)
+    model = CameraModel(
+        fx_px=FOCAL_PX,
+        fy_px=FOCAL_PX,
+        cx_px=319.5,
+        cy_px=239.5,
+        distortion=np.zeros(5),
+        width_px=WIDTH,
+        height_px=HEIGHT,
+    )
     covered = np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0])
-    camera = CameraCalibration(model, np.eye(9) * 1e-12, True, 0.0, 0.1, 9, 99, covered, BY_HAND)
+    camera = CameraCalibration(
+        camera=model,
+        covariance=np.eye(9) * 1e-12,
+        has_covariance=True,
+        rms_px=0.0,
+        sigma_point_px=0.1,
+        n_views=9,
+        n_points=99,
+        covered_px=covered,
+        provenance=BY_HAND,
+    )
     normal = SHEET[:3] / np.linalg.norm(SHEET[:3])
     along = np.cross(normal, [0.0, 0.0, 1.0])
     along /= np.linalg.norm(along)
     middle = np.array([0.0, 4.15, 140.0])
     middle -= (normal @ middle + SHEET[3] / np.linalg.norm(SHEET[:3])) * normal
     axes = np.stack([along, np.cross(normal, along), normal])
-    sheet = LightSheet(middle, axes, 30.0, np.zeros(5))
-    calibrated = SheetCalibration("A", sheet, 0.0, 6, 999, (110.0, 175.0), True)
-    return SensorCalibration(camera, (calibrated,), 1e-12 * np.eye(17), BY_HAND)
+    sheet = LightSheet(origin_mm=middle, axes=axes, scale_mm=30.0, bow_mm=np.zeros(5))
+    calibrated = SheetCalibration(
+        name="A",
+        sheet=sheet,
+        rms_mm=0.0,
+        n_boards=6,
+        n_points=999,
+        depth_range_mm=(110.0, 175.0),
+        is_redundant=True,
+    )
+    return SensorCalibration(
+        camera=camera, sheets=(calibrated,), covariance=1e-12 * np.eye(17), provenance=BY_HAND
+    )
 
 
 def _image(points_mm: np.ndarray, seed: int) -> np.ndarray:
@@ -83,7 +113,13 @@ class DrawnScan:
         count = self.repeats * len(RIG.postures)
         return tuple(
             ExposureRow(
-                k, 1_000_000 * k, 0, f"image{k}", ("A",), k, self._view(k) if self.views else None
+                index=k,
+                t_ns=1_000_000 * k,
+                camera=0,
+                source=f"image{k}",
+                lasers=("A",),
+                trigger_id=k,
+                view=self._view(k) if self.views else None,
             )
             for k in range(count)
         )
@@ -97,11 +133,11 @@ class DrawnScan:
         known = np.ones(len(rows), dtype=np.bool_)
         known[0] = self.is_first_known
         return ArmTrack(
-            np.array([row.t_ns for row in rows]),
-            np.array([pose.rotation for pose in poses]),
-            np.array([pose.translation_mm for pose in poses]),
-            known,
-            np.arange(len(rows)),
+            t_ns=np.array([row.t_ns for row in rows]),
+            rotations=np.array([pose.rotation for pose in poses]),
+            translations_mm=np.array([pose.translation_mm for pose in poses]),
+            is_known=known,
+            trigger_ids=np.arange(len(rows)),
         )
 
     def exposure(self, row: int) -> Exposure:

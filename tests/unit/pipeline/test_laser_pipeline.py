@@ -22,17 +22,25 @@ from armscan.vision.targets.target import Chessboard
 from sheet_rig import PROVENANCE
 
 WIDTH, HEIGHT = 320, 240
-CAMERA = CameraModel(400.0, 400.0, 159.5, 119.5, np.zeros(5), WIDTH, HEIGHT)
+CAMERA = CameraModel(
+    fx_px=400.0,
+    fy_px=400.0,
+    cx_px=159.5,
+    cy_px=119.5,
+    distortion=np.zeros(5),
+    width_px=WIDTH,
+    height_px=HEIGHT,
+)
 CALIBRATION = CameraCalibration(
-    CAMERA,
-    np.zeros((9, 9)),
-    True,
-    0.1,
-    0.05,
-    9,
-    99,
-    np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0]),
-    PROVENANCE,
+    camera=CAMERA,
+    covariance=np.zeros((9, 9)),
+    has_covariance=True,
+    rms_px=0.1,
+    sigma_point_px=0.05,
+    n_views=9,
+    n_points=99,
+    covered_px=np.array([0.0, 0.0, WIDTH - 1.0, HEIGHT - 1.0]),
+    provenance=PROVENANCE,
 )
 LINE_SIGMA_PX = 2.0
 DEPTH_MM = 200.0
@@ -51,9 +59,21 @@ def sensor() -> SensorCalibration:
     """One upright sheet x = z - 200, calibrated from 190 to 210 mm."""
     normal = np.array([1.0, 0.0, -1.0]) / np.sqrt(2.0)
     axes = np.stack([[0.0, 1.0, 0.0], np.cross(normal, [0.0, 1.0, 0.0]), normal])
-    sheet = LightSheet(np.array([0.0, 0.0, DEPTH_MM]), axes, 40.0, np.zeros(5))
-    entry = SheetCalibration("A", sheet, 0.01, 4, 99, (190.0, 210.0), True)
-    return SensorCalibration(CALIBRATION, (entry,), np.zeros((17, 17)), PROVENANCE)
+    sheet = LightSheet(
+        origin_mm=np.array([0.0, 0.0, DEPTH_MM]), axes=axes, scale_mm=40.0, bow_mm=np.zeros(5)
+    )
+    entry = SheetCalibration(
+        name="A",
+        sheet=sheet,
+        rms_mm=0.01,
+        n_boards=4,
+        n_points=99,
+        depth_range_mm=(190.0, 210.0),
+        is_redundant=True,
+    )
+    return SensorCalibration(
+        camera=CALIBRATION, sheets=(entry,), covariance=np.zeros((17, 17)), provenance=PROVENANCE
+    )
 
 
 def test_images_without_a_board_are_named_with_the_reason() -> None:

@@ -31,7 +31,10 @@ LOST = ((1, 1),)
 
 
 def rows_at(times: list[tuple[int, int]]) -> list[ExposureRow]:
-    return [ExposureRow(k, t_ns, camera, f"{k}.png") for k, (t_ns, camera) in enumerate(times)]
+    return [
+        ExposureRow(index=k, t_ns=t_ns, camera=camera, source=f"{k}.png")
+        for k, (t_ns, camera) in enumerate(times)
+    ]
 
 
 def grouped(times: list[tuple[int, int]]) -> list[tuple[int, ...]]:

@@ -25,7 +25,7 @@ FLOOR_MM = 30.0
 
 
 def profile(name: str, points: FloatArray) -> PointProfile:
-    return PointProfile(name, points)
+    return PointProfile(source=name, points_mm=points)
 
 
 def cut(sensor_from_base: Pose, generator: np.random.Generator) -> FloatArray:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from armscan.errors import EstimationError, InputError, OptionError
+from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
-from armscan.reconstruction.place import BaseBox, NormalOptions
+from armscan.reconstruction.place import NormalOptions
 from scan_fake import PERIOD_NS, FakeScan, as_source, fake_scan, looking_down, scanner, with_rows
 
 
@@ -54,7 +55,7 @@ def test_threads_and_volume_change_nothing_but_speed_and_extent(
     two = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, threads=2))
     np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
     assert one.cloud.normals is None
-    box = BaseBox(np.array([-100.0, -100.0, -1.0]), np.array([100.0, 2.6, 1.0]))
+    box = Box(np.array([-100.0, -100.0, -1.0]), np.array([100.0, 2.6, 1.0]))
     cut = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, volume=box))
     inside = box.holds(one.cloud.points_mm)
     np.testing.assert_array_equal(cut.cloud.points_mm, one.cloud.points_mm[inside])
@@ -150,7 +151,7 @@ def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> 
         measure_scan(as_source(scan), replace(device, sensor=None, hand_eye=coupled))
     with pytest.raises(EstimationError, match=r"could be measured: images/0\.png: the image"):
         measure_scan(as_source(replace(scan, broken=(0, 1, 2))), device)
-    away = BaseBox(np.full(3, 900.0), np.full(3, 901.0))
+    away = Box(np.full(3, 900.0), np.full(3, 901.0))
     with pytest.raises(EstimationError, match="outside the volume"):
         measure_scan(as_source(scan), device, ScanOptions(volume=away))
     with pytest.raises(InputError, match="cameras 0, 1"):

@@ -28,7 +28,7 @@ def test_hand_eye_errors_are_in_the_form_of_its_covariance() -> None:
     turned = rotation_from_vector(np.array([sigma[0], 0.0, 0.0])) @ TOOL_FROM_SENSOR.rotation
     moved = TOOL_FROM_SENSOR.translation_mm + np.array([0.0, 0.0, 2.0 * sigma[5]])
     found = replace(hand_eye, tool_from_sensor=Pose(turned, moved))
-    scanner = ScannerCalibration(None, found, PROVENANCE)
+    scanner = ScannerCalibration(sensor=None, hand_eye=found, provenance=PROVENANCE)
     errors = hand_eye_errors(scanner, TOOL_FROM_SENSOR)
     assert errors.rotation_deg == pytest.approx(np.degrees(sigma[0]), rel=1e-6)
     assert errors.translation_mm == pytest.approx(2.0 * sigma[5])
@@ -48,7 +48,12 @@ class Rows:
 
 
 def scan_of(views: list[str | None]) -> Rows:
-    return Rows(tuple(ExposureRow(k, k, 0, f"{k}.png", view=v) for k, v in enumerate(views)))
+    return Rows(
+        tuple(
+            ExposureRow(index=k, t_ns=k, camera=0, source=f"{k}.png", view=v)
+            for k, v in enumerate(views)
+        )
+    )
 
 
 def test_exposures_of_a_view_stay_together_and_the_ends_are_kept() -> None:

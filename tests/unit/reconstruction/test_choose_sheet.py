@@ -12,7 +12,15 @@ from armscan.reconstruction.label_single import DepthRange, choose_sheets
 from armscan.records.profile import Profile, StripeFlag
 from sheet_rig import PROVENANCE, make_profile
 
-CAMERA = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
+CAMERA = CameraModel(
+    fx_px=1000.0,
+    fy_px=1000.0,
+    cx_px=500.0,
+    cy_px=400.0,
+    distortion=np.zeros(5),
+    width_px=1001,
+    height_px=801,
+)
 RANGE_MM = (280.0, 320.0)
 
 
@@ -20,17 +28,39 @@ def leaning(sign: float) -> LightSheet:
     """Vertical sheet through (0, 0, 300) at 45 degrees: x = sign * (z - 300)."""
     normal = np.array([1.0, 0.0, -sign]) / np.sqrt(2.0)
     axes = np.stack([[0.0, 1.0, 0.0], np.cross(normal, [0.0, 1.0, 0.0]), normal])
-    return LightSheet(np.array([0.0, 0.0, 300.0]), axes, 40.0, np.zeros(5))
+    return LightSheet(
+        origin_mm=np.array([0.0, 0.0, 300.0]), axes=axes, scale_mm=40.0, bow_mm=np.zeros(5)
+    )
 
 
 def two_sheets() -> SensorCalibration:
     box = np.array([0.0, 0.0, 1000.0, 800.0])
-    camera = CameraCalibration(CAMERA, np.zeros((9, 9)), True, 0.1, 0.05, 9, 99, box, PROVENANCE)
+    camera = CameraCalibration(
+        camera=CAMERA,
+        covariance=np.zeros((9, 9)),
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=box,
+        provenance=PROVENANCE,
+    )
     sheets = tuple(
-        SheetCalibration(name, leaning(sign), 0.01, 4, 99, RANGE_MM, True)
+        SheetCalibration(
+            name=name,
+            sheet=leaning(sign),
+            rms_mm=0.01,
+            n_boards=4,
+            n_points=99,
+            depth_range_mm=RANGE_MM,
+            is_redundant=True,
+        )
         for name, sign in (("left", 1.0), ("right", -1.0))
     )
-    return SensorCalibration(camera, sheets, np.zeros((25, 25)), PROVENANCE)
+    return SensorCalibration(
+        camera=camera, sheets=sheets, covariance=np.zeros((25, 25)), provenance=PROVENANCE
+    )
 
 
 def stripes(*x_over_z: float) -> Profile:
@@ -64,9 +94,20 @@ def test_the_only_laser_that_was_on() -> None:
 def test_depth_names_a_stripe_that_one_sheet_alone_puts_in_range() -> None:
     """At x/z = 0.13: left z = 344.8, right z = 265.5. Range of right widened to 265 only."""
     sensor = two_sheets()
-    wide = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (262.0, 320.0), True)
+    wide = SheetCalibration(
+        name="right",
+        sheet=leaning(-1.0),
+        rms_mm=0.01,
+        n_boards=4,
+        n_points=99,
+        depth_range_mm=(262.0, 320.0),
+        is_redundant=True,
+    )
     sensor = SensorCalibration(
-        sensor.camera, (sensor.sheets[0], wide), sensor.covariance, PROVENANCE
+        camera=sensor.camera,
+        sheets=(sensor.sheets[0], wide),
+        covariance=sensor.covariance,
+        provenance=PROVENANCE,
     )
     choice = choose_sheets(stripes(0.13), sensor, DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {1}
@@ -84,9 +125,20 @@ def test_the_words_tell_the_calibrated_depths_from_those_accepted() -> None:
 def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
     """At x/z = 0.05: left z = 315.8, calibrated; right z = 285.7, outside its 290 to 320 mm."""
     sensor = two_sheets()
-    right = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (290.0, 320.0), True)
+    right = SheetCalibration(
+        name="right",
+        sheet=leaning(-1.0),
+        rms_mm=0.01,
+        n_boards=4,
+        n_points=99,
+        depth_range_mm=(290.0, 320.0),
+        is_redundant=True,
+    )
     sensor = SensorCalibration(
-        sensor.camera, (sensor.sheets[0], right), sensor.covariance, PROVENANCE
+        camera=sensor.camera,
+        sheets=(sensor.sheets[0], right),
+        covariance=sensor.covariance,
+        provenance=PROVENANCE,
     )
     choice = choose_sheets(stripes(0.05), sensor, DepthRange(3.0))
     assert set(choice.sheet.tolist()) == {0}
@@ -97,9 +149,20 @@ def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
 def test_only_segments_outside_all_calibrated_depths_ask_the_widened_ones() -> None:
     """Left's first stripe as above; the second (z = 240 or 400) is reached by left alone."""
     sensor = two_sheets()
-    right = SheetCalibration("right", leaning(-1.0), 0.01, 4, 99, (290.0, 320.0), True)
+    right = SheetCalibration(
+        name="right",
+        sheet=leaning(-1.0),
+        rms_mm=0.01,
+        n_boards=4,
+        n_points=99,
+        depth_range_mm=(290.0, 320.0),
+        is_redundant=True,
+    )
     sensor = SensorCalibration(
-        sensor.camera, (sensor.sheets[0], right), sensor.covariance, PROVENANCE
+        camera=sensor.camera,
+        sheets=(sensor.sheets[0], right),
+        covariance=sensor.covariance,
+        provenance=PROVENANCE,
     )
     choice = choose_sheets(stripes(0.05, -0.25), sensor, DepthRange(1.5))
     assert set(choice.sheet.tolist()) == {0}
@@ -122,14 +185,14 @@ def test_flagged_points_do_not_vote() -> None:
     profile = stripes(0.0)
     flags = np.full(len(profile), int(StripeFlag.NEIGHBOUR))
     flagged = Profile(
-        profile.source,
-        profile.points_px,
-        profile.normals_px,
-        profile.sigma_px,
-        profile.width_px,
-        profile.intensity,
-        flags,
-        profile.segment,
+        source=profile.source,
+        points_px=profile.points_px,
+        normals_px=profile.normals_px,
+        sigma_px=profile.sigma_px,
+        width_px=profile.width_px,
+        intensity=profile.intensity,
+        flags=flags,
+        segment=profile.segment,
     )
     choice = choose_sheets(flagged, two_sheets(), DepthRange())
     assert set(choice.sheet.tolist()) == {-1}

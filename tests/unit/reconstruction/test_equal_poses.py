@@ -22,9 +22,17 @@ def stripe(shift_mm: float, sheet: int = 0, n: int = N, seed: int = 1) -> PointC
     zeros = np.zeros(n, dtype=np.int64)
     covariance = np.broadcast_to(NOISE_MM**2 * np.eye(3), (n, 3, 3))
     return PointCloud(
-        "Base", points, covariance, np.full(n, NOISE_MM), np.full(n, sheet), ("A", "B"), zeros,
-        ("x.png",), zeros, np.full(n, 100.0),
-    )  # fmt: skip
+        frame="Base",
+        points_mm=points,
+        covariance_mm2=covariance,
+        sigma_noise_mm=np.full(n, NOISE_MM),
+        sheet=np.full(n, sheet),
+        sheet_names=("A", "B"),
+        exposure=zeros,
+        exposure_sources=("x.png",),
+        segment=zeros,
+        intensity=np.full(n, 100.0),
+    )
 
 
 def poses(places_mm: FloatArray) -> ExposurePoses:

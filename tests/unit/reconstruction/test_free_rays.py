@@ -6,8 +6,12 @@ import numpy as np
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.label_single import is_without_ray
 
-SHEET = LightSheet(np.array([0.0, 0.0, 300.0]), np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
-                   50.0, np.zeros(5))  # fmt: skip
+SHEET = LightSheet(
+    origin_mm=np.array([0.0, 0.0, 300.0]),
+    axes=np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]),
+    scale_mm=50.0,
+    bow_mm=np.zeros(5),
+)
 """u along X, depth along Z."""
 
 

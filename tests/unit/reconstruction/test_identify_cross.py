@@ -16,7 +16,7 @@ from armscan.reconstruction.labels import (
     LabelStatus,
     StripeLabeller,
 )
-from armscan.reconstruction.row_rule import RowLabeller
+from armscan.thesis.row_rule import RowLabeller
 from cross_rig import HARSH, NAMES, SCENES, THESIS, TICK_NS, CrossExposure, CrossStroke
 
 BOTH = ("A", "B")

@@ -9,9 +9,8 @@ import pytest
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction.labels import LabelStatus
-from armscan.reconstruction.row_rule import RowLabeller, RowOptions, row_differences
 from armscan.records.profile import Profile
-from armscan.records.recording import LaserSchedule
+from armscan.thesis.row_rule import LaserSchedule, RowLabeller, RowOptions, row_differences
 from cross_rig import sensor
 from sheet_rig import make_profile
 

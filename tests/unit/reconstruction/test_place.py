@@ -10,15 +10,13 @@ import pytest
 
 import placing_rig as rig
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
-    BaseBox,
     arm_covariance,
-    parse_volume,
     place_delivered_points,
     place_with_jacobian,
     prepare_placing,
@@ -99,7 +97,9 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
         placing,
         scanner=replace(
             placing.scanner,
-            hand_eye=replace(placing.scanner.hand_eye, arm_noise=ArmNoise(0.0, 0.0)),
+            hand_eye=replace(
+                placing.scanner.hand_eye, arm_noise=ArmNoise(position_mm=0.0, rotation_rad=0.0)
+            ),
         ),
     )
     cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, quiet)
@@ -163,7 +163,9 @@ def test_covariance_is_that_of_repeats() -> None:
 
 def test_the_arm_errs_least_at_the_scan_point() -> None:
     """By hand: 100 mm along x, rotation s adds (100 s)^2 across and nothing along."""
-    noise = ArmNoise(0.01, 1e-4, 0.02, 2e-4)
+    noise = ArmNoise(
+        position_mm=0.01, rotation_rad=1e-4, exposure_position_mm=0.02, exposure_rotation_rad=2e-4
+    )
     at, beside = arm_covariance(np.array([[0.0, 0, 0], [100.0, 0, 0]]), np.zeros(3), noise)
     np.testing.assert_allclose(at, np.eye(3) * 5e-4)
     turned = 100.0**2 * 5e-8
@@ -207,12 +209,12 @@ def test_a_covariance_that_is_none_is_refused() -> None:
 
 
 def test_volume() -> None:
-    box = parse_volume("0,10,-5,5,2,3")
+    box = Box.parse("0,10,-5,5,2,3", "--volume")
     inside = box.holds(np.array([[0.0, -5, 2], [10, 5, 3], [10.1, 0, 2.5], [5, 0, 1.9]]))
     assert inside.tolist() == [True, True, False, False]
-    assert str(parse_volume(str(box))) == str(box)
+    assert str(Box.parse(str(box), "--volume")) == str(box)
     for wrong in ("0,10,5,-5,2,3", "1,2,3", "a,b,c,d,e,f", "0,nan,0,1,0,1"):
         with pytest.raises(OptionError):
-            parse_volume(wrong)
+            Box.parse(wrong, "--volume")
     with pytest.raises(OptionError):
-        BaseBox(np.zeros(3), np.zeros(3))
+        Box(np.zeros(3), np.zeros(3))

@@ -17,14 +17,14 @@ def profile_of(
     n = len(points)
     zero = np.zeros(n, np.int64)
     return Profile(
-        "made by hand",
-        points,
-        np.tile([0.0, 1.0], (n, 1)),
-        np.full(n, 0.1),
-        np.full(n, 3.0),
-        np.full(n, 100.0),
-        zero if flags is None else flags,
-        zero if segment is None else segment,
+        source="made by hand",
+        points_px=points,
+        normals_px=np.tile([0.0, 1.0], (n, 1)),
+        sigma_px=np.full(n, 0.1),
+        width_px=np.full(n, 3.0),
+        intensity=np.full(n, 100.0),
+        flags=zero if flags is None else flags,
+        segment=zero if segment is None else segment,
     )
 
 

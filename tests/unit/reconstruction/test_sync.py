@@ -21,7 +21,12 @@ EPOCH_NS = 1_760_000_000_000_000_000
 
 def rows(times_ns: Sequence[int], ids: Sequence[int | None] | None = None) -> list[ExposureRow]:
     wanted = ids or [None] * len(times_ns)
-    return [ExposureRow(k, t, 0, f"{k}.png", ("A",), wanted[k]) for k, t in enumerate(times_ns)]
+    return [
+        ExposureRow(
+            index=k, t_ns=t, camera=0, source=f"{k}.png", lasers=("A",), trigger_id=wanted[k]
+        )
+        for k, t in enumerate(times_ns)
+    ]
 
 
 def steady_track(n: int = 11, period_ns: int = 10 * MS, **changes: object) -> ArmTrack:
@@ -31,7 +36,12 @@ def steady_track(n: int = 11, period_ns: int = 10 * MS, **changes: object) -> Ar
     rotations = Rotation.from_rotvec(seconds[:, None] * axis).as_matrix()
     places = np.array([100.0, 0.0, 30.0]) + seconds[:, None] * np.array([50.0, 0.0, 0.0])
     fields: dict[str, object] = {"is_known": np.ones(n, dtype=bool)} | changes
-    return ArmTrack(EPOCH_NS + np.arange(n) * period_ns, rotations, places, **fields)
+    return ArmTrack(
+        t_ns=EPOCH_NS + np.arange(n) * period_ns,
+        rotations=rotations,
+        translations_mm=places,
+        **fields,
+    )
 
 
 def test_between_samples_the_pose_moves_evenly() -> None:
@@ -86,7 +96,10 @@ def test_neighbours_too_far_apart_are_not_bridged() -> None:
     track = steady_track()
     kept = np.array([0, 1, 2, 3, 7, 8, 9, 10])
     holed = ArmTrack(
-        track.t_ns[kept], track.rotations[kept], track.translations_mm[kept], np.ones(8, bool)
+        t_ns=track.t_ns[kept],
+        rotations=track.rotations[kept],
+        translations_mm=track.translations_mm[kept],
+        is_known=np.ones(8, bool),
     )
     wanted = rows([EPOCH_NS + t * MS for t in (25, 50)])
     assert exposure_poses(wanted, holed).fate.tolist() == [PoseStatus.FOUND, PoseStatus.GAP]
@@ -164,10 +177,10 @@ def test_a_path_that_bends_between_samples_is_pointed_out() -> None:
     places = np.zeros((21, 3))
     places[:, 0] = 0.5 * acceleration * seconds**2
     track = ArmTrack(
-        EPOCH_NS + np.arange(21) * 40 * MS,
-        np.tile(np.eye(3), (21, 1, 1)),
-        places,
-        np.ones(21, bool),
+        t_ns=EPOCH_NS + np.arange(21) * 40 * MS,
+        rotations=np.tile(np.eye(3), (21, 1, 1)),
+        translations_mm=places,
+        is_known=np.ones(21, bool),
     )
     (warning,) = exposure_poses(rows([EPOCH_NS + 420 * MS]), track).warnings
     assert f"{acceleration * 0.04**2 / 8:.2g} mm" in warning

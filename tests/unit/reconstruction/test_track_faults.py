@@ -31,7 +31,12 @@ def hand_track(n: int = 1500, period_ns: int = PERIOD_NS, seed: int = 1) -> ArmT
     turn = Rotation.from_rotvec(np.column_stack([0.1 * np.sin(t), 0.0 * t, 0.002 * way]))
     place += NOISE_MM * rng.standard_normal(place.shape)
     times = 10**9 + np.arange(n, dtype=np.int64) * period_ns
-    return ArmTrack(times, turn.as_matrix(), place, np.ones(n, dtype=bool))
+    return ArmTrack(
+        t_ns=times,
+        rotations=turn.as_matrix(),
+        translations_mm=place,
+        is_known=np.ones(n, dtype=bool),
+    )
 
 
 def changed(change: Change) -> ArmTrack:
@@ -119,9 +124,19 @@ def test_postures_and_pauses_are_not_blamed() -> None:
     turns = Rotation.random(12, random_state=1).as_matrix()[np.arange(48) // 4]
     times = np.cumsum(np.where(np.arange(48) % 4 == 0, 3 * 10**9, 2 * 10**8))
     known = np.ones(48, dtype=bool)
-    assert check_track(ArmTrack(times, turns, places, known)).faults == ()
+    assert (
+        check_track(
+            ArmTrack(t_ns=times, rotations=turns, translations_mm=places, is_known=known)
+        ).faults
+        == ()
+    )
     even = 10**9 * np.arange(48, dtype=np.int64)
-    assert check_track(ArmTrack(even, turns, places, known)).faults == ()
+    assert (
+        check_track(
+            ArmTrack(t_ns=even, rotations=turns, translations_mm=places, is_known=known)
+        ).faults
+        == ()
+    )
 
 
 def test_exposures_at_faulty_samples_get_no_pose_and_a_word() -> None:
@@ -130,7 +145,10 @@ def test_exposures_at_faulty_samples_get_no_pose_and_a_word() -> None:
 
     track = changed(spike)
     times = [int(track.t_ns[k]) + PERIOD_NS // 2 for k in (600, 699, 700, 701)]
-    rows = [ExposureRow(k, t, 0, f"{k}.png", ("A",)) for k, t in enumerate(times)]
+    rows = [
+        ExposureRow(index=k, t_ns=t, camera=0, source=f"{k}.png", lasers=("A",))
+        for k, t in enumerate(times)
+    ]
     poses = exposure_poses(rows, track)
     wrong, found = PoseStatus.CONTRADICTED, PoseStatus.FOUND
     assert poses.fate.tolist() == [found, wrong, wrong, found]

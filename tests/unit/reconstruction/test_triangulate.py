@@ -18,7 +18,15 @@ from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thes
 
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
 SIGMA_PX = 0.1
-PINHOLE = CameraModel(1000.0, 1000.0, 500.0, 400.0, np.zeros(5), 1001, 801)
+PINHOLE = CameraModel(
+    fx_px=1000.0,
+    fy_px=1000.0,
+    cx_px=500.0,
+    cy_px=400.0,
+    distortion=np.zeros(5),
+    width_px=1001,
+    height_px=801,
+)
 
 
 def printed_sheet(bow_mm: FloatArray | None = None) -> LightSheet:
@@ -27,7 +35,9 @@ def printed_sheet(bow_mm: FloatArray | None = None) -> LightSheet:
     e_u = e_u / np.linalg.norm(e_u)
     origin = np.array([0.0, 0.0, THESIS_PLANE[3] / 0.67742])
     axes = np.stack([e_u, np.cross(normal, e_u), normal])
-    return LightSheet(origin, axes, 20.0, np.zeros(5) if bow_mm is None else bow_mm)
+    return LightSheet(
+        origin_mm=origin, axes=axes, scale_mm=20.0, bow_mm=np.zeros(5) if bow_mm is None else bow_mm
+    )
 
 
 def sensor(
@@ -36,12 +46,32 @@ def sensor(
     n = 9 + 8 * len(sheets)
     joint = np.zeros((n, n)) if covariance is None else covariance
     box = np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0])
-    calibrated = CameraCalibration(camera, joint[:9, :9], True, 0.1, 0.05, 9, 99, box, PROVENANCE)
+    calibrated = CameraCalibration(
+        camera=camera,
+        covariance=joint[:9, :9],
+        has_covariance=True,
+        rms_px=0.1,
+        sigma_point_px=0.05,
+        n_views=9,
+        n_points=99,
+        covered_px=box,
+        provenance=PROVENANCE,
+    )
     entries = tuple(
-        SheetCalibration("AB"[k], sheet, 0.01, 6, 600, (120.0, 150.0), True)
+        SheetCalibration(
+            name="AB"[k],
+            sheet=sheet,
+            rms_mm=0.01,
+            n_boards=6,
+            n_points=600,
+            depth_range_mm=(120.0, 150.0),
+            is_redundant=True,
+        )
         for k, sheet in enumerate(sheets)
     )
-    return SensorCalibration(calibrated, entries, joint, PROVENANCE)
+    return SensorCalibration(
+        camera=calibrated, sheets=entries, covariance=joint, provenance=PROVENANCE
+    )
 
 
 def profile_at(points_px: FloatArray) -> Profile:
@@ -148,7 +178,9 @@ def test_covariance_by_differences_of_every_parameter_on_two_sheets() -> None:
 
 
 def test_points_without_sheet_or_ray_are_left_out_and_order_is_kept() -> None:
-    behind = LightSheet(np.array([0.0, 0.0, -50.0]), np.eye(3), 10.0, np.zeros(5))
+    behind = LightSheet(
+        origin_mm=np.array([0.0, 0.0, -50.0]), axes=np.eye(3), scale_mm=10.0, bow_mm=np.zeros(5)
+    )
     q = np.array([[400.0, 300.0], [450.0, 310.0], [500.0, 320.0], [550.0, 330.0]])
     profile = replace(profile_at(q), segment=np.array([0, 0, 1, 1]))
     cloud = triangulate(profile, np.array([0, -1, 1, 0]), sensor(PINHOLE, printed_sheet(), behind))

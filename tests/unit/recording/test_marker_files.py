@@ -26,10 +26,10 @@ def test_a_full_list_comes_back_as_the_same_numbers(tmp_path: Path) -> None:
     generator = np.random.default_rng(0)
     factor = generator.normal(size=(5, 3, 3)) * 0.02
     markers = MarkerSet(
-        np.array([7, 3, 90, 4, 1]),
-        generator.normal(size=(5, 3)) * 100.0,
-        factor @ np.swapaxes(factor, 1, 2) + 1e-6 * np.eye(3),
-        "Sensor",
+        ids=np.array([7, 3, 90, 4, 1]),
+        points_mm=generator.normal(size=(5, 3)) * 100.0,
+        covariance_mm2=factor @ np.swapaxes(factor, 1, 2) + 1e-6 * np.eye(3),
+        frame="Sensor",
     )
     path = tmp_path / "markers.csv"
     path.write_bytes(markers_csv(markers))

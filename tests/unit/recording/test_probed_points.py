@@ -32,7 +32,7 @@ def written(folder: Path, content: str | bytes) -> Path:
 def test_points_come_back_bit_by_bit(
     tmp_path: Path, tip_mm: float, features: tuple[str, ...]
 ) -> None:
-    points = ProbedPoints(POINTS_MM, tip_mm, features)
+    points = ProbedPoints(points_mm=POINTS_MM, tip_diameter_mm=tip_mm, features=features)
     found = read_probed_points(written(tmp_path, probed_points_csv(points)))
     np.testing.assert_array_equal(found.points_mm, POINTS_MM)
     assert (found.tip_diameter_mm, found.features) == (tip_mm, features)
@@ -46,7 +46,7 @@ def test_points_are_on_the_surface_unless_a_comment_says_that_they_are_the_tips_
     assert read_probed_points(written(tmp_path, text)).tip_diameter_mm == 6.0
     text = "# point = surface\n" + TABLE
     assert read_probed_points(written(tmp_path, text)).tip_diameter_mm == 0.0
-    surface = ProbedPoints(POINTS_MM, 6.0, is_compensated=True)
+    surface = ProbedPoints(points_mm=POINTS_MM, tip_diameter_mm=6.0, is_compensated=True)
     content = probed_points_csv(surface)
     assert content.startswith(b"# point = surface, tip_diameter_mm = 6.0")
     found = read_probed_points(written(tmp_path, content))

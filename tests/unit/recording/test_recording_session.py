@@ -22,7 +22,14 @@ def test_a_session_comes_back(tmp_path: Path) -> None:
     session = Session(
         kind="calibration",
         cameras=(
-            CameraSetup(2658, 800, SensorWindow(203, 617, 2), 12, "high", "rgb"),
+            CameraSetup(
+                width_px=2658,
+                height_px=800,
+                window=SensorWindow(203, 617, 2),
+                bits_used=12,
+                align="high",
+                colour="rgb",
+            ),
             CameraSetup(colour="bayer_rggb"),
         ),
         clock="separate",

@@ -98,7 +98,12 @@ def test_exposures_that_contradict_their_session_are_refused(tmp_path: Path) -> 
 
 
 def test_joints_are_written_only_where_they_are_known(tmp_path: Path) -> None:
-    track = ArmTrack(np.arange(3), np.tile(np.eye(3), (3, 1, 1)), np.ones((3, 3)), np.ones(3, bool))
+    track = ArmTrack(
+        t_ns=np.arange(3),
+        rotations=np.tile(np.eye(3), (3, 1, 1)),
+        translations_mm=np.ones((3, 3)),
+        is_known=np.ones(3, bool),
+    )
     scan = memory_scan(arm=track)
     wrong = replace(scan, session=replace(scan.session, pose_form="joints"))
     with pytest.raises(InputError, match="no joint angles"):
@@ -112,10 +117,10 @@ def test_a_cell_with_a_line_break_is_refused() -> None:
 
 def test_touches_of_a_probe_come_back(tmp_path: Path) -> None:
     track = ArmTrack(
-        np.array([5, 7, 9]),
-        np.tile(np.eye(3), (3, 1, 1)),
-        np.array([[1.0, 2, 1 / 3], [400, 5, 6], [7, 8, 9]]),
-        np.array([True, False, True]),
+        t_ns=np.array([5, 7, 9]),
+        rotations=np.tile(np.eye(3), (3, 1, 1)),
+        translations_mm=np.array([[1.0, 2, 1 / 3], [400, 5, 6], [7, 8, 9]]),
+        is_known=np.array([True, False, True]),
     )
     tip = ProbeTip(np.array([0.1, -0.2, 61 / 3]), 5.9987)
     write_probing(tmp_path / "touches", track, tip, is_simulated=True)

@@ -53,7 +53,7 @@ def test_sigmas_of_the_angles_follow_from_the_covariance(seed: int) -> None:
 @pytest.mark.parametrize("method", ["plate", "sphere"])
 def test_the_page_shows_result_postures_noise_and_warnings(method: str) -> None:
     fit, stripes = fake_fit(method)
-    scanner = ScannerCalibration(None, fit.calibration, PROVENANCE)
+    scanner = ScannerCalibration(sensor=None, hand_eye=fit.calibration, provenance=PROVENANCE)
     page = render_page(hand_eye_page(fit, scanner, stripes, is_simulated=True))
     text = text_of(page)
     assert "simulated data" in text
@@ -75,7 +75,7 @@ def test_residuals_that_the_noise_model_does_not_allow_are_called_so() -> None:
         fit.calibration, diagnostics=replace(known, chi2_probability=1e-6, is_noise_estimated=False)
     )
     fit = replace(fit, calibration=odd)
-    scanner = ScannerCalibration(None, odd, PROVENANCE)
+    scanner = ScannerCalibration(sensor=None, hand_eye=odd, provenance=PROVENANCE)
     text = text_of(render_page(hand_eye_page(fit, scanner, stripes)))
     assert "Fits the noise model no" in text
     assert "larger than the noise model allows" in chi2_verdict(1e-6)
@@ -83,7 +83,7 @@ def test_residuals_that_the_noise_model_does_not_allow_are_called_so() -> None:
 
 def test_the_summary_holds_the_matrix_and_every_posture() -> None:
     fit, _ = fake_fit()
-    scanner = ScannerCalibration(None, fit.calibration, PROVENANCE)
+    scanner = ScannerCalibration(sensor=None, hand_eye=fit.calibration, provenance=PROVENANCE)
     data = hand_eye_summary(fit, scanner, (Path("s.json"),), is_simulated=False).data
     assert np.array(data["rotation_tool_from_sensor"]) == pytest.approx(TOOL_FROM_SENSOR.rotation)
     assert data["translation_tool_mm"] == pytest.approx([41.4, 21.5, 112.3])

@@ -34,7 +34,7 @@ def written(folder: Path, points: ProbedPoints) -> Path:
 
 def test_tip_centres_are_compensated_on_the_side_that_was_touched(tmp_path: Path) -> None:
     """By the user's word, by the arm, or upwards with a warning; never left at the centres."""
-    path = written(tmp_path, ProbedPoints(face(3.0), 6.0))
+    path = written(tmp_path, ProbedPoints(points_mm=face(3.0), tip_diameter_mm=6.0))
     below = np.array([[60.0, 40.0, -200.0]])
     plate, weak = read_plate(path, ORIGIN)
     assert plate.plane.point_mm[2] == pytest.approx(0.0, abs=1e-9)
@@ -49,7 +49,9 @@ def test_tip_centres_are_compensated_on_the_side_that_was_touched(tmp_path: Path
 
 
 def test_three_touches_are_not_exact(tmp_path: Path) -> None:
-    plate, weak = read_plate(written(tmp_path, ProbedPoints(face(n=4)[[0, 2, 3]])), ORIGIN)
+    plate, weak = read_plate(
+        written(tmp_path, ProbedPoints(points_mm=face(n=4)[[0, 2, 3]])), ORIGIN
+    )
     assert plate.covariance is not None
     assert np.all(np.diag(plate.covariance) > 0.0)
     assert any("3 touches" in text for text in weak)
@@ -61,9 +63,13 @@ def test_what_is_no_plate_is_refused(tmp_path: Path) -> None:
     names = ("plate",) * 8 + ("block",) * 8
     both = np.concatenate([face(), face(40.0)])
     cases: list[tuple[ProbedPoints, type[ArmscanError], str]] = [
-        (ProbedPoints(line), EstimationError, "nearly on one line"),
-        (ProbedPoints(both), EstimationError, "scatter"),
-        (ProbedPoints(both, features=names), InputError, "armscan probe POINTS --feature"),
+        (ProbedPoints(points_mm=line), EstimationError, "nearly on one line"),
+        (ProbedPoints(points_mm=both), EstimationError, "scatter"),
+        (
+            ProbedPoints(points_mm=both, features=names),
+            InputError,
+            "armscan probe POINTS --feature",
+        ),
     ]
     for points, kind, words in cases:
         with pytest.raises(kind, match=words):
@@ -84,10 +90,10 @@ def test_coefficients_keep_their_sign_unless_a_side_is_said(tmp_path: Path) -> N
 
 def test_an_upright_plate_on_the_surface_needs_no_side(tmp_path: Path) -> None:
     points = face()[:, [2, 0, 1]]
-    plate, _ = read_plate(written(tmp_path, ProbedPoints(points)), ORIGIN)
+    plate, _ = read_plate(written(tmp_path, ProbedPoints(points_mm=points)), ORIGIN)
     np.testing.assert_allclose(plate.plane.normal, [1.0, 0.0, 0.0], atol=1e-12)
     with pytest.raises(EstimationError, match="--side"):
-        read_plate(written(tmp_path, ProbedPoints(points, 6.0)), ORIGIN)
+        read_plate(written(tmp_path, ProbedPoints(points_mm=points, tip_diameter_mm=6.0)), ORIGIN)
 
 
 def test_inspection_and_daily_check_say_what_is_weak(
@@ -97,7 +103,7 @@ def test_inspection_and_daily_check_say_what_is_weak(
     grid = np.stack(np.meshgrid(np.arange(0, 120, 4), np.arange(0, 80, 4), [0.02]), axis=-1)
     cloud = tmp_path / "cloud.ply"
     cloud.write_bytes(ply_bytes(cloud_of(grid.reshape(-1, 3), np.repeat(np.arange(20), 30))))
-    plate = written(tmp_path, ProbedPoints(face(-3.0, 4)[[0, 2, 3]], 6.0))
+    plate = written(tmp_path, ProbedPoints(points_mm=face(-3.0, 4)[[0, 2, 3]], tip_diameter_mm=6.0))
     for words in (["inspect", "plane", str(cloud)], ["verify", str(cloud), "--mpe", "1"]):
         assert main([*words, "--plate", str(plate), "--side=-z", "--json"]) == 0
         content = json.loads(capsys.readouterr().out)

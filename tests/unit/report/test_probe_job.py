@@ -41,7 +41,12 @@ def track(n: int = 9) -> ArmTrack:
         [Pose.from_vectors(rng.normal(0.0, 0.2, 3), np.zeros(3)).rotation @ down for _ in range(n)]
     )
     places = centres - rotations @ TIP.centre_tool_mm
-    return ArmTrack(np.arange(n) * 10**9, rotations, places, np.ones(n, dtype=bool))
+    return ArmTrack(
+        t_ns=np.arange(n) * 10**9,
+        rotations=rotations,
+        translations_mm=places,
+        is_known=np.ones(n, dtype=bool),
+    )
 
 
 def test_a_folder_of_touches(tmp_path: Path) -> None:
@@ -62,7 +67,7 @@ def test_a_folder_of_touches(tmp_path: Path) -> None:
 def test_a_table_of_centres_gives_the_same(tmp_path: Path) -> None:
     table = tmp_path / "centres.csv"
     centres = on_plate() + 3.0 * PLANE[:3]
-    table.write_bytes(probed_points_csv(ProbedPoints(centres, 6.0)))
+    table.write_bytes(probed_points_csv(ProbedPoints(points_mm=centres, tip_diameter_mm=6.0)))
     summary = run_probing(ProbeRequest(table))
     np.testing.assert_allclose(summary.data["plane"], PLANE, atol=1e-9)
     assert summary.written == ()
@@ -104,7 +109,11 @@ def test_what_stands_in_the_way_is_said_and_nothing_is_written(tmp_path: Path) -
     write_probing(folder, track(2), TIP)
     table = tmp_path / "centres.csv"
     table.write_bytes(
-        probed_points_csv(ProbedPoints(on_plate(), 6.0, ("plate",) * 5 + ("block",) * 4))
+        probed_points_csv(
+            ProbedPoints(
+                points_mm=on_plate(), tip_diameter_mm=6.0, features=("plate",) * 5 + ("block",) * 4
+            )
+        )
     )
     cases: list[tuple[ProbeRequest, type[ArmscanError], str]] = [
         (ProbeRequest(folder, output), EstimationError, "three points"),

@@ -85,7 +85,10 @@ def test_a_scanner(tmp_path: Path, has_sensor: bool) -> None:
 
 def test_touches_probe_arm_and_probed_points(tmp_path: Path) -> None:
     track = ArmTrack(
-        np.arange(4), np.tile(np.eye(3), (4, 1, 1)), 100.0 * np.eye(4, 3), np.ones(4, bool)
+        t_ns=np.arange(4),
+        rotations=np.tile(np.eye(3), (4, 1, 1)),
+        translations_mm=100.0 * np.eye(4, 3),
+        is_known=np.ones(4, bool),
     )
     folder = tmp_path / "touches"
     write_probing(folder, track, ProbeTip(np.array([0, 0.5, 60]), 6.0))

@@ -27,10 +27,24 @@ def calibration() -> StereoCalibration:
     covariance = root @ root.T
     left, right = held(LEFT, covariance[:9, :9]), held(RIGHT, covariance[9:18, 9:18])
     evidence = StereoDiagnostics(
-        0.1, -1 / 3, (("left3.png + right3.png", "moved"),), "prior", 0.21, 1.5, 0.02
+        epipolar_rms_px=0.1,
+        epipolar_mean_px=-1 / 3,
+        left_out=(("left3.png + right3.png", "moved"),),
+        intrinsics="prior",
+        hold_out_rms_px=0.21,
+        typical_level=1.5,
+        target_error_mm=0.02,
     )
     return StereoCalibration(
-        left, right, CONVERGING, covariance, 1 / 7, 8, 700, left.provenance, evidence
+        left=left,
+        right=right,
+        right_from_left=CONVERGING,
+        covariance=covariance,
+        rms_px=1 / 7,
+        n_pairs=8,
+        n_points=700,
+        provenance=left.provenance,
+        diagnostics=evidence,
     )
 
 

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 from armscan.geometry.estimate import FitFailure
+from armscan.thesis.ellipse import ellipse_centre, fit_ellipse_algebraic, thesis_centres
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
-from armscan.vision.targets.ellipse_algebraic import (
-    ellipse_centre,
-    fit_ellipse_algebraic,
-    thesis_centres,
-)
 
 CENTRE = np.array([2811.3, 1450.8])
 HALF = np.array([36.0, 24.0])

@@ -192,12 +192,12 @@ def estimate_board_poses(
             return FitFailure("the points do not determine a pose", "show more of the board")
         found.append(
             Estimate(
-                candidate.sensor_from_board,
-                POSE_PARAMETER_NAMES,
-                _pose_covariance(equations, factor, camera_covariance),
-                residuals_px(observations, state),
-                degrees,
-                candidate.chi2,
+                value=candidate.sensor_from_board,
+                parameter_names=POSE_PARAMETER_NAMES,
+                covariance=_pose_covariance(equations, factor, camera_covariance),
+                residuals=residuals_px(observations, state),
+                degrees_of_freedom=degrees,
+                chi2=candidate.chi2,
             )
         )
     return tuple(found)

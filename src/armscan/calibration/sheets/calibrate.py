@@ -427,13 +427,13 @@ def _sheet_fit(
             warnings = (*warnings, _misfit_warning(images[misfit].data.profile.source))
     return SheetFit(
         SheetCalibration(
-            named.names[k],
-            sheet,
-            float(np.sqrt((solution.height_mm[own] ** 2).mean())),
-            geometry.n_boards,
-            int(own.sum()),
-            geometry.depth_range_mm,
-            geometry.n_boards > 2,
+            name=named.names[k],
+            sheet=sheet,
+            rms_mm=float(np.sqrt((solution.height_mm[own] ** 2).mean())),
+            n_boards=geometry.n_boards,
+            n_points=int(own.sum()),
+            depth_range_mm=geometry.depth_range_mm,
+            is_redundant=geometry.n_boards > 2,
         ),
         covariance,
         float(np.sqrt((solution.residual_px[own] ** 2).mean())),

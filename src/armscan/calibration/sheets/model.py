@@ -165,7 +165,9 @@ def sheet_from_plane(plane: Plane, points_mm: FloatArray, directions: FloatArray
     local = (points_mm - plane.point_mm) @ axes[:2].T
     middle = 0.5 * (local.min(axis=0) + local.max(axis=0))
     scale = 0.5 * float(np.ptp(local, axis=0).max())
-    return LightSheet(plane.point_mm + middle @ axes[:2], axes, scale, np.zeros(5))
+    return LightSheet(
+        origin_mm=plane.point_mm + middle @ axes[:2], axes=axes, scale_mm=scale, bow_mm=np.zeros(5)
+    )
 
 
 def compare_planes(

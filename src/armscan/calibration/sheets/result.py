@@ -543,13 +543,13 @@ class LaserFit:
         """Return the document that reconstruction needs."""
         sheets = tuple(sheet.calibration for sheet in self.sheets)
         return SensorCalibration(
-            self.camera,
-            sheets,
-            self.covariance,
-            provenance,
-            None,
-            self.second,
-            self.laser_colour,
+            camera=self.camera,
+            sheets=sheets,
+            covariance=self.covariance,
+            provenance=provenance,
+            diagnostics=None,
+            second=self.second,
+            laser_colour=self.laser_colour,
         )
 
 

@@ -128,14 +128,14 @@ def thesis_profile(
     binning = exposure.window.binning
     sigma = max(scatter(points, ridge.table[:, 2:4], ridge.chain), LEAST_SIGMA_PX)
     return Profile(
-        exposure.source,
-        exposure.window.to_full_sensor(points),
-        ridge.table[:, 2:4],
-        np.full(len(points), sigma * binning),
-        np.full(len(points), sigma_px * binning),
-        np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
-        flags,
-        ridge.chain,
+        source=exposure.source,
+        points_px=exposure.window.to_full_sensor(points),
+        normals_px=ridge.table[:, 2:4],
+        sigma_px=np.full(len(points), sigma * binning),
+        width_px=np.full(len(points), sigma_px * binning),
+        intensity=np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
+        flags=flags,
+        segment=ridge.chain,
     )
 
 
@@ -144,7 +144,16 @@ def empty_profile(source: str) -> Profile:
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     index = np.zeros(0, np.int64)
-    return Profile(source, pairs, pairs, none, none, none, index, index)
+    return Profile(
+        source=source,
+        points_px=pairs,
+        normals_px=pairs,
+        sigma_px=none,
+        width_px=none,
+        intensity=none,
+        flags=index,
+        segment=index,
+    )
 
 
 def to_profile(
@@ -173,14 +182,14 @@ def to_profile(
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning
     return Profile(
-        exposure.source,
-        exposure.window.to_full_sensor(smoothed.points),
-        smoothed.normals,
-        np.maximum(smoothed.sigma, LEAST_SIGMA_PX) * binning,
-        width * binning,
-        fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
-        flags,
-        np.unique(chain, return_inverse=True)[1],
+        source=exposure.source,
+        points_px=exposure.window.to_full_sensor(smoothed.points),
+        normals_px=smoothed.normals,
+        sigma_px=np.maximum(smoothed.sigma, LEAST_SIGMA_PX) * binning,
+        width_px=width * binning,
+        intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
+        flags=flags,
+        segment=np.unique(chain, return_inverse=True)[1],
     )
 
 

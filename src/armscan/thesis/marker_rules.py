@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Marker rules as the thesis prints them: coded lines by cross-ratio, matching by distances."""
+"""Markers as printed: coded lines (eqs. 4.22 to 4.25), and the eight steps of matching (4.3.1).
+
+With A, B, C, D in order along the line the cross ratio of eq. 4.24, ``(AC / BC) / (AD / BD)``, does
+not change when the line is read from its other end, so that it names a code of four points but
+not its direction: some perspective turns every four points round. Only how strong a perspective
+that takes can tell; see `LineCode.max_perspective`.
+"""
 
 from __future__ import annotations
 

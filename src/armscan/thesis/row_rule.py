@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The thesis's rule for a cross-line head: rows of two earlier exposures (eqs. 3.1 to 3.7)."""
+"""The printed rule for a cross-line head: rows of two earlier exposures (eqs. 3.1 to 3.7)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,33 @@ from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.labels import LabelledProfile, LabelStatus
 from armscan.records.profile import Profile
-from armscan.records.recording import THESIS_SCHEDULE, LaserSchedule
+
+
+@dataclass(frozen=True, slots=True)
+class LaserSchedule:
+    """Lasers that are on, exposure by exposure, over and over.
+
+    Parameters
+    ----------
+    pattern
+        Names of the sources that are on in each exposure of a period.
+    """
+
+    pattern: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        if not self.pattern or not any(self.pattern):
+            raise OptionError(
+                "a laser schedule without lasers", remedy="give at least one exposure with a laser"
+            )
+
+    def lasers(self, exposure: int) -> tuple[str, ...]:
+        """Sources that are on in exposure number ``exposure``, counted from 0."""
+        return self.pattern[exposure % len(self.pattern)]
+
+
+THESIS_SCHEDULE = LaserSchedule((("A",), ("B",), ("A", "B")))
+"""Figure 3.2: A alone, B alone, both; four stripes in three exposures, 1.33 of one laser's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hand-eye calibrations as the thesis prints them: plate equations (2.69)-(2.76), sphere in
-two steps.
+"""The hand-eye as printed: the plate's equations (2.53 to 2.76), the sphere in two steps (to 2.52).
+
+For points of one flat light sheet the 12 unknowns of eq. 2.73 are not determined by eq. 2.72,
+however many postures there are: the points satisfy ``a x + b y + c z + D = 0`` (eq. 2.19), which
+makes three combinations of the columns of `design_rows` vanish. The rank is 9 at most.
+
+On a sphere each stripe's section circle gives the centre in the Sensor frame; postures that only
+shift give the rotation, turned postures then give the translation. The sheet says how far the
+centre lies from it, not on which side.
 """
 
 from __future__ import annotations

@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Circle centres the thesis's way: Canny edge pixels, algebraic least squares (eqs. 2.22-2.27).
+"""Circle centres as printed: Canny edge pixels, algebraic least squares (eqs. 2.22 to 2.27).
 
-Kept for comparison: whole pixels lock to the pixel grid, and the centre of the ellipse is
-not the
-image of the circle's centre. `circle_edges` and `circle_centres` are what calibration uses.
+Kept for comparison: whole pixels lock to the pixel grid, and the centre of the ellipse is not the
+image of the circle's centre. `armscan.vision.targets.circle_edges` is what calibration uses.
 
-The print numbers two pairs of equations alike: 2.26 and 2.27 appear in section 2.3.1.1
-(here) and
-2.27 again in 2.3.1.2 (the projection). Its constraint f = 1 has no solution for an ellipse
-through
-the pixel origin and is badly conditioned far from it (u^2 reaches 1e7 beside 1). Here the
-points
+The print numbers two pairs of equations alike: 2.26 and 2.27 appear in section 2.3.1.1 (here) and
+2.27 again in 2.3.1.2 (the projection). Its constraint f = 1 has no solution for an ellipse through
+the pixel origin and is badly conditioned far from it (u^2 reaches 1e7 beside 1). Here the points
 are first shifted to their mean and divided by their spread: the origin then lies inside the
 ellipse, where f cannot vanish, and all columns are of the size 1.
 """

@@ -1,0 +1,274 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Least squares over any state: one Levenberg-Marquardt loop, whitening and robust scales.
+
+A state may be anything (poses, sheets, a vector); a step is a vector of its tangent space, and
+``retract(state, step)`` is the state after it. Residuals are whitened: of unit variance and
+independent, so that ``chi2`` is their sum of squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray
+
+S = TypeVar("S")
+L = TypeVar("L")
+
+MAX_STEPS = 100
+SETTLED = 1e-12
+"""Part of chi2 by which a step must lower it; less is the end of the search."""
+FIRST_DAMPING = 1e-4
+LEAST_DAMPING, MOST_DAMPING = 1e-15, 1e12
+
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution: 1 / Phi^-1(3/4)."""
+HUBER_LIMIT = 1.345
+"""Huber's limit in standard deviations: 95 % efficiency for normal noise (Huber 1981)."""
+
+
+def robust_sigma(residuals: FloatArray) -> float:
+    """Standard deviation of residuals about zero from their median size; 0 where there are none."""
+    return MAD_TO_SIGMA * float(np.median(np.abs(residuals))) if np.size(residuals) else 0.0
+
+
+def huber_weights(residuals: FloatArray, limit: float = HUBER_LIMIT) -> FloatArray:
+    """Huber's weights of residuals in standard deviations: 1, beyond the limit limit / size."""
+    return np.asarray(limit / np.maximum(np.abs(residuals), limit))
+
+
+def reject_outliers(
+    fit: Callable[[BoolArray], FloatArray],
+    is_used: BoolArray,
+    *,
+    sigmas: float,
+    least_sigma: float = 0.0,
+    rounds: int = 20,
+) -> BoolArray:
+    """Fit and reject in turn until the rows used no longer change.
+
+    Parameters
+    ----------
+    fit
+        Residuals (N,) of ALL rows after a fit to those of a mask.
+    is_used
+        (N,) rows to begin with; the others never return.
+    sigmas
+        Rows further off than this many robust standard deviations of the rows used are rejected.
+    least_sigma
+        Least standard deviation, in the unit of the residuals: rounding is no outlier.
+    rounds
+        Most fits.
+    """
+    eligible, used = is_used, is_used
+    for _ in range(rounds):
+        size = np.abs(fit(used))
+        sigma = max(robust_sigma(size[used]), least_sigma)
+        kept = eligible & (size <= sigmas * sigma)
+        if np.array_equal(kept, used):
+            break
+        used = kept
+    return used
+
+
+def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatArray:
+    """(P, R) matrix L with ``L L' = covariance`` (P, P), also for one without full rank R.
+
+    It is found in units that make the diagonal one, so that no parameter is lost for its unit.
+
+    Raises
+    ------
+    InputError
+        If the covariance has a negative eigenvalue beyond rounding.
+    """
+    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    unit = np.where(scale > 0.0, scale, 1.0)
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    largest = max(float(values[-1]), 0.0) if len(values) else 0.0
+    if len(values) and float(values[0]) < -1e-6 * max(largest, 1.0):
+        raise InputError(f"{name} is not positive semi-definite")
+    kept = values > 1e-15 * largest
+    return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+
+
+class Whitening:
+    """Turns residuals of a covariance (N, N) into independent ones of unit variance.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the covariance is not positive definite.
+    """
+
+    def __init__(self, covariance: FloatArray) -> None:
+        self._root = np.linalg.cholesky(covariance)
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        """Whitened residuals (N,), or the rows of a Jacobian (N, K)."""
+        return np.asarray(solve_triangular(self._root, values, lower=True))
+
+    @property
+    def log_determinant(self) -> float:
+        """Logarithm of the covariance's determinant."""
+        return 2.0 * float(np.log(np.diag(self._root)).sum())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DenseSystem:
+    """Whitened residuals and their Jacobian at a state.
+
+    Parameters
+    ----------
+    residuals
+        (N,) whitened.
+    jacobian
+        (N, K) derivative by the step.
+    """
+
+    residuals: FloatArray
+    jacobian: FloatArray
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.residuals @ self.residuals)
+
+    def step(self, damping: float) -> FloatArray:
+        """(K,) step; directions that no residual notices are left alone."""
+        scale = np.linalg.norm(self.jacobian, axis=0)
+        scale[scale == 0.0] = 1.0
+        n = len(scale)
+        stacked = np.vstack([self.jacobian / scale, np.sqrt(damping) * np.eye(n)])
+        target = np.concatenate([-self.residuals, np.zeros(n)])
+        return np.asarray(np.linalg.lstsq(stacked, target, rcond=1e-12)[0] / scale)
+
+    def promised(self, step: FloatArray) -> float:
+        """Decrease of chi2 that the linear model promises of a step."""
+        ahead = self.residuals + self.jacobian @ step
+        return self.chi2 - float(ahead @ ahead)
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(K, K) covariance of the step, ``(J' J)^-1``; None where the Jacobian lacks rank."""
+        scale = np.linalg.norm(self.jacobian, axis=0)
+        if not bool((scale > 0.0).all()):
+            return None
+        _, values, axes = np.linalg.svd(self.jacobian / scale, full_matrices=False)
+        if len(values) < len(scale) or values[-1] <= 1e-12 * values[0]:
+            return None
+        root = axes.T / values / scale[:, None]
+        return np.asarray(root @ root.T)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Minimum(Generic[S, L]):
+    """Where a search ended.
+
+    Parameters
+    ----------
+    state
+        The best state.
+    system
+        The problem linearised there.
+    chi2
+        The minimum.
+    is_settled
+        False if the steps ran out.
+    """
+
+    state: S
+    system: L
+    chi2: float
+    is_settled: bool
+
+
+def levenberg_marquardt(
+    start: S,
+    linearise: Callable[[S], tuple[FloatArray, FloatArray] | None],
+    retract: Callable[[S, FloatArray], S],
+    *,
+    settled: float = SETTLED,
+    max_steps: int = MAX_STEPS,
+) -> Minimum[S, DenseSystem] | None:
+    """Minimise the sum of squared residuals over a state.
+
+    Parameters
+    ----------
+    start
+        Where to begin.
+    linearise
+        Whitened residuals (N,) at a state and their derivative (N, K) by a step from it, or None
+        where the state is impossible.
+    retract
+        The state after a step (K,).
+    settled
+        Part of chi2 by which a step must lower it.
+    max_steps
+        Most evaluations.
+
+    Returns
+    -------
+    Minimum
+        None if the start is impossible.
+    """
+
+    def evaluate(state: S) -> tuple[float, DenseSystem] | None:
+        found = linearise(state)
+        if found is None:
+            return None
+        system = DenseSystem(residuals=found[0], jacobian=found[1])
+        return system.chi2, system
+
+    def propose(state: S, system: DenseSystem, damping: float) -> tuple[S, float]:
+        step = system.step(damping)
+        return retract(state, step), system.promised(step)
+
+    return minimise(start, evaluate, propose, settled=settled, max_steps=max_steps)
+
+
+def minimise(
+    start: S,
+    evaluate: Callable[[S], tuple[float, L] | None],
+    propose: Callable[[S, L, float], tuple[S, float] | None],
+    *,
+    settled: float = SETTLED,
+    max_steps: int = MAX_STEPS,
+) -> Minimum[S, L] | None:
+    """Levenberg-Marquardt's loop for systems that are not dense (see `levenberg_marquardt`).
+
+    Parameters
+    ----------
+    start
+        Where to begin.
+    evaluate
+        Chi2 at a state and whatever ``propose`` needs of it; None where it is impossible.
+    propose
+        For a damping relative to the diagonal: the state after the damped step, and the decrease
+        of chi2 that the linear model promises; None if there is no such step.
+    settled, max_steps
+        As for `levenberg_marquardt`.
+    """
+    found = evaluate(start)
+    if found is None:
+        return None
+    state, (chi2, system), damping = start, found, FIRST_DAMPING
+    for _ in range(max_steps):
+        proposal = propose(state, system, damping)
+        trial = evaluate(proposal[0]) if proposal is not None else None
+        if proposal is None or trial is None or not trial[0] <= chi2:
+            hidden = proposal is not None and proposal[1] <= settled * chi2
+            if hidden or damping > MOST_DAMPING:
+                return Minimum(state=state, system=system, chi2=chi2, is_settled=True)
+            damping = max(10.0 * damping, 1e-6)
+            continue
+        gain = chi2 - trial[0]
+        state, (chi2, system), damping = proposal[0], trial, max(0.1 * damping, LEAST_DAMPING)
+        if gain <= settled * chi2 or chi2 == 0.0:
+            return Minimum(state=state, system=system, chi2=chi2, is_settled=True)
+    return Minimum(state=state, system=system, chi2=chi2, is_settled=False)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one solver against SciPy's, and its robust scales against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.optimize
+from scipy.stats import norm
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.least_squares import (
+    HUBER_LIMIT,
+    MAD_TO_SIGMA,
+    Whitening,
+    huber_weights,
+    levenberg_marquardt,
+    minimise,
+    reject_outliers,
+    robust_sigma,
+    square_root,
+)
+from armscan.geometry.poses import Base, Pose, Sensor
+
+RNG_SEED = 20260101
+
+
+def decay(times: FloatArray, parameters: FloatArray) -> FloatArray:
+    return np.asarray(parameters[0] * np.exp(-parameters[1] * times) + parameters[2])
+
+
+def decay_jacobian(times: FloatArray, parameters: FloatArray) -> FloatArray:
+    fall = np.exp(-parameters[1] * times)
+    return np.column_stack([fall, -parameters[0] * times * fall, np.ones_like(times)])
+
+
+@pytest.mark.parametrize("start", [(1.0, 1.0, 0.0), (20.0, 0.01, -5.0), (2.0, 2.0, 3.0)])
+def test_it_ends_where_scipy_does(start: tuple[float, float, float]) -> None:
+    times = np.linspace(0.0, 6.0, 60)
+    noise = 0.05 * np.random.default_rng(RNG_SEED).standard_normal(60)
+    levels = decay(times, np.array([5.0, 0.7, 1.0])) + noise
+    fit = levenberg_marquardt(
+        np.array(start),
+        lambda p: (decay(times, p) - levels, decay_jacobian(times, p)),
+        lambda p, step: p + step,
+    )
+
+    def misfit(p: FloatArray) -> FloatArray:
+        return decay(times, p) - levels
+
+    oracle = scipy.optimize.least_squares(
+        misfit, [5.0, 0.7, 1.0], xtol=1e-15, ftol=1e-15, gtol=1e-15
+    )
+    assert fit is not None
+    assert fit.is_settled
+    np.testing.assert_allclose(fit.state, oracle.x, rtol=1e-6)
+    np.testing.assert_allclose(fit.chi2, 2.0 * oracle.cost, rtol=1e-10)
+    covariance = fit.system.covariance
+    jacobian = np.asarray(oracle.jac)
+    information_inverse = np.linalg.inv(jacobian.T @ jacobian)
+    assert covariance is not None
+    np.testing.assert_allclose(covariance, information_inverse, rtol=1e-4)
+
+
+def test_it_moves_on_a_manifold() -> None:
+    """A pose from points, from half a turn away: retracted, never re-orthonormalised."""
+    rng = np.random.default_rng(RNG_SEED)
+    truth: Pose[Base, Sensor] = Pose.from_vectors([0.4, -1.1, 2.2], [100.0, -50.0, 30.0])
+    points = rng.uniform(-100.0, 100.0, (30, 3))
+    seen = truth.apply(points)
+
+    def linearise(pose: Pose[Base, Sensor]) -> tuple[FloatArray, FloatArray]:
+        return (pose.apply(points) - seen).ravel(), pose.jacobian(points).reshape(-1, 6)
+
+    start: Pose[Base, Sensor] = Pose(np.eye(3), np.zeros(3))
+    fit = levenberg_marquardt(start, linearise, lambda pose, step: pose.retract(step))
+    assert fit is not None
+    np.testing.assert_allclose(fit.state.matrix, truth.matrix, atol=1e-9)
+
+
+def test_an_impossible_trial_is_damped_and_an_impossible_start_is_none() -> None:
+    def linearise(x: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        if x[0] <= 0.0:
+            return None
+        return np.log(x), 1.0 / x[:, None]
+
+    fit = levenberg_marquardt(np.array([50.0]), linearise, lambda x, step: x + step)
+    assert fit is not None
+    np.testing.assert_allclose(fit.state, [1.0], rtol=1e-6)
+    assert levenberg_marquardt(np.array([-1.0]), linearise, lambda x, step: x + step) is None
+
+
+def test_a_direction_that_no_residual_notices_stays_and_has_no_covariance() -> None:
+    fit = levenberg_marquardt(
+        np.array([3.0, 7.0]),
+        lambda p: (p[:1] - 1.0, np.array([[1.0, 0.0]])),
+        lambda p, step: p + step,
+    )
+    assert fit is not None
+    np.testing.assert_allclose(fit.state, [1.0, 7.0])
+    assert fit.system.covariance is None
+
+
+def test_steps_that_run_out_are_told() -> None:
+    fit = levenberg_marquardt(
+        np.array([1.0]), lambda p: (p**3, 3.0 * p[:, None] ** 2), lambda p, s: p + s, max_steps=3
+    )
+    assert fit is not None
+    assert not fit.is_settled
+
+
+def test_systems_that_are_not_dense_take_the_same_loop() -> None:
+    """A diagonal system: chi2 and steps by hand."""
+    target = np.arange(4.0)
+    fit = minimise(
+        np.zeros(4),
+        lambda x: (float((x - target) @ (x - target)), x - target),
+        lambda x, rest, damping: (x - rest / (1.0 + damping), float(rest @ rest)),
+    )
+    assert fit is not None
+    np.testing.assert_allclose(fit.state, target, atol=1e-9)
+    assert minimise(np.zeros(1), lambda x: (1.0, x), lambda x, rest, damping: None) is not None, (
+        "no step at all is an end"
+    )
+
+
+def test_whitened_residuals_weigh_as_the_covariance_does() -> None:
+    rng = np.random.default_rng(RNG_SEED)
+    root = rng.standard_normal((5, 5)) + 3.0 * np.eye(5)
+    covariance, residuals = root @ root.T, rng.standard_normal(5)
+    whitening = Whitening(covariance)
+    expected = residuals @ np.linalg.solve(covariance, residuals)
+    np.testing.assert_allclose(np.sum(whitening(residuals) ** 2), expected)
+    np.testing.assert_allclose(whitening.log_determinant, np.linalg.slogdet(covariance)[1])
+    with pytest.raises(np.linalg.LinAlgError):
+        Whitening(-covariance)
+
+
+def test_square_root_of_a_covariance_without_full_rank() -> None:
+    units = np.diag([1e-6, 1.0, 1e6])
+    factor = units @ np.array([[1.0, 0.0], [1.0, 1.0], [0.0, 2.0]])
+    covariance = factor @ factor.T
+    root = square_root(covariance)
+    assert root.shape == (3, 2)
+    np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-12, atol=1e-12)
+    assert square_root(np.zeros((2, 2))).shape == (2, 0)
+    with pytest.raises(InputError, match="semi-definite"):
+        square_root(np.diag([1.0, -1.0]))
+
+
+def test_robust_constants_are_those_of_the_normal_distribution() -> None:
+    np.testing.assert_allclose(MAD_TO_SIGMA, 1.0 / norm.ppf(0.75), rtol=3e-5)
+    residuals = np.random.default_rng(RNG_SEED).normal(0.0, 2.0, 200_000)
+    np.testing.assert_allclose(robust_sigma(residuals), 2.0, rtol=0.01)
+    assert robust_sigma(np.zeros(0)) == 0.0
+    inside = float(norm.cdf(HUBER_LIMIT) - norm.cdf(-HUBER_LIMIT))
+    clipped = 2.0 * (HUBER_LIMIT**2 * norm.sf(HUBER_LIMIT))
+    variance = inside - 2.0 * HUBER_LIMIT * norm.pdf(HUBER_LIMIT) + clipped
+    np.testing.assert_allclose(inside**2 / variance, 0.95, atol=1e-3)
+    np.testing.assert_allclose(huber_weights(np.array([-0.5, 1.345, -2.69])), [1.0, 1.0, 0.5])
+
+
+def test_outliers_are_rejected_until_nothing_changes() -> None:
+    values = np.concatenate([np.random.default_rng(RNG_SEED).normal(0.0, 1.0, 50), [30.0, -40.0]])
+    eligible = np.arange(52) > 0
+
+    def fit(used: BoolArray) -> FloatArray:
+        return np.asarray(values - values[used].mean())
+
+    used = reject_outliers(fit, eligible, sigmas=6.0)
+    assert used.sum() == 49
+    assert not used[0]
+    assert not used[50:].any()

@@ -192,7 +192,7 @@ def _measured(request: VerifyRequest, progress: Progress) -> tuple[Measured, boo
     scanner = None if request.scanner is None else read_scanner_calibration(request.scanner)
     if scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
-    scan = measure_scan(source, scanner, ScanOptions(normals=None), progress=progress)
+    scan = measure_scan(source, scanner, ScanOptions(has_normals=False), progress=progress)
     is_simulated = source.is_simulated or are_simulated(_inputs(request))
     return Measured(scan.cloud, scan, scanner), is_simulated
 
@@ -233,7 +233,7 @@ def _tool_places(measured: Measured) -> FloatArray | None:
     if measured.scan is None:
         return None
     poses = measured.scan.poses
-    found = poses.translations_mm[poses.fate == PoseStatus.FOUND]
+    found = poses.translations_mm[poses.has_pose]
     return found if len(found) else None
 
 

@@ -169,58 +169,60 @@ def observe_stripes(
     left out and named, as `armscan.pipeline.scan.measure_scan` does, and so is one without its
     partner of the other camera.
     """
-    poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
-    cameras = cameras_of(sensor)
-    exposures = ScanInstants(source, len(cameras))
-    lit = exposures.lit
-    has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in lit], dtype=np.bool_)
-    chosen = [lit[k] for k in _spread(np.flatnonzero(has_pose), options.max_exposures)]
+    poses = exposure_poses(source.rows, source.arm, source.session.clock)
+    scan = ScanInstants(source, len(cameras_of(sensor)))
+    has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in scan.lit], dtype=np.bool_)
+    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), options.max_exposures)]
     postures, merged = _postures(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
+    posture_of = {one: name for one, name in zip(chosen, postures, strict=True)}
     stripes: list[PosedStripe] = []
-    images: list[MeasuredProfile] = []
-    not_used = [
-        (source.rows[row].source, "the arm gave no pose for it")
-        for one, known in zip(lit, has_pose, strict=True)
+    images: list[LabelledProfile] = []
+    without_stripe: dict[int, str] = {}
+    weak: list[str] = []
+    # Each still is labelled by itself: where the sensor is on the arm is not known yet.
+    measured = measure_instants(
+        scan.read(chosen, STAGE, progress),
+        labeller_for(sensor, options.measure),
+        sensor,
+        options.measure,
+        is_pass=False,
+    )
+    for one in measured:
+        instant = one.images.instant
+        for row, found in zip(instant.rows, one.profiles, strict=True):
+            weak += found.warnings
+            if len(found.points) < options.hand_eye.min_points:
+                without_stripe[row] = "no stripe was measured in it"
+                continue
+            images.append(found.labelled)
+            pose = poses.pose(instant.rows[0])
+            stripes.append(posed_stripe(found, sensor, posture_of[instant], pose))
+    if chosen and all(one.rows[0] in scan.unreadable for one in chosen):
+        raise EstimationError(
+            f"no exposure with a pose could be read: {scan.unreadable[chosen[-1].rows[0]]}"
+        )
+    reasons = {
+        row: "the arm gave no pose for it"
+        for one, known in zip(scan.lit, has_pose, strict=True)
         for row in one.rows
         if not known
-    ]
-    not_used += [(source.rows[row].source, PARTNER_MISSING) for row in exposures.without_partner]
-    n_unreadable = 0
-    weak: list[str] = []
-    for done, (instant, posture) in enumerate(zip(chosen, postures, strict=True)):
-        first = source.rows[instant.rows[0]].source
-        progress(ProgressEvent(STAGE, done, len(chosen), first))
-        try:
-            pairs = [exposures.pair(row) for row in instant.rows]
-        except ArmscanError as error:
-            not_used.append((first, str(error)))
-            n_unreadable += 1
-            continue
-        seen = [
-            see(pair, camera, stripes_for(sensor, options.measure.stripes))
-            for pair, camera in zip(pairs, cameras, strict=True)
-        ]
-        # Each still is named by itself: where the sensor is on the arm is not known yet.
-        for one in measurer_for(sensor, options.measure).measure(seen, None, instant.t_ns):
-            weak += one.warnings
-            if len(one.points.row) < options.hand_eye.min_points:
-                not_used.append((one.image.profile.source, "no stripe was measured in it"))
-                continue
-            images.append(one.image)
-            stripes.append(posed_stripe(one, sensor, posture, poses.pose(instant.rows[0])))
-    progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
-    if n_unreadable == len(chosen) > 0:
-        raise EstimationError(f"no exposure with a pose could be read: {not_used[-1][1]}")
-    n_posed = int(has_pose.sum())
+    }
+    reasons |= dict.fromkeys(scan.without_partner, PARTNER_MISSING)
+    for one in chosen:
+        first = one.rows[0]
+        if first in scan.unreadable:
+            reasons[first] = scan.unreadable[first]
+        reasons |= {row: without_stripe[row] for row in one.rows if row in without_stripe}
+    not_used = tuple((source.rows[row].source, reason) for row, reason in reasons.items())
     warnings = (
         *poses.warnings,
-        *_left_out(len(chosen), n_posed, not_used),
+        *_left_out(len(chosen), int(has_pose.sum()), not_used),
         *merged,
-        *collected(weak),
+        *summarised(weak),
     )
-    return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
+    return ObservedStripes(tuple(stripes), tuple(images), not_used, warnings)
 
 
 def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:

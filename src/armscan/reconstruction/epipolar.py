@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import square_root
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.triangulate import (
@@ -335,12 +336,9 @@ def _residual_jacobian(
 def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
     """What is known before any data: nothing has moved, as far as the priors say."""
     n = len(sensor.covariance)
-    scale = np.sqrt(np.maximum(np.diag(sensor.covariance), 0.0))
-    unit = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(sensor.covariance / np.outer(unit, unit))
-    kept = values > 1e-12 * max(float(values[-1]), 1e-300)
-    factor = np.zeros((n + 3, int(kept.sum()) + 3))
-    factor[:n, :-3] = unit[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    root = square_root(sensor.covariance, "the sensor's covariance")
+    factor = np.zeros((n + 3, root.shape[1] + 3))
+    factor[:n, :-3] = root
     factor[n:, -3:] = np.diag([DRIFT_PX, SLOPE_SHARE * DRIFT_PX, SLOPE_SHARE * DRIFT_PX])
     return EpipolarOffset(
         parameter_step=np.zeros(n),

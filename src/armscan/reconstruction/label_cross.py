@@ -467,7 +467,7 @@ class CrossLabeller:
         self._learn(profile, found, base_from_sensor)
         self._plan(found, possible)
         reason = self._reason(possible, base_from_sensor is not None)
-        return LabelledInstant((LabelledProfile(profile, found.sheet, found.status, reason),))
+        return LabelledInstant((LabelledProfile(profile=profile, sheet=found.sheet, status=found.status, reason=reason),))
 
     def _assign(
         self, profile: Profile, possible: tuple[int, ...], pose: Pose[Base, Sensor] | None

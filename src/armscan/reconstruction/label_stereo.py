@@ -335,7 +335,7 @@ class _Side:
             nearest = self.samples.nearest
             sheet[self.segments.row] = np.where(sure, found.state, -1)[nearest]
             status[self.segments.row] = of_sample[nearest]
-        return LabelledProfile(self.profile, sheet, status, REASON)
+        return LabelledProfile(profile=self.profile, sheet=sheet, status=status, reason=REASON)
 
 
 EXCHANGES = 2

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from armscan.geometry.arrays import IntArray, frozen_ints
+from armscan.geometry.arrays import ArrayRecord, IntArray, ints
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.reconstruction.epipolar import EpipolarOffset
 from armscan.records.profile import Profile
@@ -55,8 +55,7 @@ _WORDS = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledProfile:
+class LabelledProfile(ArrayRecord):
     """Stripe points of one exposure with the light sheet that drew each.
 
     Parameters
@@ -72,14 +71,9 @@ class LabelledProfile:
     """
 
     profile: Profile
-    sheet: IntArray
-    status: IntArray
+    sheet: IntArray = ints("N")
+    status: IntArray = ints("N")
     reason: str
-
-    def __post_init__(self) -> None:
-        n = len(self.profile)
-        object.__setattr__(self, "sheet", frozen_ints(self.sheet, (n,), "sheet"))
-        object.__setattr__(self, "status", frozen_ints(self.status, (n,), "status"))
 
     def count(self, status: PointStatus) -> int:
         """Count of points of this status."""

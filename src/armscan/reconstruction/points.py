@@ -9,7 +9,7 @@ of another source, however well it meets the sheet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -258,10 +258,8 @@ def _beside(rows: IntArray, right: Profile) -> BoolArray:
 
 def _in_order(both: StripePoints, single: StripePoints) -> StripePoints:
     """Both kinds in the order of the profile."""
-    order = np.argsort(np.concatenate([both.row, single.row]), kind="stable")
-    names = [one.name for one in fields(StripePoints)]
-    joined = (np.concatenate([getattr(both, name), getattr(single, name)]) for name in names)
-    return StripePoints(*(values[order] for values in joined))
+    joined = StripePoints.concat([both, single])
+    return joined.select(np.argsort(joined.row, kind="stable"))
 
 
 def misfit_mm(sensor: SensorCalibration, sheet: int) -> float:
@@ -292,7 +290,7 @@ def _fused(
         sensor=sensor,
         shift_px=shift,
     )
-    return StripePoints(row, points, noise, by_sensor, projected.sheet)
+    return StripePoints(row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=projected.sheet)
 
 
 def fuse_points(
@@ -422,7 +420,7 @@ def _left_alone(
         noise[of_sheet, :, 2] = points / along[:, None] * misfit_mm(sensor, int(k))
     second = np.zeros((len(row), 3, projected.dq_dsecond.shape[2]))
     by_sensor = np.concatenate([projected.dpoint_dsensor, second], axis=2)
-    return StripePoints(row, projected.points_mm, noise, by_sensor, projected.sheet)
+    return StripePoints(row=row, points_mm=projected.points_mm, noise_mm=noise, by_sensor=by_sensor, sheet=projected.sheet)
 
 
 def triangulate_right(
@@ -484,4 +482,4 @@ def triangulate_right(
         # a moved camera slides the point along its ray back onto the sheet
         slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
         by_sensor[at, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
-    return StripePoints(row, points, noise, by_sensor, sheet[row]).select(is_met)
+    return StripePoints(row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=sheet[row]).select(is_met)

@@ -3,19 +3,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
     SheetCalibration,
 )
 from armscan.records.cloud import CloudFrame, PointCloud
-from armscan.records.profile import Profile
+from armscan.records.profile import PointProfile, Profile
 
 N_CAMERA, N_SHEET = 9, len(SHEET_PARAMETER_NAMES)
 
@@ -134,8 +134,7 @@ def intersect_with_jacobian(
     return SheetPoints(points, is_met, by_px, by_sensor)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StripePoints:
+class StripePoints(RowRecord):
     """Points of one exposure in the Sensor frame, with what their errors come from.
 
     Parameters
@@ -155,19 +154,11 @@ class StripePoints:
         (M,) index into ``sensor.sheets``.
     """
 
-    row: IntArray
-    points_mm: FloatArray
-    noise_mm: FloatArray
-    by_sensor: FloatArray
-    sheet: IntArray
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.row)
-
-    def select(self, rows: BoolArray | IntArray) -> StripePoints:
-        """Those that a mask or an index names."""
-        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)})
+    row: IntArray = ints("N")
+    points_mm: FloatArray = floats("N", 3)
+    noise_mm: FloatArray = floats("N", 3, None)
+    by_sensor: FloatArray = floats("N", 3, None)
+    sheet: IntArray = ints("N")
 
 
 def triangulate(
@@ -197,30 +188,37 @@ def cloud_in_sensor(
         covariance[of_sheet] += (
             jacobian @ sensor_covariance(sensor, k) @ jacobian.transpose(0, 2, 1)
         )
-    return stripe_cloud("Sensor", stripe, profile, stripe.points_mm, covariance, sensor=sensor)
+    names = tuple(one.name for one in sensor.sheets)
+    return stripe_cloud(
+        "Sensor", stripe, profile, stripe.points_mm, covariance, sheet_names=names
+    )
 
 
 def stripe_cloud(
     frame: CloudFrame,
     stripe: StripePoints,
-    profile: Profile,
+    profile: Profile | PointProfile,
     points_mm: FloatArray,
     covariance_mm2: FloatArray,
     *,
-    sensor: SensorCalibration,
+    sheet_names: tuple[str, ...],
 ) -> PointCloud:
     """The points of one exposure, given in a frame, as a cloud; the covariance is symmetrised."""
+    if isinstance(profile, Profile):
+        segment, intensity = profile.segment[stripe.row], profile.intensity[stripe.row]
+    else:
+        segment, intensity = np.zeros_like(stripe.row), np.zeros(len(stripe))
     return PointCloud(
         frame=frame,
         points_mm=points_mm,
         covariance_mm2=0.5 * (covariance_mm2 + covariance_mm2.transpose(0, 2, 1)),
         sigma_noise_mm=noise_size_mm(stripe.noise_mm),
         sheet=stripe.sheet,
-        sheet_names=tuple(sheet.name for sheet in sensor.sheets),
+        sheet_names=sheet_names,
         exposure=np.zeros(len(stripe), dtype=np.int64),
         exposure_sources=(profile.source,),
-        segment=profile.segment[stripe.row],
-        intensity=profile.intensity[stripe.row],
+        segment=segment,
+        intensity=intensity,
     )
 
 
@@ -255,7 +253,13 @@ def triangulate_stripe(
     noise = across * profile.sigma_px[asked, None]
     rest = np.zeros((len(asked), 3, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET))
     by_sensor = np.concatenate([met.dpoint_dsensor, rest], axis=2)
-    found = StripePoints(asked, met.points_mm, noise[:, :, None], by_sensor, sheets[asked])
+    found = StripePoints(
+        row=asked,
+        points_mm=met.points_mm,
+        noise_mm=noise[:, :, None],
+        by_sensor=by_sensor,
+        sheet=sheets[asked],
+    )
     return found.select(met.is_met)
 
 

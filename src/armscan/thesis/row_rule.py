@@ -134,7 +134,7 @@ class RowLabeller:
                 sheet[is_asked] = self._compared(profile.points_px[is_asked], known)
             how = f"rows of earlier exposures, within {self._options.threshold_px:g} px"
         fate[sheet >= 0] = int(LabelStatus.NAMED)
-        return LabelledProfile(profile, sheet, fate, how)
+        return LabelledProfile(profile=profile, sheet=sheet, status=fate, reason=how)
 
     def _compared(self, points_px: FloatArray, known: list[str]) -> IntArray:
         """(N,) sheet of the smallest difference of rows, -1 where none is within T."""

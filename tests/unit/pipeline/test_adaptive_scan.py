@@ -94,7 +94,7 @@ class Counting:
             expected = BASE_FROM_TOOL @ TOOL_FROM_SENSOR
             assert np.allclose(base_from_sensor.matrix, expected.matrix)
         n = len(profile)
-        return LabelledProfile(profile, np.full(n, -1), np.full(n, int(LabelStatus.AMBIGUOUS)), "")
+        return LabelledProfile(profile=profile, sheet=np.full(n, -1), status=np.full(n, int(LabelStatus.AMBIGUOUS)), reason="")
 
     def next_lasers(self) -> tuple[str, ...]:
         return ("A",) if self.n_since_reset == 0 else BOTH

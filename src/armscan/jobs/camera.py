@@ -27,12 +27,11 @@ from armscan.records.exposure import Exposure
 from armscan.report.camera import TITLE, camera_page, parameter_rows
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, Table, sentence, significant, without_source
-from armscan.storage.atomic import write_files
 from armscan.storage.detection_cache import DetectionCache
-from armscan.storage.documents import camera_document
+from armscan.storage.documents import camera_document, new_provenance
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
-from armscan.storage.json_text import new_provenance
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE

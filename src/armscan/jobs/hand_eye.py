@@ -48,10 +48,9 @@ from armscan.report.page import Page, Text, render_page
 from armscan.report.quantity import Summary, Table, sentence
 from armscan.report.stripes import MAX_PICTURES, evenly_chosen
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.atomic import write_files
-from armscan.storage.documents import read_sensor_calibration, scanner_document
+from armscan.storage.documents import new_provenance, read_sensor_calibration, scanner_document
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths
-from armscan.storage.json_text import new_provenance
 from armscan.storage.points import parse_plane, read_points_or_plane, read_profiles
 from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording

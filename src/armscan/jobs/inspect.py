@@ -36,10 +36,10 @@ from armscan.report.inspect import (
 )
 from armscan.report.page import render_page
 from armscan.report.quantity import Summary, sentence
-from armscan.storage.atomic import check_outputs, write_files
 from armscan.storage.clouds import read_cloud
+from armscan.storage.documents import new_provenance
+from armscan.storage.files import check_outputs, write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.json_text import new_provenance
 from armscan.storage.points import parse_plane, read_points_or_plane
 
 

@@ -29,7 +29,7 @@ from armscan.report.page import (
     render_page,
 )
 from armscan.report.quantity import Table, sentence, without_source
-from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.files import check_outputs, write_files
 from armscan.vision.targets.target import TargetView
 
 

@@ -27,11 +27,10 @@ from armscan.report.markers import (
 )
 from armscan.report.page import render_page
 from armscan.report.quantity import Summary, Table, significant
-from armscan.storage.atomic import check_outputs, write_files
-from armscan.storage.documents import read_stereo_calibration
+from armscan.storage.documents import new_provenance, read_stereo_calibration
+from armscan.storage.files import check_outputs, write_files
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.json_text import new_provenance
 from armscan.storage.points import markers_csv
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 

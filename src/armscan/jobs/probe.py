@@ -16,7 +16,7 @@ from armscan.models.probe import tip_centres, tool_from_probe
 from armscan.records.points import ProbedPoints
 from armscan.report.quantity import Summary, Table, sentence, significant
 from armscan.storage.arm import ARM_FILE, PROBE_FILE, read_probe_tip
-from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.files import check_outputs, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import probed_points_csv, read_probed_points
 from armscan.storage.recording import read_arm_track

@@ -25,16 +25,16 @@ from armscan.report.page import render_page
 from armscan.report.quantity import Summary, sentence, significant
 from armscan.report.stripes import evenly_chosen
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.atomic import write_files
 from armscan.storage.clouds import XYZ_LOSES, ply_bytes, xyz_bytes
 from armscan.storage.documents import (
     is_scanner_document,
+    new_provenance,
     read_scanner_calibration,
     read_sensor_calibration,
 )
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.json_text import new_provenance
 from armscan.storage.recording import FolderRecording, is_recording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 

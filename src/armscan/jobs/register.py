@@ -36,20 +36,19 @@ from armscan.report.register import (
     residual_chart,
     views_report,
 )
-from armscan.storage.atomic import check_new_folder, new_folder, write_files
-from armscan.storage.bodies import provenance_body, triple
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.documents import (
-    MovedBody,
-    RegistrationDocument,
-    ResidualBody,
+    CODEC,
+    MarkerResidual,
+    MovedMarker,
+    Registration,
+    ScanTransform,
+    new_provenance,
     registration_document,
-    transform_body,
 )
+from armscan.storage.files import check_new_folder, new_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.json_text import new_provenance
 from armscan.storage.points import MarkerList, markers_csv
-from armscan.storage.schema import REGISTRATION_SCHEMA
 
 UNLIKELY = 1e-3
 WEAK_SHARE = 0.05
@@ -96,23 +95,24 @@ def place_report(
         ),
         warnings=_warnings(old, new, place),
         transforms=(
-            transform_body(
-                name,
-                new.path,
-                new.markers.frame,
-                place.fit.value,
-                place.fit.covariance,
+            ScanTransform(
+                name=name,
+                markers=path_text(new.path),
+                own_frame=new.markers.frame,
+                rotation_rows=place.fit.value.rotation,
+                translation_mm=place.fit.value.translation_mm,
+                covariance=place.fit.covariance,
                 n_markers=n,
                 rms_mm=rms,
                 cloud=clouds,
             ),
         ),
         residuals=tuple(
-            ResidualBody(
+            MarkerResidual(
                 name=name,
                 id=int(new.markers.ids[k]),
                 common_id=int(old.markers.ids[i]),
-                residual_mm=triple(residual),
+                residual_mm=residual,
                 is_used=bool(is_used),
             )
             for (i, k), residual, is_used in zip(
@@ -120,7 +120,7 @@ def place_report(
             )
         ),
         moved=tuple(
-            MovedBody(id=item.new_id, common_id=item.old_id, offset_mm=triple(item.offset_mm))
+            MovedMarker(id=item.new_id, common_id=item.old_id, offset_mm=item.offset_mm)
             for item in place.moved
         ),
         not_joined=(),
@@ -410,17 +410,16 @@ def _written(
             **report.data,
             "chi2": report.chi2,
             "degrees_of_freedom": report.degrees_of_freedom,
-            "transforms": [item.model_dump(mode="json") for item in report.transforms],
-            "moved": [item.model_dump(mode="json") for item in report.moved],
+            "transforms": [CODEC.write(item) for item in report.transforms],
+            "moved": [CODEC.write(item) for item in report.moved],
         },
     )
 
 
 def _document(
     request: RegisterRequest, report: RegisterReport, provenance: Provenance, *, is_simulated: bool
-) -> RegistrationDocument:
-    return RegistrationDocument(
-        schema=REGISTRATION_SCHEMA,
+) -> Registration:
+    return Registration(
         kind="views" if request.moved is None else "moved arm",
         simulated=is_simulated,
         common_frame=report.common_frame,
@@ -431,5 +430,5 @@ def _document(
         not_joined=report.not_joined,
         chi2=report.chi2,
         degrees_of_freedom=report.degrees_of_freedom,
-        provenance=provenance_body(provenance),
+        provenance=provenance,
     )

@@ -42,21 +42,21 @@ from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, Table, sentence, without_source
 from armscan.report.sheets import TITLE, laser_page, sheet_facts
 from armscan.storage.arm import ARM_FILE
-from armscan.storage.atomic import write_files
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import (
+    STEREO_SCHEMA,
     document_schema,
+    new_provenance,
     read_camera_calibration,
     read_stereo_calibration,
     sensor_document,
 )
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.json_text import new_provenance
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.storage.schema import STEREO_SCHEMA
 from armscan.vision.targets.target import Target, parse_target
 
 REQUESTED = "left out by request"

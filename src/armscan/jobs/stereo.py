@@ -31,13 +31,16 @@ from armscan.records.exposure import Exposure
 from armscan.report.page import render_page
 from armscan.report.quantity import Summary, Table, sentence, significant, without_source
 from armscan.report.stereo import TITLE, pair_row, relative_rows, stereo_page
-from armscan.storage.atomic import write_files
-from armscan.storage.bodies import right_pose_body
 from armscan.storage.detection_cache import DetectionCache
-from armscan.storage.documents import read_camera_calibration, stereo_document
+from armscan.storage.documents import (
+    fingerprint,
+    new_provenance,
+    read_camera_calibration,
+    stereo_document,
+)
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
-from armscan.storage.json_text import fingerprint, new_provenance
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.vision.targets.target import parse_target
@@ -273,7 +276,10 @@ def _data(run: StereoRun, is_simulated: bool) -> dict[str, Any]:
         "kind": "stereo calibration",
         "simulated": is_simulated,
         "intrinsics": fit.options.intrinsics,
-        "right_from_sensor": right_pose_body(fit.views.right_from_left).model_dump(mode="json"),
+        "right_from_sensor": {
+            "rotation_rows": fit.views.right_from_left.rotation.tolist(),
+            "translation_right_mm": fit.views.right_from_left.translation_mm.tolist(),
+        },
         "parameters": _named(fit.parameters.tolist()),
         "sigmas": _named(fit.sigma.tolist()),
         "rms_px": fit.rms_px,

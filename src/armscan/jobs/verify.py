@@ -27,11 +27,10 @@ from armscan.reconstruction.sync import PoseStatus
 from armscan.report.inspect import InspectionReport, inspection_page, plane_report, sphere_report
 from armscan.report.page import Card, Section, Text, render_page
 from armscan.report.quantity import Summary, Table, sentence, significant
-from armscan.storage.atomic import check_outputs, write_files
 from armscan.storage.clouds import read_cloud
-from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.documents import new_provenance, read_scanner_calibration
+from armscan.storage.files import check_outputs, write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.json_text import new_provenance
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
 

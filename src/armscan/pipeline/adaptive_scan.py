@@ -23,8 +23,7 @@ from armscan.reconstruction.labels import PASS_GAP_NS, StripeLabeller
 from armscan.reconstruction.sync import exposure_poses
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from armscan.storage.images import encoded_png
-from armscan.storage.recording_writer import write_recording, written_session
+from armscan.storage.recording import encoded_png, write_recording, written_session
 
 Keep = Callable[[int, Exposure], None]
 """Told of every exposure that was taken, with its row."""

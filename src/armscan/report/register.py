@@ -24,15 +24,9 @@ from armscan.report.drawing import ACCENT, ALERT, MUTED, PALETTE, chart_markup, 
 from armscan.report.page import Card, Gallery, Page, Picture, Section, Text, footer, origin_section
 from armscan.report.quantity import Table, sentence, significant
 from armscan.report.scene3d import SceneDots, SceneLines, scene_markup, uniform_dots
-from armscan.storage.bodies import triple
 from armscan.storage.clouds import FOREIGN_FRAME, read_cloud
-from armscan.storage.documents import (
-    MovedBody,
-    NotJoinedBody,
-    ResidualBody,
-    TransformBody,
-    transform_body,
-)
+from armscan.storage.documents import MarkerResidual, MovedMarker, ScanNotJoined, ScanTransform
+from armscan.storage.files import path_text
 from armscan.storage.points import MarkerList, read_marker_list
 
 
@@ -349,10 +343,10 @@ class RegisterReport:
     residuals_table: Table
     pictures: tuple[Picture, ...]
     warnings: tuple[str, ...]
-    transforms: tuple[TransformBody, ...]
-    residuals: tuple[ResidualBody, ...]
-    moved: tuple[MovedBody, ...]
-    not_joined: tuple[NotJoinedBody, ...]
+    transforms: tuple[ScanTransform, ...]
+    residuals: tuple[MarkerResidual, ...]
+    moved: tuple[MovedMarker, ...]
+    not_joined: tuple[ScanNotJoined, ...]
     chi2: float
     degrees_of_freedom: int
     data: Mapping[str, Any]
@@ -432,10 +426,10 @@ def views_report(
         ),
         warnings=_warnings(lists, names, joined),
         transforms=_transforms(lists, placed, joined, carried),
-        residuals=_residual_bodies(lists, placed, joined),
+        residuals=_residuals(lists, placed, joined),
         moved=_moved(lists, joined),
         not_joined=tuple(
-            NotJoinedBody(name=names[item.view], reason=item.reason) for item in joined.left
+            ScanNotJoined(name=names[item.view], reason=item.reason) for item in joined.left
         ),
         chi2=joined.map.chi2,
         degrees_of_freedom=joined.map.degrees_of_freedom,
@@ -508,16 +502,17 @@ def _transforms(
     placed: Sequence[str],
     joined: JoinedViews,
     carried: Sequence[NamedCloud],
-) -> tuple[TransformBody, ...]:
+) -> tuple[ScanTransform, ...]:
     clouds = {item.name.removesuffix(".ply"): item.name for item in carried}
     n_shared, rms = _n_shared(joined), _rms_mm(joined)
     return tuple(
-        transform_body(
-            name,
-            lists[view].path,
-            lists[view].markers.frame,
-            joined.map.part_from_view[k],
-            joined.map.pose_covariance[k],
+        ScanTransform(
+            name=name,
+            markers=path_text(lists[view].path),
+            own_frame=lists[view].markers.frame,
+            rotation_rows=joined.map.part_from_view[k].rotation,
+            translation_mm=joined.map.part_from_view[k].translation_mm,
+            covariance=joined.map.pose_covariance[k],
             n_markers=int(n_shared[k]),
             rms_mm=float(rms[k]),
             cloud=clouds.get(name),
@@ -615,16 +610,16 @@ def _place_in_view(joined: JoinedViews) -> np.ndarray[tuple[int], np.dtype[np.in
     return np.concatenate([np.arange(len(item)) for item in joined.marker_of])
 
 
-def _residual_bodies(
+def _residuals(
     lists: Sequence[MarkerList], placed: Sequence[str], joined: JoinedViews
-) -> tuple[ResidualBody, ...]:
+) -> tuple[MarkerResidual, ...]:
     place = _place_in_view(joined)
     return tuple(
-        ResidualBody(
+        MarkerResidual(
             name=placed[view],
             id=int(lists[joined.placed[view]].markers.ids[place[k]]),
             common_id=int(joined.sightings.marker[k]) + 1,
-            residual_mm=triple(joined.map.residual_mm[k]),
+            residual_mm=joined.map.residual_mm[k],
             is_used=bool(joined.map.is_used[k]),
         )
         for k, view in enumerate(joined.sightings.view.tolist())
@@ -632,13 +627,13 @@ def _residual_bodies(
     )
 
 
-def _moved(lists: Sequence[MarkerList], joined: JoinedViews) -> tuple[MovedBody, ...]:
+def _moved(lists: Sequence[MarkerList], joined: JoinedViews) -> tuple[MovedMarker, ...]:
     place = _place_in_view(joined)
     return tuple(
-        MovedBody(
+        MovedMarker(
             id=int(lists[joined.placed[int(joined.sightings.view[k])]].markers.ids[place[k]]),
             common_id=int(joined.sightings.marker[k]) + 1,
-            offset_mm=triple(joined.map.residual_mm[k]),
+            offset_mm=joined.map.residual_mm[k],
         )
         for k in np.flatnonzero(~joined.map.is_used)
     )

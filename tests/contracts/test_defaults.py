@@ -26,8 +26,7 @@ from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.register import RegisterOptions
 from armscan.pipeline.simulate import SimulateOptions
 from armscan.pipeline.verify import VerifyOptions
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.label_stereo import StereoLabelOptions
+from armscan.reconstruction.triangulate import CALIBRATED_DEPTHS, LABEL_DEPTHS
 from armscan.storage.images import ImageOptions
 from armscan.vision.rings import RingOptions
 from armscan.vision.stripe.image import StripeOptions
@@ -119,10 +118,10 @@ def test_defaults_of_a_command_are_those_of_its_options(path: tuple[str, ...]) -
 
 
 def test_the_depth_margin_that_texts_name_is_the_default() -> None:
-    text = f"{DepthRange().margin:g}"
+    text = f"{CALIBRATED_DEPTHS.margin:g}"
     option = parameters(("reconstruct",))["depth_margin"]
     assert option.default is None
-    stereo = f"{StereoLabelOptions().depths.margin:g}"
+    stereo = f"{LABEL_DEPTHS.margin:g}"
     assert f"Without it {text}; with two cameras {stereo};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())

@@ -77,7 +77,7 @@ def reconstruct(
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
     from armscan.jobs.reconstruct import CloudRequest, run_measurement
     from armscan.pipeline.measure import MeasureOptions
-    from armscan.reconstruction.label_single import DepthRange
+    from armscan.reconstruction.triangulate import DepthRange
     from armscan.storage.images import Alignment, ImageOptions
     from armscan.vision.stripe.image import LaserColour, StripeMethod, StripeOptions
 

@@ -444,7 +444,7 @@ def _refused(request: HandEyeRequest, inputs: HandEyeInputs) -> Page:
     """The page of stripes that determine no hand-eye."""
     tried = []
     for image in (image for _, seen in inputs.groups for image in seen.images):
-        is_measured = image.fate == int(PointStatus.MEASURED)
+        is_measured = image.status == PointStatus.MEASURED
         n_points, n = int(is_measured.sum()), len(image.profile)
         remark = f"{n_points} of {n} stripe points measured" if n else "no stripe was found"
         points = image.profile.points_px[is_measured]

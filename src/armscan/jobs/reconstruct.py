@@ -14,11 +14,10 @@ from armscan.geometry.arrays import Box
 from armscan.jobs.job import cloud_outputs
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasureOptions, cameras_of
+from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of, reconstruct
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, ScanReconstruction, measure_scan
-from armscan.reconstruction.labels import Reconstruction
+from armscan.reconstruction.labels import PointStatus
 from armscan.records.exposure import Exposure
 from armscan.report.cloud import cloud_page, fate_table, fate_totals, scan_page
 from armscan.report.page import render_page
@@ -310,8 +309,8 @@ def cloud_summary(
                 {
                     "source": image.profile.source,
                     "n_stripe_points": len(image.profile),
-                    "n_measured": int((image.fate == 0).sum()),
-                    "naming": image.naming,
+                    "n_measured": image.count(PointStatus.MEASURED),
+                    "naming": image.reason,
                 }
                 for image in result.images
             ],

@@ -23,7 +23,6 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
-from armscan.reconstruction.sync import PoseStatus
 from armscan.report.inspect import InspectionReport, inspection_page, plane_report, sphere_report
 from armscan.report.page import Card, Section, Text, render_page
 from armscan.report.quantity import Summary, Table, sentence, significant

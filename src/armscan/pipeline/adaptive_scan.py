@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan whose lasers are chosen while it is taken: switched on, exposed, labelled, chosen again."""
+"""A scan whose lasers are chosen while it is taken: exposed, labelled, chosen again."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def take_pass(
 
     labeller.reset()
     for _ in measure_instants(
-        exposures(), labeller, scanner.sensor, MeasureOptions(), is_pass=True, look_ahead=0
+        exposures(), labeller, scanner.sensor, MeasureOptions(), is_pass=True, reads_ahead=False
     ):
         """The labels of one exposure choose the lasers of the next."""
     return TakenPass(tuple(rows), tuple(lasers))

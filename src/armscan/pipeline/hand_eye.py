@@ -12,25 +12,24 @@ from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.sources import ScanSource
-from armscan.errors import ArmscanError, EstimationError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.errors import EstimationError, OptionError
+from armscan.geometry.arrays import IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import (
-    MeasuredImage,
     MeasureOptions,
     cameras_of,
-    collected,
-    see,
-    stripes_for,
+    labeller_for,
+    measure_instants,
+    summarised,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import measurer_for
-from armscan.reconstruction.labels import MeasuredProfile
-from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns
+from armscan.pipeline.progress import Progress, silent
+from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.points import MeasuredProfile
+from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.recording import ExposureRow
 
 STAGE = "stripes of the postures"
@@ -49,15 +48,12 @@ class HandEyeScanOptions:
         The calibration itself.
     measure
         Stripe extraction and the depths accepted.
-    sync
-        How exposures find their pose.
     max_exposures
         Of a longer scan, so many are used, evenly spread.
     """
 
     hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
     measure: MeasureOptions = field(default_factory=MeasureOptions)
-    sync: SyncOptions = field(default_factory=SyncOptions)
     max_exposures: int = 200
 
     def __post_init__(self) -> None:
@@ -89,7 +85,7 @@ class HandEyeRun:
 
     fit: HandEyeFit
     stripes: tuple[PosedStripe, ...]
-    images: tuple[MeasuredProfile, ...]
+    images: tuple[LabelledProfile, ...]
     not_used: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -105,7 +101,7 @@ class ObservedStripes:
     """
 
     stripes: tuple[PosedStripe, ...]
-    images: tuple[MeasuredProfile, ...]
+    images: tuple[LabelledProfile, ...]
     not_used: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
 
@@ -176,7 +172,7 @@ def observe_stripes(
     postures, merged = _postures(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
-    posture_of = {one: name for one, name in zip(chosen, postures, strict=True)}
+    posture_of = dict(zip(chosen, postures, strict=True))
     stripes: list[PosedStripe] = []
     images: list[LabelledProfile] = []
     without_stripe: dict[int, str] = {}
@@ -237,7 +233,7 @@ def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) 
 
 
 def posed_stripe(
-    measured: MeasuredImage,
+    measured: MeasuredProfile,
     sensor: SensorCalibration,
     posture: str,
     base_from_tool: Pose[Base, Tool],
@@ -256,23 +252,19 @@ def posed_stripe(
         As the arm reported it.
     """
     points = measured.points
-    return PosedStripe(
-        measured.image.profile.source,
-        posture,
-        base_from_tool,
-        points.points_mm,
-        points.noise_mm,
-        points.sheet,
-        _by_all_parameters(points, sensor),
-    )
-
-
-def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> FloatArray:
-    spread = np.zeros((len(points.row), 3, len(sensor.parameter_names)))
+    by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
     for k in range(len(sensor.sheets)):
-        own = np.flatnonzero(points.sheet == k)
-        spread[np.ix_(own, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[own]
-    return spread
+        rows = np.flatnonzero(points.sheet == k)
+        by_all[np.ix_(rows, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[rows]
+    return PosedStripe(
+        source=measured.labelled.profile.source,
+        posture=posture,
+        base_from_tool=base_from_tool,
+        points_mm=points.points_mm,
+        noise_mm=points.noise_mm,
+        sheet=points.sheet,
+        by_sensor=by_all,
+    )
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:

@@ -43,11 +43,10 @@ from armscan.pipeline.cameras import (
 from armscan.pipeline.documents import camera_calibration, sensor_calibration
 from armscan.pipeline.hand_eye import HandEyeRun, calibrate_hand_eye_from_scan
 from armscan.pipeline.laser import calibrate_sheets_from_scan
-from armscan.pipeline.measure import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
 from armscan.pipeline.truth import (
     CameraErrors,
@@ -61,8 +60,8 @@ from armscan.pipeline.truth import (
     true_names,
 )
 from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.points import ProbedPoints
@@ -118,7 +117,7 @@ class RenderedScans:
     def calibration(self, scene: TwinScene) -> ScanSource:
         """See `TwinScans`."""
         whole, most = self.twin.scan(scene), self.most_views.get(scene)
-        return whole if most is None else FewerViews(whole, most)
+        return whole if most is None else fewer_views(whole, most)
 
     def scanned(
         self, scene: TwinScene, scanner: ScannerCalibration, progress: Progress
@@ -129,7 +128,7 @@ class RenderedScans:
             return self.calibration(scene)
         taken: dict[int, Exposure] = {}
         namer = CrossLabeller(sensor)
-        chosen, _ = scan_adaptively(self.twin.scan(scene), scanner, namer, keep=taken.__setitem__)
+        chosen = scan_adaptively(self.twin.scan(scene), scanner, namer, keep=taken.__setitem__)
         return replace(chosen, taken=taken)
 
 
@@ -184,7 +183,7 @@ class RecordedScans:
                 self.name,
                 scene,
                 scanner,
-                longest_stroke=self.most_views.get(scene),
+                longest_pass=self.most_views.get(scene),
                 processes=self.processes,
                 progress=progress,
             )

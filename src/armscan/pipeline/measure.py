@@ -43,7 +43,7 @@ from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.options import LaserColour, StripeOptions
+from armscan.vision.stripe.image import LaserColour, StripeOptions
 
 STAGE = "reconstruct"
 LEAST_APART_RAD = 0.5
@@ -140,14 +140,14 @@ def measure_instants(
     options: MeasureOptions,
     *,
     is_pass: bool,
-    look_ahead: int = LOOK_AHEAD,
+    reads_ahead: bool = True,
 ) -> Iterator[MeasuredInstant]:
     """Extract the stripes of each instant, label them, and turn them into points.
 
     Parameters
     ----------
     instants
-        In order of time; read one by one, with ``look_ahead`` of them ahead.
+        In order of time; read one by one.
     labeller
         From `labeller_for`.
     sensor
@@ -156,8 +156,8 @@ def measure_instants(
         Stripe extraction and the depths accepted.
     is_pass
         True where each instant follows the one before; else the labeller forgets it.
-    look_ahead
-        0 where the next exposure depends on the labels of this one.
+    reads_ahead
+        Read the next instant meanwhile; False where its exposure depends on the labels of this one.
 
     Raises
     ------
@@ -167,7 +167,7 @@ def measure_instants(
         If the sheet of a stripe is ambiguous.
     """
     depths = options.accepted_depths(sensor)
-    for images, profiles in _extracted(instants, sensor, options.stripes, look_ahead):
+    for images, profiles in _extracted(instants, sensor, options.stripes, reads_ahead):
         if not is_pass:
             labeller.reset()
         labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
@@ -178,7 +178,7 @@ def _extracted(
     instants: Iterable[InstantImages],
     sensor: SensorCalibration,
     options: StripeOptions,
-    look_ahead: int,
+    reads_ahead: bool,
 ) -> Iterator[tuple[InstantImages, list[Profile]]]:
     """Profiles of each instant, in order, with few instants in memory; ends at the first error."""
     cameras, stripes = cameras_of(sensor), stripes_for(sensor, options)
@@ -187,15 +187,15 @@ def _extracted(
         pairs = zip(images.pairs, cameras, strict=True)
         return [extract_profile(pair, camera, stripes) for pair, camera in pairs]
 
-    if not look_ahead:
+    if not reads_ahead:
         yield from ((images, extract(images)) for images in instants)
         return
     pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    with ThreadPoolExecutor(look_ahead) as pool:
+    with ThreadPoolExecutor(LOOK_AHEAD) as pool:
         try:
             for images in instants:
                 pending.append((images, pool.submit(extract, images)))
-                if len(pending) > look_ahead:
+                if len(pending) > LOOK_AHEAD:
                     first, found = pending.popleft()
                     yield first, found.result()
             while pending:
@@ -377,9 +377,7 @@ def measurement_warnings(
         Camera and sheets.
     """
     warnings = []
-    n_measured = [
-        one.count(PointStatus.MEASURED) + one.count(PointStatus.SHARED) for one in images
-    ]
+    n_measured = [one.count(PointStatus.MEASURED) + one.count(PointStatus.SHARED) for one in images]
     both = list(zip((one.profile for one in images), n_measured, strict=True))
     empty = [profile.source for profile, n in both if n == 0]
     if empty:

@@ -33,7 +33,6 @@ from armscan.reconstruction.place import (
     BaseTransform,
     choose_radius_mm,
     cut_cloud,
-    delivered_points,
     estimate_normals,
     merge_clouds,
     propagate_to_base,
@@ -46,7 +45,6 @@ from armscan.reconstruction.sync import (
     stripes_at_equal_poses,
 )
 from armscan.records.cloud import PointCloud
-from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
 STAGE = "scan"
@@ -147,9 +145,13 @@ class ScanReconstruction:
         found = self.of(ExposureStatus.UNREADABLE)
         return tuple((exposure.row.source, exposure.reason) for exposure in found)
 
-    def count(self, fate: ExposureStatus) -> int:
-        """Count of exposures of this fate."""
-        return sum(exposure.status is fate for exposure in self.exposures)
+    def count(self, status: ExposureStatus) -> int:
+        """Count of exposures of this status."""
+        return len(self.of(status))
+
+    def of(self, *states: ExposureStatus) -> tuple[ScanExposure, ...]:
+        """The exposures of these states."""
+        return tuple(one for one in self.exposures if one.status in states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,9 +254,7 @@ def measure_scan(
         for k in range(len(sensor.sheets))
     ]
     return ScanReconstruction(
-        cloud=replace(
-            cloud, is_simulated=source.is_simulated, forced=scanner.provenance.forced
-        ),
+        cloud=replace(cloud, is_simulated=source.is_simulated, forced=scanner.provenance.forced),
         images=images,
         image_rows=tuple(kept),
         exposures=exposures,
@@ -309,8 +309,7 @@ def _hung(
     """
     measured = {one.rows[0]: one.rows for one in instants if one.rows[0] in placed}
     clouds = {
-        first: merge_clouds([placed[row].cloud for row in rows])
-        for first, rows in measured.items()
+        first: merge_clouds([placed[row].cloud for row in rows]) for first, rows in measured.items()
     }
     apart = stripes_at_equal_poses(clouds, poses)
     return {row: apart[first] for first in apart for row in measured[first]}

@@ -82,7 +82,9 @@ def possible_sheets(
     depth = -planes[:, 3] / np.where(np.abs(slope) > 1e-9, slope, np.nan)
     low, high = np.array([depths.limits_mm(s) for s in sensor.sheets]).T
     with np.errstate(invalid="ignore"):
-        inside = (depth >= low * (1.0 - BOW_DEPTH_SHARE)) & (depth <= high * (1.0 + BOW_DEPTH_SHARE))
+        inside = (depth >= low * (1.0 - BOW_DEPTH_SHARE)) & (
+            depth <= high * (1.0 + BOW_DEPTH_SHARE)
+        )
     point, sheet = np.nonzero(inside & is_valid[:, None])
     return point, sheet
 

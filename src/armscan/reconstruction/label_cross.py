@@ -388,7 +388,7 @@ ROUNDS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Assignment:
-    """Sheet (N,), log-odds (N,) and status (N,) of points; undecided ones expected of each sheet."""
+    """Sheet (N,), log-odds (N,), status (N,) of points; undecided ones expected of each sheet."""
 
     sheet: IntArray
     odds: FloatArray
@@ -467,7 +467,13 @@ class CrossLabeller:
         self._learn(profile, found, base_from_sensor)
         self._plan(found, possible)
         reason = self._reason(possible, base_from_sensor is not None)
-        return LabelledInstant((LabelledProfile(profile=profile, sheet=found.sheet, status=found.status, reason=reason),))
+        return LabelledInstant(
+            (
+                LabelledProfile(
+                    profile=profile, sheet=found.sheet, status=found.status, reason=reason
+                ),
+            )
+        )
 
     def _assign(
         self, profile: Profile, possible: tuple[int, ...], pose: Pose[Base, Sensor] | None
@@ -521,9 +527,7 @@ class CrossLabeller:
             posterior = smoothed_posterior(evidence + taken, pieces.segment)
         return posterior
 
-    def _learn(
-        self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None
-    ) -> None:
+    def _learn(self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None) -> None:
         known = (found.odds >= REMEMBER_MARGIN) & (found.sheet >= 0)
         sheet, pixels = found.sheet[known], profile.points_px[known]
         self._image.remember(pixels, profile.normals_px[known], sheet)

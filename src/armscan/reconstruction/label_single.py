@@ -74,7 +74,9 @@ class SingleLabeller:
         sheet, reason = self._sheets(profile, lasers)
         status = np.where(sheet < 0, PointStatus.OUT_OF_DEPTH, PointStatus.MEASURED)
         status[~profile.is_accepted] = PointStatus.FLAGGED
-        return LabelledInstant((LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason),))
+        return LabelledInstant(
+            (LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason),)
+        )
 
     def next_lasers(self) -> tuple[str, ...]:
         """Those of the recording."""

@@ -290,8 +290,9 @@ class _Side:
         n, n_sheets = scores.shape
         if n == 0:
             none, empty = np.zeros(0, dtype=np.bool_), np.zeros(0, dtype=np.int64)
-            table = np.zeros((0, n_sheets), dtype=np.bool_)
-            return SheetAssignment(empty, none, none, empty, table)
+            return SheetAssignment(
+                empty, none, none, empty, np.zeros((0, n_sheets), dtype=np.bool_)
+            )
         weight = self.samples.weight[:, None]
         weighted = scores * (INDEPENDENT_SHARE * weight)
         is_first = np.diff(self.segments.number[self.samples.at], prepend=-1) != 0
@@ -538,9 +539,7 @@ def _assign_both(
     return left, _assign_right(pairs, agreed, sides[1], n_sheets)
 
 
-def _assign_left(
-    pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int
-) -> SheetAssignment:
+def _assign_left(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
     scores = np.full((len(side), n_sheets), IMPOSSIBLE)
     scores[pairs.left, pairs.sheet] = np.where(alive | ~pairs.is_match, pairs.ratio, MISSING)
     is_match = np.zeros((len(side), n_sheets), dtype=np.bool_)
@@ -548,9 +547,7 @@ def _assign_left(
     return side.assign(scores, is_match)
 
 
-def _assign_right(
-    pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int
-) -> SheetAssignment:
+def _assign_right(pairs: _Pairs, alive: BoolArray, side: _Side, n_sheets: int) -> SheetAssignment:
     """The same pairs, seen from the right stripes: each sample takes its best partner."""
     scores = np.full((len(side), n_sheets), MISSING)
     chosen = np.flatnonzero(alive & (pairs.right >= 0))

@@ -100,9 +100,7 @@ def _on_sheets(
 ) -> MeasuredProfile:
     """Points of one camera on their sheets (eq. 2.20)."""
     profile, found = labelled.profile, points_again(labelled, sensor)
-    status = np.where(
-        labelled.status == PointStatus.MEASURED, PointStatus.NO_RAY, labelled.status
-    )
+    status = np.where(labelled.status == PointStatus.MEASURED, PointStatus.NO_RAY, labelled.status)
     is_inside = depths.holds(found.points_mm, found.sheet, sensor)
     status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
     found = found.select(is_inside)
@@ -282,18 +280,14 @@ def _fused(
     if offset.is_beyond_calibration:
         moved = drift_directions(projected, sensor) @ offset.drift
         shift = -np.sum(crossings.normal * moved, axis=1)
-    points, noise, by_sensor = fuse_points(
-        projected,
-        crossings,
-        left.normals_px[row],
-        np.stack([left.sigma_px[row], right.sigma_px[crossings.row]], axis=1),
-        sensor=sensor,
-        shift_px=shift,
+    sigma = np.stack([left.sigma_px[row], right.sigma_px[crossings.row]], axis=1)
+    return fuse_points(
+        row, projected, crossings, left.normals_px[row], sigma, sensor=sensor, shift_px=shift
     )
-    return StripePoints(row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=projected.sheet)
 
 
 def fuse_points(
+    row: IntArray,
     projected: Projections,
     crossings: Crossings,
     normals_px: FloatArray,
@@ -301,7 +295,7 @@ def fuse_points(
     *,
     sensor: SensorCalibration,
     shift_px: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> StripePoints:
     """Weigh left stripe, right stripe and sheet against each other (eqs. 4.7, 4.11, 4.17).
 
     A point has three unknowns. Its place along the left stripe is a choice of where to sample, so
@@ -313,8 +307,10 @@ def fuse_points(
 
     Parameters
     ----------
+    row
+        (M,) rows of the left profile.
     projected
-        (M,) left points on their sheets.
+        (M,) these points on their sheets.
     crossings
         (M,) the right stripes beside them; all found.
     normals_px
@@ -328,13 +324,8 @@ def fuse_points(
 
     Returns
     -------
-    points_mm
-        (M, 3) in the Sensor frame.
-    noise_mm
-        (M, 3, 3) one standard deviation each of the left stripe's noise, the right stripe's, and
-        the sheet's own shape.
-    by_sensor
-        (M, 3, 32) derivative by the left camera's 9, the sheet's 8 and the second camera's 15.
+    StripePoints
+        The noises are those of the left stripe, of the right stripe, and of the sheet's own shape.
     """
     n = len(projected.sheet)
     ddistance_dpoint, ddistance_dsensor = _observations(projected, crossings, normals_px, sensor)
@@ -350,7 +341,13 @@ def fuse_points(
     missed = np.zeros((n, 1 + N_OBSERVED))
     missed[:, 2] = crossings.residual_px - shift_px
     points = projected.points_mm - np.einsum("nij,nj->ni", gain, missed)
-    return points, gain[:, :, 1:] * noise[:, None, :], -gain @ ddistance_dsensor
+    return StripePoints(
+        row=row,
+        points_mm=points,
+        noise_mm=gain[:, :, 1:] * noise[:, None, :],
+        by_sensor=-gain @ ddistance_dsensor,
+        sheet=projected.sheet,
+    )
 
 
 def _observations(
@@ -420,7 +417,13 @@ def _left_alone(
         noise[of_sheet, :, 2] = points / along[:, None] * misfit_mm(sensor, int(k))
     second = np.zeros((len(row), 3, projected.dq_dsecond.shape[2]))
     by_sensor = np.concatenate([projected.dpoint_dsensor, second], axis=2)
-    return StripePoints(row=row, points_mm=projected.points_mm, noise_mm=noise, by_sensor=by_sensor, sheet=projected.sheet)
+    return StripePoints(
+        row=row,
+        points_mm=projected.points_mm,
+        noise_mm=noise,
+        by_sensor=by_sensor,
+        sheet=projected.sheet,
+    )
 
 
 def triangulate_right(
@@ -482,4 +485,6 @@ def triangulate_right(
         # a moved camera slides the point along its ray back onto the sheet
         slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
         by_sensor[at, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
-    return StripePoints(row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=sheet[row]).select(is_met)
+    return StripePoints(
+        row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=sheet[row]
+    ).select(is_met)

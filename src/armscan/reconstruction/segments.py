@@ -176,9 +176,7 @@ def cut_pieces(profile: Profile) -> Pieces:
     of_point[rows] = piece
     sample = np.flatnonzero(np.diff(_renumbered(piece, np.floor(along / SAMPLE_PX)), prepend=-1))
     starts = np.flatnonzero(np.diff(piece, prepend=-1))
-    return Pieces(
-        of_point, number[starts], rows[sample], piece[sample], _directions(points, piece)
-    )
+    return Pieces(of_point, number[starts], rows[sample], piece[sample], _directions(points, piece))
 
 
 def _renumbered(outer: IntArray, inner: FloatArray) -> IntArray:

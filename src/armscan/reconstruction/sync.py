@@ -297,9 +297,7 @@ def _at_samples(arm: ArmTrack, found: IntArray, status: IntArray) -> tuple[Float
     return rotations, translations
 
 
-def poses_by_time(
-    rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int = 0
-) -> ExposurePoses:
+def poses_by_time(rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int = 0) -> ExposurePoses:
     """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
     times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
     max_gap = largest_gap_ns(arm)

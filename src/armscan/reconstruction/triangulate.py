@@ -189,9 +189,7 @@ def cloud_in_sensor(
             jacobian @ sensor_covariance(sensor, k) @ jacobian.transpose(0, 2, 1)
         )
     names = tuple(one.name for one in sensor.sheets)
-    return stripe_cloud(
-        "Sensor", stripe, profile, stripe.points_mm, covariance, sheet_names=names
-    )
+    return stripe_cloud("Sensor", stripe, profile, stripe.points_mm, covariance, sheet_names=names)
 
 
 def stripe_cloud(
@@ -291,7 +289,7 @@ def sensor_columns(sensor: SensorCalibration, sheet: int) -> IntArray:
     The camera's 9 parameters, the sheet's 8, then the 15 of a second camera, if there is one.
     """
     of_sheet, second = sensor.sheet_parameter_slice(sheet), sensor.second_parameter_slice
-    return np.r_[:N_CAMERA, of_sheet, second]
+    return np.asarray(np.r_[:N_CAMERA, of_sheet, second])
 
 
 def sensor_covariance(sensor: SensorCalibration, sheet: int) -> FloatArray:

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from armscan.models.calibration import Provenance, SensorCalibration
+from armscan.pipeline.measure import Reconstruction
 from armscan.pipeline.scan import ScanReconstruction
-from armscan.reconstruction.labels import PointStatus, Reconstruction
+from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import ACCENT, PALETTE, chart_markup, new_figure, raster_markup, styled
@@ -148,12 +149,14 @@ def cloud_page(
 
 def fate_table(result: Reconstruction) -> Table:
     """What became of the stripe points of each image."""
-    fates = [fate for fate in PointStatus if any(image.count(fate) for image in result.images)]
+    states = [
+        status for status in PointStatus if any(image.count(status) for image in result.images)
+    ]
     rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.naming)
+        (image.profile.source, *(str(image.count(status)) for status in states), image.reason)
         for image in result.images
     )
-    columns = ("image", *(fate.label for fate in fates), "sheet chosen by")
+    columns = ("image", *(status.label for status in states), "sheet chosen by")
     return Table(columns, rows, "", (len(columns) - 1,))
 
 
@@ -218,11 +221,11 @@ def scan_page(
 
 def fate_totals(scan: ScanReconstruction) -> Table:
     """All stripe points by what became of them."""
-    counts = {fate: sum(image.count(fate) for image in scan.images) for fate in PointStatus}
+    counts = {status: sum(image.count(status) for image in scan.images) for status in PointStatus}
     n_all = max(sum(counts.values()), 1)
     rows = [
-        (fate.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
-        for fate, count in counts.items()
+        (status.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
+        for status, count in counts.items()
         if count
     ]
     return Table(("stripe points", "count", "share"), tuple(rows))
@@ -230,11 +233,12 @@ def fate_totals(scan: ScanReconstruction) -> Table:
 
 def exposure_table(scan: ScanReconstruction) -> Table:
     """Every exposure with what became of its points."""
-    fates = [fate for fate in PointStatus if any(image.count(fate) for image in scan.images)]
+    states = [status for status in PointStatus if any(image.count(status) for image in scan.images)]
     rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates)) for image in scan.images
+        (image.profile.source, *(str(image.count(status)) for status in states))
+        for image in scan.images
     )
-    return Table(("exposure", *(fate.label for fate in fates)), rows)
+    return Table(("exposure", *(status.label for status in states)), rows)
 
 
 def without_pose_table(scan: ScanReconstruction) -> Table:

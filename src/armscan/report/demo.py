@@ -111,7 +111,7 @@ def instants(scans: Sequence[ScanReconstruction]) -> list[tuple[int, int]]:
         for row, image in zip(scan.image_rows, scan.images, strict=True):
             key = (number, scan.exposures[row].row.t_ns)
             sheets, count = found.get(key, (set(), 0))
-            measured = image.fate == int(PointStatus.MEASURED)
+            measured = image.status == PointStatus.MEASURED
             sheets = sheets | set(image.sheet[measured].tolist())
             found[key] = (sheets, count + int(measured.sum()))
     return [(len(sheets), count) for sheets, count in found.values()]
@@ -392,7 +392,7 @@ def _named_marks(demo: HeadDemo, scene: str, source: str) -> list[Marks]:
     images = [image for name, scan in demo.scans.items() if name == scene for image in scan.images]
     for image in images:
         if image.profile.source == source:
-            measured = image.fate == int(PointStatus.MEASURED)
+            measured = image.status == PointStatus.MEASURED
             return [
                 Marks(image.profile.points_px[measured & (image.sheet == k)], sheet_colour(k))
                 for k in sorted(set(image.sheet[measured].tolist()))

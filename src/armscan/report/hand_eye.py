@@ -23,7 +23,7 @@ from armscan.models.calibration import (
     HandEyeDiagnostics,
     ScannerCalibration,
 )
-from armscan.reconstruction.labels import MeasuredProfile
+from armscan.reconstruction.labels import LabelledProfile
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import (
     ACCENT,
@@ -468,7 +468,7 @@ def hand_eye_page(
     fit: HandEyeFit,
     scanner: ScannerCalibration,
     stripes: Sequence[PosedStripe],
-    images: Sequence[MeasuredProfile] = (),
+    images: Sequence[LabelledProfile] = (),
     exposures: Mapping[str, Exposure] | None = None,
     *,
     repeats: Sequence[Block] = (),

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.report.drawing import Marks, photo_markup
@@ -121,7 +121,7 @@ FATE_COLOURS = {
 
 
 def stripe_gallery(
-    images: Sequence[MeasuredProfile],
+    images: Sequence[LabelledProfile],
     sheet_names: Sequence[str],
     exposures: Mapping[str, Exposure],
 ) -> tuple[Block, ...]:
@@ -138,7 +138,7 @@ def stripe_gallery(
     """
     flags = 0
     for image in images:
-        for value in image.profile.flags[image.fate == int(PointStatus.FLAGGED)]:
+        for value in image.profile.flags[image.status == PointStatus.FLAGGED]:
             flags |= int(value)
     seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in images)}
     fates = {int(fate): (FATE_COLOURS[fate], fate.label) for fate in PointStatus if fate in seen}
@@ -147,7 +147,7 @@ def stripe_gallery(
         stripe_picture(
             exposures[image.profile.source],
             image.profile,
-            image.fate,
+            image.status,
             image.sheet,
             {int(fate): colour for fate, colour in FATE_COLOURS.items()},
             caption=f"{image.count(PointStatus.MEASURED)} of {len(image.profile)} points measured",

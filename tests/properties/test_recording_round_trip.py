@@ -27,7 +27,7 @@ from armscan.records.recording import (
     Session,
 )
 from armscan.storage.recording import FolderRecording, read_recording, write_recording
-from recording_folders import MemoryScan
+from rigs.recording_folders import MemoryScan
 
 ARM = thesis_arm((300, 400, 300, 100), (20, 30, 20))
 ROTATION_TOLERANCE = 1e-14

@@ -15,7 +15,7 @@ from armscan.calibration.cameras import result
 from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
-from smoke.drawn_bench import TARGET, Bench
+from rigs.drawn_bench import TARGET, Bench
 
 Fails = Callable[..., str]
 

@@ -13,8 +13,8 @@ from armscan.errors import InputError
 from armscan.pipeline.cameras import pair_lists
 from armscan.records.exposure import Exposure
 from armscan.storage.documents import camera_document
-from recording_folders import EXPOSURES, SESSION, lab_folder
-from stereo_rig import LEFT, held
+from rigs.recording_folders import EXPOSURES, SESSION, lab_folder
+from rigs.stereo_rig import LEFT, held
 
 Fails = Callable[..., str]
 TARGET = ("--target", "chessboard:9x6:25")

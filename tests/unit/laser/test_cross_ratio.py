@@ -4,7 +4,7 @@
 import numpy as np
 
 from armscan.calibration.sheets.model import cross_ratio_points, projective_coordinate
-from sheet_rig import exact, stripe_on_board, thesis_rig
+from rigs.sheet_rig import exact, stripe_on_board, thesis_rig
 
 RIG = exact(thesis_rig())
 

@@ -20,7 +20,7 @@ from armscan.models.two_views import (
     triangulate_directly,
     triangulate_points,
 )
-from stereo_rig import CONVERGING, LEFT, RIGHT
+from rigs.stereo_rig import CONVERGING, LEFT, RIGHT
 
 VIEWS = TwoViews(LEFT, RIGHT, CONVERGING)
 SIGMA_PX = 0.1

@@ -11,14 +11,14 @@ from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_exposures
+from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
 from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import ProgressEvent
 from armscan.reconstruction.labels import PointStatus
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard
-from sheet_rig import PROVENANCE
+from rigs.sheet_rig import PROVENANCE
 
 WIDTH, HEIGHT = 320, 240
 CAMERA = CameraModel(
@@ -77,8 +77,8 @@ def sensor() -> SensorCalibration:
 
 def test_images_without_a_board_are_named_with_the_reason() -> None:
     events: list[ProgressEvent] = []
-    fit = calibrate_sheets_from_exposures(
-        [picture("one.png", 100.0), picture("two.png", 120.0)],
+    fit = calibrate_sheets_from_pairs(
+        [(picture("one.png", 100.0), None), (picture("two.png", 120.0), None)],
         Chessboard(7, 5, 10.0),
         CALIBRATION,
         progress=events.append,
@@ -96,7 +96,7 @@ def test_images_without_a_board_are_named_with_the_reason() -> None:
 def test_images_of_another_size_are_refused_before_any_work() -> None:
     small = picture("small.png", width=300)
     for call in (
-        lambda: calibrate_sheets_from_exposures([small], Chessboard(7, 5, 10.0), CALIBRATION),
+        lambda: calibrate_sheets_from_pairs([(small, None)], Chessboard(7, 5, 10.0), CALIBRATION),
         lambda: reconstruct([small], sensor()),
     ):
         with pytest.raises(InputError, match=r"small\.png.*320 x 240"):

@@ -17,8 +17,8 @@ from armscan.reconstruction.labels import PointStatus
 from armscan.reconstruction.points import MeasuredProfile, measure_points
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange
 from armscan.records.profile import Profile
-from stereo_scenes import Noise, draw_surfaces, expose
-from two_camera_scan import small_head
+from rigs.stereo_scenes import Noise, draw_surfaces, expose
+from rigs.two_camera_scan import small_head
 
 Pair = tuple[MeasuredProfile, ...]
 

@@ -12,7 +12,7 @@ from armscan.reconstruction.label_single import SingleLabeller
 from armscan.reconstruction.labels import LabelledProfile
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
-from sheet_rig import PROVENANCE, make_profile
+from rigs.sheet_rig import PROVENANCE, make_profile
 
 CAMERA = CameraModel(
     fx_px=1000.0,

@@ -15,8 +15,8 @@ from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
 from armscan.reconstruction.points import fuse_points, misfit_mm, triangulate_right
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, sensor_covariance
-from sheet_rig import make_profile
-from stereo_head import StereoHead
+from rigs.sheet_rig import make_profile
+from rigs.stereo_head import StereoHead
 
 SHEET = 5
 SIGMA_PX = 0.07

@@ -12,7 +12,7 @@ from armscan.simulation.objects.boards import CharucoPattern, ChessboardPattern
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView
-from target_scenes import exposure, nees, render
+from rigs.target_scenes import exposure, nees, render
 
 BOARD = Chessboard(7, 4, 3.0)
 PATTERN = ChessboardPattern(7, 4, 3.0)

@@ -9,7 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
+from armscan.calibration.hand_eye.observations import (
+    MIN_POINTS,
+    HandEyeOptions,
+    PlateReference,
+    PosedStripe,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError, OptionError
@@ -189,7 +194,7 @@ def observe_stripes(
         instant = one.images.instant
         for row, found in zip(instant.rows, one.profiles, strict=True):
             weak += found.warnings
-            if len(found.points) < options.hand_eye.min_points:
+            if len(found.points) < MIN_POINTS:
                 without_stripe[row] = "no stripe was measured in it"
                 continue
             images.append(found.labelled)
@@ -263,7 +268,7 @@ def posed_stripe(
         points_mm=points.points_mm,
         noise_mm=points.noise_mm,
         sheet=points.sheet,
-        by_sensor=by_all,
+        dpoint_dsensor=by_all,
     )
 
 

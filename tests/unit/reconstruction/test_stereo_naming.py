@@ -18,7 +18,6 @@ from armscan.reconstruction.labels import LabelledInstant, PointStatus
 from armscan.reconstruction.points import MeasuredProfile, measure_points
 from armscan.reconstruction.triangulate import sensor_covariance
 from armscan.records.profile import Profile
-from armscan.vision.stripe.extract import empty_profile
 from rigs.placing_rig import scanner
 from rigs.stereo_head import StereoHead
 from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
@@ -143,7 +142,7 @@ def test_each_point_is_counted_once() -> None:
 
 
 def test_no_stripes_give_no_points() -> None:
-    none = empty_profile("none")
+    none = Profile.empty(source="none")
     _, left, _ = measured("plate", 0)
     for pair in ((none, none), (left.profile, none), (none, left.profile)):
         found = measure(head().calibration(), *pair)
@@ -154,7 +153,7 @@ def test_one_camera_is_refused() -> None:
     sensor = scanner().sensor
     assert sensor is not None
     with pytest.raises(InputError, match="one camera"):
-        measure(sensor, empty_profile("a"), empty_profile("b"))
+        measure(sensor, Profile.empty(source="a"), Profile.empty(source="b"))
 
 
 def test_log_ratio_is_that_of_a_seen_gaussian_against_an_even_spread() -> None:

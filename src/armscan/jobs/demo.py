@@ -46,8 +46,8 @@ from armscan.pipeline.truth import (
     part_errors,
     true_names,
 )
-from armscan.reconstruction.triangulate import DepthRange
 from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.cloud import PointCloud
 from armscan.report.demo import (
     FRACTION_RULE,

@@ -26,9 +26,12 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import TriedImage, document_and_page, refuse, refused_page
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import HandEyeScanOptions, ObservedStripes, observe_stripes
+from armscan.pipeline.hand_eye import (
+    ObservedStripes,
+    observe_stripes,
+    posed_stripes_from_profiles,
+)
 from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.profiles import posed_stripes_from_profiles
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.exposure import Exposure
@@ -231,9 +234,7 @@ def _from_recordings(
     recordings = tuple(read_recording(folder, arm) for folder in request.scans)
     sensor = read_sensor_calibration(sensor_file)
     plate, notes = _reference(request, _tool_places(recordings))
-    options = HandEyeScanOptions(
-        hand_eye=request.options, measure=MeasureOptions(stripes=request.stripes)
-    )
+    options = MeasureOptions(stripes=request.stripes)
     groups = []
     for recording in recordings:
         seen = observe_stripes(recording, sensor, options, progress=progress)

@@ -4,22 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import (
     MIN_POINTS,
-    HandEyeOptions,
-    PlateReference,
     PosedStripe,
 )
-from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.sources import ScanSource
-from armscan.errors import EstimationError, OptionError
+from armscan.errors import EstimationError
 from armscan.geometry.arrays import IntArray
-from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
@@ -31,68 +26,23 @@ from armscan.pipeline.measure import (
     summarised,
 )
 from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.scan import check_poses
 from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.place import delivered_points
 from armscan.reconstruction.points import MeasuredProfile
 from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import sensor_columns
+from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
 STAGE = "stripes of the postures"
+MAX_EXPOSURES = 200
+"""Of a longer scan, so many are used, evenly spread."""
 SAME_PLACE_MM = 0.05
 SAME_TURN_RAD = 2e-4
 """Consecutive exposures without a view whose poses differ by less are one posture."""
-
-
-@dataclass(frozen=True, slots=True)
-class HandEyeScanOptions:
-    """How a scan of the plate becomes a hand-eye.
-
-    Parameters
-    ----------
-    hand_eye
-        The calibration itself.
-    measure
-        Stripe extraction and the depths accepted.
-    max_exposures
-        Of a longer scan, so many are used, evenly spread.
-    """
-
-    hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
-    measure: MeasureOptions = field(default_factory=MeasureOptions)
-    max_exposures: int = 200
-
-    def __post_init__(self) -> None:
-        if self.max_exposures < 3:
-            raise OptionError(
-                f"at most {self.max_exposures} exposures",
-                where="hand-eye options",
-                remedy="allow at least 3",
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeRun:
-    """A hand-eye, and what was seen on the way.
-
-    Parameters
-    ----------
-    fit
-        The result.
-    stripes
-        The stripes that it rests on, with their poses.
-    images
-        What each of these exposures gave, in the same order.
-    not_used
-        (source, reason) of exposures that were left out.
-    warnings
-        What is weak about the scan, in words; those of the calibration are in ``fit``.
-    """
-
-    fit: HandEyeFit
-    stripes: tuple[PosedStripe, ...]
-    images: tuple[LabelledProfile, ...]
-    not_used: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
+REPEATED_DEG, REPEATED_MM = 0.1, 0.1
+"""Profiles whose poses, as a robot tells them, differ by less are one posture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,8 +51,14 @@ class ObservedStripes:
 
     Parameters
     ----------
-    stripes, images, not_used, warnings
-        As of `HandEyeRun`.
+    stripes
+        The stripes with their poses.
+    images
+        What each of these exposures gave, in the same order.
+    not_used
+        (source, reason) of exposures that were left out.
+    warnings
+        What is weak about the scan, in words.
     """
 
     stripes: tuple[PosedStripe, ...]
@@ -111,18 +67,20 @@ class ObservedStripes:
     warnings: tuple[str, ...]
 
 
-def calibrate_hand_eye_from_scan(
+def observe_stripes(
     source: ScanSource,
     sensor: SensorCalibration,
-    plate: PlateReference,
-    options: HandEyeScanOptions | None = None,
+    options: MeasureOptions | None = None,
     *,
+    max_exposures: int = MAX_EXPOSURES,
     progress: Progress = silent,
-) -> HandEyeRun | FitFailure:
-    """Measure the stripe of every exposure on the plate and calibrate.
+) -> ObservedStripes:
+    """Measure the stripe of every exposure that has a pose.
 
-    Exposures of equal view are one posture; without views, consecutive exposures whose poses agree
-    are one, so that a moving scan has a posture an exposure.
+    Whatever reference the stripes lie on: a plate or a sphere. Exposures of equal view are one
+    posture; without views, consecutive exposures whose poses agree are one, so that a moving scan
+    has a posture an exposure. An image that cannot be read is left out and named, and so is one
+    without its partner of the other camera.
 
     Parameters
     ----------
@@ -130,11 +88,11 @@ def calibrate_hand_eye_from_scan(
         The scan, with an arm and the sensor's cameras; exposures with the laser off serve as
         background of their view.
     sensor
-        Camera and sheets.
-    plate
-        The plate in Base.
+        Camera or cameras and sheets.
     options
-        Defaults if None.
+        Stripe extraction and the depths accepted.
+    max_exposures
+        Of a longer scan, so many are used, evenly spread.
     progress
         Told of every exposure.
 
@@ -147,33 +105,11 @@ def calibrate_hand_eye_from_scan(
         If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
         ambiguous.
     """
-    options = options or HandEyeScanOptions()
-    seen = observe_stripes(source, sensor, options, progress=progress)
-    fit = calibrate_on_plate(
-        seen.stripes, plate, options.hand_eye, sensor_covariance=sensor.covariance
-    )
-    if isinstance(fit, FitFailure):
-        return fit
-    return HandEyeRun(fit, seen.stripes, seen.images, seen.not_used, seen.warnings)
-
-
-def observe_stripes(
-    source: ScanSource,
-    sensor: SensorCalibration,
-    options: HandEyeScanOptions,
-    *,
-    progress: Progress = silent,
-) -> ObservedStripes:
-    """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
-
-    Whatever reference the stripes lie on: a plate or a sphere. An image that cannot be read is
-    left out and named, as `armscan.pipeline.scan.measure_scan` does, and so is one without its
-    partner of the other camera.
-    """
+    options = options or MeasureOptions()
     poses = exposure_poses(source.rows, source.arm, source.session.clock)
     scan = ScanInstants(source, len(cameras_of(sensor)))
     has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in scan.lit], dtype=np.bool_)
-    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), options.max_exposures)]
+    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), max_exposures)]
     postures, merged = _postures(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
@@ -185,9 +121,9 @@ def observe_stripes(
     # Each still is labelled by itself: where the sensor is on the arm is not known yet.
     measured = measure_instants(
         scan.read(chosen, STAGE, progress),
-        labeller_for(sensor, options.measure),
+        labeller_for(sensor, options),
         sensor,
-        options.measure,
+        options,
         is_pass=False,
     )
     for one in measured:
@@ -309,3 +245,46 @@ def _agree(pose: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
     turn: Pose[Tool, Tool] = pose.inverse() @ other
     angle = float(np.linalg.norm(turn.rotation_vector_rad))
     return shift < SAME_PLACE_MM and angle < SAME_TURN_RAD
+
+
+def posed_stripes_from_profiles(
+    profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]
+) -> tuple[PosedStripe, ...]:
+    """Join profiles that a sensor delivered and poses of equal order.
+
+    Parameters
+    ----------
+    profiles
+        One an exposure, in the Sensor frame.
+    poses
+        ``base_from_tool`` of each.
+
+    Raises
+    ------
+    InputError
+        If the counts differ.
+    """
+    check_poses(profiles, poses)
+    postures: list[str] = []
+    for k, pose in enumerate(poses):
+        same = [
+            j
+            for j in range(k)
+            if np.linalg.norm(poses[j].translation_mm - pose.translation_mm) < REPEATED_MM
+            and np.abs(poses[j].rotation - pose.rotation).max() < np.radians(REPEATED_DEG)
+        ]
+        postures.append(postures[same[0]] if same else profiles[k].source)
+    stripes = []
+    for profile, posture, pose in zip(profiles, postures, poses, strict=True):
+        points = delivered_points(profile)
+        stripes.append(
+            PosedStripe(
+                source=profile.source,
+                posture=posture,
+                base_from_tool=pose,
+                points_mm=points.points_mm,
+                noise_mm=points.noise_mm,
+                sheet=points.sheet,
+            )
+        )
+    return tuple(stripes)

@@ -30,9 +30,11 @@ from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import (
+    DELIVERED,
     BaseTransform,
     choose_radius_mm,
     cut_cloud,
+    delivered_points,
     estimate_normals,
     merge_clouds,
     propagate_to_base,
@@ -393,7 +395,13 @@ def _joined(
         raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
     if not options.has_normals:
         return cloud, ()
-    rows = list(placed)
+    return _with_normals(cloud, list(placed), poses, transform)
+
+
+def _with_normals(
+    cloud: PointCloud, rows: list[int], poses: ExposurePoses, transform: BaseTransform
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """The cloud with normals towards the sensor of each exposure, and what is weak about these."""
     eye = transform.scanner.hand_eye.tool_from_sensor.translation_mm
     cameras = poses.rotations[rows] @ eye + poses.translations_mm[rows]
     radius_mm = choose_radius_mm(cloud.points_mm, cloud.exposure)
@@ -406,6 +414,88 @@ def _joined(
             "they lie on single lines, or on no plane",
         )
     return replace(cloud, normals=normals), warnings
+
+
+def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:
+    """Raise `InputError` unless there is one pose for each profile."""
+    if len(profiles) != len(poses):
+        raise InputError(
+            f"{len(profiles)} profiles but {len(poses)} poses",
+            remedy="give one pose for each profile, in the same order",
+        )
+
+
+def place_profiles(
+    profiles: Sequence[PointProfile],
+    poses: Sequence[Pose[Base, Tool]],
+    scanner: ScannerCalibration,
+    volume: Box | None = None,
+) -> ScanReconstruction:
+    """Place what a sensor that delivers profiles saw in Base, with covariance and normals.
+
+    Parameters
+    ----------
+    profiles
+        In the Sensor frame, one for each pose.
+    poses
+        ``base_from_tool`` of each.
+    scanner
+        Its hand-eye; without a camera.
+    volume
+        Part of Base that is kept; None for all of it.
+
+    Raises
+    ------
+    InputError
+        If the counts differ, or the scanner has a camera.
+    EstimationError
+        If no point lies in the volume.
+    """
+    check_poses(profiles, poses)
+    transform = BaseTransform.of(scanner)
+    found = ExposurePoses(
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations_mm=np.array([pose.translation_mm for pose in poses]),
+        status=np.zeros(len(poses), dtype=np.int64),
+        sample=np.arange(len(poses)),
+        source="given",
+    )
+    clouds = [
+        propagate_to_base(delivered_points(profile), profile, pose, transform)
+        for profile, pose in zip(profiles, poses, strict=True)
+    ]
+    hung = stripes_at_equal_poses(dict(enumerate(clouds)), found)
+    exposures = []
+    for k, (profile, cloud) in enumerate(zip(profiles, clouds, strict=True)):
+        row = ExposureRow(index=k, t_ns=k, camera=0, source=profile.source, lasers=(DELIVERED,))
+        clouds[k] = inside = cloud if volume is None else cut_cloud(cloud, volume)
+        record = ScanExposure(
+            row,
+            ExposureStatus.PLACED,
+            n_stripe_points=len(profile),
+            n_measured=len(profile),
+            n_outside_volume=len(cloud) - len(inside),
+        )
+        if k in hung:
+            reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
+            record = ScanExposure(row, ExposureStatus.EQUAL_POSE, reason)
+        exposures.append(record)
+    kept = [k for k in range(len(clouds)) if k not in hung]
+    merged = merge_clouds([clouds[k] for k in kept])
+    if len(merged) == 0:
+        raise EstimationError(
+            f"no point lies in the volume {volume}",
+            remedy="give limits in mm in the arm's base frame, or none",
+        )
+    merged, extra = _with_normals(merged, kept, found, transform)
+    return ScanReconstruction(
+        cloud=replace(merged, forced=scanner.provenance.forced),
+        images=(),
+        image_rows=tuple(kept),
+        exposures=tuple(exposures),
+        poses=found,
+        warnings=(*_scan_warnings(exposures, found), *extra),
+    )
 
 
 def _scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tuple[str, ...]:

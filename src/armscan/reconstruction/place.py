@@ -11,8 +11,10 @@ from scipy.spatial import cKDTree
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
-from armscan.geometry.least_squares import square_root
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.shapes import fit_plane
 from armscan.models.calibration import ArmNoise, ScannerCalibration
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, stripe_cloud
 from armscan.records.cloud import PointCloud
@@ -20,6 +22,8 @@ from armscan.records.profile import PointProfile, Profile
 
 DELIVERED = "profile"
 """Name of the one light sheet of a sensor that delivers points itself."""
+THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
+"""Blind to any parabola, so to the course of a profile over four points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,13 +164,26 @@ def propagate_to_base(
     )
 
 
-def delivered_points(profile: PointProfile, noise_mm: FloatArray) -> StripePoints:
-    """Points that a sensor delivered itself, with their own noises (N, 3, J) as vectors."""
+def delivered_points(profile: PointProfile) -> StripePoints:
+    """Points that a sensor delivered itself; their noise is their own scatter.
+
+    It is taken from the third differences of neighbouring points, which neither a line nor a circle
+    touches, and acts across the profile, within its plane; zero for a straight or short profile.
+    """
     n = len(profile)
+    noise = np.zeros((n, 3, 1))
+    plane = fit_plane(profile.points_mm)
+    if n >= 8 and not isinstance(plane, FitFailure):
+        tangent = np.gradient(profile.points_mm, axis=0)
+        length = np.linalg.norm(tangent, axis=1)
+        across = np.cross(plane.value.normal, tangent / np.maximum(length, 1e-12)[:, None])
+        rough = np.apply_along_axis(np.convolve, 0, profile.points_mm, THIRD_DIFFERENCE, "valid")
+        size = np.abs(np.einsum("ni,ni->n", rough, across[1:-2]))
+        noise[:, :, 0] = across * robust_sigma(size / np.linalg.norm(THIRD_DIFFERENCE))
     return StripePoints(
         row=np.arange(n),
         points_mm=profile.points_mm,
-        noise_mm=noise_mm,
+        noise_mm=noise,
         by_sensor=np.zeros((n, 3, 0)),
         sheet=np.zeros(n, dtype=np.int64),
     )

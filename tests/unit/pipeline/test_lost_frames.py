@@ -11,7 +11,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.jobs.reconstruct import StillPaths, read_stills
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.hand_eye import HandEyeScanOptions, observe_stripes
+from armscan.pipeline.hand_eye import observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import ExposureRow
@@ -124,7 +124,7 @@ def test_a_hand_eye_scan_names_the_image_without_partner(
 ) -> None:
     monkeypatch.setattr("armscan.pipeline.measure.extract_profile", seen_as)
     assert device.sensor is not None
-    found = observe_stripes(two_camera_scan(3, lost=LOST), device.sensor, HandEyeScanOptions())
+    found = observe_stripes(two_camera_scan(3, lost=LOST), device.sensor)
     assert found.not_used == (("images/1l.png", PARTNER_MISSING),)
     assert {item.source for item in found.stripes} >= {"images/0l.png", "images/2l.png"}
     assert any(PARTNER_MISSING in text for text in found.warnings)
@@ -151,7 +151,7 @@ def test_no_complete_instant_is_refused_in_words(
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
         measure_scan(scan, device)
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
-        observe_stripes(scan, device.sensor, HandEyeScanOptions())
+        observe_stripes(scan, device.sensor)
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
         read_stills(stills_of(scan, tmp_path / "scan"), ImageOptions(), 2)
 

@@ -179,7 +179,7 @@ def test_points_that_a_sensor_delivered() -> None:
     points = np.array([[0.0, -10.0, 100.0], [0.0, 10.0, 110.0]])
     noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])[:, :, None]
     profile = PointProfile(source="profile", points_mm=points)
-    stripe = delivered_points(profile, noise)
+    stripe = replace(delivered_points(profile), noise_mm=noise)
     cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
     placed, covariance = cloud.points_mm, cloud.covariance_mm2
     by = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)

@@ -47,6 +47,7 @@ from armscan.reconstruction.sync import (
     stripes_at_equal_poses,
 )
 from armscan.records.cloud import PointCloud
+from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
 STAGE = "scan"

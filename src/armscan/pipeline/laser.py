@@ -420,22 +420,9 @@ def choose_channel(
     colours each win somewhere. Over a set the laser's line is the one that is long, straight on the
     board, narrow, and on the light sheet on which the boards agree.
 
-    Parameters
-    ----------
-    n_images
-        Photographs with a board.
-    stripes_of
-        The stripes of a photograph in a channel.
-    cameras
-        The cameras.
-    options
-        Of the light sheets.
-
-    Returns
-    -------
-    channel, reason
-        The channel and why it was taken, in words; ``auto`` and an empty reason where no channel
-        shows a straight stripe on a board.
+    ``stripes_of`` gives the stripes of one of ``n_images`` photographs with a board in a channel.
+    With the channel comes why it was taken, in words; ``auto`` and nothing where no channel shows a
+    straight stripe on a board.
     """
     sample = np.unique(np.linspace(0, n_images - 1, min(SAMPLE, n_images)).round().astype(int))
     # The middle one and both ends first: they differ most.
@@ -500,18 +487,8 @@ def _scatter_px(image: BoardImage, rows: IntArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPair:
-    """What an image with the laser on shows, the board perhaps in the one without.
-
-    Parameters
-    ----------
-    source
-        The image with the laser on.
-    board
-        The target, or why it was not found.
-    board_source
-        The image in which it was found.
-    profile
-        All stripe points.
+    """Stripe points of an image with the laser on, and the target found in ``board_source``, or why
+    it was not found.
     """
 
     source: str

@@ -39,19 +39,10 @@ def check_points(
     images: Sequence[BoardImage],
     cameras: HeadCameras,
 ) -> tuple[SheetPointCheck, ...]:
-    """Reconstruct the stripes with the solution and compare them with their boards.
+    """Reconstruct the stripes with a solution of held cameras and compare them with their boards.
 
-    Parameters
-    ----------
-    observations
-        The points used.
-    solution
-        Sheets that belong to the cameras as calibrated.
-    noise_px
-        (N,) scatter of single points; the weights hold the larger one with which they count as
-        independent.
-    images, cameras
-        As the fit had them.
+    ``noise_px`` (N,) is the scatter of the single points used; the solution's weights hold the
+    larger one with which they count as independent.
     """
     case = _Case(observations, solution, noise_px, images, cameras)
     fitted = _Claim(case, solution.normal, is_in_fit=True)

@@ -153,13 +153,8 @@ def stack_observations(
 class CommonErrors:
     """What the boards and the cameras are known to.
 
-    Parameters
-    ----------
-    pose_covariances
-        (6, 6) for each board placement.
-    camera_covariance
-        (P, P) of the cameras' parameters, P = 9 for one camera; rows of parameters that are taken
-        as exact are zero.
+    A covariance (6, 6) of each board placement's pose, and that (P, P) of the cameras' parameters,
+    in which rows of parameters that are taken as exact are zero.
     """
 
     pose_covariances: Sequence[FloatArray]
@@ -191,20 +186,17 @@ def square_matrix_root(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetSolution:
-    """Sheets at the optimum.
+    """S sheets at the optimum, of N points on M boards seen by cameras with P parameters.
 
     Parameters
     ----------
-    sheets
-        S sheets.
     covariance
         (P + 8 S, P + 8 S) of the errors of the cameras, as calibrated, and of these sheets.
     remaining_px
-        (N,) residuals after the boards, and the cameras if free, are moved within their
-        uncertainty.
+        (N,) residuals after boards, and cameras if free, are moved within their uncertainty.
     common
-        (6 M + P,) estimated common errors of M boards and the cameras, in their own sigmas; zero
-        for cameras that are held.
+        (6 M + P,) estimated common errors of boards and cameras, in their own sigmas; zero for
+        cameras that are held.
     chi2
         Weighted squares of ``remaining_px`` plus squares of ``common``.
     last_step_sigma
@@ -214,8 +206,7 @@ class SheetSolution:
     weight
         (N,) of the points, 1/px^2.
     system, normal
-        The linearised residuals at the solution, with boards and camera as measured, and the last
-        normal equations.
+        The residuals, linearised with boards and camera as measured, and the last normal equations.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -404,17 +395,10 @@ class StripeRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StripeSystem:
-    """All residuals with their derivatives.
+    """All residuals (N,), in the image and in space, with their derivatives stripe by stripe.
 
-    Parameters
-    ----------
-    stripes
-        One entry a stripe.
-    n_sheet, n_boards, n_columns
-        Free parameters of all sheets, which come first; boards, with six unknowns each; count of
-        all unknowns.
-    residual_px, height_mm
-        (N,) distance of the points from their sheets, in the image and in space.
+    Of the ``n_columns`` unknowns the ``n_sheet`` free parameters of all sheets come first, then six
+    for each of ``n_boards`` boards.
     """
 
     stripes: tuple[StripeRows, ...]
@@ -517,18 +501,11 @@ def _inverse(matrix: FloatArray, scaled_by: FloatArray) -> FloatArray | None:
 class NormalSolution:
     """Solution of the normal equations of U unknowns that are free and some that are held.
 
-    Parameters
-    ----------
-    step
-        (n_columns,) of the unknowns; zero for those that are held.
-    gain
-        (S, U) the rows of the inverse that belong to the S parameters of the sheets, which come
-        first: their covariance with all that is free. Their step is minus this times the design's
-        weighted transpose times the residuals.
-    follow
-        (S, n_held) how they follow the unknowns that are held.
-    n_board
-        Unknowns of all boards, which come next.
+    ``step`` (n_columns,) is zero for those that are held. ``gain`` (S, U) are the rows of the
+    inverse that belong to the S parameters of the sheets, which come first: their covariance with
+    all that is free; their step is minus this times the design's weighted transpose times the
+    residuals. ``follow`` (S, n_held) is how they follow the unknowns that are held; the ``n_board``
+    unknowns of all boards come next.
     """
 
     step: FloatArray

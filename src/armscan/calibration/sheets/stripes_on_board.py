@@ -163,17 +163,9 @@ def observe_board_stripes(
     Points that an edge beside the stripe may pull are left out. Where nothing else shows a stripe,
     because it runs along the target's pattern, they are used as what they are: less certain.
 
-    Parameters
-    ----------
-    data
-        The image's stripe points and its board.
-    cameras
-        The cameras.
-    margin_mm
-        Points so far outside the rectangle of the target's points count as on the board; what the
-        print covers if None.
-    n_lines
-        Stripes to look for, those with the most points; 0 for all.
+    Points up to ``margin_mm`` outside the rectangle of the target's points count as on the board,
+    those on the print if None. Of ``n_lines`` stripes those with the most points are looked for; 0
+    for all.
     """
     if margin_mm is None:
         margin_mm = printed_margin_mm(data.view)
@@ -290,23 +282,17 @@ def find_straight_stripes(
 
     Parameters
     ----------
-    points_mm
-        (N, 2) points in the board's plane.
-    sigma_mm
-        (N,) standard deviation across the stripe.
-    segment
-        (N,) connected segment of each point.
-    shortest_mm
-        Least length of a stripe.
-    tolerance_mm
-        Half width of a stripe's band.
+    points_mm, sigma_mm, segment
+        (N, 2) points in the board's plane, (N,) their standard deviation across the stripe, and
+        (N,) their connected segment.
+    shortest_mm, tolerance_mm
+        Least length of a stripe, and half the width of its band.
     n_lines
         Most stripes to look for; 0 for all.
 
     Returns
     -------
-    list of (K,) arrays
-        Rows of each stripe's points, ordered along it.
+    Rows (K,) of each stripe's points, ordered along it.
     """
     stripes: list[IntArray] = []
     lines: list[Line] = []

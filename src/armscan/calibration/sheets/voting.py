@@ -59,16 +59,8 @@ SEED = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetVote:
-    """What the boards agreed on.
-
-    Parameters
-    ----------
-    images
-        The images with the stripes that lie on a common sheet; without vote, as they were given.
-    outlying
-        Images whose stripes lie on none, with how far off.
-    warnings
-        What is doubtful about the vote.
+    """What the boards agreed on: the images with the stripes that lie on a common sheet, without
+    vote as they were given, and the outlying ones whose stripes lie on none.
     """
 
     images: tuple[BoardImage, ...]
@@ -115,15 +107,6 @@ def vote_on_sheets(
     behind show lines, too. Images whose one laser is named vote among themselves. Nothing is
     decided where no three boards agree, or where the lines of a fan are coplanar in too many ways:
     their numbering (`armscan.calibration.sheets.fan`) then judges.
-
-    Parameters
-    ----------
-    on_print, around
-        The images with the stripes on the print, and with those on print and carrier.
-    cameras
-        The cameras.
-    options
-        In force.
     """
     images: list[BoardImage] = list(on_print)
     outlying: list[SkippedImage] = []

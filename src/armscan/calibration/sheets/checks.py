@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -80,7 +81,7 @@ def _pooled(parts: Sequence[tuple[int, float]]) -> float:
     return float(np.sqrt(sum(n * rms**2 for n, rms in parts) / count)) if count else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Case:
     """The points used and the solution, as `check_points` has them."""
 
@@ -109,6 +110,7 @@ class _Case:
             found[of] = np.where(is_met, distance, np.nan)
         return found
 
+    @cached_property
     def mm_per_px(self) -> FloatArray:
         """(N,) change of that distance for one pixel of residual.
 
@@ -157,13 +159,12 @@ class _Claim:
 
     def __init__(self, case: _Case, normal: NormalSolution, *, is_in_fit: bool) -> None:
         self._case, self._normal, self._is_in_fit = case, normal, is_in_fit
-        self._mm_per_px = case.mm_per_px()
 
     def distances(self, rows: BoolArray, distance_mm: FloatArray) -> BoardDistances:
         """Figures of the points ``rows`` (N,), with the claims for them."""
         rows = rows & np.isfinite(distance_mm)
         n = int(rows.sum())
-        solution, mm_per_px = self._case.solution, self._mm_per_px
+        solution, mm_per_px = self._case.solution, self._case.mm_per_px
         # The mean: points count with the noise of the weights.
         share = np.where(rows, mm_per_px / n, 0.0)
         pull = solution.system.transposed(share)[None]

@@ -14,7 +14,6 @@ from scipy import stats
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.coplanarity import (
     SheetGeometry,
-    refuse_few_boards,
     refuse_lost_spread,
 )
 from armscan.calibration.sheets.lack_of_fit import (
@@ -98,9 +97,6 @@ def start_sheet(
     name: str, observations: SheetObservations, images: Sequence[BoardImage]
 ) -> LightSheet | FitFailure:
     """Total least squares plane of one sheet's points; refused where they are one line."""
-    few = refuse_few_boards(name, len(np.unique(observations.board)))
-    if few is not None:
-        return few
     plane = fit_plane(observations.points_mm)
     if isinstance(plane, FitFailure):
         return FitFailure(f"sheet {name}: {plane.reason}", plane.remedy)

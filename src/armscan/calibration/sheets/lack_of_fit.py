@@ -21,7 +21,6 @@ from armscan.calibration.sheets.solve import (
     SheetObservations,
     SheetSolution,
     solve_sheets,
-    square_matrix_root,
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -186,7 +185,7 @@ def board_scatter(
     by_pose = np.einsum("ni,nij->nj", by_point, observations.dpoint_dpose)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
     moved = solution.common[len(solution.common) - errors.n_camera :]
-    residual = residual + by_camera @ (square_matrix_root(errors.camera_covariance) @ moved)
+    residual = residual + by_camera @ (errors.camera_root @ moved)
     stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
     n = BOARD_SHAPES * len(stripes)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
@@ -197,7 +196,7 @@ def board_scatter(
         weighted = design / (stripe.sigma_px * noise.sigma_factor)[:, None] ** 2
         covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
         gain = covariance @ weighted.T
-        root = square_matrix_root(errors.pose_covariances[int(stripe.board[0])])
+        root = errors.pose_roots[int(stripe.board[0])]
         log_likelihood += _log_likelihood(
             gain @ (lost * residual[of]), covariance, gain @ by_pose[of] @ root
         )

@@ -17,9 +17,10 @@ from uuid import uuid4
 
 from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
 from armscan.errors import OptionError, OutputError
-from armscan.jobs.camera import CameraRequest, run_camera_calibration
-from armscan.jobs.reconstruct import CloudRequest, run_reconstruction
-from armscan.jobs.sheets import LaserRequest, run_laser_calibration
+from armscan.jobs.cameras import calibrate_camera
+from armscan.jobs.job import Job
+from armscan.jobs.reconstruct import StillPaths, reconstruct
+from armscan.jobs.sheets import SheetImages, calibrate_sheets
 from armscan.models.calibration import CameraCalibration, Provenance, ScannerCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.head_demo import (
@@ -49,7 +50,17 @@ from armscan.report.demo_comparison import (
     three_heads_table,
 )
 from armscan.report.page import footer, render_page
-from armscan.report.quantity import Summary, Table, sentence, significant, summary_json, with_sigma
+from armscan.report.quantity import (
+    Quantity,
+    Summary,
+    Table,
+    fact,
+    sentence,
+    significant,
+    summary_json,
+    values,
+    with_sigma,
+)
 from armscan.storage.atomic import write_files
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import (
@@ -454,7 +465,7 @@ def _summary(
     return Summary(
         title=f"Demo on a simulated {KINDS[request.head]} arm scanner: calibrated, used, compared "
         "with its truth",
-        facts=(("time", f"{sum(head['seconds'].values()):.0f} s"),),
+        quantities=(fact("time", f"{sum(head['seconds'].values()):.0f} s"),),
         tables=(
             comparison_table(head, request.head),
             truth_table(demo, head),
@@ -523,7 +534,6 @@ def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Su
     first = summary.data
     result = Summary(
         title="Demo of three simulated heads on the same scenes",
-        facts=(),
         tables=(three_heads_table(heads),),
         warnings=tuple(warnings),
         written=_three_heads_job_written(folder),
@@ -596,44 +606,36 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
     check_demo_folder(folder, DEMO_JOB_OWN_NAMES, photos / "camera")
     seconds: dict[str, float] = {}
     truth = _timed(seconds, "render", lambda: render_photos(photos, request.seed, progress))
-    camera = CameraRequest(
-        images=(str(photos / "camera"),),
-        target=truth.target,
-        output=folder / "camera.json",
-        is_overwriting=True,
-        command=("armscan", "demo", "photos", "-o", folder.as_posix()),
-    )
-    laser = LaserRequest(
-        camera=camera.output,
-        on=(str(photos / "laser" / "on"),),
-        off=(str(photos / "laser" / "off"),),
-        target=truth.target,
-        output=folder / "sensor.json",
-        is_overwriting=True,
-        command=camera.command,
-    )
-    cloud = CloudRequest(
-        sensor=laser.output,
-        images=(str(photos / "object" / "laser.png"),),
-        background=(str(photos / "object" / "background.png"),),
-        output=folder / "cloud.ply",
-        is_overwriting=True,
-        command=camera.command,
+    command = ("armscan", "demo", "photos", "-o", folder.as_posix())
+    camera, sensor, cloud = (folder / name for name in ("camera.json", "sensor.json", "cloud.ply"))
+
+    def writing(output: Path) -> Job:
+        return Job(output, is_overwriting=True, command=command, progress=progress)
+
+    board = SheetImages((str(photos / "laser" / "on"),), (str(photos / "laser" / "off"),))
+    stills = StillPaths(
+        (str(photos / "object" / "laser.png"),), (str(photos / "object" / "background.png"),)
     )
     stages = (
-        _timed(seconds, "calibrate_camera", lambda: run_camera_calibration(camera, progress)),
-        _timed(seconds, "calibrate_laser", lambda: run_laser_calibration(laser, progress)),
-        _timed(seconds, "reconstruct", lambda: run_reconstruction(cloud, progress)),
+        _timed(
+            seconds,
+            "calibrate_camera",
+            lambda: calibrate_camera(writing(camera), truth.target, (str(photos / "camera"),)),
+        ),
+        _timed(
+            seconds,
+            "calibrate_laser",
+            lambda: calibrate_sheets(writing(sensor), camera, truth.target, board),
+        ),
+        _timed(seconds, "reconstruct", lambda: reconstruct(writing(cloud), sensor, stills)),
     )
-    errors = compare_with_truth(
-        read_sensor_calibration(laser.output), read_ply(cloud.output), truth
-    )
+    errors = compare_with_truth(read_sensor_calibration(sensor), read_ply(cloud), truth)
     names = ("camera", "laser", "points")
     data = _data(request.seed, dict(zip(names, stages, strict=True)), errors, seconds)
     result = folder / "summary.json"
     summary = Summary(
         title="Demo on simulated photographs: camera, light sheet and points against their truth",
-        facts=_facts(errors),
+        quantities=_facts(errors),
         tables=(_commands(photos, folder, truth.target),),
         warnings=tuple(warning for stage in stages for warning in stage.warnings),
         written=(photos, *(path for stage in stages for path in stage.written), result),
@@ -652,24 +654,24 @@ def _timed(seconds: dict[str, float], stage: str, work: Callable[[], T]) -> T:
     return result
 
 
-def _facts(errors: PhotoErrors) -> tuple[tuple[str, str], ...]:
+def _facts(errors: PhotoErrors) -> tuple[Quantity, ...]:
     sheet = errors.sheet
     return (
-        (
+        fact(
             "camera",
             f"error of the focal length {with_sigma(errors.focal_px, errors.focal_sigma_px, 'px')}",
         ),
-        (
+        fact(
             "light sheet",
             f"{significant(sheet.angle_deg)} deg and {significant(abs(sheet.offset_mm))} mm off, "
             f"{significant(sheet.rms_mm)} mm rms over the boards",
         ),
-        (
+        fact(
             "object",
             f"{errors.n_on_object} points, {significant(errors.points_median_mm)} mm median and "
             f"{significant(errors.points_rms_mm)} mm rms from its true surface",
         ),
-        (
+        fact(
             "in sigmas",
             f"camera {errors.camera_normalised:.1f} ({errors.n_camera_parameters**0.5:.1f} is "
             f"usual for {errors.n_camera_parameters} numbers), sheet {sheet.normalised:.1f} "
@@ -700,7 +702,7 @@ def _data(
         "simulated": True,
         "seed": seed,
         "preset": "photos",
-        **{name: dict(stage.data) for name, stage in stages.items()},
+        **{name: {**values(stage.quantities), **stage.data} for name, stage in stages.items()},
         "errors": asdict(errors),
         "seconds": dict(seconds),
     }

@@ -20,16 +20,16 @@ from armscan.report import cloud as cloud_figures
 from armscan.report import hand_eye as hand_eye_charts
 from armscan.report.drawing import Marks, photo_markup
 from armscan.report.hand_eye import (
-    hand_eye_facts,
     hand_eye_numbers,
+    hand_eye_quantities,
     posture_scene,
     posture_table,
     total_covariance,
 )
 from armscan.report.inspect import deviation_histogram, deviation_view, height_histogram, share_text
-from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
-from armscan.report.quantity import Table, sentence, significant
-from armscan.report.stripes import sheet_colour
+from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text
+from armscan.report.photographs import sheet_colour
+from armscan.report.quantity import Quantity, Table, fact, for_people, sentence, significant
 
 FRACTION_RULE = (
     "rms and shares count every measured point of the feature (up to 1 mm from it), those that its "
@@ -506,7 +506,7 @@ def head_demo_page(
             Section(
                 "Where the sensor sits on the arm",
                 (
-                    Facts(hand_eye_facts(scanner)),
+                    Facts(for_people(hand_eye_quantities(scanner))),
                     Gallery((posture_scene(fit, demo.instrument.hand_eye.stripes),), 560),
                     Gallery(hand_eye_pictures(demo), 700),
                     posture_table(fit),
@@ -542,34 +542,34 @@ def _rule_text() -> str:
     )
 
 
-def _cards(head: Mapping[str, Any]) -> tuple[Card, ...]:
+def _cards(head: Mapping[str, Any]) -> tuple[Quantity, ...]:
     plate, ball, hand_eye = head["plate"], head["sphere"], head["hand_eye"]
     still = next(step for step in head["steps"] if step["frame"] == "Sensor")
     return (
-        Card(
+        fact(
             "Plate",
             f"{within_text(plate)} within 0.05 mm",
             f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
-        Card(
+        fact(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
             f"error of the diameter, sigma {1000.0 * ball['diameter_sigma_mm']:.1f} µm; "
             f"{within_text(ball)} within 0.05 mm",
         ),
-        Card(
+        fact(
             "Step, one exposure",
             f"{1000.0 * (still['mean_mm'] - still['nominal_mm']):+.1f} µm",
             f"error of {still['nominal_mm']:g} mm; std {1000.0 * still['std_mm']:.1f} µm",
         ),
-        Card(
+        fact(
             "Hand-eye",
             f"{1000.0 * hand_eye['translation_error_mm']:.0f} µm, "
             f"{hand_eye['rotation_error_deg']:.3f}°",
             f"off; expected {1000.0 * hand_eye['sigma_translation_mm']:.0f} µm, "
             f"{hand_eye['sigma_rotation_deg']:.3f}°",
         ),
-        Card(
+        fact(
             "Free-form part",
             f"{1000.0 * head['part']['rms_mm']:.1f} µm rms",
             f"{within_text(head['part'])} within 0.05 mm of the truth",

@@ -15,9 +15,9 @@ from armscan.pipeline.head_demo import HeadDemo
 from armscan.records.cloud import PointCloud
 from armscan.report.inspect import deviation_histogram, share_text
 from armscan.report.page import Gallery, Page, Picture, Section, Text
+from armscan.report.photographs import sheet_colour
 from armscan.report.quantity import Table
 from armscan.report.scene3d import SceneDots, scene_markup, uniform_dots
-from armscan.report.stripes import sheet_colour
 
 FRAMES_A_SECOND = 80
 """Of the thesis's cameras (5.3.1)."""

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from armscan.report.stripes import FLAG_COLOURS
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
@@ -24,7 +25,6 @@ from armscan.report.camera import ARROW_SHARE, camera_page, residual_magnificati
 from armscan.report.page import render_page
 from armscan.report.quantity import with_sigma
 from armscan.report.sheets import USE_COLOURS, lack_of_fit_text, laser_page
-from armscan.report.stripes import FLAG_COLOURS
 from camera_scene import Scene, make_views
 from sheet_rig import PROVENANCE, thesis_rig
 

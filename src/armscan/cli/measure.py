@@ -1,0 +1,470 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan demo``, ``simulate``, ``probe``, ``reconstruct``, ``markers`` and ``register``."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, cast
+
+import typer
+
+from armscan.cli.options import (
+    ArmFile,
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    DefaultOf,
+    Force,
+    LaserColourOption,
+    Side,
+    StripeMethodOption,
+    given,
+    progress_bar,
+    run,
+    show,
+)
+
+DEMO_EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
+SIMULATE_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan simulate thesis-single camera -o board\n"
+    "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
+    "  armscan simulate thesis-multi markers -o markers"
+)
+PROBE_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan probe touches/ -o plate.csv\n"
+    "  armscan probe centres.csv --side +x -o plate.csv"
+)
+RECONSTRUCT_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
+    "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
+    "      --sheet A -o cloud.ply\n"
+    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply"
+)
+MARKERS_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan markers 'photos/*.png' -o rings.html\n"
+    "  armscan markers left.png right.png --stereo stereo.json --diameter 6 -o markers.csv"
+)
+REGISTER_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan register views/view1.csv views/view2.csv views/view3.csv -o joined\n"
+    "  armscan register before.csv --moved after.csv --cloud after.ply -o joined"
+)
+RINGS = "armscan.vision.rings:RingOptions."
+
+
+class DemoScene(StrEnum):
+    """What can be shown."""
+
+    SINGLE = "single"
+    CROSS = "cross"
+    MULTI = "multi"
+    ALL = "all"
+    PHOTOS = "photos"
+
+
+class Scene(StrEnum):
+    """What the head looks at."""
+
+    CAMERA = "camera"
+    LASER = "laser"
+    HAND_EYE = "hand-eye"
+    PLATE = "plate"
+    BALL = "ball"
+    STEPS = "steps"
+    STILL_STEP = "still-step"
+    PART = "part"
+    WAVES = "waves"
+    MARKERS = "markers"
+    MARKERS_MOVED = "markers-moved"
+    PROBING = "probing"
+
+
+class PresetName(StrEnum):
+    """How good the instrument is."""
+
+    CLEAN = "clean"
+    THESIS = "thesis"
+    HARSH = "harsh"
+
+
+def demo(
+    scene: Annotated[
+        DemoScene,
+        typer.Argument(
+            help="single, cross, multi: a scanner of one, two crossed or eleven lines on a "
+            "measuring arm, with plate, ball, blocks and part; all: the three beside each other; "
+            "photos: a camera, a line laser, a board and a bust."
+        ),
+    ] = DemoScene.SINGLE,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for images, results and pages.")
+    ] = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+    preset: Annotated[
+        str, typer.Option(help="Of the arm scanner: clean, thesis or harsh.")
+    ] = "thesis",
+    as_json: AsJson = False,
+) -> None:
+    """Render images, calibrate from them, measure things, and state the errors."""
+    from armscan.devices.sources import Preset
+    from armscan.jobs.demo import (
+        DemoRequest,
+        HeadDemoRequest,
+        run_head_demo,
+        run_photo_demo,
+        run_three_heads,
+    )
+
+    with progress_bar() as progress:
+        if scene is DemoScene.PHOTOS:
+            summary = run_photo_demo(DemoRequest(output, seed), progress)
+        elif scene is DemoScene.ALL:
+            request = HeadDemoRequest(output, seed=seed, preset=cast(Preset, preset))
+            summary = run_three_heads(request, progress)
+        else:
+            head = f"thesis-{scene.value}"
+            request = HeadDemoRequest(output, head, seed, cast(Preset, preset))
+            summary = run_head_demo(request, progress)
+    show(summary, as_json=as_json)
+
+
+def simulate(
+    head: Annotated[
+        str,
+        typer.Argument(
+            help="The head: thesis-single, thesis-cross, thesis-multi (11 lines, two cameras) or "
+            "thesis-multi-5.",
+            show_default=False,
+        ),
+    ],
+    scene: Annotated[Scene, typer.Argument(help="What it looks at.", show_default=False)],
+    *,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--output", help="Folder of the recording; new or empty.", show_default=False
+        ),
+    ],
+    preset: Annotated[
+        PresetName, typer.Option(help="How good the instrument, how kind the surroundings.")
+    ] = PresetName.THESIS,
+    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+    processes: Annotated[
+        int, typer.Option(min=1, max=64, help="Processes that render; few images take one.")
+    ] = 2,
+    as_json: AsJson = False,
+) -> None:
+    """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
+
+    Scenes: camera and laser are images of a target for the head's calibration; hand-eye is the
+    plate from many postures; plate, ball, steps, part and waves are scans by hand; still-step is
+    one exposure; markers is a part with ring markers, place by place, and markers-moved the same
+    part after the arm was put down elsewhere; probing is the plate touched with a tip.
+    """
+    from armscan.jobs.simulate import SimulateRequest, run_simulation
+    from armscan.pipeline.simulate import SimulateOptions
+
+    options = SimulateOptions(preset.value, seed, processes)
+    with progress_bar() as progress:
+        summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
+    show(summary, as_json=as_json)
+
+
+def probe(
+    touches: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with arm.csv (a row a touch) and probe.toml; or a table of points.",
+            show_default=False,
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Points on the surface, a CSV table.", show_default=False
+        ),
+    ] = None,
+    side: Annotated[
+        Side | None,
+        typer.Option(
+            help="Axis that the plate's face looks along; default: to where the tool was.",
+            show_default=False,
+        ),
+    ] = None,
+    probe: Annotated[
+        Path | None,
+        typer.Option(help="The tip, if it is not probe.toml of the folder.", show_default=False),
+    ] = None,
+    feature: Annotated[
+        str, typer.Option(help="Feature to use, where the table names several.", show_default=False)
+    ] = "",
+    leave_out: Annotated[
+        bool, typer.Option("--leave-out", help="Leave out touches that do not fit the others.")
+    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit the plane of a plate to touches; the tip's radius is taken off on the side of the probe.
+
+    A touch that does not fit the others is named. In probe.toml: centre_tool_mm = [x, y, z] and
+    tip_diameter_mm = 6.0. A table of tip centres says so in its first line:
+    # point = tip-centre, tip_diameter_mm = 6
+    """
+    from armscan.calibration.hand_eye.probed_plate import ProbingOptions
+    from armscan.jobs.probe import probe as probe_plate
+
+    options = ProbingOptions(
+        side=None if side is None else side.value, leave_out_outliers=leave_out, feature=feature
+    )
+    run(
+        lambda job: probe_plate(job, touches, probe, options),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def reconstruct(
+    *,
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            help="A recording's folder; or images with the laser on: files, folders, patterns.",
+            show_default=False,
+        ),
+    ],
+    sensor: Annotated[
+        Path,
+        typer.Option(
+            "--sensor",
+            "--scanner",
+            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
+            "the Sensor frame.",
+            show_default=False,
+        ),
+    ],
+    background: Annotated[
+        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
+    ] = None,
+    right: Annotated[
+        list[str] | None,
+        typer.Option(help="Right camera's images of the same instants; of a stereo head."),
+    ] = None,
+    right_background: Annotated[
+        list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
+    ] = None,
+    sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
+    depth_margin: Annotated[
+        float | None,
+        typer.Option(
+            help="Widen the calibrated depth range by this part of its width at either end; "
+            "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
+            "extrapolated.",
+            show_default=False,
+        ),
+    ] = None,
+    volume: Annotated[
+        str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
+    ] = "",
+    arm: ArmFile = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
+    ] = Path("cloud.ply"),
+    stripe_method: StripeMethodOption = None,
+    laser_colour: LaserColourOption = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure points from a recording of a scan, or from images of laser lines on objects."""
+    from armscan.jobs.reconstruct import StillPaths
+    from armscan.jobs.reconstruct import reconstruct as reconstruct_points
+    from armscan.pipeline.measure import MeasureOptions
+    from armscan.reconstruction.label_single import DepthRange
+    from armscan.storage.images import ImageOptions
+    from armscan.vision.stripe.image import StripeOptions
+
+    paths = StillPaths(
+        tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
+    )
+    options = MeasureOptions(
+        stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
+        depths=None if depth_margin is None else DepthRange(depth_margin),
+        sheet=sheet,
+    )
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    run(
+        lambda job: reconstruct_points(
+            job, sensor, paths, volume=volume, arm=arm, options=options, image_options=pixels
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def markers(
+    *,
+    images: Annotated[
+        list[str],
+        typer.Argument(
+            help="Image files, folders, or quoted patterns; with --stereo the left one, then the "
+            "right.",
+            show_default=False,
+        ),
+    ],
+    stereo: Annotated[
+        Path | None, typer.Option(help="Calibration of two cameras: match and triangulate.")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Page NAME.html; with --stereo the table NAME.csv and a page."
+        ),
+    ] = None,
+    diameter: Annotated[
+        float | None, typer.Option(help="Outer diameter of the markers, mm; with --stereo.")
+    ] = None,
+    depth: Annotated[
+        str, typer.Option(help="Nearest and farthest depth NEAR:FAR, mm; with --stereo.")
+    ] = "",
+    min_perimeter: Annotated[
+        float | None,
+        typer.Option(
+            help="Of the outer rim, untilted, px.",
+            show_default=DefaultOf(RINGS + "min_perimeter_px"),
+        ),
+    ] = None,
+    max_perimeter: Annotated[
+        float | None,
+        typer.Option(
+            help="Of the outer rim, untilted, px.",
+            show_default=DefaultOf(RINGS + "max_perimeter_px"),
+        ),
+    ] = None,
+    max_roundness: Annotated[
+        float | None,
+        typer.Option(
+            help="Long over short axis; 1.7 is a tilt of 54 degrees.",
+            show_default=DefaultOf(RINGS + "max_roundness"),
+        ),
+    ] = None,
+    disc: Annotated[
+        str | None,
+        typer.Option(
+            help="light (in a dark ring) or dark.", show_default=DefaultOf(RINGS + "disc")
+        ),
+    ] = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find ring markers in images; with two calibrated cameras, where they are."""
+    from armscan.jobs.markers import find_markers, measure_markers
+    from armscan.markers.candidates import RingMatchOptions, parse_depth
+    from armscan.storage.images import ImageOptions
+    from armscan.vision.rings import RingOptions
+
+    rings = given(
+        RingOptions,
+        min_perimeter_px=min_perimeter,
+        max_perimeter_px=max_perimeter,
+        max_roundness=max_roundness,
+        disc=disc,
+    )
+    depth_mm = parse_depth(depth) if depth else None
+    matching = given(RingMatchOptions, depth_mm=depth_mm, diameter_mm=diameter)
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    run(
+        lambda job: (
+            find_markers(job, images, rings=rings, image_options=pixels)
+            if stereo is None
+            else measure_markers(
+                job, images, stereo, rings=rings, matching=matching, image_options=pixels
+            )
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def register(
+    lists: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Lists of markers, x_mm,y_mm,z_mm[,id,cov...]: one for each view; with --moved "
+            "the one of the old place. The cloud of view1.csv is view1.ply beside it.",
+            show_default=False,
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="New folder for clouds, registration.json and page."),
+    ] = Path("registered"),
+    moved: Annotated[
+        Path | None,
+        typer.Option(
+            help="The arm was moved: markers measured from its new place.", show_default=False
+        ),
+    ] = None,
+    cloud: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Cloud measured from the new place; repeatable. Without it, the cloud beside "
+            "the list.",
+            show_default=False,
+        ),
+    ] = None,
+    sigma_mm: Annotated[
+        float | None,
+        typer.Option(
+            "--sigma-mm",
+            help="Standard deviation an axis of markers listed without covariance.",
+            show_default=DefaultOf("armscan.pipeline.register:RegisterOptions.sigma_mm"),
+        ),
+    ] = None,
+    least_common: Annotated[
+        int | None,
+        typer.Option(
+            "--least-common",
+            help="Markers that two lists must share, 4 or more.",
+            show_default=DefaultOf("armscan.markers.alignments:MarkerMatchOptions.least_common"),
+        ),
+    ] = None,
+    by_id: Annotated[
+        bool,
+        typer.Option("--by-id", help="With --moved: equal ids in both lists are one marker."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Join scans by markers: views of a handheld scanner, or an arm that moved to a new place.
+
+    Markers carry no numbers: they are recognised by their distances, and what fits in more than
+    one way is refused. Views are joined in the frame of the first one; an arm that moved goes on
+    in its old frame.
+    """
+    from armscan.jobs.register import register as register_scans
+    from armscan.markers.alignments import MarkerMatchOptions
+    from armscan.pipeline.register import RegisterOptions
+
+    options = given(
+        RegisterOptions,
+        match=given(MarkerMatchOptions, least_common=least_common),
+        sigma_mm=sigma_mm,
+        is_by_id=by_id,
+    )
+    run(
+        lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options),
+        as_json=as_json,
+        output=output,
+    )

@@ -98,6 +98,7 @@ def listing(workspace: Path) -> dict[Path, tuple[int, int]]:
 def run_group(name: str, root: Path) -> dict[str, Tree]:
     workspace = root / name
     shutil.copytree(INPUTS, workspace)
+    shutil.copytree(HERE / "old", workspace / "old")
     prepare(workspace)
     results: dict[str, Tree] = {}
     with contextlib.chdir(workspace):
@@ -161,14 +162,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("what", choices=["compare", "make", "make-inputs"])
     parser.add_argument("--only", action="append", choices=sorted(GROUPS), help="group; repeatable")
     parser.add_argument(
-        "--sigma", action="store_true", help="another machine: 1e-2 sigma, else 1e-6"
+        "--sigma",
+        type=float,
+        nargs="?",
+        const=1e-2,
+        metavar="PART",
+        help="another machine: this part of each value's sigma (1e-2), else 1e-6 of it",
     )
     parser.add_argument("--no-warnings", action="store_true", help="leave prose differences out")
     options = parser.parse_args(arguments)
     if options.what == "make-inputs":
         make_documents()
         return 0
-    limits = Limits(1e-6, 1e-2) if options.sigma else Limits()
+    limits = Limits(1e-6, options.sigma) if options.sigma else Limits()
     n_wrong = 0
     start = time.perf_counter()
     with tempfile.TemporaryDirectory() as temporary:

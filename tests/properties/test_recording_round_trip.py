@@ -26,8 +26,7 @@ from armscan.records.recording import (
     PoseForm,
     Session,
 )
-from armscan.storage.recording import FolderRecording, read_recording
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import FolderRecording, read_recording, write_recording
 from recording_folders import MemoryScan
 
 ARM = thesis_arm((300, 400, 300, 100), (20, 30, 20))

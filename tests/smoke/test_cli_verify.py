@@ -15,7 +15,7 @@ import scan_fake
 from armscan.cli.run import main
 from armscan.geometry.poses import Pose
 from armscan.storage.documents import scanner_document
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import write_recording
 
 SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.015, 0.015, 0.015])
 

@@ -7,7 +7,8 @@ import pytest
 
 from armscan.errors import FileFormatError, InputError
 from armscan.models.camera import CameraModel
-from armscan.storage.foreign import camera_info_yaml, read_foreign_camera
+from armscan.storage.documents import read_foreign_camera
+from armscan.storage.foreign import camera_info_yaml
 
 CAMERA = CameraModel(
     fx_px=1430.123456789,

@@ -67,20 +67,16 @@ def plane(
     as_json: AsJson = False,
 ) -> None:
     """Distances of points to a plane: fitted to them, and nominal if one is given."""
+    from armscan.calibration.hand_eye.probed_plate import ProbeSide
     from armscan.inspection.selection import InspectionOptions
     from armscan.jobs.inspect import inspect_plane
 
     box = numbers(region, "--region")
     options = given(InspectionOptions, feature_mm=feature_mm)
+    axis: ProbeSide | None = None if side is None else side.value
     run(
         lambda job: inspect_plane(
-            job,
-            cloud,
-            plane=plane,
-            plate=plate,
-            side=None if side is None else side.value,
-            region=box,
-            options=options,
+            job, cloud, plane=plane, plate=plate, side=axis, region=box, options=options
         ),
         as_json=as_json,
         output=output,

@@ -17,7 +17,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import PlaneInspection, SphereInspection
-from armscan.inspection.selection import InspectionOptions
+from armscan.inspection.selection import KEPT_BAND_MM
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.uncertainty import exposure_blocks
 from armscan.records.cloud import PointCloud
@@ -353,7 +353,6 @@ def check_exposures_off(
     cloud: PointCloud,
     found: SphereInspection | PlaneInspection,
     within: BoolArray,
-    options: InspectionOptions,
 ) -> Check | None:
     """Count exposures that show the standard somewhere else than the fit has it.
 
@@ -365,8 +364,6 @@ def check_exposures_off(
         The fit.
     within
         (N,) points in the region that was asked for.
-    options
-        Those of the fit.
 
     Returns
     -------
@@ -387,7 +384,7 @@ def check_exposures_off(
         if int(own.sum()) < MIN_EXPOSURE_POINTS:
             continue
         judged.add(number)
-        limit = max(options.kept_band_mm, OFF_SIGMAS * float(np.sqrt(np.mean(variance[own]))))
+        limit = max(KEPT_BAND_MM, OFF_SIGMAS * float(np.sqrt(np.mean(variance[own]))))
         if abs(float(np.median(near.distance_mm[own]))) > limit:
             off.add(number)
     if isinstance(found, SphereInspection):

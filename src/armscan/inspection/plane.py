@@ -18,11 +18,13 @@ from armscan.inspection.results import (
 )
 from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
+    MIN_POINTS,
+    OUTLIER_RULE,
+    SEARCH_BAND_MM,
     InspectionOptions,
     Selection,
     dominant_flat,
     fit_robustly,
-    outlier_rule,
     select,
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
@@ -58,42 +60,36 @@ def inspect_plane(
     InputError
         If there are too few points.
     """
-    options = options or InspectionOptions()
-    selection = select(cloud, region, options, options.min_points)
+    selection = select(cloud, region, options)
     points = selection.points_mm
     middle = points.mean(axis=0)
-    start = reference if reference is not None else _search(points, middle, options)
+    start = reference if reference is not None else _search(points, middle)
     if isinstance(start, FitFailure):
         return start
-    is_near = np.abs(start.distance_mm(points)) <= options.feature_mm
-    if int(is_near.sum()) < options.min_points:
+    is_near = np.abs(start.distance_mm(points)) <= selection.feature_mm
+    if int(is_near.sum()) < MIN_POINTS:
         return FitFailure(
-            f"{int(is_near.sum())} of {len(points)} points lie within {options.feature_mm:g} mm of "
-            f"{reference_text}; the nearest is {_nearest(start, points):.3g} mm away",
+            f"{int(is_near.sum())} of {len(points)} points lie within {selection.feature_mm:g} mm "
+            f"of {reference_text}; the nearest is "
+            f"{np.abs(start.distance_mm(points)).min():.3g} mm away",
             "check the plane, its frame and its unit (mm), or widen --feature-mm",
         )
     feature = selection.rows[is_near]
     return _inspected(selection, feature, start, reference, reference_text)
 
 
-def _search(
-    points: FloatArray, middle: FloatArray, options: InspectionOptions
-) -> Plane | FitFailure:
-    normal = dominant_flat(points - middle, options.search_band_mm)
+def _search(points: FloatArray, middle: FloatArray) -> Plane | FitFailure:
+    normal = dominant_flat(points - middle)
     if isinstance(normal, FitFailure):
         return normal
     heights = (points - middle) @ normal
     # the densest bin: a median would fall between two faces
-    edges = np.arange(heights.min(), heights.max() + 2 * options.search_band_mm, 0.1)
+    edges = np.arange(heights.min(), heights.max() + 2 * SEARCH_BAND_MM, 0.1)
     counts = np.histogram(heights, edges)[0]
     height = float(edges[int(counts.argmax())]) + 0.05
-    near = points[np.abs(heights - height) <= options.search_band_mm]
+    near = points[np.abs(heights - height) <= SEARCH_BAND_MM]
     fit = fit_plane(near)
     return fit if isinstance(fit, FitFailure) else fit.value
-
-
-def _nearest(plane: Plane, points: FloatArray) -> float:
-    return float(np.abs(plane.distance_mm(points)).min())
 
 
 def _inspected(
@@ -103,32 +99,35 @@ def _inspected(
     reference: Plane | None,
     reference_text: str,
 ) -> PlaneInspection | FitFailure:
-    cloud, options = selection.cloud, selection.options
+    cloud, band = selection.cloud, f"within {selection.feature_mm:g} mm"
     points = cloud.points_mm[feature]
-    fit = fit_robustly(points, start, _plane, Plane.distance_mm, options)
+    fit = fit_robustly(points, start, fit_plane)
     if isinstance(fit, FitFailure):
         return fit
     plane, is_fitted = fit
-    near = np.abs(plane.distance_mm(points)) <= options.search_band_mm
+    near = np.abs(plane.distance_mm(points)) <= SEARCH_BAND_MM
     if reference is None and float(near.mean()) < LEAST_CONCENTRATION:
         return FitFailure(
             f"there is no flat face: at the best place for one, only {int(near.sum())} of "
-            f"{len(near)} points within {options.feature_mm:g} mm of its plane lie within "
-            f"{options.search_band_mm:g} mm",
+            f"{len(near)} points {band} of its plane lie within "
+            f"{SEARCH_BAND_MM:g} mm",
             "show where the face is with --region, or give the plane it should be",
         )
-    towards = start if reference is not None else _towards_sensor(cloud, feature, plane)
-    plane = _facing(plane, towards)
+    if reference is not None:
+        plane = _facing(plane, start.normal)
+    elif cloud.normals is not None:
+        # to the side that was scanned, where the cloud knows it
+        plane = _facing(plane, cloud.normals[feature].mean(axis=0))
     near_text = reference_text if reference is not None else "the face that most points lie near"
     counts = PointCounts(
         n_given=len(cloud),
         n_region=len(selection.rows),
         n_feature=len(feature),
         n_fitted=int(is_fitted.sum()),
-        feature_rule=f"points within {options.feature_mm:g} mm of {near_text}",
-        fit_rule=outlier_rule(options),
+        feature_rule=f"points {band} of {near_text}",
+        fit_rule=OUTLIER_RULE,
     )
-    text = f"all {len(feature)} points within {options.feature_mm:g} mm of {near_text}"
+    text = f"all {len(feature)} points {band} of {near_text}"
     fitted = describe_deviations(
         plane.distance_mm(points), "fitted", "the least-squares plane of these points", text
     )
@@ -141,29 +140,22 @@ def _inspected(
         sine = np.linalg.norm(np.cross(plane.normal, reference.normal))
         tilt = 1000.0 * math.asin(min(1.0, float(sine)))
     return PlaneInspection(
-        plane, reference, feature, is_fitted, counts, fitted, nominal, offset, tilt
+        plane=plane,
+        reference=reference,
+        rows=feature,
+        is_fitted=is_fitted,
+        counts=counts,
+        fitted=fitted,
+        nominal=nominal,
+        offset=offset,
+        tilt_mrad=tilt,
     )
 
 
-def _plane(points: FloatArray) -> Plane | FitFailure:
-    fit = fit_plane(points)
-    return fit if isinstance(fit, FitFailure) else fit.value
-
-
-def _towards_sensor(cloud: PointCloud, feature: IntArray, plane: Plane) -> Plane:
-    """The fitted plane with its normal to the side that was scanned, where the cloud knows it."""
-    if cloud.normals is None:
+def _facing(plane: Plane, towards: FloatArray) -> Plane:
+    """The plane with its normal to the side of ``towards`` (3,)."""
+    if float(towards @ plane.normal) >= 0.0:
         return plane
-    return (
-        plane if float(cloud.normals[feature].mean(axis=0) @ plane.normal) >= 0 else _turned(plane)
-    )
-
-
-def _facing(plane: Plane, towards: Plane) -> Plane:
-    return plane if float(plane.normal @ towards.normal) >= 0.0 else _turned(plane)
-
-
-def _turned(plane: Plane) -> Plane:
     return Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
 
 

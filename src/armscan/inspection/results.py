@@ -12,7 +12,15 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bools,
+    floats,
+    ints,
+)
 from armscan.geometry.shapes import Plane, Sphere
 
 ReferenceKind = Literal["nominal", "fitted"]
@@ -48,8 +56,7 @@ class Statistic:
     definition: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Deviations:
+class Deviations(ArrayRecord):
     """Deviations of points from one reference.
 
     Parameters
@@ -67,12 +74,8 @@ class Deviations:
     reference: ReferenceKind
     reference_text: str
     points_text: str
-    deviations_mm: FloatArray
+    deviations_mm: FloatArray = floats(None)
     statistics: tuple[Statistic, ...]
-
-    def __post_init__(self) -> None:
-        values = frozen_floats(self.deviations_mm, (None,), "deviations_mm")
-        object.__setattr__(self, "deviations_mm", values)
 
     def value(self, key: str) -> float:
         """Value of one statistic; KeyError if there is none of that name."""
@@ -141,8 +144,7 @@ class MeasuredLength:
         return max(known, default=math.nan)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneInspection:
+class PlaneInspection(ArrayRecord):
     """A flat face.
 
     Parameters
@@ -169,20 +171,16 @@ class PlaneInspection:
 
     plane: Plane
     reference: Plane | None
-    rows: IntArray
-    is_fitted: BoolArray
+    rows: IntArray = ints("N")
+    is_fitted: BoolArray = bools("N")
     counts: PointCounts
     fitted: Deviations
     nominal: Deviations | None
     offset: MeasuredLength | None
     tilt_mrad: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rows", frozen_ints(self.rows, (None,), "rows"))
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SphereInspection:
+class SphereInspection(ArrayRecord):
     """A ball.
 
     Parameters
@@ -207,19 +205,15 @@ class SphereInspection:
     sphere: Sphere
     nominal_diameter_mm: float
     diameter: MeasuredLength
-    rows: IntArray
-    is_fitted: BoolArray
+    rows: IntArray = ints("N")
+    is_fitted: BoolArray = bools("N")
     counts: PointCounts
     fitted: Deviations
     nominal: Deviations
     seen_cap_deg: float
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rows", frozen_ints(self.rows, (None,), "rows"))
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StepInspection:
+class StepInspection(ArrayRecord):
     """Two parallel faces.
 
     Parameters
@@ -244,22 +238,16 @@ class StepInspection:
         Where the normal came from, in words.
     """
 
-    lower: IntArray
-    upper: IntArray
-    normal: FloatArray
+    lower: IntArray = ints(None)
+    upper: IntArray = ints(None)
+    normal: FloatArray = floats(3)
     nominal_height_mm: float
     height: MeasuredLength
     counts: PointCounts
     fitted: Deviations
     nominal: Deviations
-    heights_mm: FloatArray
+    heights_mm: FloatArray = floats(None)
     normal_rule: str
-
-    def __post_init__(self) -> None:
-        for name in ("lower", "upper"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name), (None,), name))
-        for name, shape in (("normal", (3,)), ("heights_mm", (None,))):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
 
 
 WITHIN_MM = (0.03, 0.05, 0.08)
@@ -273,8 +261,7 @@ def within_key(limit_mm: float) -> str:
     return f"within_{1000.0 * limit_mm:.0f}_um_percent"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Histogram:
+class Histogram(ArrayRecord):
     """Counts of deviations.
 
     Parameters
@@ -287,8 +274,8 @@ class Histogram:
         Points beyond the first and the last limit: shown as numbers, never dropped in silence.
     """
 
-    edges_mm: FloatArray
-    counts: IntArray
+    edges_mm: FloatArray = floats(None)
+    counts: IntArray = ints(None)
     n_below: int
     n_above: int
 
@@ -300,7 +287,7 @@ def histogram(values_mm: FloatArray, half_width_mm: float, n_bins: int = 81) -> 
     edges = np.linspace(-half_width_mm, half_width_mm, n_bins + 1)
     counts, _ = np.histogram(values_mm, edges)
     below, above = int((values_mm < edges[0]).sum()), int((values_mm > edges[-1]).sum())
-    return Histogram(edges, counts.astype(np.int64), below, above)
+    return Histogram(edges_mm=edges, counts=counts.astype(np.int64), n_below=below, n_above=above)
 
 
 def narrowest_shell_mm(values_mm: FloatArray, share: float = SHELL_SHARE) -> float:
@@ -362,7 +349,13 @@ def describe_deviations(
         Statistic(key, label, value, unit, reference, formula, f"{label} of {about}: {formula}")
         for key, label, value, unit, formula in rows
     )
-    return Deviations(reference, reference_text, points_text, d, statistics)
+    return Deviations(
+        reference=reference,
+        reference_text=reference_text,
+        points_text=points_text,
+        deviations_mm=d,
+        statistics=statistics,
+    )
 
 
 def _share(d: FloatArray, limit_mm: float) -> tuple[str, str, float, str, str]:

@@ -8,69 +8,52 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
-from armscan.geometry.estimate import FitFailure
+from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.records.cloud import PointCloud
+
+OUTLIER_SIGMAS = 4.0
+"""A fit leaves out points further from its surface than this many robust standard deviations, in
+turn with the fit: of normal noise one point in 16,000."""
+KEPT_BAND_MM = 0.02
+"""Points nearer to the surface than this are never left out: a scanner's own noise."""
+SEARCH_BAND_MM = 0.2
+"""Half width of the band in which points support a candidate while a feature is searched."""
+MIN_POINTS = 30
+"""Fewest points that make a feature."""
 
 
 @dataclass(frozen=True, slots=True)
 class InspectionOptions:
-    """How a feature is found in a cloud.
+    """Which points belong to a feature.
 
     Parameters
     ----------
     feature_mm
         Points up to this far from the surface belong to the feature: every statistic counts them,
         outliers included. Points further away are other objects and are only counted.
-    outlier_sigma
-        A fit leaves out points further from its surface than this many robust standard deviations
-        (1.4826 times the median absolute deviation), in turn with the fit.
-    kept_band_mm
-        Points nearer to the surface than this are never left out of a fit.
-    search_band_mm
-        Half width of the band in which points support a candidate while a feature is searched.
-    min_points
-        Fewest points that make a feature.
     """
 
     feature_mm: float = 1.0
-    outlier_sigma: float = 4.0
-    kept_band_mm: float = 0.02
-    search_band_mm: float = 0.2
-    min_points: int = 30
 
     def __post_init__(self) -> None:
-        _require(
-            0.0 < self.feature_mm < math.inf,
-            f"feature_mm is {self.feature_mm}",
-            "give more than 0 mm, as 1.0",
-        )
-        _require(
-            2.0 <= self.outlier_sigma < math.inf,
-            f"outlier limit of {self.outlier_sigma} sigma",
-            "give at least 2, or good points are lost",
-        )
-        _require(
-            0.0 <= self.kept_band_mm < math.inf,
-            f"a kept band of {self.kept_band_mm} mm",
-            "give 0 or up",
-        )
-        _require(
-            0.0 < self.search_band_mm <= self.feature_mm,
-            f"a search band of {self.search_band_mm} mm",
-            f"give more than 0 and at most feature_mm, {self.feature_mm}",
-        )
-        _require(self.min_points >= 4, f"features of {self.min_points} points", "give at least 4")
+        if not SEARCH_BAND_MM <= self.feature_mm < math.inf:
+            raise OptionError(
+                f"a feature band of {self.feature_mm} mm is less than the search band",
+                where="--feature-mm",
+                remedy=f"give {SEARCH_BAND_MM:g} mm or more, as 1.0",
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class StepOptions:
-    """How two parallel faces are found.
+    """Which points of a step's faces count.
 
     Parameters
     ----------
@@ -78,30 +61,26 @@ class StepOptions:
         Points this near to an end of their face are left out: along each stripe its runs on the
         face are shortened by it, and left out is all that lies this near to points off the face,
         seen along the normal, or to the face's outline in a cloud of many stripes.
-    height_tolerance
-        Faces are searched up to this part of the nominal height from it.
     """
 
     margin_mm: float = 1.0
-    height_tolerance: float = 0.05
 
     def __post_init__(self) -> None:
-        _require(
-            0.0 <= self.margin_mm < 100.0, f"margin_mm is {self.margin_mm}", "give 0 to 100 mm"
-        )
-        _require(
-            0.0 < self.height_tolerance <= 0.5,
-            f"a height tolerance of {self.height_tolerance}",
-            "give more than 0 and at most 0.5",
-        )
+        if not 0.0 <= self.margin_mm < 100.0:
+            raise OptionError(
+                f"margin_mm is {self.margin_mm}", where="--margin", remedy="give 0 to 100 mm"
+            )
 
 
-def _require(holds: bool, what: str, remedy: str) -> None:
-    if not holds:
-        raise OptionError(what, where="inspection options", remedy=remedy)
+class Surface(Protocol):
+    """What points can be near to: a plane, a sphere."""
+
+    def distance_mm(self, points_mm: FloatArray) -> FloatArray:
+        """Signed distances (N,) of points (N, 3)."""
+        ...
 
 
-S = TypeVar("S")
+S = TypeVar("S", bound=Surface)
 MAX_ROUNDS = 20
 SMALLEST_EXTENT_MM = 2.0
 """Points that all lie this near to each other are taken for metres."""
@@ -110,27 +89,21 @@ LEAST_CONCENTRATION = 0.5
 """Part of the feature's points that must lie within the search band of the surface that was found:
 a shape that merely passes through the feature's shell spreads evenly over it instead."""
 
-ROBUST_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+OUTLIER_RULE = (
+    f"the fit left out points further from the median distance than {OUTLIER_SIGMAS:g} robust "
+    f"standard deviations, but at least {KEPT_BAND_MM:g} mm (in turn with the fit); the statistics "
+    "count them all the same"
+)
+"""The rule of `inliers` in words."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Selection:
-    """Points of a cloud that an inspection looks at.
-
-    Parameters
-    ----------
-    cloud
-        The cloud.
-    rows
-        (N,) rows of it.
-    options
-        What belongs to a feature.
-    """
+    """Rows (N,) of a cloud that an inspection looks at, and how near its feature's points lie."""
 
     cloud: PointCloud
     rows: IntArray
-    options: InspectionOptions
+    feature_mm: float
 
     @property
     def points_mm(self) -> FloatArray:
@@ -139,9 +112,12 @@ class Selection:
 
 
 def select(
-    cloud: PointCloud, region: Box | None, options: InspectionOptions, min_points: int
+    cloud: PointCloud,
+    region: Box | None,
+    options: InspectionOptions | None,
+    min_points: int = MIN_POINTS,
 ) -> Selection:
-    """Take the points of a cloud inside a region.
+    """Take the points of a cloud inside a region; default options if None.
 
     Raises
     ------
@@ -165,15 +141,11 @@ def select(
             f"{place} {len(rows)}{of_all} points; an inspection needs {min_points}",
             remedy="measure more points" if region is None else "widen the region",
         )
-    return Selection(cloud, rows, options)
+    return Selection(cloud, rows, (options or InspectionOptions()).feature_mm)
 
 
 def fit_robustly(
-    points_mm: FloatArray,
-    start: S,
-    fit: Callable[[FloatArray], S | FitFailure],
-    distance_mm: Callable[[S, FloatArray], FloatArray],
-    options: InspectionOptions,
+    points_mm: FloatArray, start: S, fit: Callable[[FloatArray], Estimate[S] | FitFailure]
 ) -> tuple[S, BoolArray] | FitFailure:
     """Fit and leave out outliers in turn until the choice stands.
 
@@ -185,10 +157,6 @@ def fit_robustly(
         Surface from which the first outliers are told.
     fit
         Least-squares fit to points.
-    distance_mm
-        Signed distances (N,) of points from a surface.
-    options
-        Outlier rule.
 
     Returns
     -------
@@ -197,32 +165,22 @@ def fit_robustly(
     """
     surface, kept = start, np.zeros(len(points_mm), dtype=np.bool_)
     for _ in range(MAX_ROUNDS):
-        chosen = inliers(distance_mm(surface, points_mm), options)
+        chosen = inliers(surface.distance_mm(points_mm))
         if np.array_equal(chosen, kept):
             break
         kept = chosen
         fitted = fit(points_mm[kept])
         if isinstance(fitted, FitFailure):
             return fitted
-        surface = fitted
+        surface = fitted.value
     return surface, kept
 
 
-def inliers(distance_mm: FloatArray, options: InspectionOptions) -> BoolArray:
-    """(N,) True where a distance is no outlier: the rule that `outlier_rule` puts in words."""
-    middle = float(np.median(distance_mm))
-    spread = ROBUST_SIGMA * float(np.median(np.abs(distance_mm - middle)))
-    limit = max(options.outlier_sigma * spread, options.kept_band_mm)
-    return np.asarray(np.abs(distance_mm - middle) <= limit)
-
-
-def outlier_rule(options: InspectionOptions) -> str:
-    """The rule of `inliers` in words."""
-    return (
-        f"the fit left out points further from the median distance than {options.outlier_sigma:g} "
-        f"robust standard deviations, but at least {options.kept_band_mm:g} mm (in turn with the "
-        "fit); the statistics count them all the same"
-    )
+def inliers(distance_mm: FloatArray) -> BoolArray:
+    """(N,) True where a distance is no outlier, by `OUTLIER_RULE`."""
+    from_middle = np.abs(distance_mm - float(np.median(distance_mm)))
+    spread = MAD_TO_SIGMA * float(np.median(from_middle))
+    return np.asarray(from_middle <= max(OUTLIER_SIGMAS * spread, KEPT_BAND_MM))
 
 
 N_TRIALS = 800
@@ -235,16 +193,8 @@ MIN_SINE = 0.02
 """Flattest triangle, as height over length, that may carry a candidate."""
 
 
-def dominant_flat(points: FloatArray, band: float) -> FloatArray | FitFailure:
-    """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points lie near.
-
-    Parameters
-    ----------
-    points
-        (N, D) points.
-    band
-        Largest distance of a supporting point.
-    """
+def dominant_flat(points: FloatArray) -> FloatArray | FitFailure:
+    """Unit normal (D,) of the plane (D = 3) or line (D = 2) that most points (N, D) lie near."""
     rng = np.random.default_rng(0)
     n, dimension = points.shape
     drawn = points[rng.integers(0, n, (N_TRIALS, dimension))]
@@ -256,12 +206,14 @@ def dominant_flat(points: FloatArray, band: float) -> FloatArray | FitFailure:
     offsets = np.einsum("md,md->m", normals, start)
     votes = np.concatenate(
         [
-            (np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH]) <= band).sum(axis=0)
+            (
+                np.abs(scored @ normals[k : k + BATCH].T - offsets[k : k + BATCH]) <= SEARCH_BAND_MM
+            ).sum(axis=0)
             for k in range(0, len(normals), BATCH)
         ]
     )
     best = int(votes.argmax())
-    return _polished(points, normals[best], float(offsets[best]), band)
+    return _polished(points, normals[best], float(offsets[best]))
 
 
 def _normals(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -281,9 +233,9 @@ def _normals(drawn: FloatArray) -> tuple[FloatArray, FloatArray]:
     return normal / np.where(size > 0.0, size, 1.0), is_valid
 
 
-def _polished(points: FloatArray, normal: FloatArray, offset: float, band: float) -> FloatArray:
+def _polished(points: FloatArray, normal: FloatArray, offset: float) -> FloatArray:
     for _ in range(POLISHING_ROUNDS):
-        near = points[np.abs(points @ normal - offset) <= band]
+        near = points[np.abs(points @ normal - offset) <= SEARCH_BAND_MM]
         if len(near) < points.shape[1]:
             break
         centre = near.mean(axis=0)
@@ -292,9 +244,7 @@ def _polished(points: FloatArray, normal: FloatArray, offset: float, band: float
     return normal
 
 
-def find_ball(
-    points_mm: FloatArray, radius_mm: float, band_mm: float
-) -> tuple[FloatArray, int] | FitFailure:
+def find_ball(points_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, int] | FitFailure:
     """Centre (3,) of the ball of known radius that most points lie on, and their count.
 
     Candidates pass through three points of one neighbourhood each, as a ball may be a small part
@@ -306,8 +256,6 @@ def find_ball(
         (N, 3) points.
     radius_mm
         Radius of the ball.
-    band_mm
-        Largest distance of a supporting point from the surface.
     """
     rng = np.random.default_rng(0)
     scored = points_mm[rng.permutation(len(points_mm))[:N_SCORED]]
@@ -319,12 +267,12 @@ def find_ball(
         )
     votes = np.concatenate(
         [
-            _ball_votes(scored, centres[k : k + BATCH], radius_mm, band_mm)
+            _ball_votes(scored, centres[k : k + BATCH], radius_mm)
             for k in range(0, len(centres), BATCH)
         ]
     )
     centre = centres[int(votes.argmax())]
-    near = np.abs(np.linalg.norm(points_mm - centre, axis=1) - radius_mm) <= band_mm
+    near = np.abs(np.linalg.norm(points_mm - centre, axis=1) - radius_mm) <= SEARCH_BAND_MM
     return centre, int(near.sum())
 
 
@@ -354,12 +302,10 @@ def _ball_candidates(scored: FloatArray, radius_mm: float, rng: np.random.Genera
     return np.concatenate([start + middle + rise, start + middle - rise])
 
 
-def _ball_votes(
-    scored: FloatArray, centres: FloatArray, radius_mm: float, band_mm: float
-) -> FloatArray:
+def _ball_votes(scored: FloatArray, centres: FloatArray, radius_mm: float) -> FloatArray:
     # |p - c|^2 by its parts: no (M, N, 3) array; about the mean, so that digits are kept
     mean = scored.mean(axis=0)
     p, c = scored - mean, centres - mean
     squared = (c**2).sum(axis=1)[:, None] + (p**2).sum(axis=1)[None, :] - 2.0 * c @ p.T
     distance = np.sqrt(np.maximum(squared, 0.0))
-    return np.asarray((np.abs(distance - radius_mm) <= band_mm).sum(axis=1))
+    return np.asarray((np.abs(distance - radius_mm) <= SEARCH_BAND_MM).sum(axis=1))

@@ -14,11 +14,13 @@ from armscan.geometry.shapes import Sphere, fit_sphere
 from armscan.inspection.results import PointCounts, SphereInspection, describe_deviations
 from armscan.inspection.selection import (
     LEAST_CONCENTRATION,
+    MIN_POINTS,
+    OUTLIER_RULE,
+    SEARCH_BAND_MM,
     InspectionOptions,
     Selection,
     find_ball,
     fit_robustly,
-    outlier_rule,
     select,
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
@@ -55,19 +57,18 @@ def inspect_sphere(
     InputError
         If there are too few points or the diameter is not positive.
     """
-    options = options or InspectionOptions()
     if not 0.0 < diameter_mm < 1e4:
         raise InputError(f"a ball of {diameter_mm} mm diameter", remedy="give the diameter in mm")
-    selection = select(cloud, region, options, options.min_points)
+    selection = select(cloud, region, options)
     points = selection.points_mm
-    found = find_ball(points, diameter_mm / 2.0, options.search_band_mm)
+    found = find_ball(points, diameter_mm / 2.0)
     if isinstance(found, FitFailure):
         return found
     centre, n_near = found
-    if n_near < options.min_points:
+    if n_near < MIN_POINTS:
         return FitFailure(
             f"there is no ball of {diameter_mm:g} mm: the best place for one has {n_near} of "
-            f"{len(points)} points on it, {options.min_points} are needed",
+            f"{len(points)} points on it, {MIN_POINTS} are needed",
             "check the diameter, or show where the ball is with --region",
         )
     return _settled(selection, Sphere(centre, diameter_mm / 2.0), diameter_mm)
@@ -77,15 +78,15 @@ def _settled(
     selection: Selection, sphere: Sphere, diameter_mm: float
 ) -> SphereInspection | FitFailure:
     """Fit to the feature, choose the feature anew about the fit, until it stays."""
-    points, options = selection.points_mm, selection.options
+    points, feature_mm = selection.points_mm, selection.feature_mm
     is_feature = np.zeros(len(points), dtype=np.bool_)
     is_fitted = is_feature
     for _ in range(SETTLING_ROUNDS):
-        chosen = np.abs(sphere.distance_mm(points)) <= options.feature_mm
+        chosen = np.abs(sphere.distance_mm(points)) <= feature_mm
         if np.array_equal(chosen, is_feature):
             break
         is_feature = chosen
-        fit = fit_robustly(points[chosen], sphere, _sphere, Sphere.distance_mm, options)
+        fit = fit_robustly(points[chosen], sphere, fit_sphere)
         if isinstance(fit, FitFailure):
             return FitFailure(
                 f"there is no ball of {diameter_mm:g} mm: {fit.reason}",
@@ -99,20 +100,15 @@ def _settled(
                 f"{2.0 * sphere.radius_mm:.4g} mm",
                 "check the diameter, or show where the ball is with --region",
             )
-    near = np.abs(sphere.distance_mm(points[is_feature])) <= options.search_band_mm
+    near = np.abs(sphere.distance_mm(points[is_feature])) <= SEARCH_BAND_MM
     if float(near.mean()) < LEAST_CONCENTRATION:
         return FitFailure(
             f"there is no ball of {diameter_mm:g} mm: at the best place for one, only "
-            f"{int(near.sum())} of {len(near)} points within {options.feature_mm:g} mm of its "
-            f"surface lie within {options.search_band_mm:g} mm",
+            f"{int(near.sum())} of {len(near)} points within {feature_mm:g} mm of its "
+            f"surface lie within {SEARCH_BAND_MM:g} mm",
             "check the diameter, or show where the ball is with --region",
         )
     return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
-
-
-def _sphere(points: FloatArray) -> Sphere | FitFailure:
-    fit = fit_sphere(points)
-    return fit if isinstance(fit, FitFailure) else fit.value
 
 
 def _described(
@@ -122,17 +118,17 @@ def _described(
     sphere: Sphere,
     diameter_mm: float,
 ) -> SphereInspection:
-    cloud, options = selection.cloud, selection.options
+    cloud = selection.cloud
     feature = selection.rows[is_feature]
     points = cloud.points_mm[feature]
-    near = f"within {options.feature_mm:g} mm of the fitted sphere"
+    near = f"within {selection.feature_mm:g} mm of the fitted sphere"
     counts = PointCounts(
         n_given=len(cloud),
         n_region=len(selection.rows),
         n_feature=len(feature),
         n_fitted=int(is_fitted.sum()),
         feature_rule=f"points {near}; it was found by its diameter, anywhere in the cloud",
-        fit_rule=outlier_rule(options),
+        fit_rule=OUTLIER_RULE,
     )
     text = f"all {len(feature)} points {near}"
     linear = linearised_sphere(sphere, points[is_fitted])

@@ -20,12 +20,14 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.selection import (
+    MIN_POINTS,
+    OUTLIER_RULE,
+    SEARCH_BAND_MM,
     InspectionOptions,
     Selection,
     StepOptions,
     dominant_flat,
     inliers,
-    outlier_rule,
     select,
 )
 from armscan.inspection.uncertainty import FitLinearised, measured_length
@@ -35,6 +37,8 @@ BIN_MM = 0.1
 MAX_PEAKS = 60
 MAX_EXTENT_MM = 1e5
 LEAST_INSIDE = 0.5
+HEIGHT_TOLERANCE = 0.05
+"""Faces are searched up to this part of the nominal height from it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +60,6 @@ def find_levels(
     normal: FloatArray,
     height_mm: float,
     tolerance_mm: float,
-    options: InspectionOptions,
 ) -> ParallelFaces | FitFailure:
     """The two best filled levels along a normal that stand a nominal height apart.
 
@@ -68,10 +71,8 @@ def find_levels(
         (D,) common normal.
     height_mm, tolerance_mm
         Nominal height, and how far from it the levels may be.
-    options
-        Band and fewest points of a level.
     """
-    levels, counts = _levels(points @ normal, options)
+    levels, counts = _levels(points @ normal)
     apart = levels[None, :] - levels[:, None]
     fits = np.abs(apart - height_mm) <= tolerance_mm
     if not fits.any():
@@ -85,21 +86,21 @@ def find_levels(
     return ParallelFaces(normal, float(levels[lower]), float(levels[upper]))
 
 
-def _levels(heights: FloatArray, options: InspectionOptions) -> tuple[FloatArray, IntArray]:
+def _levels(heights: FloatArray) -> tuple[FloatArray, IntArray]:
     """Local maxima of the heights' density, best filled first, and the points about each."""
     low = float(heights.min())
     if np.ptp(heights) > MAX_EXTENT_MM:
         return np.zeros(0), np.zeros(0, dtype=np.int64)
     bins = np.bincount(((heights - low) / BIN_MM).astype(np.int64))
-    width = max(1, round(options.search_band_mm / BIN_MM))
+    width = max(1, round(SEARCH_BAND_MM / BIN_MM))
     filled = np.convolve(bins, np.ones(2 * width + 1), "same").astype(np.int64)
     levels, counts = [], []
     for _ in range(MAX_PEAKS):
         top = int(filled.argmax())
-        if filled[top] < options.min_points:
+        if filled[top] < MIN_POINTS:
             break
         about = low + (top + 0.5) * BIN_MM
-        near = heights[np.abs(heights - about) <= options.search_band_mm + BIN_MM]
+        near = heights[np.abs(heights - about) <= SEARCH_BAND_MM + BIN_MM]
         levels.append(float(np.median(near)))
         counts.append(len(near))
         filled[max(0, top - 2 * width - 1) : top + 2 * width + 2] = 0
@@ -241,12 +242,12 @@ class _Search:
     selection: Selection
     section: _Section
     height_mm: float
-    steps: StepOptions
+    margin_mm: float
 
     @property
     def thickness_mm(self) -> float:
         """Points up to this far from a face belong to it."""
-        return min(self.selection.options.feature_mm, self.height_mm / 4.0)
+        return min(self.selection.feature_mm, self.height_mm / 4.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,14 +296,13 @@ def inspect_step(
     InputError
         If there are too few points, the height is not positive, or the normal is zero.
     """
-    options, steps = options or InspectionOptions(), step_options or StepOptions()
     if not 0.0 < height_mm < 1e4:
         raise InputError(f"a step {height_mm} mm high", remedy="give the height in mm")
-    selection = select(cloud, region, options, 2 * options.min_points)
+    selection = select(cloud, region, options, 2 * MIN_POINTS)
     section = _section(selection)
     if isinstance(section, FitFailure):
         return section
-    start = dominant_flat(section.flat_mm, options.search_band_mm)
+    start = dominant_flat(section.flat_mm)
     if isinstance(start, FitFailure):
         return start
     if float(start @ section.axes @ _upwards(selection)) < 0.0:
@@ -311,11 +311,11 @@ def inspect_step(
     section = _unbowed(section, start, lean)
     # faces stand further apart within a sheet that leans
     within = height_mm / math.cos(lean)
-    tolerance = steps.height_tolerance * within
-    faces = find_levels(section.flat_mm, start, within, tolerance, options)
+    faces = find_levels(section.flat_mm, start, within, HEIGHT_TOLERANCE * within)
     if isinstance(faces, FitFailure):
         return _explained(faces, section, normal)
-    search = _Search(selection, section, height_mm, steps)
+    margin = (step_options or StepOptions()).margin_mm
+    search = _Search(selection, section, height_mm, margin)
     chosen = _fitted(search, faces)
     if isinstance(chosen, FitFailure):
         return chosen
@@ -374,8 +374,7 @@ def _upwards(selection: Selection) -> FloatArray:
 
 def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
     """Choose the faces' points and fit, in turn."""
-    flat, stripe, margin = search.section.flat_mm, _stripes(search), search.steps.margin_mm
-    options = search.selection.options
+    flat, stripe, margin = search.section.flat_mm, _stripes(search), search.margin_mm
     used = np.zeros(len(flat), dtype=np.bool_)
     masks: list[BoolArray] = []
     for _ in range(ROUNDS):
@@ -384,15 +383,15 @@ def _fitted(search: _Search, faces: ParallelFaces) -> _Chosen | FitFailure:
             distance = flat @ faces.normal - level
             is_face = np.abs(distance) <= search.thickness_mm
             mask = away_from_ends(flat, faces.normal, is_face, stripe, margin)
-            if int(mask.sum()) < options.min_points:
+            if int(mask.sum()) < MIN_POINTS:
                 return FitFailure(
                     f"a face of the step keeps {int(mask.sum())} of {int(is_face.sum())} points "
-                    f"after {margin:g} mm at its ends are left out; {options.min_points} are "
+                    f"after {margin:g} mm at its ends are left out; {MIN_POINTS} are "
                     "needed",
                     "give a smaller --margin, or measure more of the face",
                 )
             fitted = mask.copy()
-            fitted[mask] = inliers(distance[mask], options)
+            fitted[mask] = inliers(distance[mask])
             masks.append(mask)
             kept.append(fitted)
         faces = fit_parallel(flat[kept[0]], flat[kept[1]], faces.normal)
@@ -468,9 +467,9 @@ def _counts(search: _Search, chosen: _Chosen) -> PointCounts:
         n_feature=int(chosen.is_lower.sum() + chosen.is_upper.sum()),
         n_fitted=int(chosen.is_fitted.sum()),
         feature_rule=f"points within {search.thickness_mm:g} mm of either face, without "
-        f"{search.steps.margin_mm:g} mm at the ends of each stripe's runs, along the outline and "
+        f"{search.margin_mm:g} mm at the ends of each stripe's runs, along the outline and "
         "next to points off the face",
-        fit_rule=outlier_rule(search.selection.options),
+        fit_rule=OUTLIER_RULE,
     )
 
 

@@ -45,11 +45,14 @@ from armscan.report.quantity import (
     without_source,
 )
 from armscan.report.stereo import STEREO_TITLE, pair_row, stereo_page, stereo_quantities
-from armscan.storage.bodies import right_pose_body
-from armscan.storage.documents import camera_document, read_camera_calibration, stereo_document
+from armscan.storage.documents import (
+    camera_document,
+    fingerprint,
+    read_camera_calibration,
+    stereo_document,
+)
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
-from armscan.storage.json_text import fingerprint
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
@@ -383,7 +386,10 @@ def _stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bo
             "kind": "stereo calibration",
             "simulated": is_simulated,
             "intrinsics": fit.options.intrinsics,
-            "right_from_sensor": right_pose_body(fit.views.right_from_left).model_dump(mode="json"),
+            "right_from_sensor": {
+                "rotation_rows": fit.views.right_from_left.rotation.tolist(),
+                "translation_right_mm": fit.views.right_from_left.translation_mm.tolist(),
+            },
             "parameters": dict(zip(STEREO_PARAMETER_NAMES, fit.parameters.tolist(), strict=True)),
             "sigmas": dict(zip(STEREO_PARAMETER_NAMES, fit.sigma.tolist(), strict=True)),
             "typical_level": fit.typical_level,

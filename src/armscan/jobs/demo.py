@@ -61,17 +61,17 @@ from armscan.report.quantity import (
     values,
     with_sigma,
 )
-from armscan.storage.atomic import write_files
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import (
     camera_document,
+    new_provenance,
     read_sensor_calibration,
     scanner_document,
     sensor_document,
     stereo_document,
 )
+from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.json_text import new_provenance
 from armscan.storage.recording import FolderRecording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 

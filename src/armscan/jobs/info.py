@@ -36,25 +36,28 @@ from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
 from armscan.storage.clouds import parse_ply, read_ply
+from armscan.storage.codec import parse_json
 from armscan.storage.documents import (
-    RegistrationDocument,
+    REGISTRATION_SCHEMA,
+    SCANNER_SCHEMA,
+    STEREO_SCHEMA,
+    Registration,
     read_calibration,
     read_camera_calibration,
     read_registration,
     read_scanner_calibration,
     read_stereo_calibration,
 )
+from armscan.storage.files import read_bytes
 from armscan.storage.image_paths import expand_paths
-from armscan.storage.images import image_format, read_bytes, read_exposure
-from armscan.storage.json_text import parse_json
+from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
 from armscan.storage.points import read_probed_points
 from armscan.storage.recording import FolderRecording, is_recording, read_arm_track, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.storage.schema import REGISTRATION_SCHEMA, SCANNER_SCHEMA, STEREO_SCHEMA
 
 
-def describe_registration(document: RegistrationDocument) -> dict[str, Any]:
+def describe_registration(document: Registration) -> dict[str, Any]:
     """Scans, markers and evidence of ``registration.json``."""
     return {
         "what": f"registration by markers ({document.kind}), {len(document.transforms)} scans in "

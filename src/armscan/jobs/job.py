@@ -20,9 +20,9 @@ from armscan.models.calibration import Provenance
 from armscan.pipeline.progress import Progress, silent
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import sentences
-from armscan.storage.atomic import check_outputs, write_files
 from armscan.storage.detection_cache import DetectionCache
-from armscan.storage.json_text import new_provenance
+from armscan.storage.documents import new_provenance
+from armscan.storage.files import check_outputs, write_files
 
 T = TypeVar("T")
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import Box
 from armscan.jobs.job import Job
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants

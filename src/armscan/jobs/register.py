@@ -51,21 +51,19 @@ from armscan.report.register import (
     drift_chart,
     registration_page,
 )
-from armscan.storage.atomic import check_new_folder, new_folder, write_files
-from armscan.storage.bodies import provenance_body, triple
 from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud
 from armscan.storage.documents import (
-    MovedBody,
-    NotJoinedBody,
-    RegistrationDocument,
-    ResidualBody,
-    TransformBody,
+    CODEC,
+    MarkerResidual,
+    MovedMarker,
+    Registration,
+    ScanNotJoined,
+    ScanTransform,
     registration_document,
-    transform_body,
 )
+from armscan.storage.files import check_new_folder, new_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import MarkerList, markers_csv, read_marker_list
-from armscan.storage.schema import REGISTRATION_SCHEMA
 
 DOCUMENT, PAGE, MARKERS = "registration.json", "registration.html", "markers.csv"
 UNLIKELY = 1e-3
@@ -107,10 +105,10 @@ class _Joined:
     lists: Sequence[MarkerList]
     carried: Sequence[_NamedCloud]
     markers: MarkerSet
-    transforms: tuple[TransformBody, ...]
-    residuals: tuple[ResidualBody, ...]
-    moved: tuple[MovedBody, ...]
-    not_joined: tuple[NotJoinedBody, ...]
+    transforms: tuple[ScanTransform, ...]
+    residuals: tuple[MarkerResidual, ...]
+    moved: tuple[MovedMarker, ...]
+    not_joined: tuple[ScanNotJoined, ...]
     chi2: float
     degrees_of_freedom: int
 
@@ -157,8 +155,7 @@ def register(
     is_simulated = are_simulated(inputs) or any(item.cloud.is_simulated for item in carried)
     forced = [reason for item in carried for reason in item.cloud.forced]
     provenance = job.provenance(inputs, (options,), warnings=report.warnings, forced=forced)
-    document = RegistrationDocument(
-        schema=REGISTRATION_SCHEMA,
+    document = Registration(
         kind="views" if moved is None else "moved arm",
         simulated=is_simulated,
         common_frame=joined.frame,
@@ -169,7 +166,7 @@ def register(
         not_joined=joined.not_joined,
         chi2=joined.chi2,
         degrees_of_freedom=joined.degrees_of_freedom,
-        provenance=provenance_body(provenance),
+        provenance=provenance,
     )
     contents = {
         DOCUMENT: registration_document(document),
@@ -194,8 +191,8 @@ def register(
             "common_frame": joined.frame,
             "chi2": joined.chi2,
             "degrees_of_freedom": joined.degrees_of_freedom,
-            "transforms": [item.model_dump(mode="json") for item in joined.transforms],
-            "moved": [item.model_dump(mode="json") for item in joined.moved],
+            "transforms": [CODEC.write(item) for item in joined.transforms],
+            "moved": [CODEC.write(item) for item in joined.moved],
         },
     )
 
@@ -277,13 +274,13 @@ def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
     )
 
 
-def _residual_bodies(found: MarkerResiduals) -> tuple[ResidualBody, ...]:
+def _residual_bodies(found: MarkerResiduals) -> tuple[MarkerResidual, ...]:
     return tuple(
-        ResidualBody(
+        MarkerResidual(
             name=found.scans[k],
             id=int(found.ids[k]),
             common_id=int(found.common_ids[k]),
-            residual_mm=triple(found.residual_mm[k]),
+            residual_mm=found.residual_mm[k],
             is_used=bool(found.is_used[k]),
         )
         for k in range(len(found.scans))
@@ -341,18 +338,19 @@ def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _J
         lists=lists,
         carried=carried,
         markers=MarkerSet(
-            np.arange(1, len(found.markers_mm) + 1),
-            found.markers_mm,
-            found.marker_covariance_mm2,
-            frame,
+            ids=np.arange(1, len(found.markers_mm) + 1),
+            points_mm=found.markers_mm,
+            covariance_mm2=found.marker_covariance_mm2,
+            frame=frame,
         ),
         transforms=tuple(
-            transform_body(
-                name,
-                lists[view].path,
-                lists[view].markers.frame,
-                found.part_from_view[k],
-                found.pose_covariance[k],
+            ScanTransform(
+                name=name,
+                markers=path_text(lists[view].path),
+                own_frame=lists[view].markers.frame,
+                rotation_rows=found.part_from_view[k].rotation,
+                translation_mm=found.part_from_view[k].translation_mm,
+                covariance=found.pose_covariance[k],
                 n_markers=int(numbers.n_shared[k]),
                 rms_mm=float(numbers.rms_mm[k]),
                 cloud=cloud_of.get(name),
@@ -361,15 +359,15 @@ def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _J
         ),
         residuals=_residual_bodies(numbers.shared),
         moved=tuple(
-            MovedBody(
+            MovedMarker(
                 id=int(numbers.ids[k]),
                 common_id=int(joined.sightings.marker[k]) + 1,
-                offset_mm=triple(found.residual_mm[k]),
+                offset_mm=found.residual_mm[k],
             )
             for k in np.flatnonzero(~found.is_used)
         ),
         not_joined=tuple(
-            NotJoinedBody(name=names[item.view], reason=item.reason) for item in joined.left
+            ScanNotJoined(name=names[item.view], reason=item.reason) for item in joined.left
         ),
         chi2=found.chi2,
         degrees_of_freedom=found.degrees_of_freedom,
@@ -527,12 +525,13 @@ def _join_place(
         drift=None,
         warnings=_place_warnings(old, new, place),
     )
-    transform = transform_body(
-        new.path.stem,
-        new.path,
-        new.markers.frame,
-        fit.value,
-        fit.covariance,
+    transform = ScanTransform(
+        name=new.path.stem,
+        markers=path_text(new.path),
+        own_frame=new.markers.frame,
+        rotation_rows=fit.value.rotation,
+        translation_mm=fit.value.translation_mm,
+        covariance=fit.covariance,
         n_markers=n_used,
         rms_mm=rms,
         cloud=", ".join(item.name for item in carried) or None,
@@ -546,7 +545,7 @@ def _join_place(
         transforms=(transform,),
         residuals=_residual_bodies(residuals),
         moved=tuple(
-            MovedBody(id=item.new_id, common_id=item.old_id, offset_mm=triple(item.offset_mm))
+            MovedMarker(id=item.new_id, common_id=item.old_id, offset_mm=item.offset_mm)
             for item in place.moved
         ),
         not_joined=(),

@@ -46,6 +46,7 @@ from armscan.report.quantity import (
 from armscan.report.sheets import TITLE, laser_page, sheet_quantities, sheet_warnings
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import (
+    STEREO_SCHEMA,
     document_schema,
     read_camera_calibration,
     read_stereo_calibration,
@@ -56,7 +57,6 @@ from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.storage.schema import STEREO_SCHEMA
 from armscan.vision.targets.target import Target, parse_target
 
 REQUESTED = "left out by request"

@@ -5,7 +5,6 @@ match.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TypeAlias
@@ -14,7 +13,15 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
 from armscan.geometry.poses import Frame, Pose
 from armscan.geometry.registration import closed_form_pose, spread_mm
 from armscan.records.points import MarkerSet
@@ -23,35 +30,25 @@ LEAST_TO_CHECK = 4
 """Three markers fit wherever their triangle occurs, its mirror image included; a fourth checks."""
 
 
+DISTANCE_SIGMAS = 4.0
+"""Two distances agree within this many standard deviations of their difference: of true pairs one
+in 16,000 is lost."""
+POSITION_SIGMAS = 4.5
+"""A marker agrees with an alignment within this many standard deviations."""
+FALSE_ALARMS = 1e-4
+"""Expected count of alignments, in sets without anything in common, that would explain as many
+markers: above it a match is taken for chance."""
+RIVAL_SHARE = 0.5
+"""A second alignment that explains this share of the best one's markers makes it not unique."""
+MAX_TRIANGLES = 400
+"""Triangles of markers that are looked for in the other set; all where there are no more."""
+
+
 @dataclass(frozen=True, slots=True)
 class MarkerMatchOptions:
-    """How markers are matched.
-
-    Parameters
-    ----------
-    least_common
-        Markers that must agree, 4 at least.
-    distance_sigmas
-        Two distances agree within this many standard deviations of their difference: of true
-        pairs one in 16,000 is lost at 4.
-    position_sigmas
-        A marker agrees with an alignment within this many standard deviations.
-    false_alarms
-        Expected count of alignments, in sets without anything in common, that would explain as
-        many markers: above it a match is taken for chance.
-    rival_share
-        A second alignment that explains this share of the best one's markers makes it not unique.
-    max_triangles
-        Triangles of markers that are looked for in the other set; all of them where there are
-        no more.
-    """
+    """How many markers two sets must share: ``least_common``, 4 at least."""
 
     least_common: int = LEAST_TO_CHECK
-    distance_sigmas: float = 4.0
-    position_sigmas: float = 4.5
-    false_alarms: float = 1e-4
-    rival_share: float = 0.5
-    max_triangles: int = 400
 
     def __post_init__(self) -> None:
         if self.least_common < LEAST_TO_CHECK:
@@ -60,13 +57,9 @@ class MarkerMatchOptions:
                 where="least_common",
                 remedy=f"ask for {LEAST_TO_CHECK} or more",
             )
-        for name in ("distance_sigmas", "position_sigmas", "false_alarms", "rival_share"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise OptionError(f"{name} is {getattr(self, name)}", remedy="give a number > 0")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Alignment:
+class Alignment(RowRecord):
     """A rigid motion that carries markers of the second set onto markers of the first.
 
     Parameters
@@ -77,16 +70,12 @@ class Alignment:
         The motion, unweighted; `armscan.geometry.registration` gives the weighted one.
     """
 
-    pairs: IntArray
+    pairs: IntArray = ints("N", 2)
     first_from_second: Pose[Frame, Frame]
 
     def __post_init__(self) -> None:
-        pairs = self.pairs[self.pairs[:, 0].argsort()]
-        object.__setattr__(self, "pairs", frozen_ints(pairs, (None, 2), "pairs of markers"))
-
-    def __len__(self) -> int:
-        """Count of markers explained."""
-        return len(self.pairs)
+        object.__setattr__(self, "pairs", self.pairs[self.pairs[:, 0].argsort()])
+        super().__post_init__()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +134,7 @@ class NoMatch:
 MatchResult: TypeAlias = Matched | NotUnique | NoMatch
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledMarkers:
+class LabelledMarkers(RowRecord):
     """Markers with their mutual distances.
 
     Parameters
@@ -161,14 +149,10 @@ class LabelledMarkers:
         (N, N - 1) distances of each marker to all others, the shortest first: its label V.
     """
 
-    points_mm: FloatArray
-    sigma_mm: FloatArray
-    distance_mm: FloatArray
-    labels_mm: FloatArray
-
-    def __len__(self) -> int:
-        """Count of markers."""
-        return len(self.points_mm)
+    points_mm: FloatArray = floats("N", 3)
+    sigma_mm: FloatArray = floats("N")
+    distance_mm: FloatArray = floats("N", "N")
+    labels_mm: FloatArray = floats("N", None)
 
 
 def label_markers(markers: MarkerSet) -> LabelledMarkers:
@@ -184,7 +168,12 @@ def label_points(points_mm: FloatArray, sigma_mm: FloatArray) -> LabelledMarkers
     distance = np.linalg.norm(points_mm[:, None] - points_mm[None], axis=2)
     n = len(points_mm)
     others = distance[~np.eye(n, dtype=bool)].reshape(n, max(n - 1, 0))
-    return LabelledMarkers(points_mm, sigma_mm, distance, np.sort(others, axis=1))
+    return LabelledMarkers(
+        points_mm=points_mm,
+        sigma_mm=sigma_mm,
+        distance_mm=distance,
+        labels_mm=np.sort(others, axis=1),
+    )
 
 
 def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float) -> int:
@@ -204,8 +193,7 @@ def paired_count(label_a_mm: FloatArray, label_b_mm: FloatArray, limit_mm: float
     return count
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelVotes:
+class LabelVotes(ArrayRecord):
     """How well the labels of two sets agree.
 
     Parameters
@@ -220,21 +208,21 @@ class LabelVotes:
         Pairs of distances that agree, each counted from both its ends in either set: four times.
     """
 
-    count: IntArray
-    weight: FloatArray
+    count: IntArray = ints("N", "M")
+    weight: FloatArray = floats("N", "M")
     n_agreeing: int
 
 
-def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> LabelVotes:
+def vote(first: LabelledMarkers, second: LabelledMarkers) -> LabelVotes:
     """Compare every label of one set with every label of the other.
 
-    Two distances agree if they differ by less than ``sigmas`` standard deviations of their
+    Two distances agree if they differ by less than `DISTANCE_SIGMAS` standard deviations of their
     difference; that of a distance is taken from its two ends, along their worst directions.
     """
     n, m = len(first), len(second)
     count, weight = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
     if n < 2 or m < 2:
-        return LabelVotes(count, weight, 0)
+        return LabelVotes(count=count, weight=weight, n_agreeing=0)
     owner, other = np.nonzero(~np.eye(m, dtype=bool))
     distances = second.distance_mm[owner, other]
     order = np.argsort(distances, kind="stable")
@@ -243,7 +231,9 @@ def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> Labe
     hits = 0
     for i in range(n):
         others = np.flatnonzero(np.arange(n) != i)
-        limit = sigmas * np.sqrt(first.sigma_mm[i] ** 2 + first.sigma_mm[others] ** 2 + worst)
+        limit = DISTANCE_SIGMAS * np.sqrt(
+            first.sigma_mm[i] ** 2 + first.sigma_mm[others] ** 2 + worst
+        )
         label = first.distance_mm[i, others]
         low = np.searchsorted(ordered, label - limit)
         high = np.searchsorted(ordered, label + limit)
@@ -256,7 +246,7 @@ def vote(first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> Labe
         share = agrees.sum(axis=1) / m
         count[i] = agrees.sum(axis=0)
         weight[i] = -np.log(np.clip(share, 1.0 / m, 1.0 - 0.5 / m)) @ agrees
-    return LabelVotes(count, weight, hits)
+    return LabelVotes(count=count, weight=weight, n_agreeing=hits)
 
 
 LEAST_HEIGHT_SIGMAS = 15.0
@@ -271,12 +261,10 @@ MAX_COPIES = 48
 DRAWS = 20
 
 
-def base_triangles(
-    first: LabelledMarkers, votes: LabelVotes, max_triangles: int, least_votes: int
-) -> IntArray:
+def base_triangles(first: LabelledMarkers, votes: LabelVotes, least_votes: int) -> IntArray:
     """(T, 3) triangles of markers that may be common, well shaped ones if there are any.
 
-    All of them if there are no more than ``max_triangles``; else a draw that prefers markers whose
+    All of them if there are no more than `MAX_TRIANGLES`; else a draw that prefers markers whose
     label weighs much somewhere in the other set. The draw depends on the labels only, so neither
     on the order of the markers nor on where they stand.
     """
@@ -286,19 +274,19 @@ def base_triangles(
     # an order that any numbering and any place of the markers gives
     usable = usable[np.argsort(first.labels_mm[usable].sum(axis=1), kind="stable")]
     n_all = len(usable) * (len(usable) - 1) * (len(usable) - 2) // 6
-    if n_all <= max_triangles:
+    if n_all <= MAX_TRIANGLES:
         chosen = np.array(list(combinations(usable.tolist(), 3)), dtype=np.int64)
     else:
         best = votes.weight[usable].max(axis=1)
         likely = best / best.sum() + 1.0 / len(best)
-        chosen = usable[_drawn(likely / likely.sum(), DRAWS * max_triangles)]
+        chosen = usable[_drawn(likely / likely.sum(), DRAWS * MAX_TRIANGLES)]
     height = triangle_heights(first, chosen)
     lowest = LEAST_HEIGHT_SIGMAS * float(first.sigma_mm.max())
     extent = float(first.distance_mm.max())
     broad = 0.0 if len(first) <= FEW_MARKERS else BROAD * extent
     for limit in (max(lowest, broad), lowest):
         if (height > limit).any():
-            return chosen[height > limit][:max_triangles]
+            return chosen[height > limit][:MAX_TRIANGLES]
     return chosen[:0]
 
 
@@ -318,11 +306,9 @@ class CongruentTriangles:
         first: LabelledMarkers,
         second: LabelledMarkers,
         admissible: BoolArray,
-        sigmas: float,
     ) -> None:
         self._first, self._second = first, second
         self._admissible = admissible
-        self._sigmas = sigmas
         self._sigma_mm = float(second.sigma_mm.max())
         tails, heads = np.nonzero(~np.eye(len(second), dtype=bool))
         lengths = second.distance_mm[tails, heads]
@@ -352,15 +338,9 @@ class CongruentTriangles:
 
     def _limit(self, i: int, j: int) -> float:
         sigma = self._first.sigma_mm
-        return self._sigmas * float(
+        return DISTANCE_SIGMAS * float(
             np.sqrt(sigma[i] ** 2 + sigma[j] ** 2 + 2.0 * self._sigma_mm**2)
         )
-
-
-def chunks(triangles: IntArray, size: int) -> Iterator[IntArray]:
-    """Triangles in portions."""
-    for start in range(0, len(triangles), size):
-        yield triangles[start : start + size]
 
 
 def _drawn(likely: FloatArray, count: int) -> IntArray:
@@ -381,25 +361,19 @@ SAME_PLACE_GATES = 3.0
 class MarkerPlacement:
     """Carries the second set onto the first and says which markers agree.
 
-    Parameters
-    ----------
-    first, second
-        The sets.
-    sigmas
-        A marker agrees within this many standard deviations of the difference, those of the
-        alignment included.
+    A marker agrees within `POSITION_SIGMAS` standard deviations of the difference, those of the
+    alignment included.
     """
 
-    def __init__(self, first: LabelledMarkers, second: LabelledMarkers, sigmas: float) -> None:
+    def __init__(self, first: LabelledMarkers, second: LabelledMarkers) -> None:
         self.first, self.second = first, second
-        self._sigmas = sigmas
         self._tree = cKDTree(first.points_mm)
         self._sigma_mm = float(np.hypot(first.sigma_mm.max(), second.sigma_mm.max()))
 
     @property
     def gate_mm(self) -> float:
         """Distance within which two markers agree under a perfect alignment."""
-        return self._sigmas * self._sigma_mm
+        return POSITION_SIGMAS * self._sigma_mm
 
     def poses(self, corners: IntArray, copies: IntArray) -> tuple[FloatArray, FloatArray]:
         """Rotations (H, 3, 3) and translations (H, 3) from triangles (H, 3) in both sets.
@@ -445,7 +419,7 @@ class MarkerPlacement:
             if np.array_equal(again, pairs):
                 break
             pairs = again
-        return Alignment(pairs, pose)
+        return Alignment(pairs=pairs, first_from_second=pose)
 
     def are_same(self, one: Alignment, other: Alignment) -> bool:
         """True if both carry all markers that they explain to the same places, or one is a part."""
@@ -454,13 +428,13 @@ class MarkerPlacement:
         of_both = np.union1d(one.pairs[:, 1], other.pairs[:, 1])
         points = self.second.points_mm[of_both]
         a, b = one.first_from_second, other.first_from_second
-        apart = points @ (a.rotation - b.rotation).T + a.translation_mm - b.translation_mm
+        apart = a.apply(points) - b.apply(points)
         limit = SAME_PLACE_GATES * self.gate_mm
         return bool(np.linalg.norm(apart, axis=1).max(initial=0.0) < limit)
 
     def _mutual(self, pose: Pose[Frame, Frame], reach_mm: FloatArray) -> IntArray:
         """(K, 2) pairs of markers that are nearest to each other, within ``reach_mm`` (M,)."""
-        moved = self.second.points_mm @ pose.rotation.T + pose.translation_mm
+        moved = pose.apply(self.second.points_mm)
         distance, nearest = self._nearest(moved, np.inf)
         back = np.asarray(cKDTree(moved).query(self.first.points_mm[nearest])[1])
         kept = (distance < reach_mm) & (back == np.arange(len(moved)))
@@ -528,7 +502,6 @@ FLAT_SHARE = 0.05
 def find_alignments(
     placing: MarkerPlacement,
     votes: LabelVotes,
-    options: MarkerMatchOptions,
     *,
     are_seen: bool = False,
     known: tuple[Alignment, ...] = (),
@@ -537,8 +510,8 @@ def find_alignments(
 
     Parameters
     ----------
-    placing, votes, options
-        The two sets, how their labels agree, and the limits.
+    placing, votes
+        The two sets, and how their labels agree.
     are_seen
         Both sets are in the frame of a sensor that saw them from its origin.
     known
@@ -548,13 +521,14 @@ def find_alignments(
     # among few markers three that agree are looked for too: they may be a rival of four
     least_votes = LEAST_TO_CHECK - (2 if len(a) <= FEW_MARKERS else 1)
     admissible = votes.count >= least_votes
-    triangles = base_triangles(a, votes, options.max_triangles, least_votes)
-    finder = CongruentTriangles(a, b, admissible, options.distance_sigmas)
+    triangles = base_triangles(a, votes, least_votes)
+    finder = CongruentTriangles(a, b, admissible)
     flat_mm = FLAT_SHARE * float(spread_mm(a.points_mm)[1])
     most = min(int(admissible.any(axis=1).sum()), int(admissible.any(axis=0).sum()))
     found = list(known)
     n_seen = n_scored = 0
-    for portion in chunks(triangles, CHUNK):
+    for start in range(0, len(triangles), CHUNK):
+        portion = triangles[start : start + CHUNK]
         copies = [finder.of(triangle) for triangle in portion]
         corners = np.repeat(portion, [len(item) for item in copies], axis=0)
         matches = np.concatenate(copies)
@@ -573,8 +547,8 @@ def find_alignments(
             if not agree_with_known(corners[k : k + 1], matches[k : k + 1], found).any():
                 _add(placing, found, placing.refined(rotation[k], translation[k], matches[k]))
         n_seen, n_scored = n_seen + len(portion), n_scored + len(matches)
-        is_settled = len(found) > 1 and len(found[1]) >= max(options.rival_share * most, 4)
-        share = options.rival_share * len(found[0]) / len(a) if found else 0.0
+        is_settled = len(found) > 1 and len(found[1]) >= max(RIVAL_SHARE * most, 4)
+        share = RIVAL_SHARE * len(found[0]) / len(a) if found else 0.0
         if is_settled or n_scored > MAX_ALIGNMENTS or n_seen * share**3 > ENOUGH_TRIANGLES:
             break
     return found

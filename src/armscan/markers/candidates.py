@@ -5,12 +5,19 @@ the options of stereo matching.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import (
     TwoViews,
@@ -20,18 +27,20 @@ from armscan.models.two_views import (
 )
 from armscan.records.points import RingImages
 
+MAX_SIGMAS = 4.0
+"""Threshold on the epipolar distance (delta of eq. 4.27), in its standard deviations: of true pairs
+one in 16,000 is lost."""
+UNMODELLED_PX = 0.01
+"""Standard deviation, an axis, that is added to each centre for what its covariance cannot know:
+print, light and lens across the ring."""
+
 
 @dataclass(frozen=True, slots=True)
 class RingMatchOptions:
-    """How rings in two images are matched.
+    """What is known of the markers before rings in two images are matched.
 
     Parameters
     ----------
-    max_sigmas
-        Threshold on the epipolar distance (delta of eq. 4.27), in its standard deviations.
-    unmodelled_px
-        Standard deviation, an axis, that is added to each centre for what its covariance cannot
-        know: print, light and lens across the ring.
     depth_mm
         Nearest and farthest Z of a marker in the Sensor frame; None for all that lie ahead.
     diameter_mm
@@ -39,32 +48,13 @@ class RingMatchOptions:
     size_tolerance
         Largest difference, as a fraction, of the diameters that the two images of one marker show,
         and of each from ``diameter_mm``.
-    same_size
-        Markers whose diameters differ by less than this fraction are of one make; where most are,
-        a pair of that size is believed without neighbours.
-    plane_px
-        T of the homography's consensus: markers on one plane agree to this, px.
-    depth_tolerance
-        Largest distance in depth of a marker from the plane through its neighbours, as a fraction
-        of the distance to them; for parts that curve.
     """
 
-    max_sigmas: float = 4.0
-    unmodelled_px: float = 0.01
     depth_mm: tuple[float, float] | None = None
     diameter_mm: float | None = None
     size_tolerance: float = 0.04
-    same_size: float = 0.015
-    plane_px: float = 2.0
-    depth_tolerance: float = 0.15
 
     def __post_init__(self) -> None:
-        positive = (
-            *(self.max_sigmas, self.size_tolerance, self.same_size),
-            *(self.plane_px, self.depth_tolerance),
-        )
-        if not (min(positive) > 0.0 and self.unmodelled_px >= 0.0):
-            raise OptionError("the thresholds of matching must be positive")
         if self.depth_mm is not None and not 0.0 <= self.depth_mm[0] < self.depth_mm[1]:
             raise OptionError(
                 f"a depth range of {self.depth_mm[0]:g} to {self.depth_mm[1]:g} mm",
@@ -132,8 +122,7 @@ _FIRST_LOOK_PX = 30.0
 """Pairs further than this from the epipolar constraint are not looked at more closely."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CandidatePairs:
+class CandidatePairs(RowRecord):
     """K pairs of a left and a right ring that satisfy the epipolar constraint.
 
     Parameters
@@ -146,26 +135,18 @@ class CandidatePairs:
     points_mm
         (K, 3) where the marker would be, Sensor frame.
     covariance_mm2
-        (K, 3, 3) its covariance from the centres alone, ``unmodelled_px`` included.
+        (K, 3, 3) its covariance from the centres alone, `UNMODELLED_PX` included.
     diameter_mm
         (K,) how large it would be: geometric mean of what the two images show.
     """
 
-    left: IntArray
-    right: IntArray
-    distance_px: FloatArray
-    sigma_px: FloatArray
-    points_mm: FloatArray
-    covariance_mm2: FloatArray
-    diameter_mm: FloatArray
-
-    def __len__(self) -> int:
-        """Count of pairs."""
-        return len(self.left)
-
-    def subset(self, chosen: BoolArray | IntArray) -> CandidatePairs:
-        """Return some of the pairs."""
-        return CandidatePairs(*(getattr(self, field.name)[chosen] for field in fields(self)))
+    left: IntArray = ints("N")
+    right: IntArray = ints("N")
+    distance_px: FloatArray = floats("N")
+    sigma_px: FloatArray = floats("N")
+    points_mm: FloatArray = floats("N", 3)
+    covariance_mm2: FloatArray = floats("N", 3, 3)
+    diameter_mm: FloatArray = floats("N")
 
 
 def find_candidates(
@@ -200,7 +181,7 @@ def find_candidates(
     is_near = np.abs(rough) < _FIRST_LOOK_PX
     rows, columns = rows[is_near], columns[is_near]
     left_px, right_px = left.centres_px[rows], right.centres_px[columns]
-    unmodelled = options.unmodelled_px**2 * np.eye(2)
+    unmodelled = UNMODELLED_PX**2 * np.eye(2)
     left_spread = left.covariance_px2[rows] + unmodelled
     right_spread = right.covariance_px2[columns] + unmodelled
     points = triangulate_points(views, left_px, right_px, left_spread, right_spread)
@@ -211,12 +192,20 @@ def find_candidates(
     distance, sigma = _misclosure(views, shown, observed, spread, calibration_covariance)
     in_left = diameters_mm(left, rows, views.left, shown)
     in_right = diameters_mm(right, columns, views.right, views.points_right_mm(shown))
-    is_near = points.is_valid & (np.abs(distance) < options.max_sigmas * sigma)
+    is_near = points.is_valid & (np.abs(distance) < MAX_SIGMAS * sigma)
     is_near &= _is_in_depth(shown, views, options)
     is_near &= _is_of_one_size(in_left, in_right, options)
     diameter = np.sqrt(in_left * in_right)
-    pairs = CandidatePairs(rows, columns, distance, sigma, shown, points.noise_mm2, diameter)
-    return pairs.subset(is_near)
+    pairs = CandidatePairs(
+        left=rows,
+        right=columns,
+        distance_px=distance,
+        sigma_px=sigma,
+        points_mm=shown,
+        covariance_mm2=points.noise_mm2,
+        diameter_mm=diameter,
+    )
+    return pairs.select(is_near)
 
 
 def _misclosure(

@@ -9,7 +9,12 @@ from itertools import combinations
 
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import (
+    FloatArray,
+    IntArray,
+    RowRecord,
+    ints,
+)
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Part, Pose, Sensor
 from armscan.geometry.registration import PointPairs, carried_covariance_mm2, register_points
@@ -21,8 +26,7 @@ from armscan.records.points import MarkerSet
 Node = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Link:
+class Link(RowRecord):
     """Markers that two views share.
 
     Parameters
@@ -35,11 +39,7 @@ class Link:
 
     first: int
     second: int
-    pairs: IntArray
-
-    def __len__(self) -> int:
-        """Count of markers shared."""
-        return len(self.pairs)
+    pairs: IntArray = ints("N", 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +84,7 @@ def link_views(
     for done, (i, k) in enumerate(pairs, start=1):
         result = match_markers(views[i], views[k], options)
         if isinstance(result, Matched):
-            links.append(Link(i, k, result.alignment.pairs))
+            links.append(Link(first=i, second=k, pairs=result.alignment.pairs))
         elif isinstance(result, NotUnique):
             not_unique[i] = not_unique[k] = result.reason
         else:
@@ -216,9 +216,7 @@ class JoinedViews:
         result = []
         for k, view in enumerate(self.placed):
             points = views[view].points_mm
-            one, other = self.chain[k], self.map.part_from_view[k]
-            apart = points @ (one.rotation - other.rotation).T
-            apart = apart + one.translation_mm - other.translation_mm
+            apart = self.chain[k].apply(points) - self.map.part_from_view[k].apply(points)
             result.append(float(np.sqrt((apart**2).sum(axis=1).mean())))
         return np.array(result)
 
@@ -254,10 +252,10 @@ def join_views(
     numbers = np.unique(np.concatenate([tracks.of_view[view] for view in placed]))
     marker_of = tuple(np.searchsorted(numbers, tracks.of_view[view]) for view in placed)
     sightings = MarkerObservations(
-        np.repeat(np.arange(len(placed)), [len(item) for item in marker_of]),
-        np.concatenate(marker_of),
-        np.concatenate([views[view].points_mm for view in placed]),
-        np.concatenate([views[view].covariance_mm2 for view in placed]),
+        view=np.repeat(np.arange(len(placed)), [len(item) for item in marker_of]),
+        marker=np.concatenate(marker_of),
+        point_mm=np.concatenate([views[view].points_mm for view in placed]),
+        covariance_mm2=np.concatenate([views[view].covariance_mm2 for view in placed]),
     )
     joint = adjust_jointly(sightings, chain, markers[numbers])
     return JoinedViews(
@@ -281,8 +279,8 @@ class _GrowingMap:
         self.is_known = np.zeros(n_markers, dtype=bool)
 
     def add(self, view: MarkerSet, numbers: IntArray, pose: Pose[Part, Sensor]) -> None:
-        points = view.points_mm @ pose.rotation.T + pose.translation_mm
-        inverse = np.linalg.inv(pose.rotation @ view.covariance_mm2 @ pose.rotation.T)
+        points = pose.apply(view.points_mm)
+        inverse = np.linalg.inv(pose.rotate_covariance(view.covariance_mm2))
         self._information[numbers] += inverse
         self._weighted[numbers] += np.einsum("nij,nj->ni", inverse, points)
         self.is_known[numbers] = True

@@ -9,9 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    bools,
+    floats,
+    ints,
+)
 from armscan.geometry.poses import Part, Pose, Sensor
-from armscan.geometry.rotations import rotation_from_vector, skew
+from armscan.geometry.rotations import skew
 
 MAX_ROUNDS = 30
 SETTLED = 1e-10
@@ -19,8 +28,7 @@ OUTLIER_LEVEL = 1e-3
 """Chance that any observation of a whole map without a moved marker is left out."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkerObservations:
+class MarkerObservations(RowRecord):
     """Which view saw which marker where.
 
     Parameters
@@ -31,24 +39,13 @@ class MarkerObservations:
         (K, 3) and (K, 3, 3) in the frame of the view.
     """
 
-    view: IntArray
-    marker: IntArray
-    point_mm: FloatArray
-    covariance_mm2: FloatArray
-
-    def __len__(self) -> int:
-        """Count of sightings."""
-        return len(self.view)
-
-    def chosen(self, kept: BoolArray) -> MarkerObservations:
-        """Those where ``kept`` (K,) is true."""
-        return MarkerObservations(
-            self.view[kept], self.marker[kept], self.point_mm[kept], self.covariance_mm2[kept]
-        )
+    view: IntArray = ints("N")
+    marker: IntArray = ints("N")
+    point_mm: FloatArray = floats("N", 3)
+    covariance_mm2: FloatArray = floats("N", 3, 3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class JointMap:
+class JointMap(ArrayRecord):
     """Views and markers in the frame of the first view.
 
     Parameters
@@ -69,11 +66,11 @@ class JointMap:
     """
 
     part_from_view: tuple[Pose[Part, Sensor], ...]
-    pose_covariance: FloatArray
-    markers_mm: FloatArray
-    marker_covariance_mm2: FloatArray
-    residual_mm: FloatArray
-    is_used: BoolArray
+    pose_covariance: FloatArray = floats("V", 6, 6)
+    markers_mm: FloatArray = floats("M", 3)
+    marker_covariance_mm2: FloatArray = floats("M", 3, 3)
+    residual_mm: FloatArray = floats("K", 3)
+    is_used: BoolArray = bools("K")
     chi2: float
     degrees_of_freedom: int
 
@@ -101,23 +98,23 @@ def adjust_jointly(
     is_used = np.ones(len(sightings), dtype=bool)
     problem = _Problem(sightings, tuple(start), np.array(markers_mm))
     while True:
-        problem = replace(problem, sightings=sightings.chosen(is_used)).solved()
+        problem = replace(problem, sightings=sightings.select(is_used)).solved()
         worst = problem.worst()
         if worst is None:
             break
         is_used[np.flatnonzero(is_used)[worst]] = False
     poses, covariance, own = problem.covariances()
     residual = replace(problem, sightings=sightings).residuals()
-    used = sightings.chosen(is_used)
+    used = sightings.select(is_used)
     return JointMap(
-        problem.poses,
-        poses,
-        problem.markers_mm,
-        own,
-        residual,
-        is_used,
-        problem.squares(),
-        3 * len(used) - 6 * (len(start) - 1) - 3 * len(covariance),
+        part_from_view=problem.poses,
+        pose_covariance=poses,
+        markers_mm=problem.markers_mm,
+        marker_covariance_mm2=own,
+        residual_mm=residual,
+        is_used=is_used,
+        chi2=problem.squares(),
+        degrees_of_freedom=3 * len(used) - 6 * (len(start) - 1) - 3 * len(covariance),
     )
 
 
@@ -205,10 +202,7 @@ class _Problem:
 
     def moved(self, steps: FloatArray, shift_mm: FloatArray) -> _Problem:
         """The problem after a step of the poses (V - 1, 6) and the markers (M, 3)."""
-        poses: list[Pose[Part, Sensor]] = [
-            Pose(rotation_from_vector(step[:3]) @ pose.rotation, pose.translation_mm + step[3:])
-            for pose, step in zip(self.poses[1:], steps, strict=True)
-        ]
+        poses = [pose.retract(step) for pose, step in zip(self.poses[1:], steps, strict=True)]
         return replace(self, poses=(self.poses[0], *poses), markers_mm=self.markers_mm + shift_mm)
 
     def covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -19,7 +19,9 @@ from scipy.stats import binom
 from armscan.geometry.poses import Pose
 from armscan.geometry.registration import spread_mm
 from armscan.markers.alignments import (
+    FALSE_ALARMS,
     LEAST_TO_CHECK,
+    RIVAL_SHARE,
     Alignment,
     LabelledMarkers,
     LabelVotes,
@@ -76,12 +78,12 @@ def match_markers(
     on_line = _on_a_line(a, b)
     if on_line is not None:
         return on_line
-    votes = vote(a, b, options.distance_sigmas)
-    placing = MarkerPlacement(a, b, options.position_sigmas)
+    votes = vote(a, b)
+    placing = MarkerPlacement(a, b)
     are_seen = first.frame == second.frame == "Sensor"
-    found = find_alignments(placing, votes, options, are_seen=are_seen)
+    found = find_alignments(placing, votes, are_seen=are_seen)
     result = _judged(placing, votes, found, options)
-    return _unless_symmetric(result, placing, options) if isinstance(result, Matched) else result
+    return _unless_symmetric(result, placing) if isinstance(result, Matched) else result
 
 
 def log10_false_alarms(
@@ -114,11 +116,11 @@ def _judged(
         return NoMatch("no three markers have the same distances in both sets", ENOUGH_MARKERS)
     n, rival = len(found[0]), len(found[1]) if len(found) > 1 else 0
     n_a, n_b = len(placing.first), len(placing.second)
-    has_rival = rival > max(options.rival_share * n, 3.0) or (
+    has_rival = rival > max(RIVAL_SHARE * n, 3.0) or (
         n >= LEAST_TO_CHECK and n - rival < CLEAR_LEAD
     )
     chance = log10_false_alarms(placing.first, placing.second, votes, n, placing.gate_mm)
-    if chance > np.log10(options.false_alarms) and not (has_rival and 2 * n >= min(n_a, n_b)):
+    if chance > np.log10(FALSE_ALARMS) and not (has_rival and 2 * n >= min(n_a, n_b)):
         return NoMatch(
             f"{n} of {n_a} and {n_b} markers agree, which chance would show as well",
             "measure the markers more closely, or more common ones",
@@ -167,12 +169,12 @@ def _swapped(result: MatchResult) -> MatchResult:
 
 
 def _inverse(alignment: Alignment) -> Alignment:
-    return Alignment(alignment.pairs[:, ::-1], alignment.first_from_second.inverse())
+    return Alignment(
+        pairs=alignment.pairs[:, ::-1], first_from_second=alignment.first_from_second.inverse()
+    )
 
 
-def _unless_symmetric(
-    result: Matched, placing: MarkerPlacement, options: MarkerMatchOptions
-) -> Matched | NotUnique:
+def _unless_symmetric(result: Matched, placing: MarkerPlacement) -> Matched | NotUnique:
     """Refuse a match on a part that fits on itself in another way.
 
     The two views may show different halves of a symmetric part: then the right alignment explains
@@ -181,17 +183,17 @@ def _unless_symmetric(
     first, second = placing.first, placing.second
     pose = result.alignment.first_from_second
     lonely = np.setdiff1d(np.arange(len(second)), result.alignment.pairs[:, 1])
-    carried = second.points_mm[lonely] @ pose.rotation.T + pose.translation_mm
+    carried = pose.apply(second.points_mm[lonely])
     points = np.concatenate([first.points_mm, carried])
     sigma = np.concatenate([first.sigma_mm, second.sigma_mm[lonely]])
     both = label_points(points, sigma)
     everything = np.tile(np.arange(len(points))[:, None], (1, 2))
-    itself = Alignment(everything, Pose(np.eye(3), np.zeros(3)))
-    onto_itself = MarkerPlacement(both, both, options.position_sigmas)
-    votes = vote(both, both, options.distance_sigmas)
-    found = find_alignments(onto_itself, votes, options, known=(itself,))
+    itself = Alignment(pairs=everything, first_from_second=Pose(np.eye(3), np.zeros(3)))
+    onto_itself = MarkerPlacement(both, both)
+    votes = vote(both, both)
+    found = find_alignments(onto_itself, votes, known=(itself,))
     n = len(found[1]) if len(found) > 1 else 0
-    if n <= max(options.rival_share * len(points), 3.0):
+    if n <= max(RIVAL_SHARE * len(points), 3.0):
         return result
     return NotUnique(
         f"{n} of all {len(points)} markers seen fit on themselves in another way: the part is "

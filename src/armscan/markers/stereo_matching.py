@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    floats,
+    ints,
+)
 from armscan.markers.candidates import CandidatePairs, RingMatchOptions, find_candidates
 from armscan.markers.surface_support import only_candidates, only_supported, ranks
 from armscan.models.two_views import TwoViews
@@ -29,8 +35,7 @@ class RingStatus(Enum):
     OUT_OF_ORDER = "another pair on its epipolar line lies the other way round"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StereoMatches:
+class StereoMatches(ArrayRecord):
     """Markers that both cameras saw.
 
     Parameters
@@ -49,11 +54,11 @@ class StereoMatches:
         Count of flat faces on which at least six markers agree.
     """
 
-    left: IntArray
-    right: IntArray
+    left: IntArray = ints("M")
+    right: IntArray = ints("M")
     markers: MarkerSet
-    distance_px: FloatArray
-    sigma_px: FloatArray
+    distance_px: FloatArray = floats("M")
+    sigma_px: FloatArray = floats("M")
     fates: tuple[RingStatus, ...]
     n_candidates: int
     n_planes: int
@@ -102,13 +107,13 @@ def match_rings(
     rank = best = np.zeros(len(pairs), np.int64)
     n_planes = 0
     for _ in range(_ROUNDS):
-        rank, n_planes = ranks(pairs, pairs.subset(matched), left, right, options)
+        rank, n_planes = ranks(pairs, pairs.select(matched), left, right, options)
         best = np.maximum(best, rank)
         matched = only_supported(pairs, rank, best)
-    crossed = _out_of_order(pairs.subset(matched), left, views)
+    crossed = _out_of_order(pairs.select(matched), left, views)
     kept = matched[~crossed]
     fates = _fates(len(left), pairs, np.asarray(rank >= 2), matched, crossed)
-    return _matches(left, pairs.subset(kept), fates, len(pairs), n_planes)
+    return _matches(left, pairs.select(kept), fates, len(pairs), n_planes)
 
 
 def _matches(
@@ -126,14 +131,14 @@ def _matches(
         source=left.source,
     )
     return StereoMatches(
-        chosen.left,
-        chosen.right,
-        markers,
-        chosen.distance_px,
-        chosen.sigma_px,
-        fates,
-        n_candidates,
-        n_planes,
+        left=chosen.left,
+        right=chosen.right,
+        markers=markers,
+        distance_px=chosen.distance_px,
+        sigma_px=chosen.sigma_px,
+        fates=fates,
+        n_candidates=n_candidates,
+        n_planes=n_planes,
     )
 
 

@@ -5,13 +5,19 @@ depth of the surroundings.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import combinations
 from math import comb
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bools,
+    floats,
+)
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.candidates import CandidatePairs, RingMatchOptions
 from armscan.records.points import RingImages
@@ -27,8 +33,7 @@ taken for collinear."""
 _REFITS = 5
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HomographyConsensus:
+class HomographyConsensus(ArrayRecord):
     """A homography and the pairs that agree with it.
 
     Parameters
@@ -42,8 +47,8 @@ class HomographyConsensus:
         pairs fit exactly: 0 says nothing then.
     """
 
-    matrix: FloatArray
-    is_inlier: BoolArray
+    matrix: FloatArray = floats(3, 3)
+    is_inlier: BoolArray = bools(None)
     rms_px: float
 
 
@@ -143,7 +148,7 @@ def _refined(
         if np.array_equal(before, inlier):
             break
     rms = float(np.sqrt(np.mean(distance[inlier] ** 2)))
-    return HomographyConsensus(matrix, inlier, rms)
+    return HomographyConsensus(matrix=matrix, is_inlier=inlier, rms_px=rms)
 
 
 def _samples(n: int, seed: int) -> IntArray:
@@ -205,6 +210,14 @@ def _mapped(matrix: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
+PLANE_PX = 2.0
+"""T of the homography's consensus: markers on one plane agree to this."""
+DEPTH_TOLERANCE = 0.15
+"""Largest distance in depth of a marker from the plane through its neighbours, as a fraction of the
+distance to them; for parts that curve."""
+SAME_SIZE = 0.015
+"""Markers whose diameters differ by less than this fraction are of one make; where most are, a pair
+of that size is believed without neighbours."""
 MIN_ON_PLANE = 6
 """Fewest pairs on a plane: two more than always agree."""
 _FARTHEST_PER_MM = 1e-6
@@ -224,7 +237,6 @@ def on_planes(
     seeds: CandidatePairs,
     left: RingImages,
     right: RingImages,
-    options: RingMatchOptions,
 ) -> tuple[BoolArray, int]:
     """Which pairs agree with a homography on which many seeds agree (eqs. 4.28 to 4.30).
 
@@ -239,8 +251,6 @@ def on_planes(
         Pairs that are the only candidates of both their rings.
     left, right
         Rings in the two images.
-    options
-        ``plane_px`` is T.
 
     Returns
     -------
@@ -255,14 +265,12 @@ def on_planes(
     free = np.ones(len(seeds), np.bool_)
     n_planes = 0
     while True:
-        fit = find_homography(
-            seed_from[free], seed_to[free], options.plane_px, min_inliers=MIN_ON_PLANE
-        )
+        fit = find_homography(seed_from[free], seed_to[free], PLANE_PX, min_inliers=MIN_ON_PLANE)
         if isinstance(fit, FitFailure):
             return found, n_planes
         n_planes += 1
         distance = np.linalg.norm(transfer_px(fit.matrix, from_px) - to_px, axis=1)
-        found |= distance <= options.plane_px
+        found |= distance <= PLANE_PX
         free[np.flatnonzero(free)[fit.is_inlier]] = False
 
 
@@ -304,7 +312,7 @@ def _misfit(point_mm: FloatArray, neighbours_mm: FloatArray) -> float:
     design = np.column_stack([neighbours_mm[:, :2] / neighbours_mm[:, 2:], np.ones(n)])
     inverse = 1.0 / neighbours_mm[:, 2]
     triples = np.array(list(combinations(range(n), MIN_NEIGHBOURS)), np.int64)
-    triples = triples[_surface_support_is_spread(design[triples])]
+    triples = triples[_are_spread(design[triples])]
     if not len(triples):
         return float("inf")
     planes = np.linalg.solve(design[triples], inverse[triples][..., None])[..., 0]
@@ -316,7 +324,7 @@ def _misfit(point_mm: FloatArray, neighbours_mm: FloatArray) -> float:
     return abs(expected - float(point_mm[2])) / distance
 
 
-def _surface_support_is_spread(corners: FloatArray) -> BoolArray:
+def _are_spread(corners: FloatArray) -> BoolArray:
     """(T,) True where three rays (T, 3, 3) are not nearly in one plane."""
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
@@ -341,10 +349,10 @@ def ranks(
     n_planes
         Count of homographies found.
     """
-    is_on_plane, n_planes = on_planes(pairs, seeds, left, right, options)
+    is_on_plane, n_planes = on_planes(pairs, seeds, left, right)
     misfit = depth_misfits(pairs, seeds, left)
-    rank = (misfit < options.depth_tolerance).astype(np.int64)
-    rank += misfit < _RIVAL_FACTOR * options.depth_tolerance
+    rank = (misfit < DEPTH_TOLERANCE).astype(np.int64)
+    rank += misfit < _RIVAL_FACTOR * DEPTH_TOLERANCE
     rank[_is_of_their_size(pairs, seeds, options)] = 2
     rank[is_on_plane] = 3
     return rank, n_planes
@@ -360,11 +368,11 @@ def _is_of_their_size(
     expected = options.diameter_mm
     if len(seeds) >= _MIN_OF_ONE_SIZE:
         middle = float(np.median(seeds.diameter_mm))
-        alike = np.abs(np.log(seeds.diameter_mm / middle)) < options.same_size
+        alike = np.abs(np.log(seeds.diameter_mm / middle)) < SAME_SIZE
         expected = middle if alike.mean() >= _SHARE_OF_ONE_SIZE else None
     if expected is None:
         return np.zeros(len(pairs), np.bool_)
-    return np.asarray(np.abs(np.log(pairs.diameter_mm / expected)) < options.same_size)
+    return np.asarray(np.abs(np.log(pairs.diameter_mm / expected)) < SAME_SIZE)
 
 
 def only_supported(pairs: CandidatePairs, rank: IntArray, best: IntArray) -> IntArray:

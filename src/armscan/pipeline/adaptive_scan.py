@@ -21,8 +21,7 @@ from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, Stripe
 from armscan.reconstruction.sync import ExposurePoses, exposure_poses
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from armscan.storage.recording import encoded_png
-from armscan.storage.recording_writer import write_recording, written_session
+from armscan.storage.recording import encoded_png, write_recording, written_session
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 

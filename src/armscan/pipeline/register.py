@@ -399,10 +399,10 @@ def joint_markers(old: MarkerList, new: MarkerList, place: PlaceRegistration) ->
     added = np.isin(new.markers.ids, place.only_new)
     last = int(old.markers.ids.max())
     return MarkerSet(
-        np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
-        np.concatenate([points, carried[added]]),
-        np.concatenate([covariances, covariance[added]]),
-        old.markers.frame,
+        ids=np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
+        points_mm=np.concatenate([points, carried[added]]),
+        covariance_mm2=np.concatenate([covariances, covariance[added]]),
+        frame=old.markers.frame,
     )
 
 

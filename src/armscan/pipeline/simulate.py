@@ -26,9 +26,8 @@ from armscan.errors import EstimationError, OptionError, OutputError
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.scan_part import FewerViews
 from armscan.storage.arm import ProbeTip, write_probing
-from armscan.storage.atomic import check_new_folder, check_outputs
-from armscan.storage.recording import encoded_png
-from armscan.storage.recording_writer import write_recording, written_session
+from armscan.storage.files import check_new_folder, check_outputs
+from armscan.storage.recording import encoded_png, write_recording, written_session
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -130,9 +130,7 @@ def verify_on_ball(
         by_standard=np.full((len(used), 1), -u_radius),
     )
     return _judged(
-        _Evidence(
-            measured, used, fit, found.diameter, standard, region, inspection or InspectionOptions()
-        ),
+        _Evidence(measured, used, fit, found.diameter, standard, region),
         found,
         ("diameter", "fitted minus nominal diameter (P_Size.Sph.All of ISO 10360-8)"),
         found.diameter.value_mm - diameter_mm,
@@ -181,7 +179,6 @@ def verify_on_plate(
             offset,
             standard,
             region,
-            inspection or InspectionOptions(),
         ),
         found,
         ("height", "of the scanned plane over the probed one, at the middle of the points"),
@@ -210,7 +207,6 @@ class _Evidence:
     length: MeasuredLength
     standard: _Standard
     region: Box | None
-    inspection: InspectionOptions
 
     @property
     def within(self) -> BoolArray:
@@ -269,7 +265,7 @@ def _judged(
         mpe_mm=options.mpe_mm,
     )
     spread = check_spread(fit.residuals_mm, variance, exposure)
-    off = check_exposures_off(cloud, found, evidence.within, evidence.inspection)
+    off = check_exposures_off(cloud, found, evidence.within)
     sound = None if scan is None else check_contradictions(scan.contradictions)
     checks = tuple(c for c in (size, consistency, spread, off, sound) if c is not None)
     if spread is None or (scan is not None and consistency is None):

@@ -155,7 +155,7 @@ def camera_page(
     )
     sections = [
         Section("The camera", (table, Text(words))),
-        Section("How well it fits", how_well),
+        Section("How well it fits", tuple(how_well)),
         Section("What the target covered", (Gallery((_coverage_map(fit), _tilt_rose(fit))),)),
         _views_section(fit, exposures),
     ]

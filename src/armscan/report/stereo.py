@@ -188,7 +188,7 @@ def stereo_page(
     table = quantity_table(("quantity", "value ± 1 sigma", "meaning"), relative)
     sections = [
         Section("Where the cameras are to each other", (table, Text(where))),
-        Section("How well it fits", how_well),
+        Section("How well it fits", tuple(how_well)),
         _pairs_section(fit, exposures),
         _two_cameras_section(fit),
     ]

@@ -23,8 +23,7 @@ from armscan.geometry.poses import Pose, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.models.arm import AXIS_PARAMETERS, ArmModel, forward
 from armscan.records.recording import NO_TRIGGER, ArmTrack, PoseForm, Session
-from armscan.storage.atomic import new_folder
-from armscan.storage.images import read_bytes
+from armscan.storage.files import new_folder, read_bytes
 from armscan.storage.poses import (
     FORM_COLUMNS,
     METRES_REMEDY,

@@ -21,11 +21,10 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.records.cloud import CloudFrame, PointCloud
-from armscan.storage.atomic import check_outputs, write_files
+from armscan.storage.codec import parse_json
 from armscan.storage.documents import read_calibration, read_camera_calibration
+from armscan.storage.files import check_outputs, read_bytes, write_files
 from armscan.storage.foreign import camera_info_yaml
-from armscan.storage.images import read_bytes
-from armscan.storage.json_text import parse_json
 
 TYPES = {
     "char": "i1",

@@ -1,123 +1,387 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration documents: ``camera.json``, ``sensor.json``, ``stereo.json``, ``scanner.json``,
-``registration.json``; exact, written once.
+"""Calibration documents: ``camera.json``, ``sensor.json``, ``stereo.json``, ``scanner.json`` and
+``registration.json``; exact, written once, with a SHA-256 of their content.
+
+The keys are the fields of the classes in `armscan.models`; `LAYOUTS` says what stands otherwise.
+A new field with a default is read from older documents without further ado.
 """
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import asdict
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from datetime import UTC, datetime
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
+from uuid import uuid4
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
 
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.registration import REGISTRATION_PARAMETERS
 from armscan.geometry.shapes import Plane
 from armscan.models.calibration import (
     HAND_EYE_PARAMETER_NAMES,
     ArmNoise,
     CameraCalibration,
+    CameraDiagnostics,
+    FTest,
     HandEyeCalibration,
     HandEyeDiagnostics,
+    InputFile,
+    Provenance,
     ScannerCalibration,
+    SecondCamera,
     SensorCalibration,
+    SensorDiagnostics,
+    SheetCalibration,
+    SheetDiagnostics,
 )
-from armscan.models.two_views import STEREO_PARAMETER_NAMES, StereoCalibration, StereoDiagnostics
-from armscan.storage.bodies import (
-    camera_body,
-    camera_from_body,
-    covariance_body,
-    covariance_from_body,
-    provenance_body,
-    provenance_from_body,
-    right_pose_body,
-    right_pose_from_body,
-    sensor_document_of,
-    sensor_from_document,
-    triple,
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
+from armscan.models.light_sheet import BOW_TERMS, LightSheet
+from armscan.models.two_views import (
+    STEREO_PARAMETER_NAMES,
+    StereoCalibration,
+    StereoDiagnostics,
 )
-from armscan.storage.foreign import read_foreign_camera
-from armscan.storage.images import read_bytes
-from armscan.storage.json_text import json_bytes, parse_json
-from armscan.storage.schema import (
-    CAMERA_SCHEMA,
-    REGISTRATION_SCHEMA,
-    SCANNER_SCHEMA,
-    SCHEMA_VERSION,
-    SENSOR_SCHEMA,
-    STEREO_SCHEMA,
-    ArmNoiseBody,
-    Body,
-    CameraDocument,
-    CouplingBody,
-    CovarianceBody,
-    HandEyeBody,
-    HandEyeDiagnosticsBody,
-    KnownOrNot,
-    LeftOutBody,
-    ObservationsBody,
-    PlateBody,
-    PoseBody,
-    ProvenanceBody,
-    ScannerDocument,
-    SensorDocument,
-    StereoDiagnosticsBody,
-    StereoDocument,
-    Triple,
+from armscan.storage.codec import (
+    FieldCodec,
+    Layout,
+    MismatchError,
+    RecordCodec,
+    is_json,
+    json_bytes,
+    matrix_tree,
+    named,
+    parse_json,
+    read_matrix,
 )
+from armscan.storage.files import path_text, read_bytes
+from armscan.storage.foreign import parse_foreign_camera
+from armscan.vision.stripe.image import LaserColour
 
-D = TypeVar("D", bound=BaseModel)
+T = TypeVar("T")
 
-BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-
+SCHEMA_VERSION = 1
+CAMERA_SCHEMA = "armscan/camera-calibration"
+SENSOR_SCHEMA = "armscan/sensor-calibration"
+SCANNER_SCHEMA = "armscan/scanner-calibration"
+STEREO_SCHEMA = "armscan/stereo-calibration"
+REGISTRATION_SCHEMA = "armscan/registration"
 KINDS = {
-    CAMERA_SCHEMA: "camera calibration",
-    SENSOR_SCHEMA: "sensor calibration",
-    SCANNER_SCHEMA: "scanner calibration",
-    STEREO_SCHEMA: "stereo calibration",
-    REGISTRATION_SCHEMA: "registration",
+    CAMERA_SCHEMA: ("camera calibration", "calibrate camera"),
+    SENSOR_SCHEMA: ("sensor calibration", "calibrate laser"),
+    SCANNER_SCHEMA: ("scanner calibration", "calibrate hand-eye"),
+    STEREO_SCHEMA: ("stereo calibration", "calibrate stereo"),
+    REGISTRATION_SCHEMA: ("registration", "register"),
 }
-WRITERS = {
-    CAMERA_SCHEMA: "calibrate camera",
-    SENSOR_SCHEMA: "calibrate laser",
-    SCANNER_SCHEMA: "calibrate hand-eye",
-    STEREO_SCHEMA: "calibrate stereo",
-    REGISTRATION_SCHEMA: "register",
-}
+"""What a document is, and the command that writes it."""
+ENVELOPE = ("schema", "schema_version", "observations", "sha256")
+BOW_KEYS = tuple(f"u{i}_v{j}" for i, j in BOW_TERMS)
+REGION_KEYS = ("x_min_px", "y_min_px", "x_max_px", "y_max_px")
+COUPLING_NAMES = ("row_names", "column_names")
+LARGEST_LATENCY_NS = 10**12
 
 
-def camera_document(
-    calibration: CameraCalibration, observations: tuple[str, bytes] | None = None
-) -> bytes:
-    """Text of ``camera.json``.
+# what stands in the files -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanTransform:
+    """Where one scan lies in the common frame, and how well its markers fit.
 
     Parameters
     ----------
-    calibration
-        What to write.
-    observations
-        Name and content of the file of observations beside it.
+    name, markers, own_frame
+        Of the scan, of its list of markers, and of the frame of both.
+    rotation_rows, translation_mm
+        (3, 3) and (3,): from the scan's own frame to the common one.
+    covariance
+        (6, 6) of `REGISTRATION_PARAMETERS`.
+    n_markers, rms_mm
+        Markers in common, and how far they are apart; NaN where that is not known.
+    cloud
+        File of the moved cloud, or None.
     """
-    document = CameraDocument(
-        schema=CAMERA_SCHEMA,
-        camera=camera_body(calibration),
-        observations=observations_body(observations),
-        provenance=provenance_body(calibration.provenance),
-    )
-    return json_bytes(document.model_dump(mode="json", by_alias=True))
+
+    name: str
+    markers: str
+    own_frame: str
+    rotation_rows: FloatArray
+    translation_mm: FloatArray
+    covariance: FloatArray
+    n_markers: int
+    rms_mm: float
+    cloud: str | None = None
 
 
-def sensor_document(
-    calibration: SensorCalibration, observations: tuple[str, bytes] | None = None
-) -> bytes:
-    """Text of ``sensor.json``; see `camera_document`."""
-    document = sensor_document_of(calibration, observations_body(observations))
-    return json_bytes(document.model_dump(mode="json", by_alias=True))
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerResidual:
+    """One marker of one scan against where it is in the common frame."""
+
+    name: str
+    id: int
+    common_id: int
+    residual_mm: FloatArray
+    is_used: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovedMarker:
+    """A marker that is not where the others say: its numbers and by how much, common frame."""
+
+    id: int
+    common_id: int
+    offset_mm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class ScanNotJoined:
+    """A scan that could not be joined."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Registration:
+    """``registration.json``: how scans were joined by markers.
+
+    Parameters
+    ----------
+    kind, simulated
+        What was joined, and whether of rendered images.
+    common_frame, common_frame_of
+        Frame of the results, and the list of markers that defines it.
+    transforms, residuals, moved, not_joined
+        Scans that were joined, their markers, markers that moved, and scans that could not be.
+    chi2, degrees_of_freedom
+        Squared residuals in units of their covariances.
+    provenance
+        How it came to be.
+    """
+
+    kind: Literal["views", "moved arm"]
+    simulated: bool
+    common_frame: str
+    common_frame_of: str
+    transforms: tuple[ScanTransform, ...]
+    residuals: tuple[MarkerResidual, ...]
+    moved: tuple[MovedMarker, ...]
+    not_joined: tuple[ScanNotJoined, ...]
+    chi2: float
+    degrees_of_freedom: int
+    provenance: Provenance
+
+
+def _texts(content: Any, key: str) -> tuple[tuple[str, str], ...]:
+    if not isinstance(content, dict) or not all(isinstance(text, str) for text in content.values()):
+        raise MismatchError(key, "is no table of texts")
+    return tuple(content.items())
+
+
+def _left_out(content: Any, key: str) -> tuple[tuple[str, str], ...]:
+    if not isinstance(content, list):
+        raise MismatchError(key, "is no list")
+    pairs = [dict(_texts(item, f"{key}.{k}")) for k, item in enumerate(content)]
+    if any(pair.keys() != {"images", "reason"} for pair in pairs):
+        raise MismatchError(key, "needs images and reason of each entry")
+    return tuple((pair["images"], pair["reason"]) for pair in pairs)
+
+
+def _sensor_tree(sensor: SensorCalibration) -> dict[str, Any]:
+    head = {"schema": SENSOR_SCHEMA, "schema_version": SCHEMA_VERSION, "observations": None}
+    return head | CODEC.write(sensor)
+
+
+def _sensor_of_tree(content: Any, key: str) -> SensorCalibration:
+    if not isinstance(content, dict) or content.get("schema") != SENSOR_SCHEMA:
+        raise MismatchError(key, "is no sensor's document")
+    inner = {name: value for name, value in content.items() if name not in ENVELOPE}
+    return CODEC.read(SensorCalibration, inner, key)
+
+
+def _fault_of_camera(camera: CameraCalibration) -> str:
+    x_min, y_min, x_max, y_max = camera.covered_px
+    return "" if x_min <= x_max and y_min <= y_max else "has a valid region that is turned round"
+
+
+def _fault_of_sheet(sheet: SheetCalibration) -> str:
+    low, high = sheet.depth_range_mm
+    if not sheet.name:
+        return "has no name"
+    return "" if low <= high else "has depths that are turned round"
+
+
+def _fault_of_plane(plane: Plane) -> str:
+    is_triad = float(np.abs(plane.axes @ plane.axes.T - np.eye(3)).max()) <= 1e-6
+    return "" if is_triad else "has axes that are not unit vectors at right angles"
+
+
+def _fault_of_colour(sensor: SensorCalibration) -> str:
+    colours = get_args(LaserColour)
+    return "" if sensor.laser_colour in colours else f"has a laser_colour not of {colours}"
+
+
+def _fault_of_latency(scanner: ScannerCalibration) -> str:
+    return "" if abs(scanner.latency_ns) <= LARGEST_LATENCY_NS else "has a latency of minutes"
+
+
+EVIDENCE = Layout(is_evidence=True)
+LAYOUTS: Mapping[type, Layout] = {
+    CameraModel: Layout(
+        spread={"distortion": PARAMETER_NAMES[4:]},
+        constants={
+            "model": "pinhole k1 k2 p1 p2 k3",
+            "pixel_origin": "centre of the top-left pixel",
+        },
+    ),
+    CameraCalibration: Layout(
+        keys={"camera": "intrinsics", "covered_px": "valid_region"},
+        codecs={"covered_px": named(*REGION_KEYS)},
+        given=("provenance",),
+        covariance_names=lambda _: PARAMETER_NAMES,
+        check=_fault_of_camera,
+    ),
+    LightSheet: Layout(
+        keys={"origin_mm": "origin_sensor_mm"},
+        codecs={
+            "axes": named("u_sensor", "v_sensor", "normal_sensor"),
+            "bow_mm": named(*BOW_KEYS),
+            "fan": named("lean", "spread"),
+        },
+        optional=("fan",),
+    ),
+    SheetCalibration: Layout(
+        flat=("sheet",),
+        spread={"depth_range_mm": ("depth_min_sensor_mm", "depth_max_sensor_mm")},
+        check=_fault_of_sheet,
+    ),
+    SecondCamera: Layout(lends={"camera": "camera_provenance"}),
+    SensorCalibration: Layout(
+        lends={"camera": "camera_provenance"},
+        optional=("second", "laser_colour"),
+        covariance_names=lambda sensor: sensor.parameter_names,
+        check=_fault_of_colour,
+    ),
+    StereoCalibration: Layout(
+        keys={"right_from_left": "right_from_sensor"},
+        lends={"left": "provenance", "right": "provenance"},
+        covariance_names=lambda _: STEREO_PARAMETER_NAMES,
+    ),
+    StereoDiagnostics: Layout(
+        codecs={
+            "left_out": FieldCodec(
+                lambda pairs: [{"images": name, "reason": why} for name, why in pairs], _left_out
+            )
+        },
+        is_evidence=True,
+    ),
+    HandEyeCalibration: Layout(
+        codecs={
+            "sensor_coupling": FieldCodec(
+                lambda matrix: matrix_tree(
+                    matrix, row_names=HAND_EYE_PARAMETER_NAMES, column_names=()
+                ),
+                lambda content, key: read_matrix(content, key, *COUPLING_NAMES),
+            )
+        },
+        covariance_names=lambda _: HAND_EYE_PARAMETER_NAMES,
+    ),
+    ScannerCalibration: Layout(
+        codecs={"sensor": FieldCodec(_sensor_tree, _sensor_of_tree)}, check=_fault_of_latency
+    ),
+    Plane: Layout(
+        keys={"point_mm": "point_base_mm"},
+        spread={"axes": ("along_base", "across_base", "normal_base")},
+        check=_fault_of_plane,
+    ),
+    ArmNoise: Layout(least=0.0),
+    CameraDiagnostics: EVIDENCE,
+    SheetDiagnostics: EVIDENCE,
+    SensorDiagnostics: EVIDENCE,
+    HandEyeDiagnostics: EVIDENCE,
+    FTest: EVIDENCE,
+    ScanTransform: Layout(covariance_names=lambda _: REGISTRATION_PARAMETERS),
+    Provenance: Layout(codecs={"options": FieldCodec(dict, _texts)}, optional=("forced",)),
+}
+CODEC = RecordCodec(LAYOUTS)
+
+
+# writing ------------------------------------------------------------------------------------------
+
+Observations = tuple[str, bytes] | None
+"""Name and content of the file of observations beside a document."""
+
+
+def camera_document(calibration: CameraCalibration, observations: Observations = None) -> bytes:
+    """Text of ``camera.json``."""
+    tree = {
+        "camera": CODEC.write(calibration),
+        "provenance": CODEC.write(calibration.provenance),
+    }
+    return _text(CAMERA_SCHEMA, tree, observations)
+
+
+def sensor_document(calibration: SensorCalibration, observations: Observations = None) -> bytes:
+    """Text of ``sensor.json``."""
+    return _text(SENSOR_SCHEMA, CODEC.write(calibration), observations)
+
+
+def stereo_document(calibration: StereoCalibration, observations: Observations = None) -> bytes:
+    """Text of ``stereo.json``."""
+    return _text(STEREO_SCHEMA, CODEC.write(calibration), observations)
+
+
+def scanner_document(calibration: ScannerCalibration, observations: Observations = None) -> bytes:
+    """Text of ``scanner.json``.
+
+    Raises
+    ------
+    InputError
+        If the hand-eye depends on a sensor that is not given.
+    """
+    tree = CODEC.write(calibration)
+    coupling, sensor = calibration.hand_eye.sensor_coupling, calibration.sensor
+    if coupling is not None:
+        if sensor is None:
+            raise InputError("the hand-eye depends on a sensor's parameters that have no names")
+        tree["hand_eye"]["sensor_coupling"]["column_names"] = list(sensor.parameter_names)
+    return _text(SCANNER_SCHEMA, tree, observations)
+
+
+def registration_document(registration: Registration) -> bytes:
+    """Text of ``registration.json``."""
+    return _text(REGISTRATION_SCHEMA, CODEC.write(registration))
+
+
+def _text(schema: str, tree: dict[str, Any], observations: Observations = None) -> bytes:
+    content: dict[str, Any] = {"schema": schema, "schema_version": SCHEMA_VERSION, **tree}
+    if schema != REGISTRATION_SCHEMA:
+        content["observations"] = None
+    if observations is not None:
+        name, data = observations
+        content["observations"] = {"file": name, "sha256": sha256(data).hexdigest()}
+    return json_bytes(content | {"sha256": content_hash(content)})
+
+
+def content_hash(content: Mapping[str, Any]) -> str:
+    """SHA-256 of what a document says, without its own key ``sha256``.
+
+    It is that of the compact JSON text with sorted keys, so that blanks and line ends do not count.
+    """
+    rest = {key: value for key, value in content.items() if key != "sha256"}
+    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return sha256(text.encode()).hexdigest()
+
+
+# reading ------------------------------------------------------------------------------------------
 
 
 def document_schema(path: Path) -> str | None:
@@ -129,24 +393,32 @@ def document_schema(path: Path) -> str | None:
         If the file is missing, or JSON that is damaged.
     """
     data = read_bytes(path)
-    if not data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
-        return None
-    found = parse_json(data, str(path)).get("schema")
+    found = parse_json(data, path_text(path)).get("schema") if is_json(data) else None
     return found if isinstance(found, str) else None
 
 
-def read_calibration(path: Path) -> CameraCalibration | SensorCalibration:
-    """Read any calibration document of armscan.
+def is_scanner_document(path: Path) -> bool:
+    """True if a file says that it is a scanner's document; it need not be whole.
 
     Raises
     ------
     FileFormatError
-        If the file is cut, of another kind, of a newer version, or holds values that cannot be.
+        If the file is missing or no JSON.
     """
-    data = read_bytes(path)
-    if parse_json(data, str(path)).get("schema") == SENSOR_SCHEMA:
-        return _sensor(data, path)
-    return _camera(data, path)
+    return bool(parse_json(read_bytes(path), path_text(path)).get("schema") == SCANNER_SCHEMA)
+
+
+def read_calibration(path: Path) -> CameraCalibration | SensorCalibration:
+    """Read a camera's or a sensor's document.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is cut or changed, of another kind, of a newer version, or holds values that
+        cannot be.
+    """
+    is_sensor = document_schema(path) == SENSOR_SCHEMA
+    return read_sensor_calibration(path) if is_sensor else _read_camera(path)
 
 
 def read_camera_calibration(path: Path) -> CameraCalibration:
@@ -158,10 +430,35 @@ def read_camera_calibration(path: Path) -> CameraCalibration:
         As `read_calibration`; a sensor's document is refused where a camera's is needed.
     """
     data = read_bytes(path)
-    is_object = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{")
-    if not is_object or "schema" not in parse_json(data, str(path)):
-        return read_foreign_camera(path)
-    return _camera(data, path)
+    if is_json(data) and "schema" in parse_json(data, path_text(path)):
+        return _read_camera(path)
+    return read_foreign_camera(path)
+
+
+def read_foreign_camera(path: Path) -> CameraCalibration:
+    """Read a camera that OpenCV (YAML, XML, JSON) or ROS (``camera_info`` YAML) calibrated.
+
+    Such files bring no covariance: ``has_covariance`` is False and the uncertainty figures are
+    NaN. Coefficients beyond ``k1 k2 p1 p2 k3`` are accepted when they are zero.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is missing, empty, cut short, has no camera matrix or image size, or describes
+        a lens by another model.
+    """
+    camera, rms_px = parse_foreign_camera(read_bytes(path), path_text(path))
+    return CameraCalibration(
+        camera=camera,
+        covariance=np.zeros((9, 9)),
+        has_covariance=False,
+        rms_px=rms_px,
+        sigma_point_px=math.nan,
+        n_views=0,
+        n_points=0,
+        covered_px=np.array([0.0, 0.0, camera.width_px - 1.0, camera.height_px - 1.0]),
+        provenance=new_provenance([path], command=()),
+    )
 
 
 def read_sensor_calibration(path: Path) -> SensorCalibration:
@@ -172,422 +469,159 @@ def read_sensor_calibration(path: Path) -> SensorCalibration:
     FileFormatError
         As `read_calibration`; a camera's document is refused where a sensor's is needed.
     """
-    return _sensor(read_bytes(path), path)
+    return _record(SensorCalibration, SENSOR_SCHEMA, path)
 
 
-def _camera(data: bytes, path: Path) -> CameraCalibration:
-    document = validated_document(CameraDocument, CAMERA_SCHEMA, data, path)
-    try:
-        return camera_from_body(document.camera, provenance_from_body(document.provenance))
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+def read_stereo_calibration(path: Path) -> StereoCalibration:
+    """Read ``stereo.json``; raises as `read_calibration`."""
+    return _record(StereoCalibration, STEREO_SCHEMA, path)
 
 
-def _sensor(data: bytes, path: Path) -> SensorCalibration:
-    document = validated_document(SensorDocument, SENSOR_SCHEMA, data, path)
-    try:
-        return sensor_from_document(document)
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+def read_scanner_calibration(path: Path) -> ScannerCalibration:
+    """Read ``scanner.json``; raises as `read_calibration`."""
+    return _record(ScannerCalibration, SCANNER_SCHEMA, path)
 
 
-def validated_document(kind: type[D], schema: str, data: bytes, path: Path) -> D:
-    """Check the content of a document against its schema.
+def read_registration(path: Path) -> Registration:
+    """Read ``registration.json``; raises as `read_calibration`."""
+    return _record(Registration, REGISTRATION_SCHEMA, path)
 
-    Parameters
-    ----------
-    kind
-        Model of the document.
-    schema
-        Name that its key ``schema`` must have.
-    data, path
-        Content and name of the file.
 
-    Raises
-    ------
-    FileFormatError
-        If it is of another kind or a newer version, cut, or a key is missing, unknown or wrong.
-    """
-    where = str(path)
-    content = parse_json(data, where)
-    wanted = KINDS[schema]
+def _read_camera(path: Path) -> CameraCalibration:
+    tree = _opened(path, CAMERA_SCHEMA)
+    with _explained(path, CAMERA_SCHEMA):
+        if tree.keys() != {"camera", "provenance"}:
+            raise MismatchError("", "the keys are not camera, observations and provenance")
+        provenance = CODEC.read(Provenance, tree["provenance"], "provenance")
+        return CODEC.read(CameraCalibration, tree["camera"], "camera", provenance=provenance)
+
+
+def _record(kind: type[T], schema: str, path: Path) -> T:
+    tree = _opened(path, schema)
+    with _explained(path, schema):
+        record = CODEC.read(kind, tree)
+        if isinstance(record, ScannerCalibration):
+            _check_coupling(record, tree)
+        return record
+
+
+def _check_coupling(scanner: ScannerCalibration, tree: dict[str, Any]) -> None:
+    if scanner.hand_eye.sensor_coupling is None:
+        return
+    key, coupling = "hand_eye.sensor_coupling", tree["hand_eye"]["sensor_coupling"]
+    names = () if scanner.sensor is None else scanner.sensor.parameter_names
+    if tuple(coupling["row_names"]) != HAND_EYE_PARAMETER_NAMES:
+        raise MismatchError(key, "has not the names of the hand-eye's parameters")
+    if tuple(coupling["column_names"]) != names:
+        raise MismatchError(key, "has not the names of the sensor's parameters")
+
+
+def _opened(path: Path, schema: str) -> dict[str, Any]:
+    """Content of a document without its envelope, which is checked."""
+    where = path_text(path)
+    content = parse_json(read_bytes(path), where)
+    wanted, writer = KINDS[schema]
     found = content.get("schema")
-    if found in KINDS and found != schema:
-        raise FileFormatError(
-            f"this is a {KINDS[found]}, and a {wanted} is needed",
-            where=where,
-            remedy=f"name the file that `armscan {WRITERS[schema]}` wrote",
-        )
     if found != schema:
+        fact = f"this is not a {wanted} of armscan"
+        if isinstance(found, str) and found in KINDS:
+            fact = f"this is a {KINDS[found][0]}, and a {wanted} is needed"
         raise FileFormatError(
-            f"this is not a {wanted} of armscan",
+            fact,
             where=where,
-            remedy=f"name the file that `armscan {WRITERS[schema]}` wrote",
+            remedy=f"name the file that `armscan {writer}` wrote",
         )
-    version = content.get("schema_version")
-    if isinstance(version, int) and version > SCHEMA_VERSION:
+    number = content.get("schema_version")
+    if isinstance(number, int) and number > SCHEMA_VERSION:
         raise FileFormatError(
-            f"the file has schema version {version}, and this program reads up to {SCHEMA_VERSION}",
+            f"the file has schema version {number}, and this program reads up to {SCHEMA_VERSION}",
             where=where,
             remedy="update armscan",
         )
-    try:
-        return kind.model_validate_json(data.removeprefix(BYTE_ORDER_MARK), strict=True)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
+    if "sha256" in content and content["sha256"] != content_hash(content):
         raise FileFormatError(
-            f"the {wanted} is not valid at '{key}': {first['msg'].lower()}",
+            f"the {wanted} is not as it was written: its SHA-256 does not fit its content",
             where=where,
+            remedy="copy the file again or calibrate again; if you changed it on purpose, remove "
+            "its line sha256",
+        )
+    with _explained(path, schema):
+        if number != SCHEMA_VERSION:
+            raise MismatchError("schema_version", f"is not {SCHEMA_VERSION}")
+        if content.get("observations") is not None:
+            texts = _texts(content["observations"], "observations")
+            if dict(texts).keys() != {"file", "sha256"}:
+                raise MismatchError("observations", "needs the keys file and sha256")
+    return {key: value for key, value in content.items() if key not in ENVELOPE}
+
+
+@contextmanager
+def _explained(path: Path, schema: str) -> Iterator[None]:
+    """Say of which document a key is wrong."""
+    try:
+        yield
+    except MismatchError as error:
+        raise FileFormatError(
+            f"the {KINDS[schema][0]} is not valid: {error}",
+            where=path_text(path),
             remedy="use the file as it was written, or make it anew",
         ) from error
 
 
-def observations_body(observations: tuple[str, bytes] | None) -> ObservationsBody | None:
-    """Body that names a file of observations and its hash; None for None."""
-    if observations is None:
-        return None
-    name, content = observations
-    return ObservationsBody(file=name, sha256=hashlib.sha256(content).hexdigest())
+# how a document came to be ------------------------------------------------------------------------
 
 
-def stereo_document(
-    calibration: StereoCalibration, observations: tuple[str, bytes] | None = None
-) -> bytes:
-    """Text of ``stereo.json``.
-
-    Parameters
-    ----------
-    calibration
-        What to write.
-    observations
-        Name and content of the file of observations beside it.
-    """
-    document = StereoDocument(
-        schema=STEREO_SCHEMA,
-        left=camera_body(calibration.left),
-        right=camera_body(calibration.right),
-        right_from_sensor=right_pose_body(calibration.right_from_left),
-        covariance=covariance_body(STEREO_PARAMETER_NAMES, calibration.covariance),
-        rms_px=calibration.rms_px,
-        n_pairs=calibration.n_pairs,
-        n_points=calibration.n_points,
-        diagnostics=_diagnostics_body(calibration.diagnostics),
-        observations=observations_body(observations),
-        provenance=provenance_body(calibration.provenance),
-    )
-    return json_bytes(document.model_dump(mode="json", by_alias=True))
+def fingerprint(path: Path) -> InputFile:
+    """Path as given, with ``/``, and SHA-256 of the content."""
+    return InputFile(path_text(path), sha256(read_bytes(path)).hexdigest())
 
 
-def read_stereo_calibration(path: Path) -> StereoCalibration:
-    """Read ``stereo.json``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut, of another kind, of a newer version, or holds values that cannot be.
-    """
-    document = validated_document(StereoDocument, STEREO_SCHEMA, read_bytes(path), path)
-    try:
-        provenance = provenance_from_body(document.provenance)
-        return StereoCalibration(
-            left=camera_from_body(document.left, provenance),
-            right=camera_from_body(document.right, provenance),
-            right_from_left=right_pose_from_body(document.right_from_sensor),
-            covariance=covariance_from_body(document.covariance, STEREO_PARAMETER_NAMES),
-            rms_px=document.rms_px,
-            n_pairs=document.n_pairs,
-            n_points=document.n_points,
-            provenance=provenance,
-            diagnostics=_diagnostics(document.diagnostics),
-        )
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
-
-
-def _diagnostics_body(known: StereoDiagnostics | None) -> StereoDiagnosticsBody | None:
-    if known is None:
-        return None
-    return StereoDiagnosticsBody(
-        epipolar_rms_px=known.epipolar_rms_px,
-        epipolar_mean_px=known.epipolar_mean_px,
-        left_out=tuple(LeftOutBody(images=name, reason=why) for name, why in known.left_out),
-        intrinsics=known.intrinsics,
-        hold_out_rms_px=known.hold_out_rms_px,
-        typical_level=known.typical_level,
-        target_error_mm=known.target_error_mm,
-    )
-
-
-def _diagnostics(body: StereoDiagnosticsBody | None) -> StereoDiagnostics | None:
-    if body is None:
-        return None
-    return StereoDiagnostics(
-        epipolar_rms_px=body.epipolar_rms_px,
-        epipolar_mean_px=body.epipolar_mean_px,
-        left_out=tuple((item.images, item.reason) for item in body.left_out),
-        intrinsics=body.intrinsics,
-        hold_out_rms_px=body.hold_out_rms_px,
-        typical_level=body.typical_level,
-        target_error_mm=body.target_error_mm,
-    )
-
-
-def scanner_document(
-    calibration: ScannerCalibration, observations: tuple[str, bytes] | None = None
-) -> bytes:
-    """Text of ``scanner.json``.
-
-    Parameters
-    ----------
-    calibration
-        What to write.
-    observations
-        Name and content of the file of observations beside it.
-
-    Raises
-    ------
-    InputError
-        If the hand-eye depends on a sensor that is not given.
-    """
-    sensor = calibration.sensor
-    names = () if sensor is None else sensor.parameter_names
-    document = ScannerDocument(
-        schema=SCANNER_SCHEMA,
-        sensor=None if sensor is None else sensor_document_of(sensor, None),
-        hand_eye=_hand_eye_body(calibration.hand_eye, names),
-        latency_ns=calibration.latency_ns,
-        observations=observations_body(observations),
-        provenance=provenance_body(calibration.provenance),
-    )
-    return json_bytes(document.model_dump(mode="json", by_alias=True))
-
-
-def is_scanner_document(path: Path) -> bool:
-    """True if a file says that it is a scanner's document; it need not be whole.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing or no JSON.
-    """
-    return bool(parse_json(read_bytes(path), str(path)).get("schema") == SCANNER_SCHEMA)
-
-
-def read_scanner_calibration(path: Path) -> ScannerCalibration:
-    """Read ``scanner.json``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut, of another kind, of a newer version, or holds values that cannot be.
-    """
-    document = validated_document(ScannerDocument, SCANNER_SCHEMA, read_bytes(path), path)
-    try:
-        sensor = None if document.sensor is None else sensor_from_document(document.sensor)
-        names = () if sensor is None else sensor.parameter_names
-        return ScannerCalibration(
-            sensor=sensor,
-            hand_eye=_hand_eye_from_body(document.hand_eye, names),
-            provenance=provenance_from_body(document.provenance),
-            latency_ns=document.latency_ns,
-        )
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
-
-
-def _hand_eye_body(calibration: HandEyeCalibration, sensor_names: tuple[str, ...]) -> HandEyeBody:
-    pose = calibration.tool_from_sensor
-    first, second, third = (triple(row) for row in pose.rotation)
-    known = calibration.diagnostics
-    return HandEyeBody(
-        tool_from_sensor=PoseBody(
-            rotation_rows=(first, second, third), translation_tool_mm=triple(pose.translation_mm)
-        ),
-        covariance=covariance_body(HAND_EYE_PARAMETER_NAMES, calibration.covariance),
-        sensor_coupling=_coupling_body(calibration.sensor_coupling, sensor_names),
-        arm_noise=ArmNoiseBody(**asdict(calibration.arm_noise)),
-        rms_mm=calibration.rms_mm,
-        n_postures=calibration.n_postures,
-        n_exposures=calibration.n_exposures,
-        n_points=calibration.n_points,
-        plate=_plate_body(calibration.plate),
-        diagnostics=None if known is None else HandEyeDiagnosticsBody(**asdict(known)),
-    )
-
-
-def _hand_eye_from_body(body: HandEyeBody, sensor_names: tuple[str, ...]) -> HandEyeCalibration:
-    pose = body.tool_from_sensor
-    tool_from_sensor: Pose[Tool, Sensor] = Pose(
-        np.array(pose.rotation_rows), np.array(pose.translation_tool_mm)
-    )
-    return HandEyeCalibration(
-        tool_from_sensor=tool_from_sensor,
-        covariance=covariance_from_body(body.covariance, HAND_EYE_PARAMETER_NAMES),
-        sensor_coupling=_coupling_from_body(body.sensor_coupling, sensor_names),
-        arm_noise=ArmNoise(**body.arm_noise.model_dump()),
-        rms_mm=body.rms_mm,
-        n_postures=body.n_postures,
-        n_exposures=body.n_exposures,
-        n_points=body.n_points,
-        plate=_plate_from_body(body.plate),
-        diagnostics=_diagnostics_from_body(body.diagnostics),
-    )
-
-
-def _diagnostics_from_body(body: HandEyeDiagnosticsBody | None) -> HandEyeDiagnostics | None:
-    if body is None:
-        return None
-    return HandEyeDiagnostics(
-        method=body.method,
-        rank=body.rank,
-        condition=body.condition,
-        weakest=body.weakest,
-        plate_flatness_mm=body.plate_flatness_mm,
-        flatness_length_mm=body.flatness_length_mm,
-        is_noise_estimated=body.is_noise_estimated,
-        left_out_rotation_deg=body.left_out_rotation_deg,
-        left_out_translation_mm=body.left_out_translation_mm,
-        chi2_probability=body.chi2_probability,
-    )
-
-
-def _coupling_body(matrix: FloatArray | None, names: tuple[str, ...]) -> CouplingBody | None:
-    if matrix is None:
-        return None
-    if matrix.shape[1] != len(names):
-        raise InputError("the hand-eye depends on a sensor's parameters that have no names")
-    return CouplingBody(
-        row_names=HAND_EYE_PARAMETER_NAMES,
-        column_names=names,
-        matrix=tuple(tuple(row) for row in matrix.tolist()),
-    )
-
-
-def _coupling_from_body(body: CouplingBody | None, names: tuple[str, ...]) -> FloatArray | None:
-    if body is None:
-        return None
-    if body.row_names != HAND_EYE_PARAMETER_NAMES or body.column_names != names:
-        raise InputError("the coupling's parameter names are not those of hand-eye and sensor")
-    if len(body.matrix) != 6 or any(len(row) != len(names) for row in body.matrix):
-        raise InputError(f"the coupling is not a 6 x {len(names)} matrix")
-    return np.array(body.matrix, dtype=np.float64)
-
-
-def _plate_body(plate: Plane | None) -> PlateBody | None:
-    if plate is None:
-        return None
-    return PlateBody(
-        point_base_mm=triple(plate.point_mm),
-        along_base=triple(plate.axes[0]),
-        across_base=triple(plate.axes[1]),
-        normal_base=triple(plate.axes[2]),
-    )
-
-
-def _plate_from_body(body: PlateBody | None) -> Plane | None:
-    if body is None:
-        return None
-    axes = np.array([body.along_base, body.across_base, body.normal_base])
-    if float(np.abs(axes @ axes.T - np.eye(3)).max()) > 1e-6:
-        raise InputError("the plate's axes are not unit vectors at right angles")
-    return Plane(np.array(body.point_base_mm), axes)
-
-
-class TransformBody(Body):
-    """``common_from_own`` of one scan, and how well its markers fit."""
-
-    name: str = Field(min_length=1)
-    markers: str
-    own_frame: str
-    rotation_rows: tuple[Triple, Triple, Triple]
-    translation_mm: Triple
-    covariance: CovarianceBody
-    n_markers: int = Field(ge=0)
-    rms_mm: KnownOrNot
-    cloud: str | None = None
-
-
-class ResidualBody(Body):
-    """One marker of one scan against where it is in the common frame."""
-
-    name: str
-    id: int
-    common_id: int
-    residual_mm: Triple
-    is_used: bool
-
-
-class MovedBody(Body):
-    """A marker that is not where the others say: its numbers and by how much, common frame."""
-
-    id: int
-    common_id: int
-    offset_mm: Triple
-
-
-class NotJoinedBody(Body):
-    """A scan that could not be joined."""
-
-    name: str
-    reason: str
-
-
-class RegistrationDocument(Body):
-    """``registration.json``."""
-
-    schema_name: Literal["armscan/registration"] = Field(alias="schema")
-    schema_version: Literal[1] = SCHEMA_VERSION
-    kind: Literal["views", "moved arm"]
-    simulated: bool
-    common_frame: str
-    common_frame_of: str
-    transforms: tuple[TransformBody, ...]
-    residuals: tuple[ResidualBody, ...]
-    moved: tuple[MovedBody, ...]
-    not_joined: tuple[NotJoinedBody, ...]
-    chi2: float = Field(ge=0)
-    degrees_of_freedom: int
-    provenance: ProvenanceBody
-
-
-def transform_body(
-    name: str,
-    markers: Path,
-    own_frame: str,
-    pose: Pose[Any, Any],
-    covariance: FloatArray,
+def new_provenance(
+    inputs: Iterable[Path],
     *,
-    n_markers: int,
-    rms_mm: float,
-    cloud: str | None,
-) -> TransformBody:
-    """Body of one scan's transform; covariance (6, 6) of `REGISTRATION_PARAMETERS`."""
-    first, second, third = (triple(row) for row in pose.rotation)
-    return TransformBody(
-        name=name,
-        markers=markers.as_posix(),
-        own_frame=own_frame,
-        rotation_rows=(first, second, third),
-        translation_mm=triple(pose.translation_mm),
-        covariance=covariance_body(REGISTRATION_PARAMETERS, covariance),
-        n_markers=n_markers,
-        rms_mm=rms_mm,
-        cloud=cloud,
+    command: Sequence[str],
+    options: Iterable[Any] = (),
+    parents: Sequence[Provenance] = (),
+    warnings: Sequence[str] = (),
+    forced: Sequence[str] = (),
+) -> Provenance:
+    """Describe a document that is about to be written.
+
+    Parameters
+    ----------
+    inputs
+        Files that went in; each is hashed.
+    command
+        The command line, one word an entry.
+    options
+        Options dataclasses in force; every field is recorded as ``Class.field``, one
+        that is a dataclass itself by its own class and fields.
+    parents
+        Of the documents on which this one rests; their reasons for a refusal go on.
+    warnings
+        What the program warned of.
+    forced
+        Why this document was refused, if it is written all the same.
+    """
+    return Provenance(
+        document_id=str(uuid4()),
+        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        armscan_version=version("armscan"),
+        command=tuple(command),
+        inputs=tuple(fingerprint(path) for path in inputs),
+        parent_ids=tuple(parent.document_id for parent in parents),
+        options=tuple(entry for group in options for entry in _entries(group)),
+        warnings=tuple(warnings),
+        forced=tuple(
+            dict.fromkeys((*(text for parent in parents for text in parent.forced), *forced))
+        ),
     )
 
 
-def registration_document(document: RegistrationDocument) -> bytes:
-    """Text of ``registration.json``."""
-    return json_bytes(document.model_dump(mode="json", by_alias=True))
-
-
-def read_registration(path: Path) -> RegistrationDocument:
-    """Read ``registration.json``.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is cut, of another kind, of a newer version, or holds values that cannot be.
-    """
-    return validated_document(RegistrationDocument, REGISTRATION_SCHEMA, read_bytes(path), path)
+def _entries(group: Any) -> Iterator[tuple[str, str]]:
+    for item in fields(group):
+        value = getattr(group, item.name)
+        if is_dataclass(value):
+            yield from _entries(value)
+        else:
+            yield f"{type(group).__name__}.{item.name}", str(value)

@@ -5,8 +5,8 @@ and written.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,10 +14,8 @@ import numpy as np
 
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
-from armscan.storage.images import read_bytes
-from armscan.storage.json_text import new_provenance, parse_json
+from armscan.storage.codec import is_json, parse_json
 
 MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
 DISTORTION_KEYS = (
@@ -37,25 +35,23 @@ SKEW_LIMIT = 1e-6
 N_COEFFICIENTS = 5
 
 
-def read_foreign_camera(path: Path) -> CameraCalibration:
-    """Read a camera that OpenCV (YAML, XML, JSON) or ROS (``camera_info`` YAML) calibrated.
+def parse_foreign_camera(data: bytes, where: str) -> tuple[CameraModel, float]:
+    """Camera of a file that OpenCV (YAML, XML, JSON) or ROS (``camera_info`` YAML) wrote.
 
-    Such files bring no covariance: ``has_covariance`` is False and the uncertainty figures are
-    NaN. Coefficients beyond ``k1 k2 p1 p2 k3`` are accepted when they are zero.
-
-    Parameters
-    ----------
-    path
-        The file.
+    Returns
+    -------
+    camera
+        Coefficients beyond ``k1 k2 p1 p2 k3`` are accepted when they are zero.
+    rms_px
+        Reprojection error that the file states; NaN for none.
 
     Raises
     ------
     FileFormatError
-        If the file is missing, empty, cut short, has no camera matrix or image size, or describes
-        a lens by another model.
+        If the file is cut short, has no camera matrix or image size, or describes a lens by
+        another model.
     """
-    where = str(path)
-    tree = _read_tree(read_bytes(path), where)
+    tree = _read_tree(data, where)
     matrix = _matrix(tree, where)
     width, height = _size(tree, where)
     _check_model(tree, where)
@@ -72,21 +68,11 @@ def read_foreign_camera(path: Path) -> CameraCalibration:
     except InputError as error:
         raise FileFormatError(error.what, where=where, remedy=error.remedy) from error
     rms = _first(tree, RMS_KEYS)
-    return CameraCalibration(
-        camera=camera,
-        covariance=np.zeros((9, 9)),
-        has_covariance=False,
-        rms_px=float(rms) if isinstance(rms, int | float) else float("nan"),
-        sigma_point_px=float("nan"),
-        n_views=0,
-        n_points=0,
-        covered_px=np.array([0.0, 0.0, width - 1.0, height - 1.0]),
-        provenance=new_provenance([path], command=()),
-    )
+    return camera, float(rms) if isinstance(rms, int | float) else math.nan
 
 
 def _read_tree(data: bytes, where: str) -> Mapping[str, Any]:
-    if data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+    if is_json(data):
         return parse_json(data, where)
     unreadable = FileFormatError(
         "this is not a camera calibration of armscan, OpenCV or ROS, or it is cut short",

@@ -25,6 +25,7 @@ from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import ImageArray, IntArray
 from armscan.kernels.jpeg_entropy import WHOLE, walk_scan
 from armscan.records.exposure import Exposure
+from armscan.storage.files import read_bytes
 
 Alignment = Literal["low", "high"]
 
@@ -501,35 +502,6 @@ def source_names(paths: Sequence[Path]) -> tuple[str, ...]:
             for name, tail in zip(names, tails, strict=True)
         ]
     return tuple(names)
-
-
-def read_bytes(path: Path) -> bytes:
-    """Content of a file that must exist and hold something.
-
-    Raises
-    ------
-    FileFormatError
-        If there is no such file, it is a folder, it is empty or it may not be read.
-    """
-    if path.is_dir():
-        raise FileFormatError("this is a folder, not a file", where=str(path), remedy="name a file")
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise FileFormatError(
-            "there is no such file", where=str(path), remedy="check the path"
-        ) from error
-    except OSError as error:
-        raise FileFormatError(
-            f"the file cannot be read ({error.strerror})",
-            where=str(path),
-            remedy="check that it may be read",
-        ) from error
-    if not data:
-        raise FileFormatError(
-            "the file is empty (0 bytes)", where=str(path), remedy="copy the file again"
-        )
-    return data
 
 
 def _decode(data: bytes, path: Path) -> tuple[ImageArray, int]:

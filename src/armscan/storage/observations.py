@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError
 from armscan.records.profile import Profile
-from armscan.storage.images import read_bytes
+from armscan.storage.files import read_bytes
 from armscan.vision.targets.target import TargetView
 
 VIEW_ARRAYS = ("point_index", "points_px", "covariance_px2", "points_board_mm")

@@ -17,8 +17,9 @@ from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.points import MarkerSet, ProbedPoints
 from armscan.records.profile import PointProfile
+from armscan.storage.files import read_bytes
 from armscan.storage.image_paths import expand_paths, natural_key
-from armscan.storage.images import read_bytes, source_names
+from armscan.storage.images import source_names
 from armscan.storage.poses import refuse_beyond_reach
 from armscan.storage.tables import LARGEST_MM, CsvTable, csv_bytes, number_text, parse_csv, read_csv
 

@@ -22,8 +22,8 @@ from armscan.geometry.rotations import (
     vector_from_rotation,
 )
 from armscan.records.recording import PoseForm
-from armscan.storage.images import read_bytes
-from armscan.storage.json_text import parse_json
+from armscan.storage.codec import parse_json
+from armscan.storage.files import read_bytes
 from armscan.storage.tables import LARGEST_MM
 
 POSITION: Final = ("x_mm", "y_mm", "z_mm")

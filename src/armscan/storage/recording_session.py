@@ -32,7 +32,7 @@ from armscan.records.recording import (
     Session,
     SessionKind,
 )
-from armscan.storage.images import read_bytes
+from armscan.storage.files import read_bytes
 from armscan.storage.tables import CsvTable
 
 SESSION_FILE = "session.toml"

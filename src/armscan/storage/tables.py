@@ -16,7 +16,7 @@ import numpy as np
 
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.storage.images import read_bytes
+from armscan.storage.files import read_bytes
 
 INT64 = np.iinfo(np.int64)
 WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+")

@@ -10,7 +10,6 @@ from armscan.geometry.arrays import FloatArray
 from armscan.inspection.conformity import Check, check_exposures_off
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection, SphereInspection
-from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere
 from armscan.records.cloud import PointCloud
 from inspection_clouds import cloud_of
@@ -46,7 +45,7 @@ def judged(kind: str, shift_mm: FloatArray, n_shifted: int, seed: int = 1) -> Ch
     found = inspect_sphere(cloud, 2.0 * RADIUS_MM) if is_ball else inspect_plane(cloud)
     assert isinstance(found, SphereInspection | PlaneInspection)
     within = np.ones(len(cloud), dtype=np.bool_)
-    check = check_exposures_off(cloud, found, within, InspectionOptions())
+    check = check_exposures_off(cloud, found, within)
     assert check is not None
     return check
 

@@ -171,9 +171,9 @@ def test_the_order_of_the_views_does_not_matter() -> None:
 def test_pairs_that_contradict_stronger_ones_are_dropped() -> None:
     views: list[MarkerSet] = [marker_set(np.eye(3) * 50.0 * (k + 1)) for k in range(3)]
     links = [
-        Link(0, 1, np.array([[0, 0], [1, 1], [2, 2]])),
-        Link(1, 2, np.array([[0, 0], [1, 1]])),
-        Link(0, 2, np.array([[0, 1]])),
+        Link(first=0, second=1, pairs=np.array([[0, 0], [1, 1], [2, 2]])),
+        Link(first=1, second=2, pairs=np.array([[0, 0], [1, 1]])),
+        Link(first=0, second=2, pairs=np.array([[0, 1]])),
     ]
     tracks = chain_markers(views, links)
     assert tracks.n_contradictions == 1

@@ -16,7 +16,7 @@ from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstant
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import ExposureRow
 from armscan.storage.images import ImageOptions
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import write_recording
 from two_camera_scan import (
     PERIOD_NS,
     SeenAs,

@@ -13,8 +13,7 @@ import pytest
 from armscan.errors import FileFormatError, InputError, OutputError
 from armscan.records.recording import ArmTrack, CameraSetup
 from armscan.storage.arm import ProbeTip, read_probe_tip, write_probing
-from armscan.storage.recording import read_arm_track, read_recording
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import read_arm_track, read_recording, write_recording
 from armscan.storage.tables import csv_bytes
 from recording_folders import EXPOSURES, SESSION, lab_folder, memory_scan, pixels
 

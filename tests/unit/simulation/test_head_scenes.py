@@ -22,8 +22,7 @@ from armscan.simulation.scenes import PLACES, hand_eye_poses, marker_poses
 from armscan.simulation.shots import RenderRequest, TwinScan
 from armscan.simulation.targets import MULTI_FAR_PLACES, MULTI_LEFT_PLACES
 from armscan.simulation.twin import build_twin
-from armscan.storage.recording import read_recording
-from armscan.storage.recording_writer import write_recording
+from armscan.storage.recording import read_recording, write_recording
 
 SEEDS = range(1, 11)
 IMAGE_SCENES = [scene for scene in get_args(TwinScene) if scene != "probing"]

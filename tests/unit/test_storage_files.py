@@ -5,12 +5,21 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from armscan.errors import OutputError
-from armscan.storage.atomic import check_new_folder, check_outputs, new_folder, write_files
+from armscan.errors import FileFormatError, OutputError
+from armscan.storage.files import (
+    check_new_folder,
+    check_outputs,
+    new_folder,
+    path_text,
+    read_bytes,
+    write_files,
+)
 
 
 def test_files_are_written_together(tmp_path: Path) -> None:
@@ -58,8 +67,90 @@ def test_a_refused_rename_says_what_was_written(
 
     monkeypatch.setattr(Path, "replace", refuse_b)
     with pytest.raises(OutputError, match=r"only a was written \(Permission denied\)"):
-        write_files({tmp_path / "a": b"1", tmp_path / "b": b"2"})
+        write_files({tmp_path / "a": b"1", tmp_path / "b": b"2"}, is_overwriting=True)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"a": b"1"}
+
+
+def test_a_file_that_another_program_wrote_meanwhile_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = os.link
+
+    def second_exists(part: Path, path: Path) -> None:
+        if path.name == "b":
+            path.write_bytes(b"theirs")
+        link(part, path)
+
+    monkeypatch.setattr(os, "link", second_exists)
+    with pytest.raises(OutputError, match="b: the file exists"):
+        write_files({tmp_path / "a": b"1", tmp_path / "b": b"2"})
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"b": b"theirs"}
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    """Killed between a folder's files, and with the whole result written but not named."""
+    program = """
+import os, signal, sys
+from pathlib import Path
+from armscan.storage.files import new_folder, write_files
+folder = Path(sys.argv[1])
+os.link = os.replace = lambda *names: os.kill(os.getpid(), signal.SIGKILL)
+if sys.argv[2] == "folder":
+    with new_folder(folder / "scan") as partial:
+        (partial / "a").write_bytes(b"1")
+        os.kill(os.getpid(), signal.SIGKILL)
+write_files({folder / "x.ply": b"1", folder / "x.html": b"2"})
+"""
+    for what in ("folder", "files"):
+        subprocess.run([sys.executable, "-c", program, str(tmp_path), what], check=False)
+    assert len(list(tmp_path.iterdir())) == 3
+    write_files({tmp_path / "x.ply": b"3", tmp_path / "x.html": b"4"})
+    with new_folder(tmp_path / "scan") as partial:
+        (partial / "b").write_bytes(b"2")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["scan", "x.html", "x.ply"]
+
+
+def test_the_rest_of_a_run_that_still_writes_is_left_alone(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "scan") as first:
+        (first / "a").write_bytes(b"1")
+        with (
+            pytest.raises(OutputError, match="nothing was written"),
+            new_folder(tmp_path / "scan", {tmp_path / "truth": b"2"}) as second,
+        ):
+            (second / "a").write_bytes(b"2")
+            (tmp_path / "scan").mkdir()
+            (tmp_path / "scan" / "theirs").write_bytes(b"3")
+            assert (first / "a").is_file()
+        assert (first / "a").is_file() and not (tmp_path / "truth").exists()
+        (tmp_path / "scan" / "theirs").unlink()
+    assert (tmp_path / "scan" / "a").read_bytes() == b"1"
+
+
+def test_the_loser_of_two_folders_leaves_the_winners_truth(tmp_path: Path) -> None:
+    truth = tmp_path / "scan.truth.json"
+    with (
+        pytest.raises(OutputError, match="the file exists"),
+        new_folder(tmp_path / "scan", {truth: b"second"}),
+        new_folder(tmp_path / "scan", {truth: b"first"}) as partial,
+    ):
+        (partial / "a").write_bytes(b"1")
+    assert truth.read_bytes() == b"first" and (tmp_path / "scan" / "a").is_file()
+
+
+@pytest.mark.parametrize("name", ["x" * 250, "na\udcefve", "größe"])
+def test_names_of_any_kind_are_written_and_read(tmp_path: Path, name: str) -> None:
+    write_files({tmp_path / name: b"1"})
+    assert read_bytes(tmp_path / name) == b"1"
+    path_text(tmp_path / name).encode("utf-8")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="there are no such files")
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for path in (tmp_path / "pipe", tmp_path / "loop", Path("/dev/zero"), tmp_path / ("x" * 300)):
+        with pytest.raises(FileFormatError):
+            read_bytes(path)
 
 
 def test_places_that_cannot_be_written_are_found_early(tmp_path: Path) -> None:

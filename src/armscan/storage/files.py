@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files read whole; files and folders that appear complete or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import stat
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from uuid import uuid4
+
+from armscan.errors import FileFormatError, OutputError
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover - Windows has none
+    fcntl = None  # type: ignore[assignment]
+
+STALE_SECONDS = 86_400.0
+"""Where files cannot be locked, what an interrupted run left is taken for a rest after a day."""
+
+
+def path_text(path: Path | str) -> str:
+    """The path with ``/``; bytes of a name that are not UTF-8 are told as ``\\xef``."""
+    return os.fsencode(Path(path).as_posix()).decode("utf-8", "backslashreplace")
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a file that must exist and hold something.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no such file, it is a folder or a pipe, it is empty or it may not be read.
+    """
+    where = path_text(path)
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise FileFormatError("this is a folder, not a file", where=where, remedy="name a file")
+        if not stat.S_ISREG(mode):
+            raise FileFormatError(
+                "this is a pipe or a device, not a file", where=where, remedy="name a file"
+            )
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileFormatError(
+            "there is no such file", where=where, remedy="check the path"
+        ) from error
+    except (OSError, ValueError) as error:
+        fact = error.strerror if isinstance(error, OSError) else error
+        raise FileFormatError(
+            f"the file cannot be read ({fact})", where=where, remedy="check the path and its rights"
+        ) from error
+    if not data:
+        raise FileFormatError(
+            "the file is empty (0 bytes)", where=where, remedy="copy the file again"
+        )
+    return data
+
+
+def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> None:
+    """Raise before long work if a result could not be written afterwards.
+
+    Parameters
+    ----------
+    paths
+        Files that will be written.
+    is_overwriting
+        Allow files that exist; folders are refused all the same.
+
+    Raises
+    ------
+    OutputError
+        If the folder does not exist or may not be written, or the file exists.
+    """
+    for path in paths:
+        folder, where = path.parent, path_text(path)
+        _check_parent(folder)
+        if path.is_dir():
+            raise OutputError("this is a folder", where=where, remedy="name a file to write")
+        if path.exists() and not is_overwriting:
+            raise _existing(path)
+        if not os.access(folder, os.W_OK):
+            raise OutputError(
+                "the folder may not be written",
+                where=path_text(folder),
+                remedy="choose another folder",
+            )
+
+
+def write_files(contents: Mapping[Path, bytes], *, is_overwriting: bool = False) -> None:
+    """Write files that belong together, each of them complete.
+
+    Each is written under another name in its folder, and all get their names at the end, so that a
+    full disk or an interrupt leaves what was there before. What a killed run left of files of
+    these names is removed.
+
+    Raises
+    ------
+    OutputError
+        As `check_outputs`, also if another program wrote such a file meanwhile; or if the disk is
+        full or refuses. If it refuses one of the names, the message says which files were written.
+    """
+    check_outputs(contents, is_overwriting=is_overwriting)
+    parts = {path: _part_name(path) for path in contents}
+    done: list[Path] = []
+    try:
+        with ExitStack() as locks:
+            for path, part in parts.items():
+                _remove_rests(path)
+                _write_part(part, contents[path], locks)
+            for path, part in parts.items():
+                _give_name(part, path, is_overwriting=is_overwriting)
+                done.append(path)
+    except FileExistsError as error:
+        for path in done:
+            path.unlink()
+        raise _existing(Path(error.filename2)) from error
+    except OSError as error:
+        what = f"only {', '.join(path.name for path in done)}" if done else "nothing"
+        raise OutputError(
+            f"{what} was written ({error.strerror})",
+            where=", ".join(path_text(path) for path in contents),
+            remedy="free some space or choose another folder",
+        ) from error
+    finally:
+        for part in parts.values():
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+
+
+def check_new_folder(folder: Path) -> None:
+    """Raise before long work if a folder could not be written afterwards.
+
+    Raises
+    ------
+    OutputError
+        If it holds something, is the current folder or a root, or the one above does not exist.
+    """
+    target, where = folder.resolve(), path_text(folder)
+    if target in (Path.cwd(), Path(target.anchor)):
+        raise OutputError(
+            "this is the current folder or a root, which cannot be made anew",
+            where=where,
+            remedy="name a new folder, as scan",
+        )
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise OutputError("this exists and is not empty", where=where, remedy="name a new folder")
+    _check_parent(target.parent)
+
+
+@contextmanager
+def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iterator[Path]:
+    """Give a folder of another name to write into; it gets its name when the block has ended.
+
+    If the block raises or is interrupted, nothing is left of it; what a killed run left of a folder
+    of this name is removed.
+
+    Parameters
+    ----------
+    folder
+        Must not exist, or be empty.
+    beside
+        Files outside the folder that belong to it; written when it is complete, just before it
+        gets its name, so that it is never seen without them. They must not exist.
+
+    Raises
+    ------
+    OutputError
+        As `check_new_folder`, or if the disk is full or refuses.
+    """
+    check_new_folder(folder)
+    target = folder.resolve()
+    _remove_rests(target)
+    partial = _part_name(target)
+    try:
+        partial.mkdir()
+        with _locked(partial):
+            yield partial
+            write_files(beside or {})
+            try:
+                if target.exists():
+                    target.rmdir()
+                partial.rename(target)
+            except BaseException:
+                for path in beside or ():
+                    path.unlink(missing_ok=True)
+                raise
+    except OSError as error:
+        raise OutputError(
+            f"nothing was written ({error.strerror or error})",
+            where=path_text(folder),
+            remedy="free some space or choose another folder",
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _check_parent(folder: Path) -> None:
+    if folder.is_dir():
+        return
+    is_file = folder.exists()
+    raise OutputError(
+        "this is a file, not a folder to write to" if is_file else "there is no such folder",
+        where=path_text(folder),
+        remedy="choose another folder" if is_file else "create it first",
+    )
+
+
+def _existing(path: Path) -> OutputError:
+    return OutputError(
+        "the file exists", where=path_text(path), remedy="choose another name or give --force"
+    )
+
+
+def _part_stem(path: Path) -> str:
+    """What all temporary names of one file begin with: short, so that long names have one too."""
+    return f".{path.name[:40]}.{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:12]}."
+
+
+def _part_name(path: Path) -> Path:
+    return path.with_name(f"{_part_stem(path)}{uuid4().hex[:12]}.part")
+
+
+def _write_part(part: Path, content: bytes, locks: ExitStack) -> None:
+    with part.open("xb") as file:
+        locks.enter_context(_locked(part))
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _give_name(part: Path, path: Path, *, is_overwriting: bool) -> None:
+    """Rename a complete file; raise `FileExistsError` if another program took the name."""
+    if not is_overwriting:
+        try:
+            os.link(part, path)
+        except FileExistsError:
+            raise
+        except OSError:
+            # a file system without hard links: between question and answer another may write
+            if path.exists():
+                raise FileExistsError(17, "exists", str(part), None, str(path)) from None
+        else:
+            return
+    part.replace(path)
+
+
+@contextmanager
+def _locked(part: Path) -> Iterator[None]:
+    """Hold a lock while something is written, so that a second run does not take it for a rest."""
+    if fcntl is None:
+        yield
+        return
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _remove_rests(path: Path) -> None:
+    """Remove what killed runs left of a file or folder of this name."""
+    with suppress(OSError):
+        stem = _part_stem(path)
+        rests = [
+            item
+            for item in path.parent.iterdir()
+            if item.name.startswith(stem) and item.suffix == ".part"
+        ]
+        for rest in rests:
+            if _is_abandoned(rest):
+                shutil.rmtree(rest, ignore_errors=True) if rest.is_dir() else rest.unlink()
+
+
+def _is_abandoned(part: Path) -> bool:
+    if fcntl is None:
+        return time.time() - part.stat().st_mtime > STALE_SECONDS
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(handle)
+    return True

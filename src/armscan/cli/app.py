@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate, files, inspect, measure
+from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, markers, measure
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -43,7 +43,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-calibrate_group = typer.Typer(
+calibrate = typer.Typer(
     help="Calibrate a camera, then its light sheets, then where they sit on the arm.",
     epilog=(
         "\b\nExample:\n"
@@ -54,10 +54,10 @@ calibrate_group = typer.Typer(
     callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
-calibrate_group.command("camera", epilog=calibrate.CAMERA_EXAMPLE)(calibrate.camera)
-calibrate_group.command("stereo", epilog=calibrate.STEREO_EXAMPLE)(calibrate.stereo)
-calibrate_group.command("laser", epilog=calibrate.LASER_EXAMPLE)(calibrate.laser)
-calibrate_group.command("hand-eye", epilog=calibrate.HAND_EYE_EXAMPLE)(calibrate.hand_eye)
+calibrate.command("camera", epilog=calibrate_cameras.CAMERA_EXAMPLE)(calibrate_cameras.camera)
+calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_cameras.stereo)
+calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
+calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 inspect_group = typer.Typer(
     help="Compare measured points with a plane, a ball or a step.",
     epilog=inspect.SPHERE_EXAMPLE,
@@ -69,14 +69,14 @@ inspect_group = typer.Typer(
 inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
-app.add_typer(calibrate_group, name="calibrate")
+app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)
 app.command("simulate", epilog=measure.SIMULATE_EXAMPLE)(measure.simulate)
 app.command("probe", epilog=measure.PROBE_EXAMPLE)(measure.probe)
 app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
-app.command("markers", epilog=measure.MARKERS_EXAMPLE)(measure.markers)
-app.command("register", epilog=measure.REGISTER_EXAMPLE)(measure.register)
+app.command("markers", epilog=markers.MARKERS_EXAMPLE)(markers.markers)
+app.command("register", epilog=markers.REGISTER_EXAMPLE)(markers.register)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)

@@ -50,7 +50,7 @@ def convert(
         warnings=(losses,),
         written=(output,),
         forced=done.forced,
-        data={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
+        extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
     )
     show(summary, as_json=as_json)
 

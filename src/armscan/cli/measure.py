@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan demo``, ``simulate``, ``probe``, ``reconstruct``, ``markers`` and ``register``."""
+"""``armscan demo``, ``simulate``, ``probe`` and ``reconstruct``."""
 
 from __future__ import annotations
 
@@ -44,17 +44,7 @@ RECONSTRUCT_EXAMPLE = (
     "      --sheet A -o cloud.ply\n"
     "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply"
 )
-MARKERS_EXAMPLE = (
-    "\b\nExamples:\n"
-    "  armscan markers 'photos/*.png' -o rings.html\n"
-    "  armscan markers left.png right.png --stereo stereo.json --diameter 6 -o markers.csv"
-)
-REGISTER_EXAMPLE = (
-    "\b\nExamples:\n"
-    "  armscan register views/view1.csv views/view2.csv views/view3.csv -o joined\n"
-    "  armscan register before.csv --moved after.csv --cloud after.ply -o joined"
-)
-RINGS = "armscan.vision.rings:RingOptions."
+TWIN = "armscan.pipeline.simulate:SimulateOptions."
 
 
 class DemoScene(StrEnum):
@@ -151,12 +141,29 @@ def simulate(
         ),
     ],
     preset: Annotated[
-        PresetName, typer.Option(help="How good the instrument, how kind the surroundings.")
-    ] = PresetName.THESIS,
-    seed: Annotated[int, typer.Option(min=0, help="Everything random follows from it.")] = 1,
+        PresetName | None,
+        typer.Option(
+            help="How good the instrument, how kind the surroundings.",
+            show_default=DefaultOf(TWIN + "preset"),
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Everything random follows from it.",
+            show_default=DefaultOf(TWIN + "seed"),
+        ),
+    ] = None,
     processes: Annotated[
-        int, typer.Option(min=1, max=64, help="Processes that render; few images take one.")
-    ] = 2,
+        int | None,
+        typer.Option(
+            min=1,
+            max=64,
+            help="Processes that render; few images take one.",
+            show_default=DefaultOf(TWIN + "processes"),
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Render a recording of the digital twin; NAME.truth.json beside it says what it was made from.
@@ -169,7 +176,8 @@ def simulate(
     from armscan.jobs.simulate import SimulateRequest, run_simulation
     from armscan.pipeline.simulate import SimulateOptions
 
-    options = SimulateOptions(preset.value, seed, processes)
+    quality = None if preset is None else preset.value
+    options = given(SimulateOptions, preset=quality, seed=seed, processes=processes)
     with progress_bar() as progress:
         summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
     show(summary, as_json=as_json)
@@ -307,164 +315,4 @@ def reconstruct(
         as_json=as_json,
         output=output,
         force=force,
-    )
-
-
-def markers(
-    *,
-    images: Annotated[
-        list[str],
-        typer.Argument(
-            help="Image files, folders, or quoted patterns; with --stereo the left one, then the "
-            "right.",
-            show_default=False,
-        ),
-    ],
-    stereo: Annotated[
-        Path | None, typer.Option(help="Calibration of two cameras: match and triangulate.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="Page NAME.html; with --stereo the table NAME.csv and a page."
-        ),
-    ] = None,
-    diameter: Annotated[
-        float | None, typer.Option(help="Outer diameter of the markers, mm; with --stereo.")
-    ] = None,
-    depth: Annotated[
-        str, typer.Option(help="Nearest and farthest depth NEAR:FAR, mm; with --stereo.")
-    ] = "",
-    min_perimeter: Annotated[
-        float | None,
-        typer.Option(
-            help="Of the outer rim, untilted, px.",
-            show_default=DefaultOf(RINGS + "min_perimeter_px"),
-        ),
-    ] = None,
-    max_perimeter: Annotated[
-        float | None,
-        typer.Option(
-            help="Of the outer rim, untilted, px.",
-            show_default=DefaultOf(RINGS + "max_perimeter_px"),
-        ),
-    ] = None,
-    max_roundness: Annotated[
-        float | None,
-        typer.Option(
-            help="Long over short axis; 1.7 is a tilt of 54 degrees.",
-            show_default=DefaultOf(RINGS + "max_roundness"),
-        ),
-    ] = None,
-    disc: Annotated[
-        str | None,
-        typer.Option(
-            help="light (in a dark ring) or dark.", show_default=DefaultOf(RINGS + "disc")
-        ),
-    ] = None,
-    bits_used: BitsUsed = None,
-    bits_align: BitsAlign = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Find ring markers in images; with two calibrated cameras, where they are."""
-    from armscan.jobs.markers import find_markers, measure_markers
-    from armscan.markers.candidates import RingMatchOptions, parse_depth
-    from armscan.storage.images import ImageOptions
-    from armscan.vision.rings import RingOptions
-
-    rings = given(
-        RingOptions,
-        min_perimeter_px=min_perimeter,
-        max_perimeter_px=max_perimeter,
-        max_roundness=max_roundness,
-        disc=disc,
-    )
-    depth_mm = parse_depth(depth) if depth else None
-    matching = given(RingMatchOptions, depth_mm=depth_mm, diameter_mm=diameter)
-    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
-    run(
-        lambda job: (
-            find_markers(job, images, rings=rings, image_options=pixels)
-            if stereo is None
-            else measure_markers(
-                job, images, stereo, rings=rings, matching=matching, image_options=pixels
-            )
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
-
-
-def register(
-    lists: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Lists of markers, x_mm,y_mm,z_mm[,id,cov...]: one for each view; with --moved "
-            "the one of the old place. The cloud of view1.csv is view1.ply beside it.",
-            show_default=False,
-        ),
-    ],
-    *,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", help="New folder for clouds, registration.json and page."),
-    ] = Path("registered"),
-    moved: Annotated[
-        Path | None,
-        typer.Option(
-            help="The arm was moved: markers measured from its new place.", show_default=False
-        ),
-    ] = None,
-    cloud: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Cloud measured from the new place; repeatable. Without it, the cloud beside "
-            "the list.",
-            show_default=False,
-        ),
-    ] = None,
-    sigma_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--sigma-mm",
-            help="Standard deviation an axis of markers listed without covariance.",
-            show_default=DefaultOf("armscan.pipeline.register:RegisterOptions.sigma_mm"),
-        ),
-    ] = None,
-    least_common: Annotated[
-        int | None,
-        typer.Option(
-            "--least-common",
-            help="Markers that two lists must share, 4 or more.",
-            show_default=DefaultOf("armscan.markers.alignments:MarkerMatchOptions.least_common"),
-        ),
-    ] = None,
-    by_id: Annotated[
-        bool,
-        typer.Option("--by-id", help="With --moved: equal ids in both lists are one marker."),
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Join scans by markers: views of a handheld scanner, or an arm that moved to a new place.
-
-    Markers carry no numbers: they are recognised by their distances, and what fits in more than
-    one way is refused. Views are joined in the frame of the first one; an arm that moved goes on
-    in its old frame.
-    """
-    from armscan.jobs.register import register as register_scans
-    from armscan.markers.alignments import MarkerMatchOptions
-    from armscan.pipeline.register import RegisterOptions
-
-    options = given(
-        RegisterOptions,
-        match=given(MarkerMatchOptions, least_common=least_common),
-        sigma_mm=sigma_mm,
-        is_by_id=by_id,
-    )
-    run(
-        lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options),
-        as_json=as_json,
-        output=output,
     )

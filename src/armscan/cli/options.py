@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from enum import StrEnum
 from importlib import import_module
 from pathlib import Path
@@ -26,17 +27,18 @@ T = TypeVar("T")
 
 
 class DefaultOf(str):
-    """A default that help shows, as ``package.module:Class.field``.
+    """A default that help shows, as ``package.module:Class.field`` of a dataclass.
 
-    Help formats it; only then is the module imported and the field of a default instance read.
+    Help formats it; only then is the module imported and the field's default read.
     """
 
     __slots__ = ()
 
     def __format__(self, spec: str) -> str:
         module, _, place = self.partition(":")
-        name, _, field = place.partition(".")
-        return str(getattr(getattr(import_module(module), name)(), field))
+        name, _, wanted = place.partition(".")
+        known = fields(getattr(import_module(module), name))
+        return str({field.name: field.default for field in known}[wanted])
 
 
 class Side(StrEnum):

@@ -17,7 +17,7 @@ from uuid import uuid4
 
 from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
 from armscan.errors import OptionError, OutputError
-from armscan.jobs.cameras import calibrate_camera
+from armscan.jobs.camera import calibrate_camera
 from armscan.jobs.job import Job
 from armscan.jobs.reconstruct import StillPaths, reconstruct
 from armscan.jobs.sheets import SheetImages, calibrate_sheets
@@ -58,7 +58,6 @@ from armscan.report.quantity import (
     sentence,
     significant,
     summary_json,
-    values,
     with_sigma,
 )
 from armscan.storage.clouds import ply_bytes, read_ply
@@ -475,7 +474,7 @@ def _summary(
         warnings=tuple(sentence(f"hand-eye: {text}") for text in fit.warnings),
         written=(folder / RECORDINGS, *(folder / name for name in names)),
         next_step=f"open {folder / 'report.html'} in a browser",
-        data=data,
+        extra=data,
     )
 
 
@@ -538,7 +537,7 @@ def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Su
         warnings=tuple(warnings),
         written=_three_heads_job_written(folder),
         next_step=f"open {folder / PAGE} in a browser; each head has its own page in its folder",
-        data={**{key: first[key] for key in first if key != "heads"}, "heads": heads},
+        extra={**{key: first[key] for key in first if key != "heads"}, "heads": heads},
     )
     files = {folder / PAGE: render_page(page), folder / DATA: summary_json(result).encode()}
     write_files(files, is_overwriting=True)
@@ -641,7 +640,7 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
         written=(photos, *(path for stage in stages for path in stage.written), result),
         next_step=f"open {folder / 'camera.html'}, {folder / 'sensor.html'} and "
         f"{folder / 'cloud.html'} in a browser",
-        data=data,
+        extra=data,
     )
     write_files({result: summary_json(summary).encode()}, is_overwriting=True)
     return summary
@@ -702,7 +701,7 @@ def _data(
         "simulated": True,
         "seed": seed,
         "preset": "photos",
-        **{name: {**values(stage.quantities), **stage.data} for name, stage in stages.items()},
+        **{name: stage.data for name, stage in stages.items()},
         "errors": asdict(errors),
         "seconds": dict(seconds),
     }

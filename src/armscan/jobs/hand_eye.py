@@ -278,7 +278,7 @@ def calibrate_hand_eye(
     )
     written = job.write(dict(zip(places, (scanner_document(scanner), page), strict=True)))
     tables = (posture_table(fit),) if repeats is None else (repeats[0], posture_table(fit))
-    summary = _summary(fit, scanner, written, tables, is_simulated=inputs.is_simulated)
+    summary = hand_eye_summary(fit, scanner, written, tables, is_simulated=inputs.is_simulated)
     return replace(summary, forced=provenance.forced)
 
 
@@ -437,14 +437,15 @@ def _tried(image: MeasuredProfile) -> TriedImage:
     return TriedImage(image.profile.source, remark, n_points > 0, stripe_px=points)
 
 
-def _summary(
+def hand_eye_summary(
     fit: HandEyeFit,
     scanner: ScannerCalibration,
     written: Sequence[Path],
-    tables: tuple[Table, ...],
+    tables: tuple[Table, ...] = (),
     *,
     is_simulated: bool,
 ) -> Summary:
+    """What a person, and a program, wants to know of a hand-eye calibration."""
     next_step = f"open {written[-1]}"
     if scanner.sensor is not None:
         next_step += f", then `armscan reconstruct SCAN --scanner {written[0]} -o cloud.ply`"
@@ -456,7 +457,7 @@ def _summary(
         warnings=sentences(fit.warnings),
         written=tuple(written),
         next_step=next_step,
-        data={
+        extra={
             "kind": "hand-eye calibration",
             "simulated": is_simulated,
             "postures": [_posture_data(fit, k) for k in range(len(fit.postures))],

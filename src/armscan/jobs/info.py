@@ -317,7 +317,7 @@ def describe_files(names: Sequence[str]) -> Summary:
     return Summary(
         title=count,
         quantities=tuple(fact(*pair) for pair in facts),
-        data={"kind": "info", "items": data},
+        extra={"kind": "info", "items": data},
     )
 
 
@@ -568,7 +568,7 @@ def examine_installation(*, warm: bool = False) -> Summary:
         title="armscan is ready." if is_ready else "armscan is not ready.",
         quantities=tuple(fact(*pair) for pair in facts),
         warnings=tuple(problems),
-        data={"kind": "doctor", "is_ready": is_ready, "found": dict(facts)},
+        extra={"kind": "doctor", "is_ready": is_ready, "found": dict(facts)},
     )
 
 

@@ -228,5 +228,5 @@ def _finished(
         written=written,
         next_step=f"open {job.output}" if job.output else "",
         forced=cloud.forced,
-        data={"kind": "inspection", "simulated": is_simulated, "frame": cloud.frame},
+        extra={"kind": "inspection", "simulated": is_simulated, "frame": cloud.frame},
     )

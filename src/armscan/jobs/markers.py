@@ -77,7 +77,7 @@ def find_markers(
         warnings=warnings,
         written=job.write({places[0]: page}),
         next_step=f"open {places[0]}",
-        data={
+        extra={
             "kind": "ring markers",
             "simulated": is_simulated,
             "images": [_ring_data(found) for found in detections],
@@ -160,7 +160,7 @@ def measure_markers(
         warnings=warnings,
         written=job.write({places[0]: markers_csv(matches.markers), places[1]: page}),
         next_step="`armscan register -h` joins scans that share markers",
-        data={
+        extra={
             "kind": "markers",
             "simulated": is_simulated,
             "images": [_ring_data(found) for found in detections],

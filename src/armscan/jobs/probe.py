@@ -73,7 +73,7 @@ def probe(
         warnings=sentences((*touches.warnings, *plate.warnings)),
         written=written,
         next_step=f"{next_step} -o scanner.json" if written else "",
-        data={"kind": "probed plate", "simulated": is_simulated},
+        extra={"kind": "probed plate", "simulated": is_simulated},
     )
 
 

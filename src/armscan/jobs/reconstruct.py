@@ -196,7 +196,7 @@ def _stills(
         written=written,
         next_step=f"open {written[-1]}, and the cloud in any viewer",
         forced=provenance.forced,
-        data={
+        extra={
             "kind": "reconstruction",
             "simulated": is_simulated,
             "images": _image_data(result),
@@ -266,7 +266,7 @@ def _scan(
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",
         forced=provenance.forced,
-        data={
+        extra={
             "kind": "scan",
             "simulated": is_simulated,
             "hand_eye_of": scanner.provenance.document_id,

@@ -184,7 +184,7 @@ def register(
         written=tuple(folder / name for name in contents),
         next_step=f"open {folder / PAGE}",
         forced=provenance.forced,
-        data={
+        extra={
             "kind": "registration",
             "of": document.kind,
             "simulated": is_simulated,

@@ -166,7 +166,7 @@ def calibrate_sheets(
     calibration = sensor_calibration(fit, provenance)
     document = sensor_document(calibration, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
-    summary = _summary(fit, written, read.warnings, is_simulated=is_simulated)
+    summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
     return replace(summary, forced=provenance.forced)
 
 
@@ -316,9 +316,10 @@ def _with_edge_flags(image: SheetImage) -> Profile:
     return replace(image.profile, flags=flags)
 
 
-def _summary(
+def sheets_summary(
     fit: LaserFit, written: Sequence[Path], notes: Sequence[str], *, is_simulated: bool
 ) -> Summary:
+    """What a person, and a program, wants to know of a calibration of light sheets."""
     told = [Quantity("laser_colour", "", fit.laser_colour)]
     if fit.channel_reason:
         told.append(fact("stripes in", sentence(fit.channel_reason)))
@@ -335,7 +336,7 @@ def _summary(
         warnings=sentences((*notes, *sheet_warnings(fit))),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan reconstruct IMAGES --sensor {written[0]}`",
-        data={
+        extra={
             "kind": "light sheet calibration",
             "simulated": is_simulated,
             "sheets": [values(sheet_quantities(sheet)) for sheet in fit.sheets],

@@ -49,7 +49,7 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
         quantities=(*counts, fact("target", found.target)),
         written=(found.folder, found.truth),
         next_step=_next_step(request.scene, found),
-        data={
+        extra={
             "kind": "simulate",
             "simulated": True,
             "head": request.head,

@@ -157,7 +157,7 @@ def verify(
         warnings=sentences(report.warnings),
         written=written,
         next_step=f"open {job.output}" if written else "",
-        data={
+        extra={
             "kind": "verification",
             "simulated": is_simulated,
             "verdict": result.verdict,

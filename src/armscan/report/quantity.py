@@ -143,7 +143,7 @@ class Summary:
         Files that now exist.
     next_step
         A command that comes next; empty for none.
-    data
+    extra
         More for programs: plain values only, units in the keys; NaN stands for "not known".
     forced
         Why the result, or what it rests on, was refused and made all the same (``--force-bad``).
@@ -155,14 +155,18 @@ class Summary:
     warnings: tuple[str, ...] = ()
     written: tuple[Path, ...] = ()
     next_step: str = ""
-    data: Mapping[str, Any] = field(default_factory=dict)
+    extra: Mapping[str, Any] = field(default_factory=dict)
     forced: tuple[str, ...] = ()
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """All that it holds for programs, by key."""
+        return {**values(self.quantities), **self.extra}
 
 
 def summary_json(summary: Summary) -> str:
     """JSON text of a summary in ASCII; what is not known is ``null``."""
     content = {
-        **values(summary.quantities),
         **summary.data,
         "forced": list(summary.forced),
         "warnings": list(summary.warnings),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From photographs of a flat target to the calibration of one camera, or of two."""
+"""From pairs of photographs of a flat target to a document of two cameras, and its page."""
 
 from __future__ import annotations
 
@@ -11,42 +11,30 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.cameras.pairs import StereoOptions
-from armscan.calibration.cameras.result import CameraOptions
-from armscan.calibration.cameras.result import reasons_to_refuse as reasons_of_camera
-from armscan.calibration.cameras.stereo_result import PairFit
-from armscan.calibration.cameras.stereo_result import reasons_to_refuse as reasons_of_stereo
+from armscan.calibration.cameras.stereo_result import PairFit, reasons_to_refuse
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.jobs.job import Job
-from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import STEREO_PARAMETER_NAMES
 from armscan.pipeline.cameras import (
-    CameraRun,
     ExposedPair,
     Given,
     StereoRun,
-    calibrate_camera_from_found,
     calibrate_stereo_from_found,
     pair_lists,
     stereo_calibration,
     stereo_rows,
 )
-from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.targets import find_targets
-from armscan.records.exposure import Exposure
-from armscan.report.camera import CAMERA_TITLE, camera_page, camera_quantities
 from armscan.report.photographs import refused_page, tried_targets
 from armscan.report.quantity import (
-    Quantity,
     Summary,
     Table,
     sentences,
-    significant,
     without_source,
 )
 from armscan.report.stereo import STEREO_TITLE, pair_row, stereo_page, stereo_quantities
 from armscan.storage.documents import (
-    camera_document,
     fingerprint,
     read_camera_calibration,
     stereo_document,
@@ -55,174 +43,7 @@ from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Images:
-    """Images of one camera with their files, other files that went in, and what is odd."""
-
-    exposures: tuple[Exposure, ...]
-    paths: tuple[Path, ...]
-    is_simulated: bool
-    tables: tuple[Path, ...] = ()
-    warnings: tuple[str, ...] = ()
-
-
-def calibrate_camera(
-    job: Job,
-    target: str,
-    images: Sequence[str] = (),
-    *,
-    scan: Path | None = None,
-    options: CameraOptions | None = None,
-    image_options: ImageOptions | None = None,
-) -> Summary:
-    """Read, calibrate, write ``camera.json``, ``.npz`` and ``.html``, and say what came out.
-
-    Parameters
-    ----------
-    job
-        Where to write the document ``NAME.json``.
-    target
-        Specification of the target.
-    images
-        Files, folders or patterns.
-    scan
-        Folder recording of the target, instead of images.
-    options, image_options
-        Of the calibration, and how pixels are read.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or the images do not determine the camera;
-        no document is written then. Where it is the images, a page shows them.
-    """
-    options, image_options = options or CameraOptions(), image_options or ImageOptions()
-    plate = parse_target(target)
-    places = job.places(".json", beside=(".npz", ".html"))
-    read = _camera_images(images, scan, image_options)
-    check_same_size(read.exposures)
-    sources = [exposure.source for exposure in read.exposures]
-    options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
-    found = find_targets(read.exposures, plate, cache=job.cache, progress=job.progress)
-    run = calibrate_camera_from_found(found, options, progress=job.progress)
-    inputs = (*read.paths, *read.tables)
-    by_source = dict(zip(sources, read.exposures, strict=True))
-    if isinstance(run, FitFailure):
-        used = (plate, options, image_options)
-        provenance = job.provenance(inputs, used, warnings=read.warnings)
-        tried = tried_targets(found.views, found.not_found, sources)
-        page = refused_page(
-            CAMERA_TITLE, tried, by_source, provenance, is_simulated=read.is_simulated
-        )
-        job.refuse(page, run)
-    fit, nonsense = run.fit, reasons_of_camera(run.fit)
-    provenance = job.provenance(
-        inputs,
-        (plate, fit.options, image_options),
-        warnings=(*read.warnings, *fit.warnings),
-        forced=nonsense,
-    )
-    page = camera_page(fit, run.not_found, by_source, provenance, is_simulated=read.is_simulated)
-    job.refuse_nonsense(page, nonsense)
-    hashes = {source: item.sha256 for source, item in zip(sources, provenance.inputs, strict=False)}
-    observations = pack_observations([view.view for view in fit.views], (), hashes)
-    calibration = camera_calibration(fit, provenance)
-    document = camera_document(calibration, (places[1].name, observations))
-    written = job.write(dict(zip(places, (document, observations, page), strict=True)))
-    summary = _camera_summary(run, plate, read, written)
-    return replace(summary, forced=nonsense)
-
-
-def _camera_images(
-    images: Sequence[str], scan: Path | None, image_options: ImageOptions
-) -> _Images:
-    if scan is None:
-        if not images:
-            raise OptionError("no images are given", remedy="name images, or give --scan FOLDER")
-        paths = expand_paths(images)
-        return _Images(read_exposures(paths, image_options), paths, are_simulated(paths))
-    if images:
-        raise OptionError(
-            "a recording and images are given", remedy="give --scan FOLDER, or images"
-        )
-    image_options.check_unused()
-    return _camera_scan(scan)
-
-
-def _camera_scan(folder: Path) -> _Images:
-    """The images without laser of a recording of one camera; all images where none is without."""
-    recording = read_recording(folder)
-    cameras = sorted({row.camera for row in recording.rows})
-    if len(cameras) > 1:
-        raise OptionError(
-            f"the recording is of {len(cameras)} cameras",
-            where=f"--scan {folder}",
-            remedy="calibrate them together with `armscan calibrate stereo --scan`",
-        )
-    dark = [k for k, row in enumerate(recording.rows) if not row.lasers]
-    chosen = dark or list(range(len(recording.rows)))
-    tables = (folder / EXPOSURES_FILE, folder / SESSION_FILE)
-    return _Images(
-        tuple(recording.exposure(k) for k in chosen),
-        tuple(folder / recording.rows[k].source for k in chosen),
-        recording.is_simulated,
-        tuple(path for path in tables if path.is_file()),
-        (*recording.warnings, *recording.session.assumed),
-    )
-
-
-def _camera_summary(
-    run: CameraRun, target: Target, read: _Images, written: Sequence[Path]
-) -> Summary:
-    fit = run.fit
-    noted = [view for view in fit.views if view.note]
-    rows = [(v.source, significant(v.rms_px), f"{v.tilt_deg:.0f}°", v.note) for v in noted]
-    rows += [(source, "", "", without_source(source, why)) for source, why in run.not_found]
-    table = Table(("image", "rms px", "tilt", "remark"), tuple(rows), "Images to look at", (3,))
-    return Summary(
-        title="Camera calibrated" + (" from simulated images." if read.is_simulated else "."),
-        quantities=(
-            Quantity("target_description", "Target", describe_target(target)),
-            *camera_quantities(fit, len(fit.views) + len(run.not_found)),
-        ),
-        tables=(table,) if rows else (),
-        warnings=sentences((*read.warnings, *fit.warnings)),
-        written=tuple(written),
-        next_step=f"open {written[-1]}, then `armscan calibrate laser --camera {written[0]} -h`",
-        data={
-            "kind": "camera calibration",
-            "simulated": read.is_simulated,
-            "target": format_target(target),
-            "width_px": fit.camera.width_px,
-            "height_px": fit.camera.height_px,
-            "sigmas": {
-                name.removesuffix("_px"): float(sigma)
-                for name, sigma in zip(PARAMETER_NAMES, fit.sigma, strict=True)
-            },
-            "free_parameters": list(fit.free_parameters),
-            "views": [
-                {
-                    "source": view.source,
-                    "n_points": len(view.view),
-                    "rms_px": view.rms_px,
-                    "tilt_deg": view.tilt_deg,
-                    "distance_mm": view.distance_mm,
-                    "is_used": view.is_used,
-                    "note": view.note,
-                }
-                for view in fit.views
-            ],
-            "not_found": _reasons(run.not_found),
-        },
-    )
-
-
-def _reasons(not_found: Sequence[tuple[str, str]]) -> list[dict[str, str]]:
-    return [{"source": source, "reason": reason} for source, reason in not_found]
+from armscan.vision.targets.target import parse_target
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -296,7 +117,7 @@ def calibrate_stereo(
             STEREO_TITLE, tried, by_source, provenance, is_simulated=read.is_simulated
         )
         job.refuse(page, run)
-    fit, nonsense = run.fit, reasons_of_stereo(run.fit)
+    fit, nonsense = run.fit, reasons_to_refuse(run.fit)
     provenance = job.provenance(
         inputs, used, parents=parents, warnings=fit.warnings, forced=nonsense
     )
@@ -382,7 +203,7 @@ def _stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bo
         warnings=sentences(fit.warnings),
         written=tuple(written),
         next_step=f"open {written[-1]}, then `armscan calibrate laser -h`",
-        data={
+        extra={
             "kind": "stereo calibration",
             "simulated": is_simulated,
             "intrinsics": fit.options.intrinsics,
@@ -395,7 +216,7 @@ def _stereo_summary(run: StereoRun, written: Sequence[Path], *, is_simulated: bo
             "typical_level": fit.typical_level,
             "target_error_mm": fit.target_error_mm,
             "pairs": [_pair_data(pair) for pair in fit.pairs],
-            "not_found": _reasons(run.not_found),
+            "not_found": [{"source": source, "reason": reason} for source, reason in run.not_found],
         },
     )
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import sys
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,10 +21,7 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, CircleGrid
-from camera_scene import CAMERA, Scene, make_views, normalised_error
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.camera_scene import CAMERA, Scene, make_views, normalised_error
 
 WIDE = CameraModel(
     fx_px=533.0,

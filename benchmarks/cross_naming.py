@@ -33,10 +33,8 @@ before it; strokes are.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from scipy.special import betaincinv
@@ -44,10 +42,7 @@ from scipy.special import betaincinv
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import LabelledProfile, LabelStatus, StripeLabeller
 from armscan.thesis.row_rule import RowLabeller
-from cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
 
 LEAST_POINTS = 20
 RULES = {"thesis": RowLabeller, "ours": CrossLabeller}

@@ -13,12 +13,10 @@ let pass counts as harmless, not as silent.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,11 +34,8 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import euler_from_rotations, rotations_from_euler
 from armscan.geometry.shapes import Plane
-from plate_rig import PLATE_CENTRE, PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, RigNoise
-from plate_rig import good_postures as postures_of
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.plate_rig import PLATE_CENTRE, PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, RigNoise
+from rigs.plate_rig import good_postures as postures_of
 
 N = 12
 FORM_MM = 0.2

@@ -15,10 +15,8 @@ returns no hand-eye, "wrong" those with a hand-eye more than 5 degrees off.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,11 +31,8 @@ from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sec
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
-from plate_rig import TOOL_FROM_SENSOR, PlateRig, Postures, RigNoise
-from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, Postures, RigNoise
+from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 KINDS = ("varied", "hardly turned", "one axis", "four to six")
 FOUND = 1.01

@@ -14,9 +14,7 @@ squares is eq. 2.76 as it stands, with the covariance that its own residuals sug
 from __future__ import annotations
 
 import argparse
-import sys
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,11 +24,8 @@ from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_difference
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.geometry.arrays import FloatArray
-from plate_bound import cramer_rao, plain_least_squares
-from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.plate_bound import cramer_rao, plain_least_squares
+from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
 REGION = float(chi2.ppf(0.95, 6))
 

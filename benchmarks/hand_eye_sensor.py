@@ -16,10 +16,8 @@ within its covariance, beside the sensor that is not; ``both`` the same beside t
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -41,12 +39,9 @@ from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
 from armscan.models.camera import CameraModel
-from calibrated_head import CalibratedHead
-from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR
-from sheet_rig import PROVENANCE
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.calibrated_head import CalibratedHead
+from rigs.plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR
+from rigs.sheet_rig import PROVENANCE
 
 OPTIONS = HandEyeOptions()
 N_CAMERA = 9

@@ -12,9 +12,7 @@ The two steps need postures that only shift; from the turned ones they have no a
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
@@ -26,10 +24,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
 from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
-from sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
 
 REGION = float(chi2.ppf(0.95, 6))
 OPTIONS = SphereOptions(nodes_per_stripe=10)

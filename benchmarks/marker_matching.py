@@ -13,11 +13,9 @@ With ``--times``: milliseconds of one processor for one matching, the median of 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -25,10 +23,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.markers.alignments import Matched
 from armscan.markers.match_3d import match_markers
 from armscan.thesis.marker_rules import match_after_thesis
-from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
 LIMIT_MM = 8.0 * NOISE_MM
 COMMON = ((8, 1), (12, 4), (6, 4), (5, 4), (4, 4), (3, 4))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of eleven lines by the second camera, at feature level: ours beside the thesis's own way.
 
-    PYTHONPATH=tests python benchmarks/multi_naming.py [seeds] [--first 100] [--preset thesis]
+    python benchmarks/multi_naming.py [seeds] [--first 100] [--preset thesis]
                                                        [--scenes plate,ball]
 
 Default: 20 seeds of every preset. The namer's limits were chosen on seeds 0 to 39 of preset thesis,
@@ -41,8 +41,8 @@ from armscan.reconstruction.epipolar import (
 )
 from armscan.reconstruction.label_stereo import StereoLabelOptions, name_stripes
 from armscan.records.profile import Profile
-from stereo_head import StereoHead
-from stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
+from rigs.stereo_head import StereoHead
+from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
 
 PRESETS = {
     "thesis": Noise(),

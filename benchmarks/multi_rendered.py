@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Names of the multi-line head's stripes in rendered images of the twin.
 
-Command: ``PYTHONPATH=tests python benchmarks/multi_rendered.py [preset] [seed] [scene ...]``
+Command: ``python benchmarks/multi_rendered.py [preset] [seed] [scene ...]``
 (default thesis, 1, steps). One exposure of each scene, the middle one of the recording.
 
 The sensor is the true one (sheets fitted to their true points), with the covariance of the rig of
@@ -31,8 +31,8 @@ from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.stereo_points import measure_stereo
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
-from sheet_rig import PROVENANCE
-from stereo_head import DEPTHS_MM, StereoHead
+from rigs.sheet_rig import PROVENANCE
+from rigs.stereo_head import DEPTHS_MM, StereoHead
 
 SAME_PX = 1.5
 SAME_MM = 0.1
@@ -85,7 +85,9 @@ def true_sensor(truth: Any) -> SensorCalibration:
         )
         for name in names
     )
-    second = SecondCamera(camera(truth.right_camera_parameters), truth.right_from_sensor)
+    second = SecondCamera(
+        camera=camera(truth.right_camera_parameters), right_from_sensor=truth.right_from_sensor
+    )
     return SensorCalibration(
         camera=camera(truth.camera_parameters),
         sheets=sheets,

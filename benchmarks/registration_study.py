@@ -20,7 +20,6 @@ of one processor. A run fails if a view is not joined, or is wrong by more than 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,10 +37,7 @@ from armscan.markers.join_views import JoinedViews, join_views
 from armscan.pipeline.register import register_place
 from armscan.storage.points import MarkerList
 from armscan.thesis.marker_rules import match_after_thesis
-from marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
 
 AnyPose = Pose[Frame, Frame]
 

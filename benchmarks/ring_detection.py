@@ -27,7 +27,6 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -39,11 +38,8 @@ from armscan.records.points import RingImages
 from armscan.vision.ring_edges import measure_rims
 from armscan.vision.rings import detect_rings
 from armscan.vision.targets.circle_lattice import Blobs
-from ring_pair_scenes import CALIBRATION_COVARIANCE, MarkerScene, random_scene
-from ring_scenes import Mark, Rendered, render, tilted
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-
+from rigs.ring_pair_scenes import CALIBRATION_COVARIANCE, MarkerScene, random_scene
+from rigs.ring_scenes import Mark, Rendered, render, tilted
 
 N_AZIMUTHS, N_IMAGES = 6, 6
 N_CLUTTER = 12

@@ -17,21 +17,17 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
-import placing_rig as rig
 from armscan.geometry.arrays import FloatArray
 from armscan.models.arm import forward, parameter_jacobian, thesis_arm
 from armscan.reconstruction.place import estimate_normals, prepare_placing, propagate_to_base
 from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import triangulate_stripe
 from armscan.records.recording import ArmTrack, ExposureRow
-from sheet_rig import thesis_rig
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs import placing_rig as rig
+from rigs.sheet_rig import thesis_rig
 
 ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
 RNG = np.random.default_rng(0)

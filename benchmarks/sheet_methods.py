@@ -23,7 +23,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,10 +33,7 @@ from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit, SheetFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from sheet_rig import THESIS_PLANE, SheetRig, SheetTruth, placed, thesis_rig
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.sheet_rig import THESIS_PLANE, SheetRig, SheetTruth, placed, thesis_rig
 
 CENTRE = (16.0, 12.0)
 GRID = np.stack(np.meshgrid(np.linspace(-0.9, 0.9, 5), np.linspace(-0.9, 0.9, 5)), -1).reshape(

@@ -22,7 +22,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -45,10 +44,7 @@ from armscan.simulation.shots import RenderRequest
 from armscan.simulation.station import Target
 from armscan.simulation.targets import PATTERN, made_target
 from armscan.vision.targets.target import TargetView
-from sheet_rig import PROVENANCE, make_profile
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.sheet_rig import PROVENANCE, make_profile
 
 CIRCLE_PX, STRIPE_PX, CORRELATED, PER_STRIPE = 0.005, 0.08, 11, 900
 CAMERA = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)

@@ -18,7 +18,6 @@ their places by 0.02 mm an axis, alike in all views.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 from scipy import stats
@@ -27,10 +26,7 @@ from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import StereoOptions
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.calibration.cameras.stereo_result import StereoFit
-from stereo_rig import StereoScene, make_pairs, normalised_stereo_error
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-
+from rigs.stereo_rig import StereoScene, make_pairs, normalised_stereo_error
 
 N_PARAMETERS = 24
 OPTIONS = StereoOptions(CameraOptions(distortion="k1k2p1p2k3", n_folds=0), n_folds=0)

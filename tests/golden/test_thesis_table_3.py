@@ -22,7 +22,7 @@ from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import nearest_rotation, rotations_from_euler, vector_from_rotation
 from armscan.geometry.shapes import Plane
 from armscan.models.camera import CameraModel
-from thesis_instrument import (
+from rigs.thesis_instrument import (
     CAMERA,
     DISTORTION,
     HAND_EYE_ANGLES_DEG,

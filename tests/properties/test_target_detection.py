@@ -11,7 +11,7 @@ from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
 from armscan.simulation.optics.camera import add_noise
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
-from target_scenes import render
+from rigs.target_scenes import render
 
 CIRCLES = CircleGrid(5, 3, 3.75, is_asymmetric=True)
 BOARD = Chessboard(7, 4, 3.0)

@@ -10,7 +10,7 @@ import cv2
 import pytest
 
 from armscan.cli import main
-from smoke.drawn_bench import CAMERA_TILTS, LASER_PLACES, OBJECT_PLACE, TARGET, Bench, draw
+from rigs.drawn_bench import CAMERA_TILTS, LASER_PLACES, OBJECT_PLACE, TARGET, Bench, draw
 
 
 @pytest.fixture(scope="session")

@@ -18,8 +18,8 @@ from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.points import probed_points_csv
-from smoke.drawn_arm import PLANE, PLATE, PLATE_D_MM, ROTATION, TRANSLATION_MM, draw_postures
-from smoke.drawn_bench import Bench
+from rigs.drawn_arm import PLANE, PLATE, PLATE_D_MM, ROTATION, TRANSLATION_MM, draw_postures
+from rigs.drawn_bench import Bench
 
 Fails = Callable[..., str]
 SIGMAS = 5.0

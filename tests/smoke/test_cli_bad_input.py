@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from armscan.cli import main
-from smoke.drawn_bench import TARGET, Bench
+from rigs.drawn_bench import TARGET, Bench
 
 Fails = Callable[..., str]
 

@@ -14,7 +14,7 @@ from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
 from armscan.storage.observations import read_observations
-from smoke.drawn_bench import FOCAL, HEIGHT, OBJECT_PLACE, SHEET, SHEET_D_MM, TARGET, WIDTH, Bench
+from rigs.drawn_bench import FOCAL, HEIGHT, OBJECT_PLACE, SHEET, SHEET_D_MM, TARGET, WIDTH, Bench
 
 SIGMAS = 4.0
 

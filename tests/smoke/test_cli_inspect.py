@@ -13,7 +13,7 @@ import pytest
 
 from armscan.cli import main
 from armscan.storage.clouds import ply_bytes, read_ply, xyz_bytes
-from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
 Fails = Callable[..., str]
 

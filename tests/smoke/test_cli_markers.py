@@ -19,7 +19,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.two_views import StereoCalibration
 from armscan.storage.documents import stereo_document
 from armscan.storage.points import read_marker_list
-from ring_scenes import Mark, render, tilted
+from rigs.ring_scenes import Mark, render, tilted
 
 WIDTH, HEIGHT, FOCAL_PX = 480, 400, 1000.0
 DISTANCE_MM, BASELINE_MM, RADIUS_MM = 150.0, 60.0, 3.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from armscan.cli import main
-from recording_folders import ARM, EXPOSURES, SESSION, lab_folder
+from rigs.recording_folders import ARM, EXPOSURES, SESSION, lab_folder
 
 
 def test_the_real_twin_probes_its_plate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,8 +16,8 @@ from armscan.records.cloud import PointCloud
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import read_registration
 from armscan.storage.points import markers_csv, read_marker_list
-from inspection_clouds import cloud_of
-from marker_scenes import Walk, marker_set, two_views, walk
+from rigs.inspection_clouds import cloud_of
+from rigs.marker_scenes import Walk, marker_set, two_views, walk
 
 Fails = Callable[..., str]
 PATCH = np.array([(x, y, 0.0) for x in np.linspace(-30, 30, 13) for y in np.linspace(-20, 20, 9)])

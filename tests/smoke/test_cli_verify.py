@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import scan_fake
 from armscan.cli.run import main
 from armscan.geometry.poses import Pose
 from armscan.storage.documents import scanner_document
 from armscan.storage.recording import write_recording
+from rigs import scan_fake
 
 SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.015, 0.015, 0.015])
 

@@ -7,7 +7,7 @@ import pytest
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.geometry.rotations import vector_from_rotation
-from camera_scene import CAMERA, GRID, Scene, make_views
+from rigs.camera_scene import CAMERA, GRID, Scene, make_views
 
 mrcal = pytest.importorskip("mrcal")
 

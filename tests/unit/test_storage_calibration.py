@@ -25,7 +25,7 @@ from armscan.storage.documents import (
     scanner_document,
     sensor_document,
 )
-from calibration_documents import (
+from rigs.calibration_documents import (
     assert_same,
     camera_calibration,
     scanner_calibration,

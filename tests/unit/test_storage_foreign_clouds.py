@@ -11,7 +11,7 @@ import pytest
 
 from armscan.errors import FileFormatError
 from armscan.storage.clouds import ply_bytes, read_cloud, xyz_bytes
-from inspection_clouds import cloud_of
+from rigs.inspection_clouds import cloud_of
 
 POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5]])
 

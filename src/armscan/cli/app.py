@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, markers, measure
+from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -73,10 +73,10 @@ app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)
 app.command("simulate", epilog=measure.SIMULATE_EXAMPLE)(measure.simulate)
-app.command("probe", epilog=measure.PROBE_EXAMPLE)(measure.probe)
+app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
 app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
-app.command("markers", epilog=markers.MARKERS_EXAMPLE)(markers.markers)
-app.command("register", epilog=markers.REGISTER_EXAMPLE)(markers.register)
+app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
+app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)

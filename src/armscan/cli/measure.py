@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan demo``, ``simulate``, ``probe`` and ``reconstruct``."""
+"""``armscan demo``, ``simulate`` and ``reconstruct``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from armscan.cli.options import (
     DefaultOf,
     Force,
     LaserColourOption,
-    Side,
     StripeMethodOption,
     given,
     progress_bar,
@@ -31,11 +30,6 @@ SIMULATE_EXAMPLE = (
     "  armscan simulate thesis-single camera -o board\n"
     "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
     "  armscan simulate thesis-multi markers -o markers"
-)
-PROBE_EXAMPLE = (
-    "\b\nExamples:\n"
-    "  armscan probe touches/ -o plate.csv\n"
-    "  armscan probe centres.csv --side +x -o plate.csv"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -181,61 +175,6 @@ def simulate(
     with progress_bar() as progress:
         summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
     show(summary, as_json=as_json)
-
-
-def probe(
-    touches: Annotated[
-        Path,
-        typer.Argument(
-            help="Folder with arm.csv (a row a touch) and probe.toml; or a table of points.",
-            show_default=False,
-        ),
-    ],
-    *,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", help="Points on the surface, a CSV table.", show_default=False
-        ),
-    ] = None,
-    side: Annotated[
-        Side | None,
-        typer.Option(
-            help="Axis that the plate's face looks along; default: to where the tool was.",
-            show_default=False,
-        ),
-    ] = None,
-    probe: Annotated[
-        Path | None,
-        typer.Option(help="The tip, if it is not probe.toml of the folder.", show_default=False),
-    ] = None,
-    feature: Annotated[
-        str, typer.Option(help="Feature to use, where the table names several.", show_default=False)
-    ] = "",
-    leave_out: Annotated[
-        bool, typer.Option("--leave-out", help="Leave out touches that do not fit the others.")
-    ] = False,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Fit the plane of a plate to touches; the tip's radius is taken off on the side of the probe.
-
-    A touch that does not fit the others is named. In probe.toml: centre_tool_mm = [x, y, z] and
-    tip_diameter_mm = 6.0. A table of tip centres says so in its first line:
-    # point = tip-centre, tip_diameter_mm = 6
-    """
-    from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-    from armscan.jobs.probe import probe as probe_plate
-
-    options = ProbingOptions(
-        side=None if side is None else side.value, leave_out_outliers=leave_out, feature=feature
-    )
-    run(
-        lambda job: probe_plate(job, touches, probe, options),
-        as_json=as_json,
-        output=output,
-        force=force,
-    )
 
 
 def reconstruct(

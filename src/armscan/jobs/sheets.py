@@ -21,7 +21,6 @@ from armscan.geometry.estimate import FitFailure
 from armscan.jobs.job import Job
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.two_views import StereoCalibration
-from armscan.pipeline.documents import sensor_calibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
@@ -163,8 +162,7 @@ def calibrate_sheets(
     }
     profiles = [_with_edge_flags(image) for image in fit.images]
     observations = pack_observations([image.view for image in fit.images], profiles, hashes)
-    calibration = sensor_calibration(fit, provenance)
-    document = sensor_document(calibration, (places[1].name, observations))
+    document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
     return replace(summary, forced=provenance.forced)
@@ -340,10 +338,10 @@ def sheets_summary(
             "kind": "light sheet calibration",
             "simulated": is_simulated,
             "sheets": [values(sheet_quantities(sheet)) for sheet in fit.sheets],
-            "naming": fit.naming,
+            "naming": fit.diagnostics.naming,
             "cameras": 1 if fit.second is None else 2,
             "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
-            "noise_factor": fit.noise_factor,
+            "noise_factor": fit.diagnostics.noise_factor,
             "channel_reason": fit.channel_reason,
             "skipped": [{"source": source, "reason": reason} for source, reason in reasons],
         },

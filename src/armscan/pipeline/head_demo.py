@@ -40,9 +40,10 @@ from armscan.pipeline.cameras import (
     stereo_calibration,
     stereo_rows,
 )
-from armscan.pipeline.documents import camera_calibration, sensor_calibration
+from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.hand_eye import HandEyeRun, calibrate_hand_eye_from_scan
-from armscan.pipeline.laser import calibrate_sheets_from_scan
+from armscan.pipeline.instants import pair_by_view
+from armscan.pipeline.laser import calibrate_sheets_from_pairs
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.reconstruct import reconstruct
@@ -248,16 +249,20 @@ def calibrate_head(
     camera = watch.timed(
         "calibrate_camera", lambda: _cameras_of(scans.calibration("camera"), target, progress)
     )
+    source = scans.calibration("laser")
     laser = watch.timed(
         "calibrate_laser",
         lambda: succeeded(
-            calibrate_sheets_from_scan(
-                scans.calibration("laser"), target, camera, progress=progress
+            calibrate_sheets_from_pairs(
+                pair_by_view([source.exposure(row) for row in range(len(source.rows))]),
+                target,
+                camera,
+                progress=progress,
             ),
             "laser",
         ),
     )
-    sensor = sensor_calibration(laser, IN_MEMORY)
+    sensor = laser.to_calibration(IN_MEMORY)
     plate = watch.timed("probe_plate", lambda: plate_of(twin.probe_plate()))
     hand_eye = watch.timed(
         "calibrate_hand_eye",

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.sheets.result import (
-    LackOfFit,
+    LACK_OF_FIT_P,
     LaserFit,
     PointUse,
     SheetFit,
     SheetImage,
-    SheetOptions,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray
-from armscan.models.calibration import Provenance
+from armscan.models.calibration import FTest, Provenance
 from armscan.models.light_sheet import BOW_TERMS, PLANE_PARAMETER_NAMES
 from armscan.records.exposure import Exposure
 from armscan.report.charts import PAGE_WIDTH, Bars, histogram_chart, short, symmetric_edges
@@ -86,7 +85,7 @@ POINT_HEADS = (
 
 def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
     """What is told of one sheet."""
-    stored, sheet = fit.calibration, fit.sheet
+    stored, sheet, known = fit.calibration, fit.sheet, fit.diagnostics
     a, b, c, d = sheet.plane
     low, high = stored.depth_range_mm
     sigmas = np.sqrt(fit.covariance.diagonal()[:3]).tolist()
@@ -116,9 +115,9 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
             "rms_mm",
             "Residual",
             stored.rms_mm,
-            shown=f"{significant(stored.rms_mm)} mm rms, {significant(fit.rms_px)} px rms",
+            shown=f"{significant(stored.rms_mm)} mm rms, {significant(known.rms_px)} px rms",
         ),
-        Quantity("rms_px", "", fit.rms_px),
+        Quantity("rms_px", "", known.rms_px),
         *_point_quantities(fit),
         Quantity("depth_min_mm", "Depth covered", low, shown=f"Z {low:.1f} to {high:.1f} mm"),
         Quantity("depth_max_mm", "", high),
@@ -126,7 +125,7 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
             "n_boards",
             "Rests on",
             stored.n_boards,
-            shown=f"{stored.n_boards} boards, at most {fit.board_angle_deg:.0f}° apart, "
+            shown=f"{stored.n_boards} boards, at most {known.board_angle_deg:.0f}° apart, "
             f"{stored.n_points} points",
         ),
         Quantity("n_points", "", stored.n_points),
@@ -138,8 +137,8 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
         ),
         fact(
             "Stripes miss a common plane by",
-            f"{significant(fit.coplanarity_mm)} mm, expected "
-            f"{significant(fit.coplanarity_sigma_mm)} mm",
+            f"{significant(known.coplanarity_mm)} mm, expected "
+            f"{significant(known.coplanarity_sigma_mm)} mm",
         ),
         Quantity(
             "bow_mm",
@@ -148,13 +147,13 @@ def sheet_quantities(fit: SheetFit) -> tuple[Quantity, ...]:
             shown=bow if sheet.is_bowed else "none: a plane",
         ),
         *([_light_source(fit)] if sheet.fan.any() else []),
-        fact("Plane or bow, and why", sentence(fit.bow_decision)),
-        fact("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
+        fact("Plane or bow, and why", sentence(known.bow_decision)),
+        fact("Lack of fit of a plane", lack_of_fit_text(known.plane_test)),
         Quantity(
             "lack_of_fit_p",
             "Lack of fit of the sheet",
-            fit.final_test.p_value,
-            shown=lack_of_fit_text(fit.final_test),
+            known.final_test.p_value,
+            shown=lack_of_fit_text(known.final_test),
         ),
     )
 
@@ -185,11 +184,11 @@ def _point_quantities(fit: SheetFit) -> list[Quantity]:
     return told
 
 
-def lack_of_fit_text(test: LackOfFit) -> str:
+def lack_of_fit_text(test: FTest) -> str:
     """A lack-of-fit test in words."""
     if test.degrees_of_freedom == 0 or not math.isfinite(test.p_value):
         return "nothing is redundant, so nothing can be tested"
-    if test.p_value < SheetOptions().lack_of_fit_p:
+    if test.p_value < LACK_OF_FIT_P:
         verdict = "the model does not explain the stripes"
     else:
         verdict = "weak objection" if test.p_value < WEAK_P else "no objection"
@@ -258,7 +257,7 @@ def _card(fit: SheetFit) -> Quantity:
 
 
 def _sheets_section(fit: LaserFit) -> Section:
-    named = f"Named: {fit.naming}."
+    named = f"Named: {fit.diagnostics.naming}."
     if fit.channel_reason:
         named += f" Stripes in {fit.channel_reason}."
     blocks: list[Block] = [
@@ -409,6 +408,7 @@ def _residual_panel(axes: Any, along: FloatArray, residual: FloatArray) -> None:
 
 def _residual_histogram(fit: LaserFit) -> Picture:
     """Residuals across the stripe in the image, all sheets."""
+    known = fit.diagnostics
     used = [(image, image.use == int(PointUse.USED)) for image in fit.images]
     measured = np.concatenate([image.residual_px[chosen] for image, chosen in used])
     moved = np.concatenate([image.remaining_px[chosen] for image, chosen in used])
@@ -420,8 +420,8 @@ def _residual_histogram(fit: LaserFit) -> Picture:
         symmetric_edges(measured),
         "off the sheet, across the stripe, px",
         title="Distribution of residuals",
-        caption=f"Stripe points scatter {fit.noise_factor:.2f} times as much as their sigmas "
-        f"say; about {fit.correlation_points:.0f} points along a stripe count as one.",
+        caption=f"Stripe points scatter {known.noise_factor:.2f} times as much as their sigmas "
+        f"say; about {known.correlation_points:.0f} points along a stripe count as one.",
     )
 
 

@@ -16,7 +16,7 @@ from armscan.calibration.cameras.adjustment import (
 )
 from armscan.calibration.cameras.result import CameraOptions
 from armscan.geometry.estimate import FitFailure
-from camera_scene import CAMERA, Scene, make_views
+from rigs.camera_scene import CAMERA, Scene, make_views
 
 SCENE = Scene(n_views=4, bow_mm=(0.3, -0.2))
 BASIS, _ = free_basis("k1k2p1p2k3", CameraOptions(), with_board_warp=True)

@@ -18,7 +18,7 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard
-from camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
+from rigs.camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
 
 TELE = CameraModel(
     fx_px=9000.0,

@@ -15,7 +15,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
-from camera_scene import CAMERA, Scene, make_views
+from rigs.camera_scene import CAMERA, Scene, make_views
 
 PINHOLE = CameraModel(
     fx_px=2300.0,

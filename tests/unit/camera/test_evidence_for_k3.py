@@ -9,7 +9,7 @@ from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import Chessboard, TargetView
-from camera_scene import Scene, view_of
+from rigs.camera_scene import Scene, view_of
 
 LENS = CameraModel(
     fx_px=620.0,

@@ -16,7 +16,7 @@ from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.geometry.estimate import Estimate
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import TargetView
-from camera_scene import CAMERA, Scene, make_views
+from rigs.camera_scene import CAMERA, Scene, make_views
 
 ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
 

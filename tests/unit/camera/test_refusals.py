@@ -15,7 +15,7 @@ from armscan.calibration.cameras.result import (
     reasons_to_refuse,
 )
 from armscan.vision.targets.target import TargetView
-from camera_scene import Scene, make_views
+from rigs.camera_scene import Scene, make_views
 
 OPTIONS = CameraOptions(distortion="k1k2", n_folds=4)
 

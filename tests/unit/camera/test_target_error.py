@@ -9,7 +9,7 @@ from scipy import stats
 
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
-from camera_scene import Scene, make_views, normalised_error
+from rigs.camera_scene import Scene, make_views, normalised_error
 
 OPTIONS = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
 N_RUNS = 40

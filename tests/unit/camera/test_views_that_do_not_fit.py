@@ -11,7 +11,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.vision.targets.target import TargetView
-from camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
+from rigs.camera_scene import CAMERA, GRID, Scene, board_pose, make_views, normalised_error, view_of
 
 ALL_FIVE = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
 
@@ -174,8 +174,6 @@ def test_wrong_requests_are_refused() -> None:
         CameraOptions(distortion="fisheye")  # type: ignore[arg-type]
     with pytest.raises(OptionError, match="n_folds"):
         CameraOptions(n_folds=1)
-    with pytest.raises(OptionError, match="min_points"):
-        CameraOptions(min_points=3)
 
 
 def test_scattered_points_are_no_board() -> None:

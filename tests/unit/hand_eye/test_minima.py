@@ -22,8 +22,8 @@ from armscan.calibration.hand_eye.sphere_estimate import start_candidates
 from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose, Sensor, Tool
-from plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
-from sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
+from rigs.plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
+from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 FORM_MM = 0.04
 QUICK = SphereOptions(nodes_per_stripe=10)

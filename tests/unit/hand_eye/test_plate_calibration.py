@@ -26,7 +26,7 @@ from armscan.calibration.hand_eye.observations import (
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.search import linear_hand_eye
 from armscan.geometry.arrays import FloatArray
-from plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
+from rigs.plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
 NOISE = RigNoise()
 GIVEN = HandEyeOptions(

@@ -25,7 +25,14 @@ from armscan.thesis.hand_eye import (
     plane_in_tool,
     rotation_from_angles,
 )
-from plate_rig import PLATE_CENTRE, PLATE_NORMAL, SILENT, TOOL_FROM_SENSOR, PlateRig, good_postures
+from rigs.plate_rig import (
+    PLATE_CENTRE,
+    PLATE_NORMAL,
+    SILENT,
+    TOOL_FROM_SENSOR,
+    PlateRig,
+    good_postures,
+)
 
 POSE: Pose[Base, Tool] = Pose.from_vectors([0.4, -0.2, 1.1], [300.0, -120.0, 80.0])
 PLANE = np.array([*PLATE_NORMAL, -float(PLATE_NORMAL @ PLATE_CENTRE)])

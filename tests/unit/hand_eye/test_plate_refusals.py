@@ -31,7 +31,7 @@ from armscan.geometry.rotations import (
     rotations_from_euler,
 )
 from armscan.geometry.shapes import Plane
-from plate_rig import (
+from rigs.plate_rig import (
     PLATE_NORMAL,
     SILENT,
     TOOL_FROM_SENSOR,

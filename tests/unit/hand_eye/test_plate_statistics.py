@@ -14,8 +14,8 @@ from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_d
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.solve import NoiseComponent, solve_linear
 from armscan.geometry.arrays import FloatArray
-from plate_bound import cramer_rao, plain_least_squares
-from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
+from rigs.plate_bound import cramer_rao, plain_least_squares
+from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
 NOISE = RigNoise()
 N_RUNS = 30

@@ -13,7 +13,7 @@ from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStrip
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import InputError
 from armscan.geometry.poses import Pose, Tool
-from plate_rig import PlateRig, good_postures
+from rigs.plate_rig import PlateRig, good_postures
 
 STANDING_MM, STANDING_RAD = 0.02, np.radians(0.002)
 

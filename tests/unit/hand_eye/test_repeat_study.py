@@ -18,7 +18,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import nearest_rotation, rotation_from_vector
 from armscan.models.calibration import ArmNoise, HandEyeCalibration
-from thesis_instrument import MEAN_ROTATION, TABLE_4, TABLE_4_MEAN, TABLE_4_STD
+from rigs.thesis_instrument import MEAN_ROTATION, TABLE_4, TABLE_4_MEAN, TABLE_4_STD
 
 SEED = 3
 

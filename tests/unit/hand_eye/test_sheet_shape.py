@@ -26,7 +26,7 @@ from armscan.calibration.hand_eye.solve import noise_components
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SHEET_PARAMETER_NAMES
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
-from plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, Surface, good_postures
+from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, Surface, good_postures
 
 NOISE = RigNoise(exposure_mm=0.0, exposure_rad=0.0)
 SHAPE_MM = 0.0015

@@ -21,7 +21,14 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
-from sphere_rig import DIAMETER_MM, HAND_EYE, POINT_NOISE_MM, SHEET_NORMAL, SphereRig, turned_poses
+from rigs.sphere_rig import (
+    DIAMETER_MM,
+    HAND_EYE,
+    POINT_NOISE_MM,
+    SHEET_NORMAL,
+    SphereRig,
+    turned_poses,
+)
 
 SEED = 5
 POSE_NOISE_MM = 0.02

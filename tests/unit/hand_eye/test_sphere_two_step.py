@@ -15,7 +15,7 @@ from armscan.thesis.hand_eye import (
     rotation_from_shifts,
     translation_from_turns,
 )
-from sphere_rig import DIAMETER_MM, HAND_EYE, SHEET_NORMAL, SphereRig, shifted_poses
+from rigs.sphere_rig import DIAMETER_MM, HAND_EYE, SHEET_NORMAL, SphereRig, shifted_poses
 
 SEED = 9
 

@@ -17,9 +17,9 @@ from armscan.calibration.hand_eye.observations import (
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.geometry.arrays import FloatArray
-from calibrated_head import CalibratedHead
-from plate_rig import PLATE_NORMAL, RigNoise
-from sphere_rig import DIAMETER_MM, SphereRig, turned_poses
+from rigs.calibrated_head import CalibratedHead
+from rigs.plate_rig import PLATE_NORMAL, RigNoise
+from rigs.sphere_rig import DIAMETER_MM, SphereRig, turned_poses
 
 NOISE = RigNoise()
 GIVEN = HandEyeOptions(

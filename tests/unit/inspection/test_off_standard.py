@@ -12,7 +12,7 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection, SphereInspection
 from armscan.inspection.sphere import inspect_sphere
 from armscan.records.cloud import PointCloud
-from inspection_clouds import cloud_of
+from rigs.inspection_clouds import cloud_of
 
 RADIUS_MM, NOISE_MM, STRIPES = 17.5, 0.005, 24
 

@@ -13,7 +13,7 @@ from armscan.geometry.shapes import Plane, plane_from_coefficients
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
 from armscan.inspection.selection import InspectionOptions
-from inspection_clouds import cloud_of, random_motion
+from rigs.inspection_clouds import cloud_of, random_motion
 
 GRID = np.stack(np.meshgrid(np.arange(20.0), np.arange(10.0), [0.0]), axis=-1).reshape(-1, 3)
 

@@ -12,7 +12,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import SphereInspection
 from armscan.inspection.sphere import inspect_sphere
-from inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
 
 DIAMETER_MM = 2.0 * RADIUS_MM
 CENTRE = np.array([600.0, -120.0, 90.0])

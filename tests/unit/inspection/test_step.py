@@ -12,7 +12,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import StepInspection
 from armscan.inspection.selection import StepOptions
 from armscan.inspection.step import inspect_step
-from inspection_clouds import block_stripes, cloud_of, random_motion
+from rigs.inspection_clouds import block_stripes, cloud_of, random_motion
 
 HEIGHT_MM = 20.0
 

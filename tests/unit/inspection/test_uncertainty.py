@@ -11,7 +11,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import MeasuredLength
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
-from inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
 ARM_MM = 0.008
 NOISE_MM = 0.004

@@ -20,7 +20,7 @@ from armscan.calibration.sheets.coplanarity import (
 from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
-from sheet_rig import thesis_rig
+from rigs.sheet_rig import thesis_rig
 
 GEOMETRY = SheetGeometry(3, 20.0, (120.0, 150.0), np.array([10.0, 8.0]))
 

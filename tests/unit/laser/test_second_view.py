@@ -20,8 +20,8 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, vector_from_rotation
 from armscan.vision.targets.target import TargetView
-from fan_rig import STEREO_SIGMA, FanRig, fan_rig
-from sheet_rig import placed, project
+from rigs.fan_rig import STEREO_SIGMA, FanRig, fan_rig
+from rigs.sheet_rig import placed, project
 
 POSE: Pose[Sensor, Board] = placed(8.0, 28.0, 140.0, (18.75, 15.0))
 RIG = fan_rig(0, 1)

@@ -15,7 +15,7 @@ from armscan.calibration.sheets.solve import solve_sheets
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.triangulate import triangulate
-from sheet_rig import PROVENANCE, SheetRig, thesis_rig
+from rigs.sheet_rig import PROVENANCE, SheetRig, thesis_rig
 
 N_RUNS = 60
 POOR = 20.0

@@ -13,8 +13,8 @@ from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.two_views import StereoCalibration
-from fan_rig import FanRig, LaserTruth, fan_rig
-from sheet_rig import PROVENANCE
+from rigs.fan_rig import FanRig, LaserTruth, fan_rig
+from rigs.sheet_rig import PROVENANCE
 
 GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), -1).reshape(-1, 2)
 

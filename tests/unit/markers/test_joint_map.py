@@ -17,7 +17,7 @@ from armscan.geometry.rotations import vector_from_rotation
 from armscan.markers.join_views import JoinedViews, Link, chain_markers, join_views
 from armscan.markers.joint_map import adjust_jointly
 from armscan.records.points import MarkerSet
-from marker_scenes import NOISE_MM, Walk, marker_set, scattered, walk
+from rigs.marker_scenes import NOISE_MM, Walk, marker_set, scattered, walk
 
 
 def joined(scene: Walk) -> JoinedViews:

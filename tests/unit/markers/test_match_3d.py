@@ -13,7 +13,7 @@ from armscan.markers.alignments import MarkerMatchOptions, Matched, NoMatch, Not
 from armscan.markers.match_3d import match_markers
 from armscan.records.points import MarkerSet
 from armscan.thesis.marker_rules import match_after_thesis
-from marker_scenes import NOISE_MM, marker_set, random_pose, scattered, two_views
+from rigs.marker_scenes import NOISE_MM, marker_set, random_pose, scattered, two_views
 
 SOLID = np.array([200.0, 150.0, 80.0])
 FLAT = np.array([250.0, 160.0, 0.0])

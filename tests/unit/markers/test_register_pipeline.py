@@ -15,8 +15,8 @@ from armscan.markers.alignments import MarkerMatchOptions
 from armscan.pipeline.register import RegisterOptions, carry_cloud, register_place
 from armscan.records.points import MarkerSet
 from armscan.storage.points import MarkerList
-from inspection_clouds import cloud_of
-from marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
+from rigs.inspection_clouds import cloud_of
+from rigs.marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
 SIZE = np.array([400.0, 300.0, 80.0])
 

@@ -12,7 +12,7 @@ from armscan.errors import OptionError
 from armscan.markers.candidates import RingMatchOptions, find_candidates
 from armscan.markers.stereo_matching import RingStatus, StereoMatches, match_rings
 from armscan.records.points import RingImages
-from ring_pair_scenes import (
+from rigs.ring_pair_scenes import (
     CALIBRATION_COVARIANCE,
     RADIUS_MM,
     MarkerScene,

@@ -13,7 +13,7 @@ from armscan.models.calibration import (
     SheetCalibration,
 )
 from armscan.models.light_sheet import LightSheet
-from sheet_rig import PROVENANCE, thesis_rig
+from rigs.sheet_rig import PROVENANCE, thesis_rig
 
 SHEET = LightSheet(
     origin_mm=np.array([0.0, 0.0, 135.0]), axes=np.eye(3), scale_mm=20.0, bow_mm=np.zeros(5)

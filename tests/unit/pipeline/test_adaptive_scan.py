@@ -23,7 +23,7 @@ from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, LabelS
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from placing_rig import BASE_FROM_TOOL, TOOL_FROM_SENSOR, scanner
+from rigs.placing_rig import BASE_FROM_TOOL, TOOL_FROM_SENSOR, scanner
 
 TICK_NS = 12_500_000
 TIMES_NS = [*(k * TICK_NS for k in range(4)), *(10**9 + k * TICK_NS for k in range(3))]

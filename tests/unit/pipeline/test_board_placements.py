@@ -12,7 +12,7 @@ from armscan.pipeline import targets
 from armscan.pipeline.laser import find_placements
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard, TargetOptions
-from sheet_rig import thesis_rig
+from rigs.sheet_rig import thesis_rig
 
 
 def test_the_first_images_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,7 @@ from armscan.pipeline.hand_eye import (
 )
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
+from rigs.plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
 
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 1000.0
 LINE_SIGMA_PX = 2.0

@@ -17,7 +17,7 @@ from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import ExposureRow
 from armscan.storage.images import ImageOptions
 from armscan.storage.recording import write_recording
-from two_camera_scan import (
+from rigs.two_camera_scan import (
     PERIOD_NS,
     SeenAs,
     TwoCameraScan,

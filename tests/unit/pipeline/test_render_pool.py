@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import fake_twin
 from armscan.devices.sources import TwinScene
 from armscan.errors import EstimationError
 from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.simulate import TwinName, record_scenes
 from armscan.storage.recording import read_recording
-from recording_folders import pixels
+from rigs import fake_twin
+from rigs.recording_folders import pixels
 
 SCENES: tuple[TwinScene, ...] = ("camera", "ball", "plate")
 

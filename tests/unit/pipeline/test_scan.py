@@ -15,7 +15,15 @@ from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.reconstruction.place import NormalOptions
-from scan_fake import PERIOD_NS, FakeScan, as_source, fake_scan, looking_down, scanner, with_rows
+from rigs.scan_fake import (
+    PERIOD_NS,
+    FakeScan,
+    as_source,
+    fake_scan,
+    looking_down,
+    scanner,
+    with_rows,
+)
 
 
 @pytest.fixture(scope="module")

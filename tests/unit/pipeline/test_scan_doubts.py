@@ -15,8 +15,8 @@ from armscan.geometry.poses import Pose
 from armscan.models.calibration import ScannerCalibration
 from armscan.reconstruction.sync import poses_by_time
 from armscan.reconstruction.track_faults import TrackFault
-from passes_over_a_ball import N_PASSES, N_STEPS, BallScan, ball_scan, doubt, poses_of, read_as
-from scan_fake import scanner
+from rigs.passes_over_a_ball import N_PASSES, N_STEPS, BallScan, ball_scan, doubt, poses_of, read_as
+from rigs.scan_fake import scanner
 
 Misread = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 UP = np.array([0.0, 0.6, 0.8])

@@ -13,9 +13,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from armscan.cli.simulate import PresetName, Scene
 
-import fake_twin
+from armscan.cli.measure import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
 from armscan.jobs import simulate as simulate_job_simulate
@@ -24,11 +23,12 @@ from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan_part import FewerViews
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene, truth_path
-from armscan.storage import atomic
+from armscan.storage import files
 from armscan.storage.arm import read_probe_tip
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_arm_track, read_recording
-from recording_folders import memory_scan, pixels
+from rigs import fake_twin
+from rigs.recording_folders import memory_scan, pixels
 
 HEAD = "thesis-single"
 
@@ -90,7 +90,7 @@ def test_no_recording_is_seen_without_its_truth(
     def full(contents: object, **_: object) -> None:
         raise OutputError("no space")
 
-    monkeypatch.setattr(atomic, "write_files", full)
+    monkeypatch.setattr(files, "write_files", full)
     with pytest.raises(OutputError, match="no space"):
         simulate_scene(tmp_path / "scan", HEAD, scene, SimulateOptions(processes=1))
     assert list(tmp_path.iterdir()) == []

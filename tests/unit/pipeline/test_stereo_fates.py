@@ -17,8 +17,8 @@ from armscan.reconstruction.label_stereo import StereoLabelOptions
 from armscan.reconstruction.labels import LabelStatus, PointStatus, StereoStatus
 from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
 from armscan.records.profile import Profile
-from stereo_scenes import Noise, draw_surfaces, expose
-from two_camera_scan import small_head
+from rigs.stereo_scenes import Noise, draw_surfaces, expose
+from rigs.two_camera_scan import small_head
 
 STRICT = StereoLabelOptions(consistency_sigmas=1.0)
 """Drops many a pair that noise alone explains."""

@@ -9,7 +9,7 @@ from armscan.pipeline.cameras import calibrate_camera_from_exposures
 from armscan.pipeline.targets import ENOUGH_IMAGES, wrong_count
 from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
 from armscan.vision.targets.target import Chessboard, CircleGrid, OtherCountSeen, TargetView
-from target_scenes import exposure, render
+from rigs.target_scenes import exposure, render
 
 ASKED = Chessboard(9, 7, 3.0)
 

@@ -16,9 +16,9 @@ from armscan.pipeline.scan_part import FewerViews
 from armscan.pipeline.truth import hand_eye_errors, true_names
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
-from scan_fake import scanner as one_sheet_scanner
-from sheet_rig import PROVENANCE
+from rigs.hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
+from rigs.scan_fake import scanner as one_sheet_scanner
+from rigs.sheet_rig import PROVENANCE
 
 
 def test_hand_eye_errors_are_in_the_form_of_its_covariance() -> None:

@@ -8,8 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import placing_rig as rig
-import scan_fake
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
@@ -24,7 +22,9 @@ from armscan.reconstruction.labels import MeasuredProfile
 from armscan.reconstruction.place import merge_clouds, prepare_placing, propagate_to_base
 from armscan.reconstruction.sync import ExposurePoses
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
-from sheet_rig import thesis_rig
+from rigs import placing_rig as rig
+from rigs import scan_fake
+from rigs.sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
 SHEET_OF = np.array([0, 1, 1])

@@ -10,7 +10,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.label_single import DepthRange, choose_sheets
 from armscan.records.profile import Profile, StripeFlag
-from sheet_rig import PROVENANCE, make_profile
+from rigs.sheet_rig import PROVENANCE, make_profile
 
 CAMERA = CameraModel(
     fx_px=1000.0,

@@ -19,8 +19,8 @@ from armscan.reconstruction.label_cross import (
 )
 from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.stretches import Pieces, cut_pieces
-from cross_rig import PLANES, camera, light_sheet, sensor
-from sheet_rig import make_profile
+from rigs.cross_rig import PLANES, camera, light_sheet, sensor
+from rigs.sheet_rig import make_profile
 
 SENSOR = sensor()
 DEPTHS = DepthRange(0.0)

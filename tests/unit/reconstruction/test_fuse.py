@@ -20,8 +20,8 @@ from armscan.reconstruction.stereo_points import (
     triangulate_right,
 )
 from armscan.reconstruction.triangulate import sensor_columns, sensor_covariance
-from sheet_rig import make_profile
-from stereo_head import StereoHead
+from rigs.sheet_rig import make_profile
+from rigs.stereo_head import StereoHead
 
 SHEET = 5
 SIGMA_PX = 0.07

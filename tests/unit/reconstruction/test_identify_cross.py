@@ -17,7 +17,7 @@ from armscan.reconstruction.labels import (
     StripeLabeller,
 )
 from armscan.thesis.row_rule import RowLabeller
-from cross_rig import HARSH, NAMES, SCENES, THESIS, TICK_NS, CrossExposure, CrossStroke
+from rigs.cross_rig import HARSH, NAMES, SCENES, THESIS, TICK_NS, CrossExposure, CrossStroke
 
 BOTH = ("A", "B")
 N_EXPOSURES = 16

@@ -11,8 +11,8 @@ from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction.labels import LabelStatus
 from armscan.records.profile import Profile
 from armscan.thesis.row_rule import LaserSchedule, RowLabeller, RowOptions, row_differences
-from cross_rig import sensor
-from sheet_rig import make_profile
+from rigs.cross_rig import sensor
+from rigs.sheet_rig import make_profile
 
 A, B = 0, 1
 

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import placing_rig as rig
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
@@ -24,7 +23,8 @@ from armscan.reconstruction.place import (
     scan_point_mm,
 )
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
-from sheet_rig import thesis_rig
+from rigs import placing_rig as rig
+from rigs.sheet_rig import thesis_rig
 
 PLACES_PX = np.array([[1400.0, 600.0], [700.0, 820.0], [1000.0, 700.0]])
 SHEET_OF = np.array([0, 1, 1])

@@ -15,9 +15,9 @@ from armscan.reconstruction.labels import LabelStatus
 from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
 from armscan.reconstruction.triangulate import sensor_covariance
 from armscan.vision.stripe.extract import empty_profile
-from placing_rig import scanner
-from stereo_head import StereoHead
-from stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
+from rigs.placing_rig import scanner
+from rigs.stereo_head import StereoHead
+from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
 
 MOST_WRONG = 0.001
 LEAST_NAMED = 0.97

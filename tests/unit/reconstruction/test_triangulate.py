@@ -14,7 +14,7 @@ from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.place import merge_clouds
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate
 from armscan.records.profile import Profile
-from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
+from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
 SIGMA_PX = 0.1

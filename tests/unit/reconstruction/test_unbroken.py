@@ -12,7 +12,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.kernels.chains import best_states
 from armscan.reconstruction.segments import cut_stripes, take_samples
 from armscan.records.profile import Profile
-from sheet_rig import make_profile
+from rigs.sheet_rig import make_profile
 
 
 def line(points: FloatArray) -> Profile:

@@ -13,7 +13,7 @@ from armscan.errors import FileFormatError
 from armscan.models.arm import ArmModel, forward, thesis_arm
 from armscan.storage.arm import arm_model_toml, read_arm_model
 from armscan.storage.recording import FolderRecording, read_recording
-from recording_folders import ARM, POSITION, SESSION, lab_folder, refusal, table
+from rigs.recording_folders import ARM, POSITION, SESSION, lab_folder, refusal, table
 
 NO_SESSION = SESSION.replace('form = "quaternion"\n', "")
 ANGLES = np.array([[10.0, 0.0, 0.0], [30.0, -40.0, 75.0], [-170.0, 20.0, 100.0]])

@@ -15,7 +15,7 @@ from armscan.records.recording import CameraSetup, Session
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import read_session_file, session_toml
-from recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
+from rigs.recording_folders import ARM, EXPOSURES, SESSION, lab_folder, pixels, refusal
 
 
 def test_a_session_comes_back(tmp_path: Path) -> None:

@@ -10,7 +10,16 @@ import pytest
 
 from armscan.errors import FileFormatError
 from armscan.storage.recording import read_recording
-from recording_folders import ARM, EXPOSURES, HEADER, SESSION, lab_folder, pixels, refusal, table
+from rigs.recording_folders import (
+    ARM,
+    EXPOSURES,
+    HEADER,
+    SESSION,
+    lab_folder,
+    pixels,
+    refusal,
+    table,
+)
 
 
 def exposures(*lines: str, header: str = HEADER) -> str:

@@ -15,7 +15,7 @@ from armscan.records.recording import ArmTrack, CameraSetup
 from armscan.storage.arm import ProbeTip, read_probe_tip, write_probing
 from armscan.storage.recording import read_arm_track, read_recording, write_recording
 from armscan.storage.tables import csv_bytes
-from recording_folders import EXPOSURES, SESSION, lab_folder, memory_scan, pixels
+from rigs.recording_folders import EXPOSURES, SESSION, lab_folder, memory_scan, pixels
 
 
 def test_a_camera_file_is_copied_byte_by_byte(tmp_path: Path) -> None:

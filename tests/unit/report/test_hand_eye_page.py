@@ -16,8 +16,8 @@ from armscan.jobs.hand_eye import hand_eye_summary
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration
 from armscan.report.hand_eye import chi2_verdict, hand_eye_numbers, hand_eye_page, repeat_blocks
 from armscan.report.page import render_page
-from hand_eye_fake import N_POSTURES, TOOL_FROM_SENSOR, fake_fit
-from sheet_rig import PROVENANCE
+from rigs.hand_eye_fake import N_POSTURES, TOOL_FROM_SENSOR, fake_fit
+from rigs.sheet_rig import PROVENANCE
 
 
 def text_of(page: bytes) -> str:

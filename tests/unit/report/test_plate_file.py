@@ -16,7 +16,7 @@ from armscan.jobs.inspect import read_plate
 from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.points import probed_points_csv
-from inspection_clouds import cloud_of
+from rigs.inspection_clouds import cloud_of
 
 ORIGIN = np.zeros(3)
 OUTLINE = np.array([[0, 0], [60, 0], [120, 0], [0, 80], [60, 80], [120, 80], [0, 40], [120, 40.0]])

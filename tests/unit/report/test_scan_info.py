@@ -15,8 +15,8 @@ from armscan.records.recording import ArmTrack
 from armscan.report.quantity import summary_json, summary_text
 from armscan.storage.arm import ProbeTip, arm_model_toml, write_probing
 from armscan.storage.documents import scanner_document
-from calibration_documents import scanner_calibration
-from recording_folders import ARM, EXPOSURES, lab_folder
+from rigs.calibration_documents import scanner_calibration
+from rigs.recording_folders import ARM, EXPOSURES, lab_folder
 
 
 def described(path: Path) -> dict[str, object]:

@@ -8,7 +8,7 @@ import pytest
 
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings
-from ring_scenes import GROUND, Mark, Rendered, render, tilted
+from rigs.ring_scenes import GROUND, Mark, Rendered, render, tilted
 
 DISTANCE_MM = 300.0
 BIAS_PX = 0.003

@@ -16,7 +16,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
-from stereo_rig import CONVERGING, StereoScene, make_pairs, normalised_stereo_error, pair_at
+from rigs.stereo_rig import CONVERGING, StereoScene, make_pairs, normalised_stereo_error, pair_at
 
 SCENE = StereoScene(n_pairs=8)
 OPTIONS = StereoOptions(CameraOptions(distortion="k1k2p1p2k3", n_folds=0), n_folds=0)

@@ -20,7 +20,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import IntrinsicsUse
-from stereo_rig import (
+from rigs.stereo_rig import (
     CONVERGING,
     LEFT,
     RIGHT,

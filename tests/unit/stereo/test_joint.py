@@ -15,7 +15,7 @@ from armscan.calibration.cameras.joint import (
     retract_state,
     stack_pair_observations,
 )
-from stereo_rig import CONVERGING, LEFT, RIGHT, StereoScene, make_pairs
+from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, StereoScene, make_pairs
 
 PAIRS, POSES = make_pairs(StereoScene(n_pairs=2), 0)
 OBSERVATIONS = stack_pair_observations(PAIRS)

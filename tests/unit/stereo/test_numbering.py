@@ -18,7 +18,7 @@ from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.two_views import TwoViews
 from armscan.vision.targets.detect import numberings, renumbered
 from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target
-from stereo_rig import (
+from rigs.stereo_rig import (
     CONVERGING,
     LEFT,
     RIGHT,

@@ -18,7 +18,7 @@ from armscan.storage.documents import (
     read_stereo_calibration,
     stereo_document,
 )
-from stereo_rig import CONVERGING, LEFT, RIGHT, held
+from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, held
 
 
 def calibration() -> StereoCalibration:
@@ -86,6 +86,7 @@ def test_documents_of_other_kinds_are_refused_by_name(tmp_path: Path) -> None:
 def test_values_that_cannot_be_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "stereo.json"
     content = json.loads(stereo_document(calibration()))
+    del content["sha256"]
     content["right_from_sensor"]["rotation_rows"][0][0] += 0.1
     path.write_text(json.dumps(content))
     with pytest.raises(FileFormatError, match="not a rotation"):

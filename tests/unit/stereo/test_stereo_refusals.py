@@ -17,7 +17,7 @@ from armscan.calibration.cameras.stereo_result import (
     reasons_to_refuse,
 )
 from armscan.models.camera import PARAMETER_NAMES
-from stereo_rig import StereoScene, make_pairs
+from rigs.stereo_rig import StereoScene, make_pairs
 
 SCENE = StereoScene(n_pairs=6)
 OPTIONS = StereoOptions(CameraOptions(distortion="k1k2", n_folds=0), n_folds=0)

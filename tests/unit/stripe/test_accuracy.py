@@ -14,7 +14,7 @@ from armscan.simulation.stripe_image import (
     WaveCurve,
 )
 from armscan.vision.stripe.image import StripeOptions
-from stripe_scenes import line, score
+from rigs.stripe_scenes import line, score
 
 NOISE_LIMIT_PX = 0.045
 BIAS_LIMIT_PX = 0.01

@@ -8,7 +8,7 @@ from armscan.records.exposure import Exposure
 from armscan.simulation.stripe_image import StripeNoise, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
-from stripe_scenes import line
+from rigs.stripe_scenes import line
 
 SCENE = StripeScene((line(75.0),), 320, 240)
 ROLL = {"red": 0, "green": 1, "blue": 2}

@@ -9,7 +9,7 @@ from armscan.records.exposure import Exposure
 from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
-from stripe_scenes import line
+from rigs.stripe_scenes import line
 
 METHODS = ("fit", "threshold", "centroid", "template", "hessian")
 

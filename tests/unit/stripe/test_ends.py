@@ -8,7 +8,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
-from stripe_scenes import line
+from rigs.stripe_scenes import line
 
 NEAR_SIGMAS = 14.0
 CUTS = ("vertical", "perpendicular", "horizontal")

@@ -10,7 +10,7 @@ from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.flags import close_gaps
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.stripe.ridge import strong_median
-from stripe_scenes import line, score
+from rigs.stripe_scenes import line, score
 
 
 def share(scene: StripeScene, flag: StripeFlag, seed: int = 1) -> float:

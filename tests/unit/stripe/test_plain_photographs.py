@@ -7,7 +7,7 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
-from stripe_scenes import line
+from rigs.stripe_scenes import line
 
 
 def thick_line(seed: int, sigma_px: float) -> np.ndarray:

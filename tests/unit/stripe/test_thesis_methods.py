@@ -9,7 +9,7 @@ from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import measure_level
 from armscan.vision.stripe.thesis import THESIS_METHODS, StripeCentres
-from stripe_scenes import line, score
+from rigs.stripe_scenes import line, score
 
 METHODS: tuple[StripeMethod, ...] = ("threshold", "centroid", "template", "hessian")
 NOISE_PX = {"threshold": 0.4, "centroid": 0.2, "template": 0.45, "hessian": 0.1}

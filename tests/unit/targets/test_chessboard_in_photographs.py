@@ -14,7 +14,7 @@ from armscan.simulation.objects.board_image import Lighting, RenderedTarget
 from armscan.simulation.objects.boards import ChessboardPattern
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
-from target_scenes import (
+from rigs.target_scenes import (
     BareChessboard,
     exposure,
     line_distance,

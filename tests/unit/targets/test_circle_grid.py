@@ -13,7 +13,7 @@ from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
-from target_scenes import camera, exposure, model, nees, render
+from rigs.target_scenes import camera, exposure, model, nees, render
 
 TARGET = CircleGrid(6, 5, 3.75)
 PATTERN = CirclePattern(6, 5, 3.75, 1.875)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from armscan.calibration.cameras.result import (
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import Minimum, minimise
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
@@ -183,11 +184,6 @@ def basis_of(names: Sequence[str], *, is_aspect_fixed: bool) -> FloatArray:
     return basis
 
 
-CONVERGED = 1e-12
-"""Relative decrease of chi2 at which the iteration ends."""
-
-MAX_DAMPING = 1e12
-
 S = TypeVar("S")
 
 
@@ -211,25 +207,6 @@ class NormalEquations:
     pose: FloatArray
     shared_gradient: FloatArray
     pose_gradient: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Adjustment(Generic[S]):
-    """Where an adjustment ended.
-
-    Parameters
-    ----------
-    state
-        The unknowns.
-    equations
-        The normal equations there.
-    is_converged
-        False if the last step allowed still lowered chi2: a lower minimum is near.
-    """
-
-    state: S
-    equations: NormalEquations
-    is_converged: bool
 
 
 def predict(
@@ -381,7 +358,7 @@ def adjust(
     basis: FloatArray,
     weights: FloatArray | None = None,
     max_steps: int = MAX_STEPS,
-) -> Adjustment[State] | FitFailure:
+) -> Minimum[State, NormalEquations] | FitFailure:
     """Minimise eq. 2.39, weighted by each point's covariance.
 
     Parameters
@@ -416,7 +393,7 @@ def descend(
     equations_at: Callable[[S], NormalEquations | None],
     move: Callable[[S, FloatArray, FloatArray], S],
     max_steps: int = MAX_STEPS,
-) -> Adjustment[S] | FitFailure:
+) -> Minimum[S, NormalEquations] | FitFailure:
     """Levenberg-Marquardt with the poses eliminated per view, over any such unknowns.
 
     Parameters
@@ -430,32 +407,20 @@ def descend(
     max_steps
         Most iterations; what is reached by then is returned.
     """
-    equations = equations_at(start)
-    if equations is None:
-        return FitFailure("the starting values put the board behind the camera")
-    state, damping = start, 1e-4
-    for _ in range(max_steps):
+
+    def evaluate(state: S) -> tuple[float, NormalEquations] | None:
+        equations = equations_at(state)
+        return None if equations is None else (equations.chi2, equations)
+
+    def propose(state: S, equations: NormalEquations, damping: float) -> tuple[S, float] | None:
         step = damped_step(equations, damping)
-        trial = move(state, *step) if step is not None else None
-        proposed = equations_at(trial) if trial is not None else None
-        if trial is None or proposed is None or not proposed.chi2 <= equations.chi2:
-            if damping > MAX_DAMPING or (step is not None and _is_tiny(equations, step)):
-                return Adjustment(state, equations, is_converged=True)
-            damping *= 10.0
-            continue
-        decrease = equations.chi2 - proposed.chi2
-        state, equations, damping = trial, proposed, max(0.1 * damping, 1e-14)
-        if decrease <= CONVERGED * equations.chi2:
-            return Adjustment(state, equations, is_converged=True)
-    return Adjustment(state, equations, is_converged=False)
+        if step is None:
+            return None
+        promised = equations.shared_gradient @ step[0] + np.sum(equations.pose_gradient * step[1])
+        return move(state, *step), float(promised)
 
-
-def _is_tiny(equations: NormalEquations, step: tuple[FloatArray, FloatArray]) -> bool:
-    """True if the step promises a decrease that rounding hides."""
-    promised = float(
-        equations.shared_gradient @ step[0] + np.sum(equations.pose_gradient * step[1])
-    )
-    return promised <= CONVERGED * equations.chi2
+    found = minimise(start, evaluate, propose, max_steps=max_steps)
+    return found or FitFailure("the starting values put the board behind the camera")
 
 
 SINGULAR_CONDITION = 1e13

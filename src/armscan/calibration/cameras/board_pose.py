@@ -237,7 +237,7 @@ def _refined(
     result = adjust(observations, State.from_poses(shared, [start]), _POSE_ONLY)
     if isinstance(result, FitFailure):
         return result
-    return PoseCandidate(result.state.pose(0), result.equations.chi2)
+    return PoseCandidate(result.state.pose(0), result.system.chi2)
 
 
 def _is_same(a: PoseCandidate, b: PoseCandidate) -> bool:

@@ -108,7 +108,7 @@ def prepare_views(
     left_out: dict[int, str] = {}
     refused: list[RefusedView] = []
     for index, view in enumerate(views):
-        homography = view_homography(view, options.min_points)
+        homography = view_homography(view)
         if isinstance(homography, FitFailure):
             refused.append(RefusedView(view.source, homography.reason))
         elif view.source in options.leave_out:

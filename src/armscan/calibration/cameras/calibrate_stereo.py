@@ -322,9 +322,9 @@ def _view_residuals(evidence: Evidence, side: int, board: int) -> ViewResiduals 
     solution = evidence.solution
     rows = (solution.observations.left, solution.observations.right)[side].rows(board)
     return ViewResiduals(
-        solution.state.pose(board),
-        solution.residuals_px()[side][rows],
-        solution.weights[side][rows] == 0.0,
+        sensor_from_board=solution.state.pose(board),
+        residuals_px=solution.residuals_px()[side][rows],
+        is_outlier=solution.weights[side][rows] == 0.0,
     )
 
 
@@ -337,13 +337,14 @@ def _matched(
     if left is None or right is None:
         return None
     _, in_left, in_right = np.intersect1d(left.point_index, right.point_index, return_indices=True)
-    points = left.points_board_mm[in_left] @ sensor_from_board.rotation.T
-    distances = epipolar_distances_px(views, left.points_px[in_left], right.points_px[in_right])
+    left_px, right_px = left.points_px[in_left], right.points_px[in_right]
+    apart_left_px, apart_right_px = epipolar_distances_px(views, left_px, right_px)
     return MatchedPoints(
-        left.points_px[in_left],
-        right.points_px[in_right],
-        *distances,
-        points[:, 2] + sensor_from_board.translation_mm[2],
+        left_px=left_px,
+        right_px=right_px,
+        in_left_px=apart_left_px,
+        in_right_px=apart_right_px,
+        depth_mm=sensor_from_board.apply(left.points_board_mm[in_left])[:, 2],
     )
 
 

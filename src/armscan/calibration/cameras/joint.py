@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
-    Adjustment,
     NormalEquations,
     Observations,
     State,
@@ -38,6 +37,7 @@ from armscan.calibration.cameras.robust import (
 )
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import Minimum
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew
 from armscan.models.camera import CameraModel
@@ -268,7 +268,7 @@ def retract_state(
 
 def adjust_both(
     problem: JointProblem, start: StereoState, max_steps: int
-) -> Adjustment[StereoState] | FitFailure:
+) -> Minimum[StereoState, NormalEquations] | FitFailure:
     """Minimise both cameras' squared residuals over all unknowns, weighted by covariance.
 
     Parameters
@@ -417,9 +417,9 @@ def solve_both(
             tuple(boards),
             problem,
             state,
-            result.equations,
+            result.system,
             (float(np.sqrt(levels[0])), float(np.sqrt(levels[1]))),
-            result.is_converged,
+            result.is_settled,
         )
         observations, found = _levelled(raw, solution)
         weights = _judged(observations, state)

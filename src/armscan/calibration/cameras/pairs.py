@@ -13,7 +13,7 @@ from armscan.calibration.cameras.adjustment import basis_of
 from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.model_choice import rms
-from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.result import MIN_VIEW_POINTS, CameraFit, CameraOptions
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -36,7 +36,7 @@ class StereoOptions:
     Parameters
     ----------
     camera
-        Of each camera: distortion model, what is held, least points of a view, most steps. What it
+        Of each camera: distortion model, what is held, most steps. What it
         says of views to leave out and of folds does not count here.
     intrinsics
         What given calibrations of the cameras are for: ``free`` takes none, ``prior`` takes their
@@ -261,7 +261,7 @@ def _given(
     found = {view.source: view for view in fit.used_views} if fit is not None else {}
     refused = {view.source: view.reason for view in fit.refused_views} if fit is not None else {}
     for view in views:
-        if len(view) < options.camera.min_points or view.source in refused:
+        if len(view) < MIN_VIEW_POINTS or view.source in refused:
             left_out[view.source] = refused.get(view.source, f"only {len(view)} target points")
         elif fit is not None and view.source not in found:
             left_out[view.source] = "its residuals are far larger than those of the other views"

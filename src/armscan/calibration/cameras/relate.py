@@ -77,10 +77,10 @@ def board_near(
     result = adjust(gather([view]), State.from_poses(shared, [near]), NO_SHARED)
     if isinstance(result, FitFailure):
         return result
-    if not condition_number(result.equations.pose[0]) < SINGULAR_CONDITION:
+    if not condition_number(result.system.pose[0]) < SINGULAR_CONDITION:
         return FitFailure("the points do not determine a pose", "show more of the board")
-    level = result.equations.chi2 / max(2 * len(view) - 6, 1)
-    return BoardSeen(result.state.pose(0), level * np.linalg.inv(result.equations.pose[0]))
+    level = result.system.chi2 / max(2 * len(view) - 6, 1)
+    return BoardSeen(result.state.pose(0), level * np.linalg.inv(result.system.pose[0]))
 
 
 def relative_pose(

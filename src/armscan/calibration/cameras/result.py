@@ -12,8 +12,16 @@ from typing import Literal
 
 import numpy as np
 
-from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.errors import OptionError
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    bools,
+    floats,
+    ints,
+)
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import TargetView
@@ -30,6 +38,8 @@ DISTORTION_PARAMETERS: dict[DistortionModel, tuple[str, ...]] = {
 """Free coefficients of each distortion model; those not named are zero."""
 
 MIN_VIEWS = 3
+MIN_VIEW_POINTS = 6
+"""Fewest points with which a view is used: two more than a pose needs."""
 MAX_STEPS = 200
 """A wide lens whose distortion nearly folds over needs more than 60."""
 
@@ -58,8 +68,6 @@ class CameraOptions:
     n_folds
         Folds of the cross-validation over views; 0 switches it off. With fewer views than folds
         each view is a fold of its own.
-    min_points
-        Fewest points with which a view is used.
     max_steps
         Most iterations of one adjustment; a solution that needs more is returned with a warning.
     """
@@ -71,7 +79,6 @@ class CameraOptions:
     leave_out: tuple[str, ...] = ()
     leave_out_misfits: bool = False
     n_folds: int = 5
-    min_points: int = 6
     max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
@@ -82,16 +89,11 @@ class CameraOptions:
             )
         if self.n_folds < 0 or self.n_folds == 1:
             raise OptionError(f"n_folds is {self.n_folds}", remedy="give 0 (off) or at least 2")
-        if self.min_points < 4:
-            raise OptionError(
-                f"min_points is {self.min_points}", remedy="a pose needs at least 4 points"
-            )
         if self.max_steps < 1:
             raise OptionError(f"max_steps is {self.max_steps}", remedy="give at least 1")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewFit:
+class ViewFit(ArrayRecord):
     """One view of the target and how it fits.
 
     Parameters
@@ -124,29 +126,15 @@ class ViewFit:
 
     view: TargetView
     sensor_from_board: Pose[Sensor, Board]
-    pose_covariance: FloatArray
-    residuals_px: FloatArray
-    is_outlier: BoolArray
+    pose_covariance: FloatArray = floats(6, 6)
+    residuals_px: FloatArray = floats("M", 2)
+    is_outlier: BoolArray = bools("M")
     chi2_per_point: float
     tilt_deg: float
     distance_mm: float
     is_used: bool
     is_misfit: bool
     note: str
-
-    def __post_init__(self) -> None:
-        m = len(self.view)
-        object.__setattr__(
-            self, "pose_covariance", frozen_floats(self.pose_covariance, (6, 6), "pose_covariance")
-        )
-        object.__setattr__(
-            self, "residuals_px", frozen_floats(self.residuals_px, (m, 2), "residuals_px")
-        )
-        is_outlier = np.array(self.is_outlier, dtype=np.bool_)
-        if is_outlier.shape != (m,):
-            raise InputError(f"is_outlier has shape {is_outlier.shape}, expected ({m},)")
-        is_outlier.setflags(write=False)
-        object.__setattr__(self, "is_outlier", is_outlier)
 
     @property
     def source(self) -> str:
@@ -167,8 +155,7 @@ class RefusedView:
     reason: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Coverage:
+class Coverage(ArrayRecord):
     """Which part of the image the target points of the used views cover.
 
     Parameters
@@ -187,23 +174,12 @@ class Coverage:
         (V,) direction in the image towards which the board's normal leans, -180 to 180.
     """
 
-    counts: IntArray
+    counts: IntArray = ints(None, None)
     fraction: float
     empty: tuple[str, ...]
-    covered_px: FloatArray
-    tilts_deg: FloatArray
-    tilt_directions_deg: FloatArray
-
-    def __post_init__(self) -> None:
-        v = len(self.tilts_deg)
-        object.__setattr__(self, "counts", frozen_ints(self.counts, (None, None), "counts"))
-        object.__setattr__(self, "covered_px", frozen_floats(self.covered_px, (4,), "covered_px"))
-        object.__setattr__(self, "tilts_deg", frozen_floats(self.tilts_deg, (v,), "tilts_deg"))
-        object.__setattr__(
-            self,
-            "tilt_directions_deg",
-            frozen_floats(self.tilt_directions_deg, (v,), "tilt_directions_deg"),
-        )
+    covered_px: FloatArray = floats(4)
+    tilts_deg: FloatArray = floats("V")
+    tilt_directions_deg: FloatArray = floats("V")
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,8 +208,7 @@ class CrossValidation:
     view_rms_px: tuple[float, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BoardWarp:
+class BoardWarp(ArrayRecord):
     """Bow of the board: ``z = bow_x (1 - u^2) + bow_y (1 - v^2)``.
 
     Here u and v run from -1 to 1 over the target's points along x and y; positive bows lie
@@ -251,16 +226,10 @@ class BoardWarp:
         Probability of such a decrease on a flat board.
     """
 
-    bow_mm: FloatArray
-    covariance_mm2: FloatArray
+    bow_mm: FloatArray = floats(2)
+    covariance_mm2: FloatArray = floats(2, 2)
     f_statistic: float
     p_value: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "bow_mm", frozen_floats(self.bow_mm, (2,), "bow_mm"))
-        object.__setattr__(
-            self, "covariance_mm2", frozen_floats(self.covariance_mm2, (2, 2), "covariance_mm2")
-        )
 
     @property
     def sigma_mm(self) -> FloatArray:
@@ -273,8 +242,7 @@ class BoardWarp:
         return self.p_value < 0.01
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraFit:
+class CameraFit(ArrayRecord):
     """A calibrated camera with its uncertainty and evidence.
 
     Parameters
@@ -325,9 +293,9 @@ class CameraFit:
     """
 
     camera: CameraModel
-    covariance: FloatArray
+    covariance: FloatArray = floats(9, 9)
     free_parameters: tuple[str, ...]
-    joint_covariance: FloatArray
+    joint_covariance: FloatArray = floats("J", "J")
     views: tuple[ViewFit, ...]
     refused_views: tuple[RefusedView, ...]
     rms_px: float
@@ -342,13 +310,6 @@ class CameraFit:
     model_reason: str
     warnings: tuple[str, ...]
     options: CameraOptions
-
-    def __post_init__(self) -> None:
-        n = 9 + 6 * self.n_views
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (9, 9), "covariance"))
-        object.__setattr__(
-            self, "joint_covariance", frozen_floats(self.joint_covariance, (n, n), "joint")
-        )
 
     @property
     def used_views(self) -> tuple[ViewFit, ...]:
@@ -400,12 +361,16 @@ def measure_coverage(
         _region_name(row, column) for row, column in np.argwhere(thirds == 0).astype(int).tolist()
     )
     return Coverage(
-        counts.astype(np.int64),
-        float(np.mean(counts > 0)),
-        empty,
-        np.concatenate([points_px.min(axis=0), points_px.max(axis=0)]),
-        np.asarray(np.rad2deg(np.arccos(np.clip(np.abs(normals_sensor[:, 2]), 0.0, 1.0)))),
-        np.asarray(np.rad2deg(np.arctan2(normals_sensor[:, 1], normals_sensor[:, 0]))),
+        counts=counts.astype(np.int64),
+        fraction=float(np.mean(counts > 0)),
+        empty=empty,
+        covered_px=np.concatenate([points_px.min(axis=0), points_px.max(axis=0)]),
+        tilts_deg=np.asarray(
+            np.rad2deg(np.arccos(np.clip(np.abs(normals_sensor[:, 2]), 0.0, 1.0)))
+        ),
+        tilt_directions_deg=np.asarray(
+            np.rad2deg(np.arctan2(normals_sensor[:, 1], normals_sensor[:, 0]))
+        ),
     )
 
 

@@ -187,11 +187,11 @@ def solve_robustly(
                 observations,
                 result.state,
                 basis,
-                result.equations,
+                result.system,
                 np.ones(len(chi2)),
                 levels,
                 0.0 * levels,
-                result.is_converged,
+                result.is_settled,
             )
     state = _reweighted(observations, start, basis, trusted)
     chi2 = chi2_of_points(observations, state)
@@ -202,7 +202,7 @@ def solve_robustly(
         kept = adjust(observations, state, basis, weights, max_steps)
         if isinstance(kept, FitFailure):
             return kept
-        state, equations, is_converged = kept.state, kept.equations, kept.is_converged
+        state, equations, is_converged = kept.state, kept.system, kept.is_settled
         _, again = judge(observations, chi2_of_points(observations, state))
         if np.array_equal(again, outlier):
             break
@@ -436,8 +436,8 @@ def with_board_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
         flat,
         state=result.state,
         basis=basis,
-        equations=result.equations,
-        is_converged=result.is_converged,
+        equations=result.system,
+        is_converged=result.is_settled,
     )
 
 
@@ -456,4 +456,9 @@ def decide_board_warp(flat: Solution, bowed: Solution, covariance: FloatArray) -
     statistic = decrease / n_parameters / bowed.variance_factor
     p_value = float(stats.f.sf(statistic, n_parameters, max(bowed.degrees_of_freedom, 1)))
     bow = bowed.state.shared[WARP_ROWS]
-    return BoardWarp(bow, covariance[WARP_ROWS, WARP_ROWS], float(statistic), p_value)
+    return BoardWarp(
+        bow_mm=bow,
+        covariance_mm2=covariance[WARP_ROWS, WARP_ROWS],
+        f_statistic=float(statistic),
+        p_value=p_value,
+    )

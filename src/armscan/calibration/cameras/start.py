@@ -10,7 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import Observations, State
-from armscan.calibration.cameras.result import DISTORTION_PARAMETERS, CameraOptions, DistortionModel
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    MIN_VIEW_POINTS,
+    CameraOptions,
+    DistortionModel,
+)
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
@@ -286,10 +291,10 @@ NEAR_PX_PER_WIDTH = 0.005
 """Two views whose points differ by less than this share of the image width are the same view."""
 
 
-def view_homography(view: TargetView, min_points: int) -> FloatArray | FitFailure:
+def view_homography(view: TargetView) -> FloatArray | FitFailure:
     """Homography of a view, or why the view cannot be used at all."""
-    if len(view) < min_points:
-        return FitFailure(f"only {len(view)} target points, needs {min_points}")
+    if len(view) < MIN_VIEW_POINTS:
+        return FitFailure(f"only {len(view)} target points, needs {MIN_VIEW_POINTS}")
     if flatness(view.points_px) < EDGE_ON:
         return FitFailure("the board is seen edge-on")
     return estimate_homography(view.points_board_mm[:, :2], view.points_px)

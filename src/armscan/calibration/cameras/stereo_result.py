@@ -20,14 +20,20 @@ from armscan.calibration.cameras.result import (
     focal_reasons,
     rms_reasons,
 )
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    RowRecord,
+    bools,
+    floats,
+)
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import PARAMETER_NAMES
-from armscan.models.two_views import STEREO_PARAMETER_NAMES, TwoViews
+from armscan.models.two_views import TwoViews
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ViewResiduals:
+class ViewResiduals(ArrayRecord):
     """How one view fits.
 
     Parameters
@@ -42,8 +48,8 @@ class ViewResiduals:
     """
 
     sensor_from_board: Pose[Sensor, Board]
-    residuals_px: FloatArray
-    is_outlier: BoolArray
+    residuals_px: FloatArray = floats("M", 2)
+    is_outlier: BoolArray = bools("M")
 
     @property
     def rms_px(self) -> float:
@@ -51,8 +57,7 @@ class ViewResiduals:
         return float(np.sqrt(np.mean(np.sum(self.residuals_px**2, axis=1))))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MatchedPoints:
+class MatchedPoints(RowRecord):
     """Target points that both views of a pair show.
 
     Parameters
@@ -66,11 +71,11 @@ class MatchedPoints:
         (K,) Z in the Sensor frame, of the board's pose.
     """
 
-    left_px: FloatArray
-    right_px: FloatArray
-    in_left_px: FloatArray
-    in_right_px: FloatArray
-    depth_mm: FloatArray
+    left_px: FloatArray = floats("N", 2)
+    right_px: FloatArray = floats("N", 2)
+    in_left_px: FloatArray = floats("N")
+    in_right_px: FloatArray = floats("N")
+    depth_mm: FloatArray = floats("N")
 
     @property
     def rms_px(self) -> float:
@@ -79,8 +84,7 @@ class MatchedPoints:
         return float(np.sqrt(np.mean(both**2))) if len(both) else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PairFit:
+class PairFit(ArrayRecord):
     """One pair and how it fits.
 
     Parameters
@@ -114,14 +118,11 @@ class PairFit:
     right: ViewResiduals | None
     matched: MatchedPoints | None
     quarter_turns: int
-    apart: FloatArray
+    apart: FloatArray = floats(6, nan=True)
     level: float
     is_related: bool
     is_misfit: bool
     note: str
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "apart", frozen_floats(self.apart, (6,), "apart", allow_nan=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,8 +154,7 @@ class SideFit:
     coverage: Coverage
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StereoFit:
+class StereoFit(ArrayRecord):
     """Two calibrated cameras with their uncertainty and evidence.
 
     Parameters
@@ -191,7 +191,7 @@ class StereoFit:
     """
 
     views: TwoViews
-    covariance: FloatArray
+    covariance: FloatArray = floats(24, 24)
     left: SideFit
     right: SideFit
     pairs: tuple[PairFit, ...]
@@ -206,10 +206,6 @@ class StereoFit:
     is_converged: bool
     warnings: tuple[str, ...]
     options: StereoOptions
-
-    def __post_init__(self) -> None:
-        n = len(STEREO_PARAMETER_NAMES)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
 
     @property
     def parameters(self) -> FloatArray:

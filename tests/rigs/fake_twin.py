@@ -14,7 +14,7 @@ import pytest
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack
-from recording_folders import MemoryScan, memory_scan
+from rigs.recording_folders import MemoryScan, memory_scan
 
 N_IMAGES = 6
 
@@ -90,5 +90,5 @@ def register(folder: Path, patch: pytest.MonkeyPatch) -> None:
     info = folder / "fake_twin-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-twin\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[armscan.drivers]\ntwin = fake_twin:build\n")
+    (info / "entry_points.txt").write_text("[armscan.drivers]\ntwin = rigs.fake_twin:build\n")
     patch.syspath_prepend(str(folder))

@@ -20,7 +20,7 @@ from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile, StripeFlag
 from armscan.simulation.objects.shapes import Box, Placed
 from armscan.simulation.optics.scene import Floor, Scene, Sphere, Surface
-from stereo_head import WINDOW_PX, StereoHead
+from rigs.stereo_head import WINDOW_PX, StereoHead
 
 KINDS = ("plate", "ball", "waves", "steps")
 N_RAYS = 4200

@@ -20,7 +20,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import TwoViews
 from armscan.simulation.optics.lasers import LineLaser
-from sheet_rig import PROVENANCE
+from rigs.sheet_rig import PROVENANCE
 
 LEFT = CameraModel(
     fx_px=5174.97,
@@ -238,7 +238,9 @@ class StereoHead:
             for k, (laser, sheet) in enumerate(zip(self.lasers, self.sheets, strict=True))
         )
         cov = self.covariance
-        second = SecondCamera(_document(right, cov[n - 15 : n - 6, n - 15 : n - 6]), moved)
+        second = SecondCamera(
+            camera=_document(right, cov[n - 15 : n - 6, n - 15 : n - 6]), right_from_sensor=moved
+        )
         return SensorCalibration(
             camera=_document(left, cov[:9, :9]),
             sheets=sheets,

@@ -24,7 +24,7 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
-from sheet_rig import PROVENANCE, THESIS_PLANE
+from rigs.sheet_rig import PROVENANCE, THESIS_PLANE
 
 CAMERA = CameraModel(
     fx_px=600.0,

@@ -16,8 +16,8 @@ from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile, StripeFlag
 from armscan.simulation.arm.hand import HeadOrientation, Sway, sensor_over
-from sheet_rig import PROVENANCE
-from thesis_instrument import CAMERA, DISTORTION, IMAGE_PX
+from rigs.sheet_rig import PROVENANCE
+from rigs.thesis_instrument import CAMERA, DISTORTION, IMAGE_PX
 
 PLANES = {
     "A": np.array([-0.659905, -0.551732, 0.51, -68.7215]),

@@ -11,7 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.geometry.arrays import FloatArray
-from plate_rig import PLATE_CENTRE, PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Surface, draw_waves
+from rigs.plate_rig import (
+    PLATE_CENTRE,
+    PLATE_NORMAL,
+    TOOL_FROM_SENSOR,
+    PlateRig,
+    Surface,
+    draw_waves,
+)
 
 N_WAVES = 1500
 EVERY = 6

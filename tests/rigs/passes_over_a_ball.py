@@ -18,7 +18,7 @@ from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
-from scan_fake import CAMERA, TOOL_FROM_SENSOR, scanner
+from rigs.scan_fake import CAMERA, TOOL_FROM_SENSOR, scanner
 
 CENTRE_MM, RADIUS_MM = np.array([600.0, -150.0, 200.0]), 17.5
 N_PASSES, N_STEPS, STEP_MM = 6, 12, 2.2

@@ -21,8 +21,16 @@ from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, S
 from armscan.reconstruction.place import prepare_placing, propagate_to_base
 from armscan.reconstruction.triangulate import StripePoints, triangulate_stripe
 from armscan.records.profile import Profile
-from plate_rig import PlateRig, RigNoise, Surface, good_postures
-from sheet_rig import CAMERA_SIGMA, PROVENANCE, SheetRig, make_profile, placed, project, thesis_rig
+from rigs.plate_rig import PlateRig, RigNoise, Surface, good_postures
+from rigs.sheet_rig import (
+    CAMERA_SIGMA,
+    PROVENANCE,
+    SheetRig,
+    make_profile,
+    placed,
+    project,
+    thesis_rig,
+)
 
 STRIPE_PX = 0.06
 TILTS_AND_DEPTHS = (

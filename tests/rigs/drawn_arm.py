@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from smoke.drawn_bench import HEIGHT, WIDTH, draw
+from rigs.drawn_bench import HEIGHT, WIDTH, draw
 
 ROTATION = cv2.Rodrigues(np.array([0.3, -0.8, 1.7]))[0]
 TRANSLATION_MM = np.array([40.0, 20.0, 110.0])

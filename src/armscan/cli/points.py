@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan markers`` and ``register``: ring markers, and scans joined by them."""
+"""``armscan probe``, ``markers`` and ``register``: touches, ring markers, scans joined by them."""
 
 from __future__ import annotations
 
@@ -14,10 +14,16 @@ from armscan.cli.options import (
     BitsUsed,
     DefaultOf,
     Force,
+    Side,
     given,
     run,
 )
 
+PROBE_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan probe touches/ -o plate.csv\n"
+    "  armscan probe centres.csv --side +x -o plate.csv"
+)
 MARKERS_EXAMPLE = (
     "\b\nExamples:\n"
     "  armscan markers 'photos/*.png' -o rings.html\n"
@@ -54,6 +60,61 @@ Disc = Annotated[
     str | None,
     typer.Option(help="light (in a dark ring) or dark.", show_default=DefaultOf(RINGS + "disc")),
 ]
+
+
+def probe(
+    touches: Annotated[
+        Path,
+        typer.Argument(
+            help="Folder with arm.csv (a row a touch) and probe.toml; or a table of points.",
+            show_default=False,
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="Points on the surface, a CSV table.", show_default=False
+        ),
+    ] = None,
+    side: Annotated[
+        Side | None,
+        typer.Option(
+            help="Axis that the plate's face looks along; default: to where the tool was.",
+            show_default=False,
+        ),
+    ] = None,
+    probe: Annotated[
+        Path | None,
+        typer.Option(help="The tip, if it is not probe.toml of the folder.", show_default=False),
+    ] = None,
+    feature: Annotated[
+        str, typer.Option(help="Feature to use, where the table names several.", show_default=False)
+    ] = "",
+    leave_out: Annotated[
+        bool, typer.Option("--leave-out", help="Leave out touches that do not fit the others.")
+    ] = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Fit the plane of a plate to touches; the tip's radius is taken off on the side of the probe.
+
+    A touch that does not fit the others is named. In probe.toml: centre_tool_mm = [x, y, z] and
+    tip_diameter_mm = 6.0. A table of tip centres says so in its first line:
+    # point = tip-centre, tip_diameter_mm = 6
+    """
+    from armscan.calibration.hand_eye.probed_plate import ProbingOptions
+    from armscan.jobs.probe import probe as probe_plate
+
+    options = ProbingOptions(
+        side=None if side is None else side.value, leave_out_outliers=leave_out, feature=feature
+    )
+    run(
+        lambda job: probe_plate(job, touches, probe, options),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
 
 
 def markers(

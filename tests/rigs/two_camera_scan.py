@@ -18,10 +18,10 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.vision.stripe.image import StripeOptions
-from scan_fake import TOOL_FROM_SENSOR
-from sheet_rig import PROVENANCE
-from stereo_head import LEFT, RIGHT, RIGHT_FROM_LEFT, StereoHead, fitted_sheet, sheet_lasers
-from stereo_scenes import Noise, draw_surfaces, expose
+from rigs.scan_fake import TOOL_FROM_SENSOR
+from rigs.sheet_rig import PROVENANCE
+from rigs.stereo_head import LEFT, RIGHT, RIGHT_FROM_LEFT, StereoHead, fitted_sheet, sheet_lasers
+from rigs.stereo_scenes import Noise, draw_surfaces, expose
 
 PERIOD_NS = 10_000_000
 N_SHEETS = 3

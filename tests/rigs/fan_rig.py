@@ -22,7 +22,7 @@ from armscan.models.two_views import StereoCalibration
 from armscan.simulation.head import Tolerances, draw_lasers
 from armscan.simulation.heads import printed_heads
 from armscan.simulation.optics.lasers import LineLaser
-from sheet_rig import PROVENANCE, SheetRig, make_profile, project, stripe_on_board
+from rigs.sheet_rig import PROVENANCE, SheetRig, make_profile, project, stripe_on_board
 
 COLUMNS, ROWS, PITCH_MM = 11, 9, 3.75
 MIDDLE_MM = np.array([(COLUMNS - 1) * PITCH_MM / 2, (ROWS - 1) * PITCH_MM / 2, 0.0])

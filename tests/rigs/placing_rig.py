@@ -19,7 +19,7 @@ from armscan.models.calibration import (
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile
-from sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
+from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
 
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.4, -0.9, -1.9], [41.4, 21.5, 112.3])
 BASE_FROM_TOOL: Pose[Base, Tool] = Pose.from_vectors([1.1, 0.3, -0.6], [420.0, -310.0, 250.0])

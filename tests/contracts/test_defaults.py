@@ -18,7 +18,7 @@ import typer
 
 from armscan.cli.app import command
 from armscan.cli.options import DefaultOf
-from armscan.jobs.demo import HeadDemoRequest
+from armscan.jobs.demo import DemoRequest
 from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.label_stereo import StereoLabelOptions
 
@@ -78,7 +78,7 @@ def _is_required(path: str, name: str) -> bool:
 
 def test_the_demo_without_options_is_the_library_s() -> None:
     options = {option.name: option for option in COMMANDS["demo",].params}
-    defaults = {item.name: item.default for item in fields(HeadDemoRequest)}
+    defaults = {item.name: item.default for item in fields(DemoRequest)}
     for name in ("seed", "preset"):
         assert options[name].default == defaults[name]
 

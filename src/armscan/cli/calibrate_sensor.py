@@ -216,7 +216,6 @@ def hand_eye(
 ) -> None:
     """Find where the sensor sits on the arm, from postures over a flat plate or a sphere."""
     from armscan.calibration.hand_eye.observations import HandEyeOptions
-    from armscan.calibration.hand_eye.sphere_sections import SphereOptions
     from armscan.geometry.rotations import check_convention
     from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye
     from armscan.vision.stripe.image import StripeOptions
@@ -239,11 +238,10 @@ def hand_eye(
         plate_flatness_mm=plate_flatness_mm,
         solve_plate=solve_plate,
     )
-    of_sphere = given(SphereOptions, arm_position_mm=arm_position_mm, arm_rotation_rad=rotation_rad)
     stripes = given(StripeOptions, method=stripe_method, laser_colour=laser_colour)
     run(
         lambda job: calibrate_hand_eye(
-            job, source, artefact, options=options, sphere_options=of_sphere, stripe_options=stripes
+            job, source, artefact, options=options, stripe_options=stripes
         ),
         as_json=as_json,
         output=output,

@@ -19,7 +19,6 @@ from armscan.calibration.hand_eye.probed_plate import (
     plate_from_coefficients,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -198,7 +197,6 @@ def calibrate_hand_eye(
     artefact: Artefact,
     *,
     options: HandEyeOptions | None = None,
-    sphere_options: SphereOptions | None = None,
     stripe_options: StripeOptions | None = None,
 ) -> Summary:
     """Read, calibrate, write ``scanner.json`` and ``.html``, and say what came out.
@@ -209,10 +207,8 @@ def calibrate_hand_eye(
         Where to write the document ``NAME.json``.
     source, artefact
         What to calibrate from.
-    options, sphere_options
-        Of the plate and of the sphere method.
-    stripe_options
-        Of stripe extraction.
+    options, stripe_options
+        Of the calibration, and of stripe extraction.
 
     Raises
     ------
@@ -220,24 +216,22 @@ def calibrate_hand_eye(
         If a file is unreadable, an option is wrong, or the postures do not determine the
         hand-eye; no document is written then. Where it is the postures, a page shows them.
     """
-    of_plate = options or HandEyeOptions()
-    of_sphere = sphere_options or SphereOptions()
-    of_stripes = stripe_options or StripeOptions()
+    options, stripe_options = options or HandEyeOptions(), stripe_options or StripeOptions()
     diameter = artefact.sphere_diameter_mm
-    if diameter is not None and of_plate.solve_plate:
+    if diameter is not None and options.solve_plate:
         raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
     places = job.places(".json", beside=(".html",))
-    inputs = read_hand_eye_inputs(source, artefact, of_plate, of_stripes, job.progress)
+    inputs = read_hand_eye_inputs(source, artefact, options, stripe_options, job.progress)
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
-    used = (of_plate if diameter is None else of_sphere, of_stripes)
+    used = (options, stripe_options)
 
     def solve(stripes: Sequence[PosedStripe]) -> HandEyeFit | FitFailure:
         known = inputs.sensor_covariance
         if diameter is not None:
-            return calibrate_on_sphere(stripes, diameter, of_sphere, sensor_covariance=known)
+            return calibrate_on_sphere(stripes, diameter, options, sensor_covariance=known)
         if inputs.plate is None:
             return FitFailure("there is no plate")
-        return calibrate_on_plate(stripes, inputs.plate, of_plate, sensor_covariance=known)
+        return calibrate_on_plate(stripes, inputs.plate, options, sensor_covariance=known)
 
     n_steps = len(inputs.groups) + 1
     job.progress(ProgressEvent("solve", 0, n_steps))

@@ -7,12 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
-import numpy as np
-
 from armscan.calibration.sheets.result import (
     LaserFit,
     PointUse,
-    SheetImage,
     SkippedImage,
     reasons_to_refuse,
 )
@@ -29,7 +26,6 @@ from armscan.pipeline.laser import (
     look_at_pairs,
 )
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile, StripeFlag
 from armscan.report.photographs import TriedImage, refused_page
 from armscan.report.quantity import (
     Quantity,
@@ -53,7 +49,7 @@ from armscan.storage.documents import (
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.observations import pack_observations
+from armscan.storage.observations import pack_board_stripes
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.vision.targets.target import Target, parse_target
@@ -135,7 +131,7 @@ def calibrate_sheets(
     inputs = (*read.paths, *read.tables, camera_file)
     if isinstance(fit, FitFailure):
         seen = look_at_pairs(read.pairs, board, options, cache=job.cache, progress=job.progress)
-        used = (board, options.target, options.stripes, options.sheets, image_options)
+        used = (board, options.stripes, options.sheets, image_options)
         provenance = job.provenance(
             inputs, used, parents=(camera.provenance,), warnings=read.warnings
         )
@@ -150,7 +146,7 @@ def calibrate_sheets(
     nonsense = reasons_to_refuse(fit)
     provenance = job.provenance(
         inputs,
-        (board, options.target, options.stripes, fit.options, image_options),
+        (board, options.stripes, fit.options, image_options),
         parents=(camera.provenance,),
         warnings=(*read.warnings, *sheet_warnings(fit)),
         forced=nonsense,
@@ -160,8 +156,7 @@ def calibrate_sheets(
     hashes = {
         source: item.sha256 for source, item in zip(by_source, provenance.inputs, strict=False)
     }
-    profiles = [_with_edge_flags(image) for image in fit.images]
-    observations = pack_observations([image.view for image in fit.images], profiles, hashes)
+    observations = pack_board_stripes(fit, hashes)
     document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
@@ -302,16 +297,6 @@ def _other_size(target: Target, parent: Provenance) -> tuple[str, ...]:
         f"the camera was calibrated with a board of {float(size):g} mm from point to point, this "
         f"one is said to have {target.size_mm:g} mm: is it the same board?",
     )
-
-
-def _with_edge_flags(image: SheetImage) -> Profile:
-    """The stripe points with those flagged that lay along an edge of the target.
-
-    The edges themselves are not kept, and without them the sheet could not be solved again.
-    """
-    is_on_edge = image.use == int(PointUse.ON_EDGE)
-    flags = image.profile.flags | np.where(is_on_edge, int(StripeFlag.TARGET_EDGE), 0)
-    return replace(image.profile, flags=flags)
 
 
 def sheets_summary(

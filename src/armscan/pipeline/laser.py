@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 
@@ -32,18 +32,19 @@ from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import CameraCalibration, SensorCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.targets import cached_profile, cached_target, wrong_count
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
+from armscan.storage.observations import Observations
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, LaserColour, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
-from armscan.vision.targets.target import Target, TargetOptions, TargetView
+from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
 BOARDS_STAGE = "boards"
 STRIPES_STAGE = "stripes"
@@ -69,7 +70,6 @@ CHANNELS: tuple[LaserColour, ...] = get_args(LaserColour)[1:]
 class LaserOptions:
     """Options of the three stages: target, stripes, sheets."""
 
-    target: TargetOptions = field(default_factory=TargetOptions)
     stripes: StripeOptions = field(default_factory=StripeOptions)
     sheets: SheetOptions = field(default_factory=SheetOptions)
 
@@ -116,7 +116,7 @@ def calibrate_sheets_from_pairs(
     places: dict[str, BoardPlacement] = {}
     answers: list[TargetView | FitFailure] = []
     n_places = len({placement_of(pair) for pair in pairs})
-    for place in find_placements(pairs, target, cameras, options.target, cache):
+    for place in find_placements(pairs, target, cameras, cache):
         places[place.name] = place
         progress(ProgressEvent(BOARDS_STAGE, len(places), n_places, place.name))
         answers += [
@@ -172,6 +172,45 @@ def calibrate_sheets_from_pairs(
         return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
     skipped += fit.skipped
     return replace(fit, skipped=tuple(skipped), laser_colour=colour, channel_reason=reason)
+
+
+def calibrate_sheets_again(
+    found: Observations, sensor: SensorCalibration, options: SheetOptions | None = None
+) -> LaserFit | FitFailure:
+    """Solve the sheets of a sensor again from the observations that lie beside its document."""
+    if len(found.contexts) != len(found.profiles) or not found.contexts:
+        return FitFailure(
+            "the observations do not say which laser and camera took part: an older version of "
+            "armscan wrote them, or they are of a camera",
+            "calibrate again from the images",
+        )
+    cameras = HeadCameras.of(sensor)
+    boards = []
+    for view, profile, context in zip(found.views, found.profiles, found.contexts, strict=True):
+        rims = CircleEdges(
+            points_px=np.zeros((0, 2)), circle=np.zeros(0, dtype=np.int64), sigma_px=np.zeros(0)
+        )
+        board = replace(view, edges=rims if context.has_rims else None)
+        pose = estimate_board_pose(board, cameras.model(context.camera))
+        if isinstance(pose, FitFailure):
+            return pose
+        flags = profile.flags & ~int(StripeFlag.TARGET_EDGE)
+        boards.append(
+            BoardStripes(
+                profile=replace(profile, flags=flags),
+                view=board,
+                sensor_from_board=pose,
+                lasers=context.lasers,
+                on_edge=context.on_edge,
+                camera=context.camera,
+                placed=context.placed,
+                placement=context.placement,
+            )
+        )
+    fit = calibrate_sheets(boards, sensor, options)
+    if isinstance(fit, FitFailure):
+        return fit
+    return replace(fit, laser_colour=cast(LaserColour, sensor.laser_colour))
 
 
 def _poor_images(
@@ -282,7 +321,6 @@ def find_placements(
     pairs: Sequence[ExposurePair],
     target: Target,
     cameras: HeadCameras,
-    options: TargetOptions,
     cache: DetectionCache | None = None,
 ) -> Iterator[BoardPlacement]:
     """Look for the board in each placement, one after the other; ``cache`` knows earlier finds.
@@ -302,7 +340,7 @@ def find_placements(
         """The board in the first image that shows it, or why the first does not."""
         failures: list[FitFailure] = []
         for image in images:
-            view = cached_target(image, target, options, cache)
+            view = cached_target(image, target, cache)
             found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
             if not isinstance(found, FitFailure):
                 return found
@@ -495,9 +533,9 @@ def look_at_pairs(
     for done, (exposure, background) in enumerate(pairs):
         progress(ProgressEvent(AGAIN_STAGE, done, len(pairs), exposure.source))
         tried = exposure if background is None else background
-        board = cached_target(tried, target, options.target, cache)
+        board = cached_target(tried, target, cache)
         if isinstance(board, FitFailure) and tried is not exposure:
-            again = cached_target(exposure, target, options.target, cache)
+            again = cached_target(exposure, target, cache)
             if not isinstance(again, FitFailure):
                 board, tried = again, exposure
         lit, dark = exposure, background

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.simulation.stripe_image import (
+from armscan.vision.stripe.extract import extract_stripes
+from rigs.stripe_image import (
     NO_NOISE,
     SimulatedStripe,
     StraightCurve,
     StripeNoise,
     StripeScene,
 )
-from armscan.vision.stripe.extract import extract_stripes
 
 ANGLES_DEG = (-50.0, 55.0)
 SIGMA_PX = 3.0

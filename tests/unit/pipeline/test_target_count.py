@@ -7,8 +7,9 @@ import pytest
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.cameras import calibrate_camera_from_exposures
 from armscan.pipeline.targets import ENOUGH_IMAGES, wrong_count
-from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.target import Chessboard, CircleGrid, OtherCountSeen, TargetView
+from rigs.flat_prints import ChessboardPattern
 from rigs.target_scenes import exposure, render
 
 ASKED = Chessboard(9, 7, 3.0)

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.simulation.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import measure_level
 from armscan.vision.stripe.thesis import THESIS_METHODS
+from rigs.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
 from rigs.stripe_scenes import line, score
 
 METHODS: tuple[StripeMethod, ...] = ("threshold", "centroid", "template", "hessian")

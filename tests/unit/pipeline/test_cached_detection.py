@@ -85,9 +85,9 @@ def test_the_second_look_gives_the_same_without_looking(
     exposure: Exposure, target: Target, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path / "cache")
-    first = cached_target(exposure, target, None, cache)
+    first = cached_target(exposure, target, cache)
     assert isinstance(first, FitFailure) == (target is GRID and exposure.source == "board.png")
-    assert_same(cached_target(exposure, target, None, cache), first)
+    assert_same(cached_target(exposure, target, cache), first)
     assert looked == [exposure.source]
 
 
@@ -166,14 +166,14 @@ def test_a_damaged_entry_is_looked_for_again(
     damage: str, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path)
-    first = cached_target(circles(), GRID, None, cache)
+    first = cached_target(circles(), GRID, cache)
     (entry,) = tmp_path.glob(f"*{SUFFIX}")
     content = bytearray(entry.read_bytes())
     if damage == "flipped":
         content[len(content) // 2] ^= 4
     elif damage == "renamed":
         # whole, but of another image
-        cached_target(chessboard(), BOARD, None, cache)
+        cached_target(chessboard(), BOARD, cache)
         (other,) = set(tmp_path.glob(f"*{SUFFIX}")) - {entry}
         content = bytearray(other.read_bytes())
         looked.clear()
@@ -181,10 +181,10 @@ def test_a_damaged_entry_is_looked_for_again(
     entry.write_bytes(
         {"cut": content[:-9], "empty": b"", "foreign": b"x" * 99}.get(damage, content)
     )
-    again = cached_target(circles(), GRID, None, cache)
+    again = cached_target(circles(), GRID, cache)
     assert_same(again, first)
     assert looked == ["grid.png", "grid.png"]
-    assert_same(cached_target(circles(), GRID, None, cache), first)
+    assert_same(cached_target(circles(), GRID, cache), first)
     assert len(looked) == 2
 
 
@@ -193,8 +193,8 @@ def test_a_folder_that_may_not_be_written_costs_time_only(
 ) -> None:
     (tmp_path / "cache").write_text("a file")
     cache = DetectionCache(tmp_path / "cache")
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
     assert len(looked) == 2
     cache.trim()
     assert (tmp_path / "cache").read_text() == "a file"

@@ -176,6 +176,8 @@ LARGEST_RADIUS_SIGMA = 0.5
 SCATTER_SIGMAS = 2.0
 """Points no thicker than this many standard deviations may as well lie on a line or plane."""
 ROUNDS_OF_REJECTION = 20
+SETTLED = 1e-17
+"""To rounding: a fit costs little, and its figures are then those of any other solver."""
 START_SAMPLES, START_POINTS = 150, 500
 """Surfaces through a few points that are tried, and points that judge them."""
 
@@ -298,7 +300,9 @@ def _solve_round(
         kept = size <= max(limit, 1e-12)
         if int(kept.sum()) < len(state):
             return None
-        fit = levenberg_marquardt(state, partial(_round_system, points[kept]), np.add)
+        fit = levenberg_marquardt(
+            state, partial(_round_system, points[kept]), np.add, settled=SETTLED
+        )
         is_same, is_used = np.array_equal(kept, is_used), kept
         if fit is None or is_same:
             break

@@ -23,7 +23,7 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.records.exposure import Exposure
 from armscan.records.points import RingImages
-from armscan.vision.ring_edges import Rims, common_centres, measure_rims, nearest_gaps_px
+from armscan.vision.ring_edges import MeasuredRims, common_centres, measure_rims, nearest_gaps_px
 from armscan.vision.targets.circle_lattice import Blobs, find_blobs
 from armscan.vision.targets.grey import grey_channels, to_grey8
 
@@ -220,7 +220,9 @@ def detect_rings(exposure: Exposure, options: RingOptions | None = None) -> Ring
     return _filtered(exposure, rims, outer, inner, options)
 
 
-def _chosen(rims: Rims, cluster: IntArray, options: RingOptions) -> tuple[IntArray, IntArray]:
+def _chosen(
+    rims: MeasuredRims, cluster: IntArray, options: RingOptions
+) -> tuple[IntArray, IntArray]:
     """Rows of the outermost and innermost rim of each cluster that has both."""
     towards_disc = rims.contrast_levels if options.disc == "light" else -rims.contrast_levels
     rows = []
@@ -239,7 +241,7 @@ def _chosen(rims: Rims, cluster: IntArray, options: RingOptions) -> tuple[IntArr
 
 
 def _filtered(
-    exposure: Exposure, rims: Rims, outer: IntArray, inner: IntArray, options: RingOptions
+    exposure: Exposure, rims: MeasuredRims, outer: IntArray, inner: IntArray, options: RingOptions
 ) -> RingDetection:
     window = exposure.window
     half = rims.half_px * window.binning
@@ -274,7 +276,7 @@ def _filtered(
     return RingDetection(rings, centres[~kept], _reasons(fails, kept))
 
 
-def _contrast(rims: Rims, inner: IntArray, exposure: Exposure) -> FloatArray:
+def _contrast(rims: MeasuredRims, inner: IntArray, exposure: Exposure) -> FloatArray:
     """Level of the disc minus that of the ring, as a fraction of full scale."""
     return np.asarray(-rims.contrast_levels[inner] / exposure.full_scale)
 

@@ -199,8 +199,8 @@ class _Grower:
         """Blobs nearest to the middle of all blobs first: the middle has most neighbours."""
         middle = np.median(self._centres, axis=0)
         order = np.argsort(((self._centres - middle) ** 2).sum(axis=1), kind="stable")
-        spread = np.unique(np.linspace(0, self._count - 1, _MAX_SEEDS).astype(np.int64))
-        return [int(k) for k in order[spread]]
+        chosen = np.unique(np.linspace(0, self._count - 1, _MAX_SEEDS).astype(np.int64))
+        return [int(k) for k in order[chosen]]
 
     def grow(self, seed: int) -> Lattice:
         """Lattice from a seed, breadth first; each cell hands its basis to its neighbours."""

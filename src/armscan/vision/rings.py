@@ -212,7 +212,7 @@ def detect_rings(exposure: Exposure, options: RingOptions | None = None) -> Ring
     nested[pairs[0]] = nested[pairs[1]] = True
     rims = measure_rims(
         grey,
-        blobs.subset(nested),
+        blobs.select(nested),
         nearest_gaps_px(blobs, pairs)[nested],
         options.min_contrast * exposure.full_scale,
     )
@@ -247,7 +247,7 @@ def _filtered(
     half = rims.half_px * window.binning
     size, shape = perimeters_px(half[outer]), roundness(half[outer])
     centres, covariance, mismatch = common_centres(
-        rims.ellipses.subset(outer), rims.ellipses.subset(inner)
+        rims.ellipses.select(outer), rims.ellipses.select(inner)
     )
     shift = np.hypot(*(rims.centres_px[outer] - rims.centres_px[inner]).T)
     fails = np.stack(

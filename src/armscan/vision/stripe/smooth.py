@@ -107,7 +107,8 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     rough = course.fit_parabolas(half, np.ones(len(half)))
     score = np.abs(rough[:, PREDICTED]) / np.hypot(rough[:, PREDICTED_SIGMA], course.sigma)
-    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * _scale(score))
+    scale = max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
+    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
     course = replace(course, is_used=course.is_used & ~is_outlier)
     correlation = noise_correlation(course, half[-1])
     course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
@@ -136,11 +137,6 @@ def curvature(course: Polyline) -> FloatArray:
     square = result[:, BEND] ** 2
     noise = result[:, BEND_SIGMA] ** 2
     return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
-
-
-def _scale(score: FloatArray) -> float:
-    """Typical size of scores that should have unit variance; at least 1."""
-    return max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
 
 
 def _weights(half: int) -> FloatArray:

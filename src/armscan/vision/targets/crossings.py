@@ -333,18 +333,13 @@ def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
         (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
     )
     missed = np.hypot(*(predicted - points).T)
-    step = _step_px(points, others)
+    step = np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1)
     is_regular = ~(missed > _POSITION_TOLERANCE * step)
     return {
         (int(a), int(b)): int(k)
         for (a, b), k, keep in zip(cells, index, is_regular, strict=True)
         if keep
     }
-
-
-def _step_px(points: FloatArray, others: IntArray) -> FloatArray:
-    """Way (N,) to the nearest other point."""
-    return np.asarray(np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1))
 
 
 def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:

@@ -27,7 +27,6 @@ from armscan.jobs.job import TriedImage, calibration_outputs, refuse, refused_fo
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
-from armscan.pipeline.documents import sensor_calibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
@@ -166,7 +165,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         hashes,
     )
     document = sensor_document(
-        sensor_calibration(fit, provenance), (files.observations.name, observations)
+        fit.to_calibration(provenance), (files.observations.name, observations)
     )
     write_files(
         {files.document: document, files.observations: observations, files.page: render_page(page)},
@@ -382,10 +381,10 @@ def laser_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool)
             "kind": "light sheet calibration",
             "simulated": is_simulated,
             "sheets": [_sheet_data(sheet) for sheet in fit.sheets],
-            "naming": fit.naming,
+            "naming": fit.diagnostics.naming,
             "cameras": 1 if fit.second is None else 2,
             "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
-            "noise_factor": fit.noise_factor,
+            "noise_factor": fit.diagnostics.noise_factor,
             "laser_colour": fit.laser_colour,
             "channel_reason": fit.channel_reason,
             "skipped": [{"source": item.source, "reason": item.reason} for item in fit.skipped],
@@ -405,13 +404,13 @@ def _sheet_data(fit: SheetFit) -> dict[str, Any]:
         "tilt_sigma_deg": fit.tilt_sigma_deg,
         "offset_sigma_mm": fit.offset_sigma_mm,
         "rms_mm": fit.calibration.rms_mm,
-        "rms_px": fit.rms_px,
+        "rms_px": fit.diagnostics.rms_px,
         "n_boards": fit.calibration.n_boards,
         "n_points": fit.calibration.n_points,
         "depth_min_mm": low,
         "depth_max_mm": high,
         "is_redundant": fit.calibration.is_redundant,
-        "lack_of_fit_p": fit.final_test.p_value,
+        "lack_of_fit_p": fit.diagnostics.final_test.p_value,
         "points_off_boards": {
             **asdict(fit.points.fitted),
             "left_out_rms_mm": _known(fit.points.left_out_rms_mm),

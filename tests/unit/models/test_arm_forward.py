@@ -111,7 +111,7 @@ def test_an_arm_cut_in_two_composes() -> None:
     """Flange, offsets and order: the pose of the whole is that of the parts, one after another."""
     arm, joints = general_arm(), some_joints(1)
     first = ArmModel(*(getattr(arm, n)[:3] for n in ("theta_offset_rad", *CHAIN)))
-    second = ArmModel(*(getattr(arm, n)[3:] for n in ("theta_offset_rad", *CHAIN)), arm.flange)
+    second = ArmModel(*[*(getattr(arm, n)[3:] for n in ("theta_offset_rad", *CHAIN)), arm.flange])
     whole, low, high = (
         Pose(*(part[0] for part in forward(a, q)))
         for a, q in ((arm, joints), (first, joints[:, :3]), (second, joints[:, 3:]))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+import armscan
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline import targets
 from armscan.pipeline.targets import cached_profile, cached_target
@@ -146,14 +148,14 @@ def test_the_code_version_follows_the_detectors_sources(
     """A copy of the package with one line more in a detector has another version."""
     root = tmp_path / "armscan"
     for package in detection_cache.CODE:
-        source = Path(detection_cache.armscan.__file__).parent / package
+        source = Path(armscan.__file__).parent / package
         for path in source.rglob("*.py"):
             copy = root / package / path.relative_to(source)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
     version = detection_cache.code_version.__wrapped__
     here = version()
-    monkeypatch.setattr(detection_cache.armscan, "__file__", str(root / "__init__.py"))
+    monkeypatch.setattr(armscan, "__file__", str(root / "__init__.py"))
     assert version() == here
     saddle = root / "vision" / "targets" / "saddle.py"
     saddle.write_text(saddle.read_text("utf-8") + "\n", "utf-8")
@@ -205,7 +207,7 @@ def test_the_folder_stays_below_its_limit(tmp_path: Path) -> None:
     found = FitFailure("x" * 1000)
     for k, name in enumerate("abcd"):
         cache.put(name, found)
-        detection_cache.os.utime(tmp_path / f"{name}{SUFFIX}", (k, k))
+        os.utime(tmp_path / f"{name}{SUFFIX}", (k, k))
     size = (tmp_path / f"a{SUFFIX}").stat().st_size
     assert cache.get("a") == found
     (tmp_path / "mine.txt").write_text("y" * 5000)

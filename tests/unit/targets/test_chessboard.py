@@ -26,7 +26,7 @@ def tilted() -> RenderedTarget:
 def test_corners_and_covariance_against_the_truth(tilted: RenderedTarget) -> None:
     errors, covariances = [], []
     rough = tilted.marks_px.reshape(4, 7, 2)
-    step_x, step_y = (np.gradient(rough, axis=k).reshape(-1, 2) for k in (1, 0))
+    step_x, step_y = (np.asarray(np.gradient(rough, axis=k)).reshape(-1, 2) for k in (1, 0))
     for seed in range(20):
         image = exposure(tilted.image, seed).image
         start = tilted.marks_px + 0.7 * np.random.default_rng(seed).uniform(-1, 1, (28, 2))

@@ -27,6 +27,7 @@ from armscan.calibration.hand_eye.sphere_sections import (
 )
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import levenberg_marquardt
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
 
@@ -111,6 +112,41 @@ def objective(
         misclosure = design_rows(plane_tool, points) @ unknowns + plane_tool[3]  # eq. 2.74
         total += float(misclosure @ misclosure)
     return total
+
+
+def minimise_objective(
+    plane_base: FloatArray,
+    poses: list[Pose[Base, Tool]],
+    points_mm: list[FloatArray],
+    start: Pose[Tool, Sensor],
+) -> tuple[Pose[Tool, Sensor], float] | FitFailure:
+    """Minimise F of eq. 2.76 over the six parameters of eqs. 2.69 and 2.70; arguments as there.
+
+    Every point counts alike and the plate is exact: pose errors, the plate's flatness and the
+    probed plane's uncertainty, which are common to many points, have no place in it.
+
+    Returns
+    -------
+    tool_from_sensor, rms_mm
+        Where F is least, and the root mean square distance of the points from the plate there.
+    """
+    planes = [plane_in_tool(plane_base, pose) for pose in poses]
+    normals = np.repeat([plane[:3] for plane in planes], [len(p) for p in points_mm], axis=0)
+    offsets = np.repeat([plane[3] for plane in planes], [len(p) for p in points_mm])
+    points = np.concatenate(points_mm)
+
+    def linearise(pose: Pose[Tool, Sensor]) -> tuple[FloatArray, FloatArray]:
+        turned = pose.rotate(points)
+        misclosure = np.einsum("ni,ni->n", turned + pose.translation_mm, normals) + offsets
+        return misclosure, np.hstack([np.cross(turned, normals), normals])
+
+    found = levenberg_marquardt(start, linearise, lambda pose, step: pose.retract(step))
+    if found is None or found.system.covariance is None:
+        return FitFailure(
+            "the postures do not determine the minimum of eq. 2.76",
+            "turn the tool more, about two or three axes",
+        )
+    return found.state, float(np.sqrt(found.chi2 / len(points)))
 
 
 RANK_RATIO = 1e-3

@@ -23,12 +23,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.observations import (
-    PlateReference,
-    PosedStripe,
-    hand_eye_difference,
-)
+from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool

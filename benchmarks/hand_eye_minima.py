@@ -22,12 +22,22 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye import search, sphere_estimate
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
-from armscan.calibration.hand_eye.observations import HandEyeOptions, condense, straight_stripes
+from armscan.calibration.hand_eye.observations import (
+    condense_plate,
+    find_sections,
+    straight_stripes,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.search import descend_all
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
+from armscan.calibration.hand_eye.search import (
+    descend_all,
+    many_placed,
+    minima_on_plate,
+    minima_on_sphere,
+    place_sections,
+    unit_steps,
+)
+from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
@@ -69,11 +79,11 @@ def sphere_set(
         for turn in turns_of(kind, count, rng)
     ]
     stripes = rig.stripes(poses, rng)
-    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, SphereOptions())
-    place = sphere_estimate._placing(sections, 0.5 * DIAMETER_MM)
-    states = sphere_estimate.start_candidates(sections, 0.5 * DIAMETER_MM)
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
+    place, _ = place_sections(sections, 0.5 * DIAMETER_MM)
+    states = minima_on_sphere(sections, 0.5 * DIAMETER_MM)
     rotations = np.array([state.tool_from_sensor.rotation for state in states])
-    others = np.array([[*s.tool_from_sensor.translation_mm, *s.centre_mm] for s in states])
+    others = np.array([[*s.tool_from_sensor.translation_mm, *s.surface[:3]] for s in states])
     scale = np.array([0.007] * 3 + [1.0] * 6)
     ours = descend_all(place, rotations, others, STEPS, scale)[2].min()
     random = Rotation.random(starts, rng=rng).as_matrix()
@@ -105,10 +115,11 @@ def plate_set(
     noise = replace(noise, posture_rad=noise.posture_mm / 265.0)
     rig = PlateRig(postures, noise, points_per_stripe=60)
     stripes, plate = rig.draw(int(rng.integers(1 << 30)))
-    options = HandEyeOptions()
-    nodes = condense(stripes, straight_stripes(stripes, options), 3)
-    place, scale = search._placing(nodes, plate.plane), search._scale(nodes)
-    found = search.minima_from_everywhere(nodes, plate.plane)
+    nodes = condense_plate(stripes, straight_stripes(stripes), 3)
+    surface, scale = PlateSurface(plate), unit_steps(nodes.points_mm, 3)
+    poses = nodes.rotations[nodes.stripe], nodes.translations_mm[nodes.stripe]
+    place = many_placed(nodes.points_mm, *poses, surface)
+    found = minima_on_plate(nodes, surface)
     rotations = np.array([pose.rotation for pose in found])
     shifts = np.array([pose.translation_mm for pose in found])
     ours = descend_all(place, rotations, shifts, STEPS, scale)[2].min()

@@ -21,8 +21,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_difference
+from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from rigs.plate_bound import cramer_rao, plain_least_squares
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures

@@ -23,18 +23,20 @@ import cv2
 import numpy as np
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.estimate import PlateFit, fit_plate
+from armscan.calibration.hand_eye.estimate import Problem, estimate
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
-    PlateState,
     PosedStripe,
-    condense,
-    hand_eye_difference,
-    residual_by_sensor,
+    condense_plate,
     straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import (
+    PlateSurface,
+    dresidual_dsensor,
+    hand_eye_difference,
+)
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
@@ -54,22 +56,22 @@ def moved_pair(
     stored: HandEyeCalibration,
 ) -> tuple[HandEyeCalibration, SensorCalibration]:
     """Hand-eye and sensor of one least squares in which the sensor may move."""
-    nodes = condense(stripes, straight_stripes(stripes, OPTIONS), OPTIONS.nodes_per_stripe)
+    nodes = condense_plate(stripes, straight_stripes(stripes), 12)
     nodes = replace(nodes, sensor_covariance=sensor.covariance)
-    fit = fit_plate(nodes, plate, PlateState(stored.tool_from_sensor, np.zeros(3)), OPTIONS)
-    if not isinstance(fit, PlateFit):
-        raise EstimationError(fit.reason)
-    placed = fit.refined.placed
-    by_sensor = residual_by_sensor(nodes, placed)
+    problem = Problem(nodes, PlateSurface(plate), OPTIONS)
+    fit = estimate(problem, problem.start(stored.tool_from_sensor))
+    if fit is None:
+        raise EstimationError("the stripes do not determine the hand-eye")
+    by_sensor = dresidual_dsensor(nodes, fit.placed)
     if by_sensor is None:
         raise EstimationError("the stripes do not say how they follow the sensor")
     hand_eye = replace(
         stored,
-        tool_from_sensor=fit.refined.state.tool_from_sensor,
+        tool_from_sensor=fit.state.tool_from_sensor,
         covariance=fit.covariance[:6, :6],
         sensor_coupling=-fit.linear.gain[:6] @ by_sensor,
     )
-    step = -sensor.covariance @ by_sensor.T @ fit.linear.projected @ placed.residual_mm
+    step = -sensor.covariance @ by_sensor.T @ fit.explained
     model, sheet = sensor.camera.camera, sensor.sheets[0]
     camera = CameraModel.from_parameters(
         model.parameters + step[:N_CAMERA], model.width_px, model.height_px

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
@@ -27,7 +27,7 @@ from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
 from rigs.sphere_rig import DIAMETER_MM, HAND_EYE, SphereRig, shifted_poses, turned_poses
 
 REGION = float(chi2.ppf(0.95, 6))
-OPTIONS = SphereOptions(nodes_per_stripe=10)
+OPTIONS = HandEyeOptions(per_stripe=10)
 RIG = SphereRig(pose_noise_mm=0.02, point_noise_mm=0.01, n_points=60)
 
 
@@ -46,7 +46,7 @@ def study(name: str, poses: list[Pose[Base, Tool]], runs: int, seed: int) -> Non
             error = error_of(fit.calibration.tool_from_sensor)
             one.append(error)
             inside += int(error @ np.linalg.solve(fit.calibration.covariance, error) < REGION)
-        steps = calibrate_in_two_steps(stripes, DIAMETER_MM, OPTIONS)
+        steps = calibrate_in_two_steps(stripes, DIAMETER_MM)
         if isinstance(steps, TwoStepHandEye):
             two.append(error_of(steps.tool_from_sensor))
     show(f"{name}, one least squares", one, f"{inside} of {len(one)} within 95 %")

@@ -152,12 +152,12 @@ def observed(generator: np.random.Generator, scale: float) -> list[PosedStripe]:
             noise = generator.normal(0.0, scale * STRIPE_MM, (len(points), 1))
             found.append(
                 PosedStripe(
-                    f"{name}{exposure}",
-                    name,
-                    reported,
-                    points + noise * across,
-                    np.tile(STRIPE_MM * across, (len(points), 1))[:, :, None],
-                    np.zeros(len(points), dtype=np.int64),
+                    source=f"{name}{exposure}",
+                    posture=name,
+                    base_from_tool=reported,
+                    points_mm=points + noise * across,
+                    noise_mm=np.tile(STRIPE_MM * across, (len(points), 1))[:, :, None],
+                    sheet=np.zeros(len(points), dtype=np.int64),
                 )
             )
     return found
@@ -169,14 +169,13 @@ def plate() -> PlateReference:
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first), normal])
     centre = np.array([650.0, -170.0, 0.0])
-    return PlateReference(Plane(centre - (normal @ centre + PLATE[3]) * normal, axes))
+    return PlateReference(plane=Plane(centre - (normal @ centre + PLATE[3]) * normal, axes))
 
 
 KNOWN_NOISE = HandEyeOptions(
     arm_position_mm=ARM_MM,
     arm_rotation_rad=float(ARM_RAD),
     plate_flatness_mm=FLATNESS_MM,
-    flatness_length_mm=FLATNESS_LENGTH_MM,
     stripe_noise_factor=1.0,
 )
 

@@ -98,13 +98,15 @@ class CalibratedHead:
             points = _points(seen, sensor)
             stripes.append(
                 PosedStripe(
-                    seen.profile.source,
-                    f"posture{seen.posture:02d}",
-                    self.rig.reported_pose(seen.posture, _pose_error(rng, self.noise)),
-                    points.points_mm,
-                    points.noise_mm,
-                    points.sheet,
-                    points.by_sensor,
+                    source=seen.profile.source,
+                    posture=f"posture{seen.posture:02d}",
+                    base_from_tool=self.rig.reported_pose(
+                        seen.posture, _pose_error(rng, self.noise)
+                    ),
+                    points_mm=points.points_mm,
+                    noise_mm=points.noise_mm,
+                    sheet=points.sheet,
+                    dpoint_dsensor=points.by_sensor,
                 )
             )
         return stripes, plate

@@ -30,7 +30,11 @@ def fake_fit(method: str = "plate") -> tuple[HandEyeFit, tuple[PosedStripe, ...]
             stripe, points = _stripe(source, name, k, generator)
             stripes.append(stripe)
             residual = mean + 0.003 * generator.standard_normal(len(points))
-            residuals.append(StripeResidual(source, name, points, residual))
+            residuals.append(
+                StripeResidual(
+                    source=source, posture=name, points_base_mm=points, residual_mm=residual
+                )
+            )
         postures.append(_posture(name, mean, k, is_plate=method == "plate"))
     plate = Plane(np.zeros(3), np.eye(3)) if method == "plate" else None
     hand_eye = HandEyeCalibration(
@@ -51,13 +55,13 @@ def fake_fit(method: str = "plate") -> tuple[HandEyeFit, tuple[PosedStripe, ...]
         diagnostics=_diagnostics(method),
     )
     fit = HandEyeFit(
-        hand_eye,
-        TOOL_FROM_SENSOR,
-        tuple(residuals),
-        tuple(postures),
-        np.geomspace(30.0, 1.0, 6),
-        (("Plate", "plane of 40 probed points, 0.008 mm rms"),),
-        ("posture 3 is the only one tilted towards the far side",),
+        calibration=hand_eye,
+        start=TOOL_FROM_SENSOR,
+        stripes=tuple(residuals),
+        postures=tuple(postures),
+        singular_values=np.geomspace(30.0, 1.0, 6),
+        reference=(("Plate", "plane of 40 probed points, 0.008 mm rms"),),
+        warnings=("posture 3 is the only one tilted towards the far side",),
     )
     return fit, tuple(stripes)
 
@@ -107,11 +111,11 @@ def _stripe(
     camera: Pose = Pose(tilted, centre - STAND_OFF_MM * tilted[:, 2])
     in_sensor = (points - camera.translation_mm) @ camera.rotation
     stripe = PosedStripe(
-        source,
-        posture,
-        camera @ TOOL_FROM_SENSOR.inverse(),
-        in_sensor,
-        np.tile([0.0, 0.0, 0.003], (len(points), 1))[:, :, None],
-        np.zeros(len(points), dtype=np.int64),
+        source=source,
+        posture=posture,
+        base_from_tool=camera @ TOOL_FROM_SENSOR.inverse(),
+        points_mm=in_sensor,
+        noise_mm=np.tile([0.0, 0.0, 0.003], (len(points), 1))[:, :, None],
+        sheet=np.zeros(len(points), dtype=np.int64),
     )
     return stripe, points

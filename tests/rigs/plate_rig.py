@@ -212,14 +212,14 @@ class PlateRig:
                 noise = self.noise.stripe_mm * rng.normal(size=(len(clean), 1)) * across
                 stripes.append(
                     PosedStripe(
-                        f"image{k:02d}-{number}",
-                        f"posture{k:02d}",
-                        self.reported_pose(k, common + own),
-                        clean + noise,
-                        np.tile(max(self.noise.stripe_mm, 1e-4) * across, (len(clean), 1))[
+                        source=f"image{k:02d}-{number}",
+                        posture=f"posture{k:02d}",
+                        base_from_tool=self.reported_pose(k, common + own),
+                        points_mm=clean + noise,
+                        noise_mm=np.tile(max(self.noise.stripe_mm, 1e-4) * across, (len(clean), 1))[
                             :, :, None
                         ],
-                        np.zeros(len(clean), dtype=np.int64),
+                        sheet=np.zeros(len(clean), dtype=np.int64),
                     )
                 )
         return stripes, plate
@@ -245,7 +245,13 @@ class PlateRig:
         if plane.normal @ PLATE_NORMAL < 0.0:
             plane = Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
         rms = float(np.sqrt((fitted.residuals**2).mean()))
-        return PlateReference(plane, fitted.covariance, rms, len(points), "rig")
+        return PlateReference(
+            plane=plane,
+            covariance=fitted.covariance,
+            rms_mm=rms,
+            n_points=len(points),
+            source="rig",
+        )
 
     @property
     def probed_places(self) -> FloatArray:

@@ -66,12 +66,12 @@ class SphereRig:
             noise.append(max(self.point_noise_mm, 1e-6) * radial)
             sheets.append(np.full(self.n_points, k))
         return PosedStripe(
-            name,
-            name,
-            self._reported(pose, generator),
-            np.concatenate(points),
-            np.concatenate(noise)[:, :, None],
-            np.concatenate(sheets),
+            source=name,
+            posture=name,
+            base_from_tool=self._reported(pose, generator),
+            points_mm=np.concatenate(points),
+            noise_mm=np.concatenate(noise)[:, :, None],
+            sheet=np.concatenate(sheets),
         )
 
     def _reported(self, pose: Pose[Base, Tool], generator: np.random.Generator) -> Pose[Base, Tool]:

@@ -11,9 +11,13 @@ import pytest
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    PlateReference,
+    PosedStripe,
+    find_sections,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector_from_rotation
@@ -21,7 +25,7 @@ from armscan.geometry.shapes import Plane
 from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
-from armscan.thesis.hand_eye import TwoStepHandEye, calibrate_in_two_steps
+from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))
@@ -61,13 +65,12 @@ def author() -> FloatArray:
 
 def shifted_pairs(stripes: tuple[PosedStripe, ...]) -> list[tuple[FloatArray, FloatArray]]:
     """Pairs of postures of nearly equal rotation: how the sphere moved in Tool and in Sensor."""
-    options = SphereOptions()
-    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, options)
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
     pairs = []
     for first, last in combinations(sections, 2):
         before, after = first.stripe.base_from_tool, last.stripe.base_from_tool
         turn = vector_from_rotation(nearest_rotation(before.rotation.T @ after.rotation))
-        if np.degrees(np.linalg.norm(turn)) < options.same_rotation_deg:
+        if np.degrees(np.linalg.norm(turn)) < SAME_ROTATION_DEG:
             shift = before.rotation.T @ (before.translation_mm - after.translation_mm)
             pairs.append((shift, last.centre_mm - first.centre_mm))
     return pairs
@@ -137,7 +140,7 @@ def test_the_authors_rotation_contradicts_the_shift_from_p1_to_p3(
 ) -> None:
     """Between them the tool only shifts, so that the section centre's path is the shift itself."""
     pair = (stripes[0], stripes[2])
-    (first, last), _ = find_sections(pair, 0.5 * DIAMETER_MM, SphereOptions())
+    (first, last), _ = find_sections(pair, 0.5 * DIAMETER_MM)
     seen_z_mm = float(last.centre_mm[2] - first.centre_mm[2])
     poses = [stripe.base_from_tool for stripe in pair]
     np.testing.assert_allclose(poses[0].rotation, poses[1].rotation, atol=1e-4)
@@ -184,7 +187,7 @@ def test_the_board_is_refused_whatever_its_plane(axis: int) -> None:
     poses = read_robot_poses(BOARD / "rob2board.txt", "extrinsic-xyz")
     stripes = posed_stripes_from_profiles(read_profiles([BOARD]), poses)
     axes = np.roll(np.eye(3), axis - 2, axis=1)
-    plate = PlateReference(Plane(np.zeros(3), axes))
+    plate = PlateReference(plane=Plane(np.zeros(3), axes))
     failure = calibrate_on_plate(stripes, plate, HandEyeOptions(solve_plate=True))
     assert isinstance(failure, FitFailure)
     assert "of the hand-eye's 6 parameters" in failure.reason

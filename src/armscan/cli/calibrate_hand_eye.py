@@ -56,7 +56,6 @@ def hand_eye(
 ) -> None:
     """Find where the sensor sits on the arm, from postures over a flat plate or a sphere."""
     from armscan.calibration.hand_eye.observations import HandEyeOptions
-    from armscan.calibration.hand_eye.sphere_sections import SphereOptions
     from armscan.geometry.rotations import check_convention
     from armscan.jobs.hand_eye import HandEyeRequest, run_hand_eye_calibration
     from armscan.vision.stripe.image import LaserColour, StripeMethod, StripeOptions
@@ -79,9 +78,6 @@ def hand_eye(
             arm_rotation_rad=rotation_rad,
             plate_flatness_mm=plate_flatness_mm,
             solve_plate=solve_plate,
-        ),
-        sphere_options=SphereOptions(
-            arm_position_mm=arm_position_mm, arm_rotation_rad=rotation_rad
         ),
         stripes=StripeOptions(
             method=cast(StripeMethod, stripe_method),

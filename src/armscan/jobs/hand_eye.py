@@ -20,7 +20,6 @@ from armscan.calibration.hand_eye.probed_plate import (
     plate_from_coefficients,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -89,8 +88,8 @@ class HandEyeRequest:
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
     output
         The document ``NAME.json``; ``NAME.html`` is written beside it.
-    options, sphere_options
-        Of the plate and of the sphere method.
+    options
+        Of the calibration.
     stripes
         Of stripe extraction.
     is_overwriting
@@ -116,7 +115,6 @@ class HandEyeRequest:
     sphere_diameter_mm: float | None = None
     arm: Path | None = None
     options: HandEyeOptions = field(default_factory=HandEyeOptions)
-    sphere_options: SphereOptions = field(default_factory=SphereOptions)
     stripes: StripeOptions = field(default_factory=StripeOptions)
     is_overwriting: bool = False
     command: tuple[str, ...] = ()
@@ -416,7 +414,7 @@ def calibrated(
     known = None if inputs.sensor is None else inputs.sensor.covariance
     if request.sphere_diameter_mm is not None:
         fit = calibrate_on_sphere(
-            stripes, request.sphere_diameter_mm, request.sphere_options, sensor_covariance=known
+            stripes, request.sphere_diameter_mm, request.options, sensor_covariance=known
         )
     elif inputs.plate is not None:
         fit = calibrate_on_plate(stripes, inputs.plate, request.options, sensor_covariance=known)
@@ -464,12 +462,11 @@ def _refused(request: HandEyeRequest, inputs: HandEyeInputs) -> Page:
 def _provenance(
     request: HandEyeRequest, inputs: HandEyeInputs, warnings: Sequence[str]
 ) -> Provenance:
-    options = request.sphere_options if request.is_sphere else request.options
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
     return new_provenance(
         inputs.files,
         command=request.command,
-        options=(options, request.stripes),
+        options=(request.options, request.stripes),
         parents=parents,
         warnings=warnings,
     )

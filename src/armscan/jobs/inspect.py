@@ -76,7 +76,7 @@ def read_plate(
             raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)
         return fit.reference, fit.warnings
     if side is None:
-        return PlateReference(plane_from_coefficients(found, near_mm), source=str(path)), ()
+        return PlateReference(plane=plane_from_coefficients(found, near_mm), source=str(path)), ()
     plate = plate_from_coefficients(found, near_mm, side, str(path))
     if isinstance(plate, FitFailure):
         raise EstimationError(plate.reason, where=str(path), remedy=plate.remedy)

@@ -145,7 +145,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
         command=request.command,
-        options=(target, options.target, options.stripes, fit.options, request.image_options),
+        options=(target, options.stripes, fit.options, request.image_options),
         parents=(camera.provenance,),
         warnings=(*images.warnings, *all_warnings(fit)),
         forced=nonsense,
@@ -189,7 +189,7 @@ def _refused(
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
         command=request.command,
-        options=(target, options.target, options.stripes, options.sheets, request.image_options),
+        options=(target, options.stripes, options.sheets, request.image_options),
         parents=(parent,),
         warnings=images.warnings,
     )

@@ -9,7 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
+from armscan.calibration.hand_eye.observations import (
+    MIN_POINTS,
+    HandEyeOptions,
+    PlateReference,
+    PosedStripe,
+)
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError, EstimationError, OptionError
@@ -205,7 +210,7 @@ def observe_stripes(
         # Each still is named by itself: where the sensor is on the arm is not known yet.
         for one in measurer_for(sensor, options.measure).measure(seen, None, instant.t_ns):
             weak += one.warnings
-            if len(one.points.row) < options.hand_eye.min_points:
+            if len(one.points.row) < MIN_POINTS:
                 not_used.append((one.image.profile.source, "no stripe was measured in it"))
                 continue
             images.append(one.image)
@@ -255,13 +260,13 @@ def posed_stripe(
     """
     points = measured.points
     return PosedStripe(
-        measured.image.profile.source,
-        posture,
-        base_from_tool,
-        points.points_mm,
-        points.noise_mm,
-        points.sheet,
-        _by_all_parameters(points, sensor),
+        source=measured.image.profile.source,
+        posture=posture,
+        base_from_tool=base_from_tool,
+        points_mm=points.points_mm,
+        noise_mm=points.noise_mm,
+        sheet=points.sheet,
+        dpoint_dsensor=_by_all_parameters(points, sensor),
     )
 
 

@@ -43,7 +43,7 @@ from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, LaserColour, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
-from armscan.vision.targets.target import Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Target, TargetView
 
 BOARDS_STAGE = "boards"
 STRIPES_STAGE = "stripes"
@@ -69,7 +69,6 @@ CHANNELS: tuple[LaserColour, ...] = get_args(LaserColour)[1:]
 class LaserOptions:
     """Options of the three stages: target, stripes, sheets."""
 
-    target: TargetOptions = field(default_factory=TargetOptions)
     stripes: StripeOptions = field(default_factory=StripeOptions)
     sheets: SheetOptions = field(default_factory=SheetOptions)
 
@@ -116,7 +115,7 @@ def calibrate_sheets_from_pairs(
     places: dict[str, BoardPlacement] = {}
     answers: list[TargetView | FitFailure] = []
     n_places = len({placement_of(pair) for pair in pairs})
-    for place in find_placements(pairs, target, cameras, options.target, cache):
+    for place in find_placements(pairs, target, cameras, cache):
         places[place.name] = place
         progress(ProgressEvent(BOARDS_STAGE, len(places), n_places, place.name))
         answers += [
@@ -282,7 +281,6 @@ def find_placements(
     pairs: Sequence[ExposurePair],
     target: Target,
     cameras: HeadCameras,
-    options: TargetOptions,
     cache: DetectionCache | None = None,
 ) -> Iterator[BoardPlacement]:
     """Look for the board in each placement, one after the other; ``cache`` knows earlier finds.
@@ -302,7 +300,7 @@ def find_placements(
         """The board in the first image that shows it, or why the first does not."""
         failures: list[FitFailure] = []
         for image in images:
-            view = cached_target(image, target, options, cache)
+            view = cached_target(image, target, cache)
             found = view if isinstance(view, FitFailure) else _posed(camera, view, cameras)
             if not isinstance(found, FitFailure):
                 return found
@@ -495,9 +493,9 @@ def look_at_pairs(
     for done, (exposure, background) in enumerate(pairs):
         progress(ProgressEvent(AGAIN_STAGE, done, len(pairs), exposure.source))
         tried = exposure if background is None else background
-        board = cached_target(tried, target, options.target, cache)
+        board = cached_target(tried, target, cache)
         if isinstance(board, FitFailure) and tried is not exposure:
-            again = cached_target(exposure, target, options.target, cache)
+            again = cached_target(exposure, target, cache)
             if not isinstance(again, FitFailure):
                 board, tried = again, exposure
         lit, dark = exposure, background

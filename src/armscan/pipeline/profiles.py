@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
-from armscan.calibration.hand_eye.observations import PosedStripe
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import DEFAULT_OPTIONS, SphereOptions
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -53,12 +52,12 @@ def posed_stripes_from_profiles(
     postures = _postures(profiles, poses)
     return tuple(
         PosedStripe(
-            profile.source,
-            posture,
-            pose,
-            profile.points_mm,
-            _noise(profile.points_mm)[:, :, None],
-            np.zeros(len(profile), dtype=np.int64),
+            source=profile.source,
+            posture=posture,
+            base_from_tool=pose,
+            points_mm=profile.points_mm,
+            noise_mm=_noise(profile.points_mm)[:, :, None],
+            sheet=np.zeros(len(profile), dtype=np.int64),
         )
         for profile, posture, pose in zip(profiles, postures, poses, strict=True)
     )
@@ -68,7 +67,7 @@ def calibrate_hand_eye_from_profiles(
     profiles: Sequence[PointProfile],
     poses: Sequence[Pose[Base, Tool]],
     diameter_mm: float,
-    options: SphereOptions = DEFAULT_OPTIONS,
+    options: HandEyeOptions | None = None,
 ) -> HandEyeFit | FitFailure:
     """Hand-eye from profiles of a sphere.
 

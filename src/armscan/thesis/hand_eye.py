@@ -17,11 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.sphere_sections import (
-    DEFAULT_OPTIONS,
-    Section,
-    SphereOptions,
+from armscan.calibration.hand_eye.observations import (
+    CircleSection,
+    PosedStripe,
     check_diameter,
     find_sections,
 )
@@ -149,6 +147,8 @@ def minimise_objective(
     return found.state, float(np.sqrt(found.chi2 / len(points)))
 
 
+SAME_ROTATION_DEG = 0.1
+"""Postures that turn by less against each other count as moved without turning."""
 RANK_RATIO = 1e-3
 """A direction that is weaker than the strongest by more is taken as missing."""
 
@@ -187,7 +187,6 @@ class TwoStepHandEye:
 def calibrate_in_two_steps(
     stripes: Sequence[PosedStripe],
     diameter_mm: float,
-    options: SphereOptions = DEFAULT_OPTIONS,
     side: int | None = None,
 ) -> TwoStepHandEye | FitFailure:
     """Solve rotation (eqs. 2.49, 2.50), then translation (eq. 2.52).
@@ -199,20 +198,18 @@ def calibrate_in_two_steps(
         directions, and three orientations that turn about different axes.
     diameter_mm
         Of the sphere.
-    options
-        Rejection of points; what counts as one orientation.
     side
         On which side of the sheet the sphere's centre lies, 1 or -1 along the sheet's normal, the
         same for all exposures; None tries both and takes the one that contradicts less.
     """
     check_diameter(diameter_mm)
-    sections, left_out = find_sections(stripes, 0.5 * diameter_mm, options)
+    sections, left_out = find_sections(stripes, 0.5 * diameter_mm)
     if len(sections) < 4:
         return FitFailure(
             f"{len(sections)} usable sections of the sphere, two steps need more", "scan more"
         )
     sides = (1, -1) if side is None else (1 if side > 0 else -1,)
-    solved = [_solve(sections, 0.5 * diameter_mm, s, options, left_out) for s in sides]
+    solved = [_solve(sections, 0.5 * diameter_mm, s, left_out) for s in sides]
     good = [one for one in solved if isinstance(one, TwoStepHandEye)]
     if not good:
         return solved[0]
@@ -242,7 +239,7 @@ def group_by_rotation(poses: Sequence[Pose[Base, Tool]], tolerance_deg: float) -
     return rank[label]
 
 
-def sphere_centres(sections: Sequence[Section], radius_mm: float, side: int) -> FloatArray:
+def sphere_centres(sections: Sequence[CircleSection], radius_mm: float, side: int) -> FloatArray:
     """(n, 3) the sphere's centre in the Sensor frame, from the section circle and the sheet."""
     return np.array(
         [one.centre_mm + side * one.height_mm(radius_mm) * one.normal for one in sections]
@@ -250,15 +247,14 @@ def sphere_centres(sections: Sequence[Section], radius_mm: float, side: int) -> 
 
 
 def _solve(
-    sections: tuple[Section, ...],
+    sections: tuple[CircleSection, ...],
     radius_mm: float,
     side: int,
-    options: SphereOptions,
     left_out: tuple[str, ...],
 ) -> TwoStepHandEye | FitFailure:
     centres = sphere_centres(sections, radius_mm, side)
     poses = [section.stripe.base_from_tool for section in sections]
-    shifted = np.flatnonzero(group_by_rotation(poses, options.same_rotation_deg) == 0)
+    shifted = np.flatnonzero(group_by_rotation(poses, SAME_ROTATION_DEG) == 0)
     first = rotation_from_shifts([poses[k] for k in shifted], centres[shifted])
     if isinstance(first, FitFailure):
         return first

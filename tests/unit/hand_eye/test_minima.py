@@ -13,20 +13,25 @@ from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PosedStripe,
-    condense,
+    condense_plate,
+    find_sections,
     straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.search import distinct, minima_from_everywhere, rotations_all_over
-from armscan.calibration.hand_eye.sphere_estimate import start_candidates
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
+from armscan.calibration.hand_eye.search import (
+    distinct,
+    minima_on_plate,
+    minima_on_sphere,
+    rotations_all_over,
+)
+from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose, Sensor, Tool
 from rigs.plate_rig import PLATE_NORMAL, TOOL_FROM_SENSOR, PlateRig, Postures, good_postures
 from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 FORM_MM = 0.04
-QUICK = SphereOptions(nodes_per_stripe=10)
+QUICK = HandEyeOptions(per_stripe=10)
 
 
 def test_the_rotations_leave_no_orientation_far_away() -> None:
@@ -62,8 +67,8 @@ def _hardly_turned(rig: SphereRig, rng: np.random.Generator) -> list[PosedStripe
 def test_the_spheres_minimum_is_no_worse_than_the_truths(seed: int) -> None:
     rng = np.random.default_rng(seed)
     stripes = _hardly_turned(SphereRig(pose_noise_mm=0.1, point_noise_mm=0.01), rng)
-    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, SphereOptions())
-    best = start_candidates(sections, 0.5 * DIAMETER_MM)[0]
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
+    best = minima_on_sphere(sections, 0.5 * DIAMETER_MM)[0]
 
     def left(pose: Pose[Tool, Sensor], centre: FloatArray) -> float:
         total = 0.0
@@ -74,7 +79,7 @@ def test_the_spheres_minimum_is_no_worse_than_the_truths(seed: int) -> None:
             total += float((off**2).mean())
         return total
 
-    assert left(best.tool_from_sensor, best.centre_mm) < left(HAND_EYE, CENTRE_MM)
+    assert left(best.tool_from_sensor, best.surface[:3]) < left(HAND_EYE, CENTRE_MM)
 
 
 def test_stripes_of_a_wrong_curvature_do_not_drive_the_refinement_away() -> None:
@@ -108,11 +113,10 @@ def test_few_postures_on_a_plate_lead_to_the_truth_from_nowhere(seed: int) -> No
         rng.uniform(-80.0, 80.0, (5, 2)),
     )
     stripes, plate = PlateRig(postures).draw(seed)
-    options = HandEyeOptions()
-    nodes = condense(stripes, straight_stripes(stripes, options), 3)
+    nodes = condense_plate(stripes, straight_stripes(stripes), 3)
     turns = [
         Rotation.from_matrix(pose.rotation.T @ TOOL_FROM_SENSOR.rotation).magnitude()
-        for pose in minima_from_everywhere(nodes, plate.plane)
+        for pose in minima_on_plate(nodes, PlateSurface(plate))
     ]
     assert min(turns) < np.radians(3.0)
 

@@ -11,20 +11,20 @@ from scipy.linalg import solve_triangular
 from scipy.optimize import least_squares
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.estimate import fit_plate
+from armscan.calibration.hand_eye.estimate import Problem, estimate
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
-    PlateState,
     PosedStripe,
-    condense,
-    hand_eye_difference,
-    place_nodes,
-    step_hand_eye,
+    condense_plate,
     straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.search import linear_hand_eye
+from armscan.calibration.hand_eye.surface import (
+    PlateSurface,
+    hand_eye_difference,
+)
 from armscan.geometry.arrays import FloatArray
 from rigs.plate_rig import SILENT, TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
@@ -83,7 +83,7 @@ def test_two_crossed_sheets_are_used_together() -> None:
         )
         for one, two in zip(stripes, turned, strict=True)
     ]
-    nodes = condense(both, straight_stripes(both, GIVEN), 8)
+    nodes = condense_plate(both, straight_stripes(both), 8)
     start = linear_hand_eye(nodes, plate.plane)
     assert start is not None
     assert np.abs(hand_eye_difference(start, TOOL_FROM_SENSOR)).max() < 1e-8
@@ -93,22 +93,22 @@ def test_two_crossed_sheets_are_used_together() -> None:
 def test_the_refinement_stops_where_scipy_does() -> None:
     """Independent oracle: whitened residuals handed to SciPy from another start."""
     stripes, plate = _rig().draw(4)
-    nodes = condense(stripes, straight_stripes(stripes, GIVEN), GIVEN.nodes_per_stripe)
-    fit = fit_plate(nodes, plate, PlateState(TOOL_FROM_SENSOR, np.zeros(3)), GIVEN)
-    assert fit
-    root = np.linalg.cholesky(fit.total)
+    nodes = condense_plate(stripes, straight_stripes(stripes), 12)
+    problem = Problem(nodes, PlateSurface(plate), GIVEN)
+    fit = estimate(problem, problem.start(TOOL_FROM_SENSOR))
+    assert fit is not None
+    root = np.linalg.cholesky(fit.scatter + fit.known)
 
     def whitened(step: FloatArray) -> FloatArray:
-        state = PlateState(step_hand_eye(TOOL_FROM_SENSOR, step), np.zeros(3))
-        residual = place_nodes(nodes, plate.plane, state).residual_mm
+        residual = problem.place(problem.start(TOOL_FROM_SENSOR.retract(step))).residual_mm
         return np.asarray(solve_triangular(root, residual, lower=True))
 
     start = np.array([2e-3, -1e-3, 3e-3, 0.2, -0.3, 0.1])
     scale = np.array([1e-3] * 3 + [0.1] * 3)
     found = least_squares(whitened, start, x_scale=scale, method="lm", xtol=1e-14, ftol=1e-14)
-    ours = hand_eye_difference(fit.refined.state.tool_from_sensor, TOOL_FROM_SENSOR)
+    ours = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
     assert np.abs((found.x - ours) / np.sqrt(np.diag(fit.linear.covariance))).max() < 1e-3
-    assert fit.refined.chi2 == pytest.approx(2.0 * found.cost, rel=1e-9)
+    assert fit.chi2 == pytest.approx(2.0 * found.cost, rel=1e-9)
     np.testing.assert_allclose(
         fit.linear.covariance, np.linalg.inv(found.jac.T @ found.jac), rtol=1e-3, atol=1e-14
     )
@@ -133,7 +133,7 @@ def test_the_coupling_is_what_a_changed_sensor_does() -> None:
     """Derivative of the solution by the sensor's parameters, against solving with moved points."""
     stripes, plate = _rig().draw(6)
     by_shift = [
-        replace(s, by_sensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
+        replace(s, dpoint_dsensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
         for s in stripes
     ]
     fit = _fitted(by_shift, plate)
@@ -151,7 +151,7 @@ def test_errors_of_the_sensor_are_weighted_but_not_stated() -> None:
     """A sensor that may be shifted makes the hand-eye no less certain: it shifts against it."""
     stripes, plate = _rig().draw(6)
     by_shift = [
-        replace(s, by_sensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
+        replace(s, dpoint_dsensor=np.stack([np.tile(v, (len(s), 1)) for v in np.eye(3)], axis=2))
         for s in stripes
     ]
     exact = _fitted(by_shift, plate)

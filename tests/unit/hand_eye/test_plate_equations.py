@@ -8,15 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.observations import (
-    HandEyeOptions,
-    PlateNodes,
-    PlateState,
-    condense,
-    place_nodes,
-    shifted_plane,
-    step_hand_eye,
+    CondensedObservations,
+    PlateReference,
+    condense_plate,
     straight_stripes,
 )
+from armscan.calibration.hand_eye.surface import HandEyeState, PlateSurface, place
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Points, Pose, Tool
@@ -39,14 +36,15 @@ from rigs.plate_rig import (
 
 POSE: Pose[Base, Tool] = Pose.from_vectors([0.4, -0.2, 1.1], [300.0, -120.0, 80.0])
 PLANE = np.array([*PLATE_NORMAL, -float(PLATE_NORMAL @ PLATE_CENTRE)])
+RIG = PlateRig(good_postures(8, np.random.default_rng(3)))
+SURFACE = PlateSurface(PlateReference(plane=RIG.plane))
 STEP = np.array([1e-3, -2e-3, 5e-4, 0.1, -0.2, 0.3])
 
 
-def _nodes(noise_seed: int = 3) -> tuple[PlateNodes, PlateRig]:
+def _nodes(noise_seed: int = 3) -> tuple[CondensedObservations, PlateRig]:
     rig = PlateRig(good_postures(8, np.random.default_rng(noise_seed)))
     stripes, _ = rig.draw(noise_seed)
-    options = HandEyeOptions()
-    return condense(stripes, straight_stripes(stripes, options), 6), rig
+    return condense_plate(stripes, straight_stripes(stripes), 6), rig
 
 
 def test_a_point_is_as_far_from_the_plane_in_tool_as_in_base() -> None:
@@ -76,8 +74,8 @@ def test_rows_times_unknowns_are_the_distance_from_the_plate() -> None:
 def test_the_objective_is_the_sum_of_squared_residuals() -> None:
     """Eq. 2.76 and the residuals that the refinement uses are the same numbers."""
     nodes, rig = _nodes()
-    off = step_hand_eye(TOOL_FROM_SENSOR, STEP)
-    residual = place_nodes(nodes, rig.plane, PlateState(off, np.zeros(3))).residual_mm
+    off = TOOL_FROM_SENSOR.retract(STEP)
+    residual = place(nodes, SURFACE, HandEyeState(off, np.zeros(3))).residual_mm
     poses: list[Pose[Base, Tool]] = [
         Pose(r, t) for r, t in zip(nodes.rotations, nodes.translations_mm, strict=True)
     ]
@@ -98,28 +96,27 @@ def test_twelve_unknowns_have_rank_nine_and_the_nine_are_enough() -> None:
 
 
 def test_residuals_differentiate_as_stated() -> None:
-    nodes, rig = _nodes()
-    state = PlateState(step_hand_eye(TOOL_FROM_SENSOR, STEP), np.array([1e-3, -2e-3, 0.2]))
-    placed = place_nodes(nodes, rig.plane, state)
+    nodes, _ = _nodes()
+    state = HandEyeState(TOOL_FROM_SENSOR.retract(STEP), np.array([1e-3, -2e-3, 0.2]))
+    placed = place(nodes, SURFACE, state)
 
     def at(step: FloatArray) -> FloatArray:
-        return place_nodes(nodes, rig.plane, state.stepped(step)).residual_mm
+        return place(nodes, SURFACE, state.retract(step)).residual_mm
 
-    stated = np.concatenate([placed.by_hand_eye, placed.by_plane], axis=1)
-    for k, size in enumerate([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 2 + [1e-4]):
-        step = np.zeros(9)
+    for k, size in enumerate([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 2 + [1e-4, 1e-6]):
+        step = np.zeros(10)
         step[k] = size
         numeric = (at(step) - at(-step)) / (2.0 * size)
         scale = max(float(np.abs(numeric).max()), 1.0)
-        np.testing.assert_allclose(stated[:, k], numeric, atol=1e-7 * scale)
+        np.testing.assert_allclose(placed.jacobian[:, k], numeric, atol=1e-7 * scale)
 
 
 def test_a_shifted_plane_is_the_plane_of_the_residuals() -> None:
     """The plane that a report shows is the one that the residuals were measured from."""
-    nodes, rig = _nodes()
+    nodes, _ = _nodes()
     shift = np.array([2e-3, -1e-3, 0.3])
-    placed = place_nodes(nodes, rig.plane, PlateState(TOOL_FROM_SENSOR, shift))
-    plane = shifted_plane(rig.plane, shift)
+    placed = place(nodes, SURFACE, HandEyeState(TOOL_FROM_SENSOR, shift))
+    plane = SURFACE.plane_at(shift)
     np.testing.assert_allclose(
         plane.distance_mm(placed.points_base_mm), placed.residual_mm, atol=2e-6
     )

@@ -16,11 +16,9 @@ from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
     PosedStripe,
-    condense,
-    hand_eye_difference,
-    straight_stripes,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
@@ -156,11 +154,9 @@ def test_a_misread_convention_is_named_before_the_plate_is_blamed(read: EulerCon
 
 def test_a_posture_that_the_hand_eye_rests_on_is_named() -> None:
     """Sigmas of 0.01: a move by 6 of them in one parameter is named, one by 4 is not."""
-    options = HandEyeOptions()
-    stripes, _ = _scan()
-    nodes = condense(stripes, straight_stripes(stripes, options), options.nodes_per_stripe)
-    left = {k: LeftOut(size * np.eye(9)[4], 1.0, 1.0, 0.0) for k, size in ((3, 0.04), (11, -0.06))}
-    (warning,) = influence_warnings(nodes, left, 1e-4 * np.eye(6))
+    names = [f"posture{k:02d}" for k in range(N)]
+    left = {k: LeftOut(size * np.eye(9)[4], 1.0, 1.0, 1.0) for k, size in ((3, 0.04), (11, -0.06))}
+    (warning,) = influence_warnings(names, left, 1e-4 * np.eye(6))
     assert "without posture posture11" in warning and "by 6 of its stated sigmas" in warning
 
 
@@ -382,7 +378,7 @@ def test_points_beyond_the_plate_are_left_out_and_counted() -> None:
 
 @pytest.mark.parametrize(
     "option",
-    [{"arm_rotation_rad": 0.5}, {"plate_flatness_mm": -1.0}, {"nodes_per_stripe": 1}],
+    [{"arm_rotation_rad": 0.5}, {"plate_flatness_mm": -1.0}, {"per_stripe": 1}],
 )
 def test_impossible_options_are_refused(option: dict[str, float]) -> None:
     with pytest.raises(OptionError):

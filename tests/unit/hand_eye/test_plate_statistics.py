@@ -9,10 +9,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
-from armscan.calibration.hand_eye.estimate import estimate_noise
-from armscan.calibration.hand_eye.observations import HandEyeOptions, hand_eye_difference
+from armscan.calibration.hand_eye.noise import NoiseComponent, estimate_noise, solve_linear
+from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.solve import NoiseComponent, solve_linear
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from rigs.plate_bound import cramer_rao, plain_least_squares
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
@@ -83,7 +83,7 @@ def test_the_means_of_the_postures_scatter_as_predicted() -> None:
             replace(
                 s,
                 points_mm=s.points_mm + wrong,
-                by_sensor=np.tile(np.eye(3), (len(s), 1, 1)),
+                dpoint_dsensor=np.tile(np.eye(3), (len(s), 1, 1)),
             )
             for s in stripes
         ]

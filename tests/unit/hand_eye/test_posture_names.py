@@ -54,4 +54,4 @@ def test_a_worse_arm_that_was_stated_may_move_more() -> None:
         1
     )
     moved = [stripes[0], _moved(stripes[1], 1.5, 0.0)]
-    check_postures(moved, HandEyeOptions(exposure_position_mm=0.3).exposure_position_mm)
+    check_postures(moved, HandEyeOptions(exposure_position_mm=0.3))

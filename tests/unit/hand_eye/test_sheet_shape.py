@@ -8,21 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.estimate import PlateFit, fit_plate
+from armscan.calibration.hand_eye.estimate import Problem, estimate
 from armscan.calibration.hand_eye.observations import (
+    CondensedObservations,
     HandEyeOptions,
-    PlateNodes,
     PlateReference,
-    PlateState,
     PosedStripe,
-    condense,
-    hand_eye_difference,
-    place_nodes,
-    residual_by_sensor,
+    condense_plate,
     straight_stripes,
 )
-from armscan.calibration.hand_eye.result import sigma_of
-from armscan.calibration.hand_eye.solve import noise_components
+from armscan.calibration.hand_eye.surface import (
+    PlateSurface,
+    dresidual_dsensor,
+    hand_eye_difference,
+    place,
+)
 from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SHEET_PARAMETER_NAMES
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
@@ -36,7 +36,7 @@ N_CAMERA, N_SHEET = len(CAMERA_PARAMETER_NAMES), len(SHEET_PARAMETER_NAMES)
 MIDDLE_MM = np.array([0.0, 0.0, 140.0])
 SCALE_MM = 35.0
 SHEET_SIGMA_MM = 0.002
-FEW = HandEyeOptions(nodes_per_stripe=4)
+FEW = HandEyeOptions(per_stripe=4)
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,13 @@ class CrossRig:
             )
             stripes.append(
                 PosedStripe(
-                    f"image{k:02d}",
-                    f"posture{k:02d}",
-                    pose,
-                    np.concatenate([part[0] for part in parts]),
-                    NOISE.stripe_mm * across[:, :, None],
-                    np.repeat(np.arange(len(heads)), count),
-                    np.concatenate([part[2] for part in parts]),
+                    source=f"image{k:02d}",
+                    posture=f"posture{k:02d}",
+                    base_from_tool=pose,
+                    points_mm=np.concatenate([part[0] for part in parts]),
+                    noise_mm=NOISE.stripe_mm * across[:, :, None],
+                    sheet=np.repeat(np.arange(len(heads)), count),
+                    dpoint_dsensor=np.concatenate([part[2] for part in parts]),
                 )
             )
         return stripes, plate
@@ -128,8 +128,8 @@ def _terms(places_mm: FloatArray) -> FloatArray:
     return np.column_stack([u, v, np.ones(len(u)), u * u, u * v, v * v, u**3, u * u * v])
 
 
-def _nodes(rig: CrossRig, stripes: list[PosedStripe]) -> PlateNodes:
-    nodes = condense(stripes, straight_stripes(stripes, FEW), FEW.nodes_per_stripe)
+def _nodes(rig: CrossRig, stripes: list[PosedStripe]) -> CondensedObservations:
+    nodes = condense_plate(stripes, straight_stripes(stripes), 4)
     return replace(nodes, sensor_covariance=rig.sensor_covariance)
 
 
@@ -140,14 +140,15 @@ def _runs(options: HandEyeOptions, n_runs: int) -> tuple[FloatArray, FloatArray]
     for seed in range(n_runs):
         stripes, plate = rig.draw(seed)
         nodes = _nodes(rig, stripes)
-        fit = fit_plate(nodes, plate, PlateState(TOOL_FROM_SENSOR, np.zeros(3)), options)
-        assert isinstance(fit, PlateFit)
-        by_sensor = residual_by_sensor(nodes, fit.refined.placed)
+        problem = Problem(nodes, PlateSurface(plate), options)
+        fit = estimate(problem, problem.start(TOOL_FROM_SENSOR))
+        assert fit is not None
+        by_sensor = dresidual_dsensor(nodes, fit.placed)
         assert by_sensor is not None
-        error = hand_eye_difference(fit.refined.state.tool_from_sensor, TOOL_FROM_SENSOR)
+        error = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
         coupling = fit.linear.gain @ by_sensor
         total = fit.covariance + coupling @ rig.sensor_covariance @ coupling.T
-        sigmas.append([sigma_of(fit, "arm"), sigma_of(fit, "sheet shape")])
+        sigmas.append([fit.sigma_of("arm"), fit.sigma_of("sheet shape")])
         squares.append(float(error @ np.linalg.solve(total, error)))
     return np.array(sigmas), np.array(squares)
 
@@ -170,15 +171,16 @@ def test_a_sheets_shape_moves_a_residual_as_the_sheets_height_does() -> None:
     rig = CrossRig(0.0)
     stripes, plate = rig.draw(0)
     nodes = _nodes(rig, stripes)
-    state = PlateState(TOOL_FROM_SENSOR, np.zeros(3))
-    placed = place_nodes(nodes, plate.plane, state)
-    found = {c.name: c for c in noise_components(nodes, placed, plate.plane, FEW)}["sheet shape"]
+    problem = Problem(nodes, PlateSurface(plate), FEW)
+    state = problem.start(TOOL_FROM_SENSOR)
+    placed = problem.place(state)
+    found = {c.name: c for c in problem.components(placed)}["sheet shape"]
     moved = np.zeros(len(nodes))
     for sheet, head in enumerate(rig.heads):
         own = nodes.sheet == sheet
         raised = nodes.points_mm.copy()
         raised[own] += _on_sheet(nodes.points_mm[own], head.sheet[:3])[1]
-        there = place_nodes(replace(nodes, points_mm=raised), plate.plane, state)
+        there = place(replace(nodes, points_mm=raised), problem.surface, state)
         moved += there.residual_mm - placed.residual_mm
     np.testing.assert_allclose(np.diag(found.covariance), moved**2, rtol=1e-4)
     assert found.is_estimated
@@ -193,7 +195,8 @@ def test_a_sheets_shape_moves_a_residual_as_the_sheets_height_does() -> None:
 def test_points_without_a_sheet_have_no_such_part() -> None:
     rig = CrossRig(0.0)
     stripes, plate = rig.draw(0)
-    nodes = replace(_nodes(rig, stripes), by_sensor=None)
-    placed = place_nodes(nodes, plate.plane, PlateState(TOOL_FROM_SENSOR, np.zeros(3)))
-    names = [component.name for component in noise_components(nodes, placed, plate.plane, FEW)]
+    nodes = replace(_nodes(rig, stripes), dpoint_dsensor=None)
+    problem = Problem(nodes, PlateSurface(plate), FEW)
+    placed = problem.place(problem.start(TOOL_FROM_SENSOR))
+    names = [component.name for component in problem.components(placed)]
     assert "sheet shape" not in names

@@ -8,14 +8,9 @@ import pytest
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import HandEyeOptions, condense_sphere, find_sections
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_estimate import (
-    N_COLUMNS,
-    SphereState,
-    place_on_sphere,
-    sphere_nodes,
-)
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions, find_sections
+from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface, place
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -32,7 +27,8 @@ from rigs.sphere_rig import (
 
 SEED = 5
 POSE_NOISE_MM = 0.02
-QUICK = SphereOptions(nodes_per_stripe=10)
+QUICK = HandEyeOptions(per_stripe=10)
+SPHERE = SphereSurface(0.5 * DIAMETER_MM)
 
 
 def error_of(fit: HandEyeFit) -> FloatArray:
@@ -64,31 +60,31 @@ def test_exact_points_give_the_hand_eye_back(n_sheets: int) -> None:
 def test_slopes_are_the_derivatives() -> None:
     rig = SphereRig(pose_noise_mm=0.5)
     stripes = rig.stripes(turned_poses(rig, 4), np.random.default_rng(SEED))
-    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM, QUICK)
-    nodes = sphere_nodes(sections, 8)
-    state = SphereState(HAND_EYE, np.array([650.3, -170.0, 35.5]), 25.2, 1.01)
-    placed = place_on_sphere(nodes, state)
-    for column in range(N_COLUMNS):
-        step = np.zeros(N_COLUMNS)
+    sections, _ = find_sections(stripes, 0.5 * DIAMETER_MM)
+    nodes = condense_sphere(sections, 8)
+    state = HandEyeState(HAND_EYE, np.array([650.3, -170.0, 35.5, 25.2]), 1.01)
+    placed = place(nodes, SPHERE, state)
+    for column in range(placed.jacobian.shape[1]):
+        step = np.zeros(placed.jacobian.shape[1])
         step[column] = 1e-5
-        ahead = place_on_sphere(nodes, state.stepped(step)).residual_mm
-        behind = place_on_sphere(nodes, state.stepped(-step)).residual_mm
+        ahead = place(nodes, SPHERE, state.retract(step)).residual_mm
+        behind = place(nodes, SPHERE, state.retract(-step)).residual_mm
         slope = (ahead - behind) / 2e-5
         scale = max(1.0, np.abs(slope).max())
-        np.testing.assert_allclose(placed.slopes[:, column] / scale, slope / scale, atol=1e-6)
+        np.testing.assert_allclose(placed.jacobian[:, column] / scale, slope / scale, atol=1e-6)
 
 
 def test_pose_slopes_are_the_derivatives_by_the_arms_pose() -> None:
     rig = SphereRig()
     stripe = rig.stripes(turned_poses(rig, 1), np.random.default_rng(SEED))[0]
-    state = SphereState(HAND_EYE, np.array([650.0, -170.5, 35.0]), 25.0)
+    state = HandEyeState(HAND_EYE, np.array([650.0, -170.5, 35.0, 25.0]))
 
     def residual(moved: Pose) -> tuple[FloatArray, FloatArray, FloatArray]:
         changed = replace(stripe, base_from_tool=moved)
-        sections, _ = find_sections([changed], 25.0, QUICK)
-        nodes = sphere_nodes(sections, 6)
-        placed = place_on_sphere(nodes, state)
-        return placed.residual_mm, placed.by_pose, placed.points_base_mm.mean(axis=0)
+        sections, _ = find_sections([changed], 25.0)
+        nodes = condense_sphere(sections, 6)
+        placed = place(nodes, SPHERE, state)
+        return placed.residual_mm, placed.dresidual_dpose, placed.points_base_mm.mean(axis=0)
 
     start = stripe.base_from_tool
     _, slopes, middle = residual(start)
@@ -151,7 +147,7 @@ def test_the_sensors_error_counts_once() -> None:
             replace(
                 stripe,
                 points_mm=stripe.points_mm + by_sensor(stripe.points_mm) @ wrong,
-                by_sensor=by_sensor(stripe.points_mm),
+                dpoint_dsensor=by_sensor(stripe.points_mm),
             )
             for stripe in rig.stripes(poses, generator)
         ]
@@ -186,7 +182,7 @@ def test_a_posture_that_contradicts_is_named_and_hardly_spoils_the_rest() -> Non
 def test_leaving_a_posture_out_is_solving_without_it() -> None:
     rig = SphereRig(pose_noise_mm=POSE_NOISE_MM, point_noise_mm=POINT_NOISE_MM)
     stripes = rig.stripes(turned_poses(rig, 8), np.random.default_rng(SEED))
-    options = replace(QUICK, arm_position_mm=POSE_NOISE_MM, posture_sigma=1e6)
+    options = replace(QUICK, arm_position_mm=POSE_NOISE_MM, posture_sigmas=1e6)
     every = solved(calibrate_on_sphere(stripes, DIAMETER_MM, options))
     less = solved(calibrate_on_sphere(stripes[1:], DIAMETER_MM, options))
     change = error_of(less) - error_of(every)
@@ -202,7 +198,7 @@ def test_an_error_of_the_sensor_moves_the_hand_eye_against_it() -> None:
     rig = SphereRig()
     stripes = rig.stripes(turned_poses(rig, 8), np.random.default_rng(SEED))
     shifts = np.broadcast_to(np.eye(3), (rig.n_points, 3, 3))
-    stripes = [replace(stripe, by_sensor=shifts) for stripe in stripes]
+    stripes = [replace(stripe, dpoint_dsensor=shifts) for stripe in stripes]
     fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
     coupling = fit.calibration.sensor_coupling
     assert coupling is not None
@@ -287,6 +283,6 @@ def test_bad_input() -> None:
     with pytest.raises(OptionError, match="diameter in mm"):
         calibrate_on_sphere(stripes, 0.05)
     with pytest.raises(OptionError, match="give rad, not degrees"):
-        SphereOptions(arm_rotation_rad=1.0)
-    with pytest.raises(OptionError, match="nodes_per_stripe is 2"):
-        SphereOptions(nodes_per_stripe=2)
+        HandEyeOptions(arm_rotation_rad=1.0)
+    with pytest.raises(OptionError, match="per_stripe is 2"):
+        HandEyeOptions(per_stripe=2)

@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
@@ -86,6 +85,6 @@ def test_too_few_or_only_turned_postures_are_refused() -> None:
     stripes = rig.stripes(shifted_poses(rig), np.random.default_rng(SEED))
     few = calibrate_in_two_steps(stripes[:3], DIAMETER_MM)
     assert isinstance(few, FitFailure)
-    turned = calibrate_in_two_steps(stripes[5:], DIAMETER_MM, SphereOptions())
+    turned = calibrate_in_two_steps(stripes[5:], DIAMETER_MM)
     assert isinstance(turned, FitFailure)
     assert "one-step" in turned.remedy

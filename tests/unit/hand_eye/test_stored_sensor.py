@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
-from armscan.calibration.hand_eye.observations import (
-    HandEyeOptions,
-    PosedStripe,
-    hand_eye_difference,
-)
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.calibration.hand_eye.sphere_sections import SphereOptions
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
 from rigs.calibrated_head import CalibratedHead
 from rigs.plate_rig import PLATE_NORMAL, RigNoise
@@ -63,8 +59,8 @@ def test_on_a_sphere_what_the_sensor_is_known_to_does_not_move_the_hand_eye() ->
     weights differ a little; the hand-eye of a sensor that may move lies 4.2 sigmas off.
     """
     rig = SphereRig(pose_noise_mm=0.02, point_noise_mm=0.01, n_points=60)
-    options = SphereOptions(
-        nodes_per_stripe=10, arm_position_mm=0.02, arm_rotation_rad=0.02 / 265.0, posture_sigma=1e6
+    options = HandEyeOptions(
+        per_stripe=10, arm_position_mm=0.02, arm_rotation_rad=0.02 / 265.0, posture_sigmas=1e6
     )
     stripes = [_skewed(one) for one in rig.stripes(turned_poses(rig), np.random.default_rng(2))]
     exact = calibrate_on_sphere(stripes, DIAMETER_MM, options)
@@ -78,7 +74,7 @@ def test_on_a_sphere_what_the_sensor_is_known_to_does_not_move_the_hand_eye() ->
 def _skewed(stripe: PosedStripe) -> PosedStripe:
     by_skew = (stripe.points_mm - [0.0, 0.0, 140.0])[:, [2, 1, 1]] * [1.0, 0.0, 0.0]
     return replace(
-        stripe, points_mm=stripe.points_mm + 0.01 * by_skew, by_sensor=by_skew[:, :, None]
+        stripe, points_mm=stripe.points_mm + 0.01 * by_skew, dpoint_dsensor=by_skew[:, :, None]
     )
 
 

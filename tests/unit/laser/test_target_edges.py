@@ -55,16 +55,18 @@ def view_of(target: Target, rim_px: FloatArray | None = None) -> TargetView:
     edges = None
     if rim_px is not None:
         n = len(rim_px)
-        edges = CircleEdges(rim_px, np.zeros(n, dtype=np.int64), np.full(n, 0.02))
+        edges = CircleEdges(
+            points_px=rim_px, circle=np.zeros(n, dtype=np.int64), sigma_px=np.full(n, 0.02)
+        )
     return TargetView(
-        "board.png",
-        1001,
-        801,
-        np.arange(len(board)),
-        CAMERA.project(board + HERE.translation_mm),
-        np.tile(0.01 * np.eye(2), (len(board), 1, 1)),
-        board,
-        edges,
+        source="board.png",
+        width_px=1001,
+        height_px=801,
+        point_index=np.arange(len(board)),
+        points_px=CAMERA.project(board + HERE.translation_mm),
+        covariance_px2=np.tile(0.01 * np.eye(2), (len(board), 1, 1)),
+        points_board_mm=board,
+        edges=edges,
     )
 
 

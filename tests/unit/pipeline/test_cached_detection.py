@@ -20,7 +20,7 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
 from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
 from armscan.vision.stripe.image import StripeOptions
-from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
 
 GRID = CircleGrid(5, 4, 10.0)
 BOARD = Chessboard(5, 4, 10.0)
@@ -85,9 +85,9 @@ def test_the_second_look_gives_the_same_without_looking(
     exposure: Exposure, target: Target, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path / "cache")
-    first = cached_target(exposure, target, None, cache)
+    first = cached_target(exposure, target, cache)
     assert isinstance(first, FitFailure) == (target is GRID and exposure.source == "board.png")
-    assert_same(cached_target(exposure, target, None, cache), first)
+    assert_same(cached_target(exposure, target, cache), first)
     assert looked == [exposure.source]
 
 
@@ -123,22 +123,21 @@ def other_pixel(exposure: Exposure) -> Exposure:
 )
 def test_another_image_is_another_entry(change: Any) -> None:
     same = replace(circles(), t_ns=7, view="v", trigger_id=1)
-    key = detection_key("target", circles(), (GRID, TargetOptions()))
-    assert detection_key("target", same, (GRID, TargetOptions())) == key
-    assert detection_key("target", change(circles()), (GRID, TargetOptions())) != key
+    key = detection_key("target", circles(), (GRID,))
+    assert detection_key("target", same, (GRID,)) == key
+    assert detection_key("target", change(circles()), (GRID,)) != key
 
 
 def test_other_options_and_other_code_are_other_entries(monkeypatch: pytest.MonkeyPatch) -> None:
     exposure = circles()
     keys = {
-        detection_key("target", exposure, (GRID, TargetOptions())),
-        detection_key("stripes", exposure, (GRID, TargetOptions())),
-        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5), TargetOptions())),
-        detection_key("target", exposure, (GRID, TargetOptions(min_contrast=0.03))),
-        detection_key("target", exposure, (GRID, TargetOptions()), exposure),
+        detection_key("target", exposure, (GRID,)),
+        detection_key("stripes", exposure, (GRID,)),
+        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5),)),
+        detection_key("target", exposure, (GRID,), exposure),
     }
     monkeypatch.setattr(detection_cache, "code_version", lambda: "newer")
-    keys.add(detection_key("target", exposure, (GRID, TargetOptions())))
+    keys.add(detection_key("target", exposure, (GRID,)))
     assert len(keys) == 6
 
 
@@ -167,14 +166,14 @@ def test_a_damaged_entry_is_looked_for_again(
     damage: str, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path)
-    first = cached_target(circles(), GRID, None, cache)
+    first = cached_target(circles(), GRID, cache)
     (entry,) = tmp_path.glob(f"*{SUFFIX}")
     content = bytearray(entry.read_bytes())
     if damage == "flipped":
         content[len(content) // 2] ^= 4
     elif damage == "renamed":
         # whole, but of another image
-        cached_target(chessboard(), BOARD, None, cache)
+        cached_target(chessboard(), BOARD, cache)
         (other,) = set(tmp_path.glob(f"*{SUFFIX}")) - {entry}
         content = bytearray(other.read_bytes())
         looked.clear()
@@ -182,10 +181,10 @@ def test_a_damaged_entry_is_looked_for_again(
     entry.write_bytes(
         {"cut": content[:-9], "empty": b"", "foreign": b"x" * 99}.get(damage, content)
     )
-    again = cached_target(circles(), GRID, None, cache)
+    again = cached_target(circles(), GRID, cache)
     assert_same(again, first)
     assert looked == ["grid.png", "grid.png"]
-    assert_same(cached_target(circles(), GRID, None, cache), first)
+    assert_same(cached_target(circles(), GRID, cache), first)
     assert len(looked) == 2
 
 
@@ -194,8 +193,8 @@ def test_a_folder_that_may_not_be_written_costs_time_only(
 ) -> None:
     (tmp_path / "cache").write_text("a file")
     cache = DetectionCache(tmp_path / "cache")
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
     assert len(looked) == 2
     cache.trim()
     assert (tmp_path / "cache").read_text() == "a file"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.observations import hand_eye_difference
+from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.estimate import FitFailure

@@ -23,7 +23,13 @@ def view_of(target: Chessboard, chosen: slice) -> TargetView:
     points = target.points_board_mm[chosen]
     n = len(points)
     return TargetView(
-        "seen", 640, 480, np.arange(n), points[:, :2], np.tile(np.eye(2), (n, 1, 1)), points
+        source="seen",
+        width_px=640,
+        height_px=480,
+        point_index=np.arange(n),
+        points_px=points[:, :2],
+        covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+        points_board_mm=points,
     )
 
 

@@ -89,7 +89,11 @@ def test_points_that_are_missing_are_noticed() -> None:
 
 SIGMA = np.array([2e-4, 2e-4, 2e-4, 0.015, 0.015, 0.015])
 PLATE = PlateReference(
-    Plane(np.zeros(3), np.eye(3)), np.diag([1e-5, 1e-5, 0.002]) ** 2, 0.003, 12, "plate.csv"
+    plane=Plane(np.zeros(3), np.eye(3)),
+    covariance=np.diag([1e-5, 1e-5, 0.002]) ** 2,
+    rms_mm=0.003,
+    n_points=12,
+    source="plate.csv",
 )
 
 

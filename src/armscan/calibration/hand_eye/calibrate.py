@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand-eye calibration on a plate and on a sphere, from stripes with poses to result or
-refusal.
-"""
+"""Hand-eye calibration on a plate and on a sphere, from stripes with poses to result or refusal."""
 
 from __future__ import annotations
 
@@ -10,95 +8,87 @@ from dataclasses import replace
 
 import numpy as np
 
-from armscan.calibration.hand_eye.alternatives import (
-    find_alternatives,
-    find_contradiction,
-    find_mirror,
-    plane_in_words,
-)
+from armscan.calibration.hand_eye.alternatives import find_mirror
 from armscan.calibration.hand_eye.checks import (
-    REMEDY,
+    LIKELIER,
+    NO_SOLUTION,
+    VARY_POSTURES,
+    CheckedFit,
     agreement_warnings,
     common_to_postures,
+    conditioning_warnings,
+    estimate_and_check,
     explain_misfit,
     influence_warnings,
+    likeliest_start,
     point_warnings,
-    refuse_scatter,
-    settle_alternatives,
+    refuse_few_postures,
+    refuse_underdetermined,
 )
 from armscan.calibration.hand_eye.estimate import (
-    CheckedFit,
-    PlateFit,
-    fit_plate,
-    fit_without_wrong_postures,
-    hand_eye_information,
+    Conditioning,
+    HandEyeSolution,
+    LeftOut,
+    Problem,
+    conditioning_at,
+    estimate_robustly,
     hold_sensor,
     leave_each_out,
-    plane_after,
+    minimise_distances,
 )
 from armscan.calibration.hand_eye.observations import (
+    CircleSection,
     HandEyeOptions,
-    PlateNodes,
     PlateReference,
-    PlateState,
     PosedStripe,
+    check_diameter,
     check_postures,
-    condense,
-    place_nodes,
-    shifted_plane,
+    condense_plate,
+    condense_sphere,
+    find_sections,
     straight_stripes,
 )
 from armscan.calibration.hand_eye.result import (
     HandEyeFit,
     hand_eye_calibration,
+    plate_facts,
     posture_results,
-    reference_facts,
-    sigma_of,
-    sphere_fit,
+    sphere_facts,
+    sphere_warnings,
     stripe_residuals,
 )
-from armscan.calibration.hand_eye.search import Start, find_start
-from armscan.calibration.hand_eye.solve import (
-    LEAST_POSTURES,
-    Conditioning,
-    LinearSolution,
-    conditioning_warnings,
-    describe_conditioning,
-    design,
-    noise_components,
-    refuse_few_postures,
-    refuse_open_hand_eye,
-    total_covariance,
+from armscan.calibration.hand_eye.search import (
+    APART_ON_SPHERE_RAD,
+    Start,
+    find_start,
+    minima_on_sphere,
+    turn_between_rad,
 )
-from armscan.calibration.hand_eye.sphere_estimate import (
-    RADIUS_COLUMN,
-    SphereNodes,
-    SphereSolution,
-    SphereState,
-    descend,
-    free_columns,
-    is_apart,
-    place_on_sphere,
-    refine_with_noise,
-    solve_at,
-    sphere_nodes,
-    start_candidates,
-    with_weights,
+from armscan.calibration.hand_eye.surface import (
+    N_HAND_EYE,
+    HandEyeState,
+    PlateSurface,
+    SphereSurface,
 )
-from armscan.calibration.hand_eye.sphere_estimate import hold_sensor as sphere_estimate_hold_sensor
-from armscan.calibration.hand_eye.sphere_sections import (
-    DEFAULT_OPTIONS,
-    Section,
-    SphereOptions,
-    check_diameter,
-    find_sections,
-)
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose, Sensor, Tool
 
-AS_WELL = 1.5
-"""What moved explains all postures if it leaves no more than this times the scatter of the arm that
-is left without the postures that look wrong."""
+START_PIECES, START_POINTS = 6, 48
+"""Of each stripe on a sphere, for the search; the estimate takes all."""
+ALIKE_COST = 9.0
+"""Minima whose sum of squares is not larger by more than this factor are compared in earnest."""
+LEAST_RESIDUAL_MM = 1e-4
+LIKELY_DIAMETER = 0.2
+"""Part of the diameter by which it may have been mistaken."""
+NAMED_STRIPES = 3
+LOOSE_PART = 0.2
+"""A combination known less well than this part of the diameter is not determined."""
+TURN_THE_TOOL = (
+    "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
+    "at another height"
+)
+_OPEN = FitFailure("the postures do not determine hand-eye and sphere together", TURN_THE_TOOL)
 
 
 def calibrate_on_plate(
@@ -124,10 +114,10 @@ def calibrate_on_plate(
     options
         Defaults if None.
     sensor_covariance
-        (P, P) of the sensor's parameters, in the order of the stripes' ``by_sensor``: its errors
-        bend all stripes alike, and are not taken for something that moved. The hand-eye returned,
-        and its covariance, are for the sensor as it is; ``sensor_coupling`` carries its errors on.
-        None takes it as exact.
+        (P, P) of the sensor's parameters, in the order of the stripes' ``dpoint_dsensor``: its
+        errors bend all stripes alike, and are not taken for something that moved. The hand-eye
+        returned, and its covariance, are for the sensor as it is; ``sensor_coupling`` carries its
+        errors on. None takes it as exact.
 
     Returns
     -------
@@ -140,166 +130,117 @@ def calibrate_on_plate(
         If one posture's name stands for different poses.
     """
     options = options or HandEyeOptions()
-    check_postures(stripes, options.exposure_position_mm, options.exposure_rotation_rad)
-    kept = straight_stripes(stripes, options)
-    nodes = replace(
-        condense(stripes, kept, options.nodes_per_stripe), sensor_covariance=sensor_covariance
+    check_postures(stripes, options)
+    kept, surface = straight_stripes(stripes), PlateSurface(plate)
+    observations = replace(
+        condense_plate(stripes, kept, options.per_stripe or surface.per_stripe),
+        sensor_covariance=sensor_covariance,
     )
-    few = refuse_few_postures(len(nodes.used_postures))
+    few = refuse_few_postures(len(observations.used_postures))
     if few is not None:
         return few
-    start = find_start(nodes, plate.plane)
-    refusal = _refuse_start(nodes, plate, start, options)
+    problem, start = Problem(observations, surface, options), find_start(observations, surface)
+    cause = common_to_postures(observations, surface.plane)
+    refusal = _refuse_start(problem, surface, start, cause)
     if refusal is not None:
-        also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept, options))
+        also = "".join(f"; {warning}" for warning in point_warnings(stripes, kept))
         return FitFailure(refusal.reason + also, refusal.remedy)
-    settled = settle_alternatives(
-        nodes, plate, start, options, common_to_postures(nodes, plate.plane)
-    )
-    if isinstance(settled, FitFailure):
-        return settled
-    mirror = find_mirror(nodes, plate, settled, options)
+    likeliest = likeliest_start(problem, start, cause)
+    if isinstance(likeliest, FitFailure):
+        return likeliest
+    mirror = find_mirror(problem, surface, likeliest)
     if mirror is not None:
         return mirror
-    checked = _checked(nodes, plate, settled, options)
+    checked = estimate_and_check(problem, surface, likeliest)
     if isinstance(checked, FitFailure):
         return checked
-    return _result(stripes, kept, plate, options, start=settled, checked=checked)
-
-
-def _checked(
-    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
-) -> CheckedFit | FitFailure:
-    """Refine, leave wrong postures out, and look for something that moved or is not as given.
-
-    A plate that moved makes postures look wrong, and wrong postures may look like a plate that
-    moved. If what moved explains all postures about as well as leaving some out explains the rest,
-    it is believed.
-    """
-    state = PlateState(start.tool_from_sensor, np.zeros(3))
-    right = nodes.select(~start.is_wrong[nodes.posture])
-    first = fit_plate(right, plate, state, options)
-    if isinstance(first, FitFailure):
-        return first
-    checked = fit_without_wrong_postures(nodes, plate, start, first, options)
-    usual_mm = sigma_of(first if isinstance(checked, FitFailure) else checked.fit, "arm")
-    trials = [(right, first)]
-    if start.is_wrong.any():
-        whole = fit_plate(nodes, plate, state, options)
-        trials += [(nodes, whole)] if isinstance(whole, PlateFit) else []
-    for tried, fit in trials:
-        found = find_alternatives(tried, plate, fit, options)
-        moved = find_contradiction(found, tried, plate, fit)
-        is_all = isinstance(checked, CheckedFit) and fit is checked.fit
-        if moved is None or not moved.is_refused:
-            continue
-        if is_all or moved.arm_mm < AS_WELL * usual_mm:
-            return moved.failure
-    if isinstance(checked, FitFailure):
-        return checked
-    found = find_alternatives(checked.nodes, plate, checked.fit, options)
-    moved = find_contradiction(found, checked.nodes, plate, checked.fit)
-    checked = replace(checked, plane_check=plane_in_words(found))
-    if moved is None:
-        refusal = refuse_scatter(checked.fit, options)
-        return checked if refusal is None else refusal
-    if moved.is_refused:
-        return moved.failure
-    return replace(checked, widening=moved.widening, warnings=(*checked.warnings, moved.reason))
+    return _fit_on_plate(stripes, kept, surface, likeliest, checked, cause=cause)
 
 
 def _refuse_start(
-    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
+    problem: Problem, plate: PlateSurface, start: Start, cause: str
 ) -> FitFailure | None:
-    state = PlateState(start.tool_from_sensor, np.zeros(3))
-    placed = place_nodes(nodes, plate.plane, state)
-    components = noise_components(nodes, placed, plate.plane, options)
-    total = total_covariance(components, np.array([c.sigma for c in components]))
-    slopes = design(placed, options.solve_plate)
-    conditioning = describe_conditioning(hand_eye_information(slopes, total))
-    cause = common_to_postures(nodes, plate.plane)
-    refusal = refuse_open_hand_eye(conditioning, cause, REMEDY)
-    if refusal is not None:
-        return refusal
-    if not start.typical_mm <= options.max_rms_mm:
-        return explain_misfit(nodes, plate, start, options)
-    return None
+    conditioning = conditioning_at(problem, problem.start(start.tool_from_sensor))
+    refusal = refuse_underdetermined(conditioning, cause, VARY_POSTURES)
+    if refusal is None and not start.typical_mm <= problem.options.max_rms_mm:
+        return explain_misfit(problem, plate, start)
+    return refusal
 
 
-def _result(
+def _fit_on_plate(
     stripes: Sequence[PosedStripe],
     kept: tuple[BoolArray, ...],
-    plate: PlateReference,
-    options: HandEyeOptions,
-    *,
+    plate: PlateSurface,
     start: Start,
     checked: CheckedFit,
+    *,
+    cause: str,
 ) -> HandEyeFit | FitFailure:
     """Checks let the sensor err within its covariance; what is stored belongs to the sensor."""
-    fit, nodes = checked.fit, checked.nodes
-    stored = hold_sensor(nodes, plate, fit, options)
-    if isinstance(stored, FitFailure):
-        return stored
-    conditioning = describe_conditioning(hand_eye_information(fit.slopes, fit.total))
-    plane = shifted_plane(plate.plane, plane_after(stored, plate))
-    residuals = stripe_residuals(stripes, kept, stored.refined.state.tool_from_sensor, plane)
-    left = leave_each_out(nodes, fit.refined.placed.residual_mm, fit.linear)
-    postures = posture_results(nodes, stored, residuals, left, plane)
-    cause = common_to_postures(nodes, plate.plane)
-    return HandEyeFit(
-        hand_eye_calibration(
-            checked,
-            stored,
-            plate,
-            options,
-            conditioning=conditioning,
-            residuals=residuals,
-            postures=postures,
-        ),
-        start.linear or start.tool_from_sensor,
-        residuals,
-        postures,
-        conditioning.singular_values,
-        reference_facts(plate, options, fit, checked.plane_check),
-        (
-            *checked.warnings,
-            *conditioning_warnings(conditioning, len(postures), cause),
-            *agreement_warnings(nodes, plate, stored, options),
-            *influence_warnings(nodes, left, fit.covariance[:6, :6]),
-            *point_warnings(stripes, kept, options),
-        ),
+    fit, held = checked.fit, hold_sensor(checked.fit)
+    if held is None:
+        return NO_SOLUTION
+    conditioning, left = _conditioning(fit), leave_each_out(fit)
+    rows = [np.flatnonzero(mark) for mark in kept]
+    found = _evidence(
+        checked,
+        held,
+        conditioning,
+        left,
+        stripes=list(zip(stripes, rows, strict=True)),
+        start=start.linear or start.tool_from_sensor,
     )
+    warnings = (
+        *checked.warnings,
+        *conditioning_warnings(conditioning, len(found.postures), cause),
+        *agreement_warnings(held, plate),
+        *influence_warnings(fit.problem.observations.postures, left, fit.covariance),
+        *point_warnings(stripes, kept),
+    )
+    return replace(found, reference=plate_facts(checked, plate), warnings=warnings)
 
 
-START_NODES = 6
-START_POINTS = 48
-"""Of each stripe, for the search; the refinement takes all."""
-RIVAL_COST = 9.0
-"""Minima whose sum of squares is not larger by more than this factor are compared in earnest."""
-LIKELIER = 6.0
-"""Logarithm of the likelihood ratio from which one solution is preferred to another."""
-LEAST_RESIDUAL_MM = 1e-4
-LIKELY_DIAMETER = 0.2
-"""Part of the diameter by which it may have been mistaken."""
-NAMED_STRIPES = 3
-LOOSE_PART = 0.2
-"""A combination known less well than this part of the diameter is not determined."""
-ROBUST_ROUNDS = 10
-POSTURES_REMEDY = (
-    "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
-    "at another height"
-)
-_OPEN = FitFailure("the postures do not determine hand-eye and sphere together", POSTURES_REMEDY)
+def _conditioning(fit: HandEyeSolution) -> Conditioning:
+    return conditioning_at(fit.problem, fit.state, fit.noise.sigmas)
+
+
+def _evidence(
+    checked: CheckedFit,
+    held: HandEyeSolution,
+    conditioning: Conditioning,
+    left: dict[int, LeftOut],
+    *,
+    stripes: Sequence[tuple[PosedStripe, IntArray]],
+    start: Pose[Tool, Sensor],
+) -> HandEyeFit:
+    """The result without words; ``stripes`` with the rows of their points that were used."""
+    residuals = stripe_residuals(stripes, held)
+    postures = posture_results(held, residuals, left)
+    calibration = hand_eye_calibration(
+        checked, held, conditioning, stripes=residuals, postures=postures
+    )
+    return HandEyeFit(
+        calibration=calibration,
+        start=start,
+        stripes=residuals,
+        postures=postures,
+        singular_values=conditioning.singular_values,
+        reference=(),
+    )
 
 
 def calibrate_on_sphere(
     stripes: Sequence[PosedStripe],
     diameter_mm: float,
-    options: SphereOptions = DEFAULT_OPTIONS,
+    options: HandEyeOptions | None = None,
     *,
     sensor_covariance: FloatArray | None = None,
 ) -> HandEyeFit | FitFailure:
-    """Find the hand-eye from stripes on a sphere that does not move.
+    """Find the hand-eye from stripes on a sphere that does not move, from whatever postures.
+
+    Eq. 2.46 places every stripe point in Base; its distance from the sphere's surface is the
+    residual. Hand-eye and centre are unknown. Neither the section circle nor postures that only
+    shift are needed, and no side of the sheet has to be told.
 
     Parameters
     ----------
@@ -308,9 +249,9 @@ def calibrate_on_sphere(
     diameter_mm
         Of the sphere.
     options
-        Rejection, noise, and what is solved along.
+        Defaults if None.
     sensor_covariance
-        As of `armscan.calibration.hand_eye.calibrate.calibrate_on_plate`.
+        As of `calibrate_on_plate`.
 
     Returns
     -------
@@ -325,101 +266,104 @@ def calibrate_on_sphere(
     OptionError
         If the diameter is none.
     """
+    options = options or HandEyeOptions()
     check_diameter(diameter_mm)
-    check_postures(stripes)
-    radius = 0.5 * diameter_mm
-    sections, left_out = find_sections(stripes, radius, options)
-    n_postures = len({section.stripe.posture for section in sections})
-    refused = _refuse_sections(len(sections), left_out, diameter_mm)
-    few = refuse_few_postures(n_postures)
-    if refused is None and few is not None:
-        refused = FitFailure(few.reason, POSTURES_REMEDY)
+    check_postures(stripes, options)
+    surface = SphereSurface(0.5 * diameter_mm)
+    sections, left_out = find_sections(stripes, surface.radius_mm)
+    refused = _refuse_sections(sections, left_out, diameter_mm)
     if refused is not None:
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
-    starts = _search(thinned, radius, options)
+    few = Problem(condense_sphere(thinned, START_PIECES), surface, options)
+    starts = _search(few, thinned)
     if isinstance(starts, FitFailure):
         return starts
-    nodes = sphere_nodes(sections, options.nodes_per_stripe, sensor_covariance)
-    best = _best(nodes, starts, options)
+    observations = replace(
+        condense_sphere(sections, options.per_stripe or surface.per_stripe),
+        sensor_covariance=sensor_covariance,
+    )
+    best = _likeliest(Problem(observations, surface, options), starts)
     if isinstance(best, FitFailure):
         return best
-    start, checked = best
-    stored = sphere_estimate_hold_sensor(nodes, checked)
-    if stored is None:
-        return _OPEN
-    conditioning = _conditioning(checked.linear)
-    warnings = (*left_out, *conditioning_warnings(conditioning, n_postures, ""))
-    given = replace(start, radius_mm=radius)
-    return sphere_fit(nodes, checked, stored, conditioning, start=given, warnings=warnings)
+    start, fit = best
+    held = hold_sensor(fit)
+    return _OPEN if held is None else _fit_on_sphere(sections, left_out, start, fit, held)
 
 
 def _refuse_sections(
-    n_sections: int, left_out: tuple[str, ...], diameter_mm: float
+    sections: Sequence[CircleSection], left_out: Sequence[str], diameter_mm: float
 ) -> FitFailure | None:
-    """Refuse where most stripes do not show the sphere."""
-    if len(left_out) <= n_sections:
-        return None
-    return FitFailure(
-        f"{len(left_out)} stripes show no section of a sphere of {diameter_mm:g} mm diameter, "
-        f"{n_sections} do: {'; '.join(left_out[:NAMED_STRIPES])}",
-        "check the sphere's diameter, and that the stripes lie on the sphere",
-    )
+    """Refuse where most stripes do not show the sphere, and too few postures."""
+    if len(left_out) > len(sections):
+        return FitFailure(
+            f"{len(left_out)} stripes show no section of a sphere of {diameter_mm:g} mm diameter, "
+            f"{len(sections)} do: {'; '.join(left_out[:NAMED_STRIPES])}",
+            "check the sphere's diameter, and that the stripes lie on the sphere",
+        )
+    few = refuse_few_postures(len({section.stripe.posture for section in sections}))
+    return None if few is None else FitFailure(few.reason, TURN_THE_TOOL)
 
 
-def _refuse_postures(linear: LinearSolution | None, diameter_mm: float) -> FitFailure | None:
+def _search(
+    few: Problem, sections: Sequence[CircleSection]
+) -> tuple[HandEyeState, ...] | FitFailure:
+    """Distinct minima of the plain sum of squares that are nearly the least, best first."""
+    n, radius_mm = len(few.observations), float(few.surface.start[3])
+    fixed_radius = np.arange(N_HAND_EYE + 3)
+    ends = []
+    for start in minima_on_sphere(sections, radius_mm):
+        found = minimise_distances(few, start, np.eye(n), fixed_radius)
+        if found is not None:
+            ends.append((found.chi2, found.state))
+    ends.sort(key=lambda end: end[0])
+    limit = ALIKE_COST * (ends[0][0] + n * LEAST_RESIDUAL_MM**2)
+    kept: list[HandEyeState] = []
+    for cost, state in ends:
+        if cost <= limit and all(_is_apart(state, one) for one in kept):
+            found = minimise_distances(few, state, np.eye(n))
+            kept.append(state if found is None else found.state)
+    refused = _refuse_far(few, kept[0])
+    if refused is None:
+        refused = _refuse_open(conditioning_at(few, kept[0]), 2.0 * radius_mm)
+    return tuple(kept) if refused is None else refused
+
+
+def _is_apart(one: HandEyeState, other: HandEyeState) -> bool:
+    turn_rad = turn_between_rad(one.tool_from_sensor, other.tool_from_sensor)
+    return turn_rad > APART_ON_SPHERE_RAD
+
+
+def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure | None:
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
-    if linear is None:
-        return FitFailure(f"the postures do not determine the hand-eye{cause}", POSTURES_REMEDY)
-    conditioning = _conditioning(linear)
-    refused = refuse_open_hand_eye(conditioning, cause, POSTURES_REMEDY)
+    refused = refuse_underdetermined(conditioning, cause, TURN_THE_TOOL)
     if refused is None and conditioning.singular_values[-1] * LOOSE_PART * diameter_mm < 1.0:
         return FitFailure(
             f"the postures hardly determine the hand-eye{cause} (least known: "
             f"{conditioning.weakest})",
-            POSTURES_REMEDY,
+            TURN_THE_TOOL,
         )
     return refused
 
 
-def _search(
-    sections: tuple[Section, ...], radius_mm: float, options: SphereOptions
-) -> tuple[SphereState, ...] | FitFailure:
-    """Distinct minima of the plain sum of squares that are nearly the least, best first."""
-    nodes = sphere_nodes(sections, START_NODES)
-    plain = np.eye(len(nodes))
-    ends = []
-    for start in start_candidates(sections, radius_mm):
-        state, cost, _ = descend(nodes, start, plain, np.arange(RADIUS_COLUMN))
-        ends.append((cost, state))
-    ends.sort(key=lambda pair: pair[0])
-    limit = RIVAL_COST * (ends[0][0] + len(nodes) * LEAST_RESIDUAL_MM**2)
-    kept: list[SphereState] = []
-    for cost, state in ends:
-        if cost <= limit and all(is_apart(state, one) for one in kept):
-            kept.append(descend(nodes, state, plain, free_columns(options))[0])
-    if _typical_mm(nodes, kept[0]) > options.max_rms_mm:
-        return _refuse_misfit(nodes, kept[0], options)
-    refused = _refuse_postures(solve_at(nodes, kept[0], options), 2.0 * radius_mm)
-    return tuple(kept) if refused is None else refused
-
-
-def _typical_mm(nodes: SphereNodes, state: SphereState) -> float:
-    return float(np.median(np.abs(place_on_sphere(nodes, state).residual_mm)))
-
-
-def _refuse_misfit(nodes: SphereNodes, state: SphereState, options: SphereOptions) -> FitFailure:
-    """Say how far the points stay from any sphere, and whether another diameter would do."""
-    typical = _typical_mm(nodes, state)
+def _refuse_far(problem: Problem, state: HandEyeState) -> FitFailure | None:
+    """Refuse points that stay away from any sphere; say whether another diameter would do."""
+    limit_mm = problem.options.max_rms_mm
+    typical_mm = _typical_mm(problem, state)
+    if not typical_mm > limit_mm:
+        return None
+    diameter_mm = 2.0 * float(state.surface[3])
     reason = (
-        f"no hand-eye puts the points on one sphere of {2.0 * state.radius_mm:g} mm diameter: "
-        f"they stay {typical:.2f} mm away (median)"
+        f"no hand-eye puts the points on one sphere of {diameter_mm:g} mm diameter: "
+        f"they stay {typical_mm:.2f} mm away (median)"
     )
-    freed, _, _ = descend(nodes, state, np.eye(len(nodes)), np.arange(RADIUS_COLUMN + 1))
-    is_better = _typical_mm(nodes, freed) < min(0.5 * typical, options.max_rms_mm)
-    if is_better and abs(freed.radius_mm / state.radius_mm - 1.0) < LIKELY_DIAMETER:
-        reason += f"; {2.0 * freed.radius_mm:.1f} mm would fit"
+    plain, columns = np.eye(len(problem.observations)), np.arange(N_HAND_EYE + 4)
+    freed = minimise_distances(problem, state, plain, columns)
+    if freed is not None and _typical_mm(problem, freed.state) < min(0.5 * typical_mm, limit_mm):
+        better_mm = 2.0 * float(freed.state.surface[3])
+        if abs(better_mm / diameter_mm - 1.0) < LIKELY_DIAMETER:
+            reason += f"; {better_mm:.1f} mm would fit"
     return FitFailure(
         reason,
         "check the convention of the arm's angles, the order of poses and profiles, the "
@@ -427,48 +371,60 @@ def _refuse_misfit(nodes: SphereNodes, state: SphereState, options: SphereOption
     )
 
 
-def _best(
-    nodes: SphereNodes, starts: tuple[SphereState, ...], options: SphereOptions
-) -> tuple[SphereState, SphereSolution] | FitFailure:
-    """The likeliest of the refined minima, refused where another one is nearly as likely."""
-    found = [(start, _refine(nodes, start, options)) for start in starts]
+def _typical_mm(problem: Problem, state: HandEyeState) -> float:
+    return float(np.median(np.abs(problem.place(state).residual_mm)))
+
+
+def _likeliest(
+    problem: Problem, starts: Sequence[HandEyeState]
+) -> tuple[HandEyeState, HandEyeSolution] | FitFailure:
+    """The likeliest of the solutions, refused where another one is nearly as likely."""
+    found = [(start, estimate_robustly(problem, start)) for start in starts]
     solved = [(start, one) for start, one in found if one is not None]
     if not solved:
         return _OPEN
     solved.sort(key=lambda pair: -pair[1].linear.log_likelihood)
-    best = solved[0]
-    if _typical_mm(nodes, best[1].state) > options.max_rms_mm:
-        return _refuse_misfit(nodes, best[1].state, options)
-    refused = _refuse_postures(best[1].linear, 2.0 * best[0].radius_mm)
+    start, best = solved[0]
+    refused = _refuse_far(problem, best.state)
+    if refused is None:
+        refused = _refuse_open(_conditioning(best), 2.0 * float(start.surface[3]))
     if refused is not None:
         return refused
     for _, other in solved[1:]:
-        lost = best[1].linear.log_likelihood - other.linear.log_likelihood
-        if lost < LIKELIER and is_apart(best[1].state, other.state):
+        lost = best.linear.log_likelihood - other.linear.log_likelihood
+        if lost < LIKELIER and _is_apart(best.state, other.state):
             return FitFailure(
                 "two quite different hand-eyes explain the stripes equally well: seen from the "
                 "sensor, the sphere's centre moved within one plane only",
                 "vary the stand-off too: nearer and farther by 15 % and more",
             )
-    return best
+    return start, best
 
 
-def _conditioning(linear: LinearSolution) -> Conditioning:
-    return describe_conditioning(np.asarray(np.linalg.inv(linear.covariance[:6, :6])))
-
-
-def _refine(
-    nodes: SphereNodes, start: SphereState, options: SphereOptions
-) -> SphereSolution | None:
-    """Refine; postures whose pose errs far more than the others' lose weight."""
-    weights = np.ones(len(nodes.postures))
-    solution = refine_with_noise(nodes, start, options, weights)
-    for _ in range(ROBUST_ROUNDS):
-        if solution is None or len(nodes.postures) <= LEAST_POSTURES:
-            return solution
-        updated = with_weights(nodes, solution, options.posture_sigma)
-        if float(np.abs(updated - weights).max()) < 0.02:
-            break
-        weights = updated
-        solution = refine_with_noise(nodes, solution.state, options, weights)
-    return solution
+def _fit_on_sphere(
+    sections: Sequence[CircleSection],
+    left_out: Sequence[str],
+    start: HandEyeState,
+    fit: HandEyeSolution,
+    held: HandEyeSolution,
+) -> HandEyeFit:
+    rows: dict[int, tuple[PosedStripe, IntArray]] = {}
+    for section in sections:
+        stripe, before = rows.get(id(section.stripe), (section.stripe, np.zeros(0, np.int64)))
+        rows[id(stripe)] = (stripe, np.concatenate([before, section.rows]))
+    conditioning, left = _conditioning(fit), leave_each_out(fit)
+    found = _evidence(
+        CheckedFit(fit),
+        held,
+        conditioning,
+        left,
+        stripes=list(rows.values()),
+        start=start.tool_from_sensor,
+    )
+    given_mm = 2.0 * float(fit.problem.surface.start[3])
+    warnings = (
+        *left_out,
+        *conditioning_warnings(conditioning, len(found.postures), ""),
+        *sphere_warnings(fit, held, sections, found.postures),
+    )
+    return replace(found, reference=sphere_facts(fit, held, given_mm), warnings=warnings)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks of a hand-eye on a plate: other likely solutions, varied postures, refusals, warnings."""
+"""Do reference, poses and stripes belong together? What is wrong, in words a person can act on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,62 +12,148 @@ from armscan.calibration.hand_eye.alternatives import (
     BETTER,
     FIND_WHAT_MOVED,
     PROBE_AGAIN,
+    find_alternatives,
+    find_contradiction,
     find_free_plane,
     find_mirror,
     find_reading,
     offset_in_words,
+    plane_in_words,
 )
-from armscan.calibration.hand_eye.estimate import LeftOut, PlateFit, fit_plate
+from armscan.calibration.hand_eye.estimate import (
+    Conditioning,
+    HandEyeSolution,
+    LeftOut,
+    Problem,
+    estimate,
+    leave_each_out,
+)
 from armscan.calibration.hand_eye.observations import (
-    HandEyeOptions,
-    PlateNodes,
-    PlateReference,
-    PlateState,
+    MIN_POINTS,
+    CondensedObservations,
     PosedStripe,
-    place_nodes,
 )
-from armscan.calibration.hand_eye.result import sigma_of
 from armscan.calibration.hand_eye.search import (
     GROSS_MM,
     GROSS_RATIO,
     Start,
-    few_stripes,
+    camera_heights_mm,
     find_start,
-    posture_rms,
+    posture_rms_at,
     thinned,
+    turn_between_rad,
 )
+from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.shapes import Plane
 
-ALIKE_DEG = 3.0
-SMALL_DEG = 8.0
+MAX_CONDITION = 100.0
+GOOD_POSTURES, LEAST_POSTURES = 6, 3
+LIKELIER = 6.0
+"""Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
+MOST_ALTERNATIVES = 4
+APART_DEG = 1.0
+ALIKE_DEG, SMALL_DEG = 3.0, 8.0
+"""Tilts that count as none, and as small."""
 FLAT_RATIO = 0.15
-"""Spread of the normals off their plane over that within it, below which they are in one plane."""
+"""Extent of the normals off their plane over that within it, below which they are in one plane."""
 SAME_STAND_OFF = 0.03
 """Standard deviation of the stand-off over its mean, below which it counts as constant."""
-REMEDY = (
+VARY_POSTURES = (
     "tilt the head by 30 to 45 degrees in two or more directions, turn it about its own axis, and "
     "vary the distance by 15 %"
 )
+LARGE_ARM_MM = 0.1
+MOST_ARM_MM = 0.25
+"""An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
+REJECTED_SHARE = 0.2
+MAX_MOVE_SIGMA = 5.0
+LEAST_TO_SPLIT = 8
+GROSS_TILT_DEG, GROSS_OFFSET_MM = 3.0, 10.0
+"""A plate that seems to lie further off than this was hardly probed wrongly: poses that are read
+wrongly are asked for first."""
+FREE_PLANE_SHARE = 0.2
+"""A plane left free is to blame where it leaves less than this part of the distances."""
+MAX_WRONG_SHARE = 0.34
+LEAST_LEFT = 6
+SUSPECT_PROBABILITY = 0.2
+WRONG_PROBABILITY = 1e-5
+"""Probability, among as many postures, of a shift and slope like those of the posture."""
+AS_WELL = 1.5
+"""What moved is believed if it leaves the arm less scatter than this many times what leaving
+postures out does."""
+NO_SOLUTION = FitFailure(
+    "the refinement found no minimum: the noise model or the data are degenerate",
+    "check the standard deviations given, and the poses",
+)
 
 
-def common_to_postures(nodes: PlateNodes, plate: Plane) -> str:
+def refuse_few_postures(n_postures: int) -> FitFailure | None:
+    """Refuse fewer postures than any solution needs."""
+    if n_postures >= LEAST_POSTURES:
+        return None
+    return FitFailure(
+        f"{n_postures} postures with a usable stripe; {LEAST_POSTURES} are the least for any "
+        f"solution, {GOOD_POSTURES} for a checked one",
+        "scan from 12 postures: tilts of 30 to 45 degrees in two or more directions, stand-off "
+        "varied by 15 %",
+    )
+
+
+def refuse_underdetermined(
+    conditioning: Conditioning, cause: str, remedy: str
+) -> FitFailure | None:
+    """Refuse a system of rank below six; ``cause`` says what the postures have in common."""
+    if conditioning.rank == N_HAND_EYE:
+        return None
+    return FitFailure(
+        f"the postures determine only {conditioning.rank} of the hand-eye's 6 parameters{cause} "
+        f"(least known: {conditioning.weakest})",
+        remedy,
+    )
+
+
+def conditioning_warnings(
+    conditioning: Conditioning, n_postures: int, cause: str
+) -> tuple[str, ...]:
+    """What is weak about the postures of a solved hand-eye."""
+    warnings = []
+    if n_postures < GOOD_POSTURES:
+        warnings.append(
+            f"{n_postures} postures only: a wrong one would not be noticed, and the hand-eye is "
+            f"several times less certain than from 12; use at least {GOOD_POSTURES}, better 12"
+        )
+    if conditioning.condition > MAX_CONDITION:
+        warnings.append(
+            f"the hand-eye is badly determined (condition {conditioning.condition:.0f}, good is "
+            f"below {MAX_CONDITION:.0f}){cause}; least known: {conditioning.weakest}"
+        )
+    elif cause:
+        warnings.append(
+            f"the postures are less varied than they should be{cause}; least known: "
+            f"{conditioning.weakest}"
+        )
+    return tuple(warnings)
+
+
+def common_to_postures(observations: CondensedObservations, plane: Plane) -> str:
     """Say what keeps the postures from being independent; empty if nothing does.
 
     The plate's normals in Tool decide: without turning, or turning about the normal only, they
     are all alike; with tilts in one azimuth only they lie in a plane through the origin.
     """
-    first = [int(np.flatnonzero(nodes.posture == k)[0]) for k in nodes.used_postures]
-    rotations = nodes.rotations[nodes.stripe[first]]
-    normals = np.einsum("pij,i->pj", rotations, plate.normal)
-    spread = np.linalg.svd(normals - normals.mean(axis=0), compute_uv=False) / np.sqrt(len(normals))
+    used = observations.used_postures
+    first = [int(np.flatnonzero(observations.posture == k)[0]) for k in used]
+    rotations = observations.rotations[observations.stripe[first]]
+    normals = np.einsum("pij,i->pj", rotations, plane.normal)
+    extent = np.linalg.svd(normals - normals.mean(axis=0), compute_uv=False) / np.sqrt(len(normals))
     through_origin = np.linalg.svd(normals, compute_uv=False) / np.sqrt(len(normals))
-    tilt_deg = float(np.degrees(np.hypot(spread[0], spread[1])))
+    tilt_deg = float(np.degrees(np.hypot(extent[0], extent[1])))
     causes = []
     if tilt_deg < ALIKE_DEG:
-        turn_deg = _largest_turn_deg(rotations)
+        cosine = 0.5 * (np.einsum("pij,ij->p", rotations, rotations[0]) - 1.0)
+        turn_deg = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
         causes.append(
             "the arm never turned, it only shifted"
             if turn_deg < ALIKE_DEG
@@ -75,117 +161,76 @@ def common_to_postures(nodes: PlateNodes, plate: Plane) -> str:
         )
     elif tilt_deg < SMALL_DEG:
         causes.append(f"the head was hardly tilted (by {tilt_deg:.0f} deg, root mean square)")
-    elif through_origin[2] < FLAT_RATIO * spread[0]:
+    elif through_origin[2] < FLAT_RATIO * extent[0]:
         causes.append("the head was tilted in one azimuth plane only")
-    stand_off = np.array(
-        [
-            np.linalg.norm(nodes.points_mm[nodes.posture == k].mean(axis=0))
-            for k in nodes.used_postures
-        ]
-    )
+    points, posture = observations.points_mm, observations.posture
+    middles = np.array([points[posture == k].mean(axis=0) for k in used])
+    stand_off = np.linalg.norm(middles, axis=1)
     if float(stand_off.std()) < SAME_STAND_OFF * float(stand_off.mean()):
         causes.append(f"the stand-off was always about {stand_off.mean():.0f} mm")
     return ": " + ", and ".join(causes) if causes else ""
 
 
-def _largest_turn_deg(rotations: FloatArray) -> float:
-    cosine = 0.5 * (np.einsum("pij,ij->p", rotations, rotations[0]) - 1.0)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+def likeliest_start(problem: Problem, start: Start, cause: str) -> Start | FitFailure:
+    """Take the likeliest of the start and its alternatives; refuse where another is as likely.
 
-
-LIKELIER = 6.0
-"""Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
-MOST_RIVALS = 4
-APART_DEG = 1.0
-
-
-def settle_alternatives(
-    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions, cause: str
-) -> Start | FitFailure:
-    """Take the likeliest of the start and its rivals; refuse where another one is as likely.
-
-    Parameters
-    ----------
-    nodes, plate, options
-        Data, reference and noise model.
-    start
-        With minima that leave little more.
-    cause
-        What the postures have in common, in words.
+    ``cause`` says what the postures have in common.
     """
-    if not start.rivals:
+    if not start.alternatives:
         return start
-    few = few_stripes(thinned(nodes.select(~start.is_wrong[nodes.posture])))
+    few = replace(problem, observations=thinned(problem.without(start.is_wrong).observations))
     found = []
-    for pose in (start.tool_from_sensor, *start.rivals[:MOST_RIVALS]):
-        fit = fit_plate(few, plate, PlateState(pose, np.zeros(3)), options)
-        if isinstance(fit, PlateFit):
-            found.append((fit.linear.log_likelihood, pose, fit.refined.state.tool_from_sensor))
+    for pose in (start.tool_from_sensor, *start.alternatives[:MOST_ALTERNATIVES]):
+        fit = estimate(few, few.start(pose))
+        if fit is not None:
+            found.append((fit.linear.log_likelihood, pose, fit.state.tool_from_sensor))
     if not found:
         return start
     found.sort(key=lambda one: -one[0])
     likely, best, end = found[0]
     for other, _, other_end in found[1:]:
-        if likely - other < LIKELIER and _apart_deg(end, other_end) > APART_DEG:
+        apart_deg = np.degrees(turn_between_rad(end, other_end))
+        if likely - other < LIKELIER and apart_deg > APART_DEG:
+            shift_mm = float(np.linalg.norm(end.translation_mm - other_end.translation_mm))
             return FitFailure(
-                f"{len(nodes.used_postures)} postures leave different hand-eyes that explain the "
-                f"stripes equally well, {_in_words(end, other_end)} apart{cause}",
-                f"add postures: {REMEDY}",
+                f"{len(problem.observations.used_postures)} postures leave different hand-eyes "
+                f"that explain the stripes equally well, {apart_deg:.1f} deg and {shift_mm:.1f} mm "
+                f"apart{cause}",
+                f"add postures: {VARY_POSTURES}",
             )
     return replace(start, tool_from_sensor=best)
 
 
-def _apart_deg(one: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> float:
-    cosine = 0.5 * (float((one.rotation * other.rotation).sum()) - 1.0)
-    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
-
-
-def _in_words(one: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> str:
-    shift = float(np.linalg.norm(one.translation_mm - other.translation_mm))
-    return f"{_apart_deg(one, other):.1f} deg and {shift:.1f} mm"
-
-
-LARGE_ARM_MM = 0.1
-REJECTED_SHARE = 0.2
-MAX_MOVE_SIGMA = 5.0
-MOST_ARM_MM = 0.25
-"""An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
-LEAST_TO_SPLIT = 8
-GROSS_TILT_DEG = 3.0
-GROSS_OFFSET_MM = 10.0
-"""A plate that seems to lie further off than this was hardly probed wrongly: poses that are read
-wrongly are asked for first."""
-
-
-def explain_misfit(
-    nodes: PlateNodes, plate: PlateReference, start: Start, options: HandEyeOptions
-) -> FitFailure:
+def explain_misfit(problem: Problem, plate: PlateSurface, start: Start) -> FitFailure:
     """Say why no hand-eye fits: another plane, another reading of the poses, or neither."""
+    observations, limit_mm = problem.observations, problem.options.max_rms_mm
+    typical_mm = start.typical_mm
     fact = (
-        f"no hand-eye fits: the stripes of the typical posture lie {start.typical_mm:.2f} mm from "
-        f"the plate, more than {options.max_rms_mm:g} mm"
+        f"no hand-eye fits: the stripes of the typical posture lie {typical_mm:.2f} mm from "
+        f"the plate, more than {limit_mm:g} mm"
     )
-    free = find_free_plane(nodes, plate.plane)
-    is_plate = free is not None and free.typical_mm < 0.2 * start.typical_mm
-    mirror = find_mirror(nodes, plate, start, options, smaller=BETTER)
-    if mirror is not None:
-        return mirror
-    change = _split(nodes, plate, start, fact)
-    if change is not None:
-        return change
-    if free is not None and is_plate and _is_gross(free.offset_mm, free.tilt_deg):
-        best_mm = min(free.typical_mm, options.max_rms_mm)
-        misread = _misread(nodes, plate, fact, start.typical_mm, best_mm)
-        if misread is not None:
-            return misread
-        is_plate = free.typical_mm <= options.max_rms_mm
+    refusal = find_mirror(problem, plate, start, smaller=BETTER)
+    if refusal is None:
+        refusal = _split(observations, plate, typical_mm, fact)
+    if refusal is not None:
+        return refusal
+    free = find_free_plane(problem, plate)
+    is_plate = free is not None and free.typical_mm < FREE_PLANE_SHARE * typical_mm
     if free is not None and is_plate:
-        return FitFailure(
-            f"{fact}; with the plate's plane left free it is {free.typical_mm:.3f} mm, and the "
-            f"plane then lies {offset_in_words(free.offset_mm, free.tilt_deg, plate)}",
-            PROBE_AGAIN,
-        )
-    misread = _misread(nodes, plate, fact, start.typical_mm, options.max_rms_mm)
+        if abs(free.offset_mm) > GROSS_OFFSET_MM or free.tilt_deg > GROSS_TILT_DEG:
+            most_mm = min(free.typical_mm, limit_mm)
+            misread = find_reading(observations, plate, fact, typical_mm, most_mm=most_mm)
+            if misread is not None:
+                return misread
+            is_plate = free.typical_mm <= limit_mm
+        if is_plate:
+            where = offset_in_words(free.offset_mm, free.tilt_deg, plate.reference)
+            return FitFailure(
+                f"{fact}; with the plate's plane left free it is {free.typical_mm:.3f} mm, and the "
+                f"plane then lies {where}",
+                PROBE_AGAIN,
+            )
+    misread = find_reading(observations, plate, fact, typical_mm, most_mm=limit_mm)
     if misread is not None:
         return misread
     return FitFailure(
@@ -196,41 +241,176 @@ def explain_misfit(
     )
 
 
-def _split(nodes: PlateNodes, plate: PlateReference, start: Start, fact: str) -> FitFailure | None:
+def _split(
+    observations: CondensedObservations, plate: PlateSurface, typical_mm: float, fact: str
+) -> FitFailure | None:
     """Refuse postures of which the first and the last each agree, but not with each other."""
-    used = np.sort(nodes.used_postures)
+    used, names = observations.used_postures, observations.postures
     if len(used) < LEAST_TO_SPLIT:
         return None
-    most_mm = BETTER * start.typical_mm
-    for order in (used, used[::-1]):
-        half = find_start(
-            nodes.select(np.isin(nodes.posture, order[: len(order) // 2])), plate.plane
-        )
-        if half.typical_mm > most_mm:
+    for order, which in ((used, "the former"), (used[::-1], "the latter")):
+        first_half = np.isin(observations.posture, order[: len(order) // 2])
+        half = find_start(observations.select(first_half), plate)
+        if half.typical_mm > BETTER * typical_mm:
             continue
-        state = PlateState(half.tool_from_sensor, np.zeros(3))
-        rms = posture_rms(nodes, place_nodes(nodes, plate.plane, state).residual_mm)[order]
+        rms = posture_rms_at(observations, plate, half.tool_from_sensor)[order]
         far = np.flatnonzero(rms > max(GROSS_RATIO * half.typical_mm, GROSS_MM))
         if not len(far) or not (rms[far[0] :] > GROSS_MM).all():
             continue
-        before, after = nodes.postures[order[far[0] - 1]], nodes.postures[order[far[0]]]
-        first, second = (before, after) if order is used else (after, before)
+        first, second = sorted((int(order[far[0] - 1]), int(order[far[0]])))
         return FitFailure(
-            f"{fact}; the postures up to {first} and those from {second} on do not agree with each "
-            f"other: with the hand-eye of {'the former' if order is used else 'the latter'} "
-            f"({half.typical_mm:.3f} mm) the others lie {float(np.median(rms[far[0] :])):.2f} mm "
-            "from the plate",
+            f"{fact}; the postures up to {names[first]} and those from {names[second]} on do not "
+            f"agree with each other: with the hand-eye of {which} ({half.typical_mm:.3f} mm) the "
+            f"others lie {float(np.median(rms[far[0] :])):.2f} mm from the plate",
             FIND_WHAT_MOVED,
         )
     return None
 
 
-def refuse_scatter(fit: PlateFit, options: HandEyeOptions) -> FitFailure | None:
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedFit:
+    """A solution, what is weak about it, and what is added to its covariance for that.
+
+    Parameters
+    ----------
+    fit
+        In which the sensor may err within its covariance.
+    warnings
+        In words.
+    widening
+        (6, 6) added to the hand-eye's covariance for what contradicts it a little.
+    plane_check
+        What the stripes alone say of the plate.
+    """
+
+    fit: HandEyeSolution
+    warnings: tuple[str, ...] = ()
+    widening: FloatArray = field(default_factory=lambda: np.zeros((N_HAND_EYE, N_HAND_EYE)))
+    plane_check: str = ""
+
+
+def estimate_and_check(
+    problem: Problem, plate: PlateSurface, start: Start
+) -> CheckedFit | FitFailure:
+    """Estimate, leave wrong postures out, and look for something that moved or is not as given.
+
+    A plate that moved makes postures look wrong, and wrong postures may look like a plate that
+    moved. If what moved explains all postures about as well as leaving some out explains the rest,
+    it is believed.
+    """
+    state = problem.start(start.tool_from_sensor)
+    first = estimate(problem.without(start.is_wrong), state)
+    if first is None:
+        return NO_SOLUTION
+    checked = _without_wrong_postures(problem, start, first)
+    usual_mm = (first if isinstance(checked, FitFailure) else checked.fit).sigma_of("arm")
+    trials = [first]
+    if start.is_wrong.any():
+        whole = estimate(problem, state)
+        trials += [] if whole is None else [whole]
+    for fit in trials:
+        moved = find_contradiction(find_alternatives(fit), fit, plate.reference)
+        is_all = isinstance(checked, CheckedFit) and fit is checked.fit
+        if moved is None or not moved.is_refused:
+            continue
+        if is_all or moved.arm_mm < AS_WELL * usual_mm:
+            return moved.failure
+    if isinstance(checked, FitFailure):
+        return checked
+    found = find_alternatives(checked.fit)
+    moved = find_contradiction(found, checked.fit, plate.reference)
+    checked = replace(checked, plane_check=plane_in_words(found))
+    if moved is None:
+        refusal = _refuse_scatter(checked.fit)
+        return checked if refusal is None else refusal
+    if moved.is_refused:
+        return moved.failure
+    warnings = (*checked.warnings, moved.failure.reason)
+    return replace(checked, widening=moved.widening, warnings=warnings)
+
+
+def _without_wrong_postures(
+    problem: Problem, start: Start, first: HandEyeSolution
+) -> CheckedFit | FitFailure:
+    """Leave out postures whose pose is wrong.
+
+    Gross ones are known from the start. Of the rest, the posture that the others predict worst is
+    left out for trial; if the scatter of the others then makes its distance all but impossible, it
+    stays out, and the next one is tried. ``first`` is the fit without the gross ones.
+    """
+    wrong, fit = start.is_wrong.copy(), first
+    while True:
+        refusal = _refuse_many(problem.observations, wrong)
+        if refusal is not None:
+            return refusal
+        suspect = _suspect(fit)
+        if suspect is None or len(fit.problem.observations.used_postures) <= LEAST_LEFT:
+            break
+        trial = wrong.copy()
+        trial[suspect] = True
+        without = estimate(problem.without(trial), fit.state)
+        if without is None or not _is_contradicted(fit.problem, without, suspect):
+            break
+        wrong, fit = trial, without
+    return CheckedFit(fit, _left_out_in_words(problem.observations, wrong, start))
+
+
+def _suspect(fit: HandEyeSolution) -> int | None:
+    left = leave_each_out(fit)
+    worst = min(left, key=lambda number: left[number].probability)
+    return worst if left[worst].probability * len(left) < SUSPECT_PROBABILITY else None
+
+
+def _is_contradicted(problem: Problem, without: HandEyeSolution, suspect: int) -> bool:
+    """Predict the suspect with the scatter that the other postures show."""
+    judged = estimate(problem, without.state, without.noise.sigmas, hold_noise=True)
+    if judged is None:
+        return False
+    left = leave_each_out(judged)
+    return left[suspect].probability * len(left) < WRONG_PROBABILITY
+
+
+def _refuse_many(observations: CondensedObservations, wrong: BoolArray) -> FitFailure | None:
+    used = observations.used_postures
+    n_wrong = int(wrong[used].sum())
+    if n_wrong <= MAX_WRONG_SHARE * len(used):
+        return None
+    names = ", ".join(observations.postures[k] for k in np.flatnonzero(wrong)[:8])
+    return FitFailure(
+        f"{n_wrong} of {len(used)} postures contradict the others ({names})",
+        "check that every exposure has its own pose (none missing, doubled or swapped) and that "
+        "the plate did not move",
+    )
+
+
+def _left_out_in_words(
+    observations: CondensedObservations, wrong: BoolArray, start: Start
+) -> tuple[str, ...]:
+    """Name the postures that were left out."""
+    names, warnings = observations.postures, []
+    gross, mild = np.flatnonzero(start.is_wrong), np.flatnonzero(wrong & ~start.is_wrong)
+    if len(gross):
+        named = ", ".join(f"{names[k]} ({start.rms_mm[k]:.2f} mm)" for k in gross)
+        warnings.append(
+            f"left out {len(gross)} postures whose stripes lie far from where the others "
+            f"put the plate: {named}; a missing, doubled or swapped pose looks like this"
+        )
+    if len(mild):
+        named = ", ".join(f"{names[k]} ({start.rms_mm[k]:.3f} mm)" for k in mild)
+        warnings.append(
+            f"left out {len(mild)} postures that fit the others worse than their scatter "
+            f"allows: {named}; the arm may have moved during the exposure, or the plate was dirty"
+        )
+    return tuple(warnings)
+
+
+def _refuse_scatter(fit: HandEyeSolution) -> FitFailure | None:
     """Refuse residuals that no arm explains; none where the arm's scatter was given."""
-    arm_mm = sigma_of(fit, "arm")
-    names = [component.name for component in fit.components]
-    sigma_log = float(np.sqrt(fit.noise.log_covariance[names.index("arm"), names.index("arm")]))
-    if options.arm_position_mm is not None or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
+    arm_mm = fit.sigma_of("arm")
+    k = [component.name for component in fit.components].index("arm")
+    sigma_log = float(np.sqrt(fit.noise.log_covariance[k, k]))
+    is_given = fit.problem.options.arm_position_mm is not None
+    if is_given or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
         return None
     return FitFailure(
         f"the arm would have to scatter by {arm_mm:.2f} mm an axis to explain the stripes: no "
@@ -240,42 +420,23 @@ def refuse_scatter(fit: PlateFit, options: HandEyeOptions) -> FitFailure | None:
     )
 
 
-def _is_gross(offset_mm: float, tilt_deg: float) -> bool:
-    return abs(offset_mm) > GROSS_OFFSET_MM or tilt_deg > GROSS_TILT_DEG
-
-
-def _misread(
-    nodes: PlateNodes, plate: PlateReference, fact: str, typical_mm: float, most_mm: float
-) -> FitFailure | None:
-    """Refuse in favour of another reading of the poses; None if there is none."""
-    reading = find_reading(nodes, plate.plane, typical_mm, most_mm=most_mm)
-    if reading is None:
-        return None
-    return FitFailure(
-        f"{fact}; {reading.words} would leave {reading.typical_mm:.3f} mm", reading.remedy
-    )
-
-
-def agreement_warnings(
-    nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
-) -> tuple[str, ...]:
+def agreement_warnings(fit: HandEyeSolution, plate: PlateSurface) -> tuple[str, ...]:
     """Warn of a plate seen from behind, and of an arm that scatters much."""
     warnings = []
-    pose = fit.refined.state.tool_from_sensor
-    cameras = nodes.rotations @ pose.translation_mm + nodes.translations_mm
-    if float(np.median(plate.plane.distance_mm(cameras))) < 0.0:
+    pose, observations = fit.state.tool_from_sensor, fit.problem.observations
+    if float(np.median(camera_heights_mm(observations, plate.plane, pose))) < 0.0:
         warnings.append(
             "the plate's normal points away from the scanner: it was probed from the side that "
             "was not scanned, or its sign is arbitrary; a tip compensated to the wrong side "
             "shifts the plane by its diameter"
         )
-    if not fit.refined.is_settled:
+    if not fit.is_settled:
         warnings.append(
             "the refinement had not settled when its steps ran out: the hand-eye may be off by "
             "more than stated"
         )
-    arm_mm = sigma_of(fit, "arm")
-    if arm_mm > LARGE_ARM_MM and options.arm_position_mm is None:
+    arm_mm = fit.sigma_of("arm")
+    if arm_mm > LARGE_ARM_MM and fit.problem.options.arm_position_mm is None:
         warnings.append(
             f"the arm's poses seem to scatter by {arm_mm:.2f} mm: much for a measuring arm; a bad "
             "sensor calibration or a plate that moved looks the same"
@@ -284,32 +445,32 @@ def agreement_warnings(
 
 
 def influence_warnings(
-    nodes: PlateNodes, left_out: Mapping[int, LeftOut], covariance: FloatArray
+    postures: Sequence[str], left_out: Mapping[int, LeftOut], covariance: FloatArray
 ) -> tuple[str, ...]:
     """Name the postures without which the hand-eye would move further than its sigma allows.
 
     Parameters
     ----------
-    nodes
-        With the names of the postures.
+    postures
+        Names.
     left_out
         What changes without each posture, by its number.
     covariance
         (6, 6) of the hand-eye, in the order of the changes' first six.
     """
-    sigma = np.sqrt(np.diag(covariance)[:6])
-    moves = {k: float(np.max(np.abs(left.change[:6]) / sigma)) for k, left in left_out.items()}
+    sigma = np.sqrt(np.diag(covariance)[:N_HAND_EYE])
+    moves = {
+        k: float(np.max(np.abs(left.change[:N_HAND_EYE]) / sigma)) for k, left in left_out.items()
+    }
     far = sorted((k for k in moves if moves[k] > MAX_MOVE_SIGMA), key=lambda k: -moves[k])
     return tuple(
-        f"without posture {nodes.postures[k]} the hand-eye would move by {moves[k]:.0f} of its "
+        f"without posture {postures[k]} the hand-eye would move by {moves[k]:.0f} of its "
         "stated sigmas: it rests on this posture; check its pose and stripes, or scan more like it"
         for k in far[:3]
     )
 
 
-def point_warnings(
-    stripes: Sequence[PosedStripe], kept: Sequence[BoolArray], options: HandEyeOptions
-) -> tuple[str, ...]:
+def point_warnings(stripes: Sequence[PosedStripe], kept: Sequence[BoolArray]) -> tuple[str, ...]:
     """Count what did not lie on a straight stripe, and name exposures without any."""
     total = sum(len(mark) for mark in kept)
     left_out = total - sum(int(mark.sum()) for mark in kept)
@@ -319,12 +480,10 @@ def point_warnings(
             f"{left_out} of {total} points are not on straight stripes and were left out: the "
             "stripes leave the plate, or it is not flat, or the sensor is badly calibrated"
         )
-    empty = [
-        stripe.source for stripe, mark in zip(stripes, kept, strict=True) if not bool(mark.any())
-    ]
+    empty = [one.source for one, mark in zip(stripes, kept, strict=True) if not bool(mark.any())]
     if empty:
         warnings.append(
-            f"{len(empty)} exposures without a straight stripe of {options.min_points} points: "
+            f"{len(empty)} exposures without a straight stripe of {MIN_POINTS} points: "
             f"{', '.join(empty[:6])}"
         )
     return tuple(warnings)

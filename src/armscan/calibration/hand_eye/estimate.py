@@ -1,211 +1,361 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The hand-eye on a plate by generalised least squares, noise levels by restricted maximum
-likelihood, leave-one-posture-out and the search for postures whose pose is wrong.
+"""The estimator of the hand-eye: generalised least squares in turn with the scatter's estimate.
+
+One for all reference surfaces: it minimises the distances of the condensed observations from the
+surface (eq. 2.76) under their covariance, tells how well the postures determine each parameter, and
+what changes without a posture.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg import solve_triangular
-from scipy.optimize import brentq
-from scipy.stats import chi2
 from scipy.stats import chi2 as chi2_distribution
 
-from armscan.calibration.hand_eye.observations import (
-    N_HAND_EYE,
-    HandEyeOptions,
-    PlacedNodes,
-    PlateNodes,
-    PlateReference,
-    PlateState,
-    place_nodes,
-    sensor_covariance,
-)
-from armscan.calibration.hand_eye.search import Start
-from armscan.calibration.hand_eye.solve import (
+from armscan.calibration.hand_eye.noise import (
+    ROTATION_LEVER_MM,
     LinearSolution,
     NoiseComponent,
-    Refined,
-    design,
+    NoiseEstimate,
+    covariance_over_noise,
+    estimate_noise,
     noise_components,
-    plane_covariance,
-    refine,
     solve_linear,
     total_covariance,
 )
+from armscan.calibration.hand_eye.observations import CondensedObservations, HandEyeOptions
+from armscan.calibration.hand_eye.surface import (
+    N_HAND_EYE,
+    HandEyeState,
+    Placed,
+    PlateSurface,
+    ReferenceSurface,
+    dresidual_dsensor,
+    free_columns,
+    place,
+)
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import DenseSystem, Minimum, Whitening, levenberg_marquardt
+from armscan.geometry.poses import Pose, Sensor, Tool
 
-REGION = 0.95
-MAX_ROUNDS = 30
-SETTLED = 1e-3
-LONGEST_STEP = 1.0
-MAX_LOG = 7.0
-"""A standard deviation leaves its typical value by a factor of 1100 at most."""
+MAX_STEPS = 60
+SETTLED = 1e-10
+"""A step that lowers chi2 by less than this part of it ends the search."""
+NOISE_ROUNDS = {"plate": (4, 0.02), "sphere": (6, 1e-3)}
+"""Rounds at most, and change of a sigma's logarithm that ends them. On a sphere the scatter of a
+robot is far from its typical value."""
+LEVER_MM = 100.0
+"""Turns are compared with shifts by what they move at this distance."""
+RANK_RATIO = 1e-4
+"""Singular values below this part of the largest are taken as zero: a posture that was meant to
+repeat another still turns by a hundredth of a degree."""
+NAMED_SHARE = 0.3
+"""Parts of the weakest combination above this are named."""
+ROBUST_ROUNDS = 10
+WEIGHTS_SETTLED = 0.02
+LEAST_FOR_WEIGHTS = 4
+"""With fewer postures a wrong one cannot be told."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NoiseEstimate:
-    """Standard deviations of the causes of scatter.
+class Problem:
+    """Data, reference and noise model of one estimate.
 
     Parameters
     ----------
-    sigmas
-        (C,) of each component, given ones included.
-    log_covariance
-        (C, C) of their logarithms; zero for given ones.
+    observations, surface, options
+        What is to be solved.
+    weights
+        (n postures,) at most 1: below it, the posture's pose is trusted less. None for all 1.
     """
 
-    sigmas: FloatArray
-    log_covariance: FloatArray
+    observations: CondensedObservations
+    surface: ReferenceSurface
+    options: HandEyeOptions
+    weights: FloatArray | None = None
+
+    def select(self, kept: BoolArray) -> Problem:
+        """With some of the observations (M,)."""
+        return replace(self, observations=self.observations.select(kept))
+
+    def without(self, is_wrong: BoolArray) -> Problem:
+        """Without some of the postures (n postures,)."""
+        return self.select(~is_wrong[self.observations.posture])
+
+    def place(self, state: HandEyeState) -> Placed:
+        """Place the observations."""
+        return place(self.observations, self.surface, state)
+
+    def start(self, pose: Pose[Tool, Sensor]) -> HandEyeState:
+        """A hand-eye with the surface as given."""
+        return HandEyeState(pose, self.surface.start)
+
+    @property
+    def columns(self) -> IntArray:
+        """Which entries of a step are solved for."""
+        return free_columns(self.surface, self.options)
+
+    def components(self, placed: Placed) -> tuple[NoiseComponent, ...]:
+        """Causes of scatter."""
+        observations, surface, options = self.observations, self.surface, self.options
+        return noise_components(observations, surface, placed, options, self.weights)
+
+    def surface_covariance(self, placed: Placed) -> FloatArray:
+        """(M, M) covariance of the residuals by a surface that is known beforehand."""
+        prior = self.surface.prior(self.options)
+        if prior is None:
+            return np.zeros((len(placed.residual_mm),) * 2)
+        return np.asarray(placed.by_surface @ prior @ placed.by_surface.T)
+
+    def sensor_covariance(self, placed: Placed) -> FloatArray:
+        """(M, M) covariance of the residuals by the sensor's calibration; 0 where it is exact."""
+        by_sensor = dresidual_dsensor(self.observations, placed)
+        if by_sensor is None or self.observations.sensor_covariance is None:
+            return np.zeros((len(placed.residual_mm),) * 2)
+        return np.asarray(by_sensor @ self.observations.sensor_covariance @ by_sensor.T)
 
 
-def estimate_noise(
-    residual: FloatArray,
-    slopes: FloatArray,
-    components: tuple[NoiseComponent, ...],
-    fixed: FloatArray,
-    start: FloatArray | None = None,
-) -> NoiseEstimate:
-    """Maximise the restricted likelihood by scoring.
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeSolution:
+    """A minimum with its noise model.
 
     Parameters
     ----------
-    residual, slopes
-        (N,) and (N, K) at the minimum.
-    components
-        Causes of scatter.
-    fixed
-        (N, N) covariance that is added and not estimated (the probed plane).
+    problem
+        What was solved.
+    state, placed
+        All unknowns, and the observations placed with them.
+    components, noise
+        Causes of scatter and their standard deviations.
+    known
+        (M, M) covariance of the residuals by what errs alike in all postures: a probed plane and,
+        unless it is held (`hold_sensor`), the sensor.
+    linear
+        Linearised at the minimum, in the columns solved for.
+    is_settled
+        False if the steps ran out.
+    """
+
+    problem: Problem
+    state: HandEyeState
+    placed: Placed
+    components: tuple[NoiseComponent, ...]
+    noise: NoiseEstimate
+    known: FloatArray
+    linear: LinearSolution
+    is_settled: bool
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """(M, F) derivative of the residuals by the unknowns solved for."""
+        return np.asarray(self.placed.jacobian[:, self.problem.columns])
+
+    @property
+    def scatter(self) -> FloatArray:
+        """(M, M) covariance of the residuals by the causes of scatter."""
+        return total_covariance(self.components, self.noise.sigmas)
+
+    @property
+    def explained(self) -> FloatArray:
+        """(M,) ``P e``: the residuals by their covariance, zero along the unknowns."""
+        return np.asarray(self.linear.projected @ self.placed.residual_mm)
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squared whitened residuals."""
+        return float(self.placed.residual_mm @ self.explained)
+
+    @property
+    def probability(self) -> float:
+        """Of residuals at least this large under the noise model."""
+        freedom = len(self.placed.residual_mm) - len(self.problem.columns)
+        return float(chi2_distribution.sf(self.chi2, freedom))
+
+    def sigma_of(self, name: str) -> float:
+        """Standard deviation of one cause of scatter; 0 where it is none."""
+        for component, sigma in zip(self.components, self.noise.sigmas, strict=True):
+            if component.name == name:
+                return float(sigma)
+        return 0.0
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(F, F) of the unknowns, estimated scatter not taken as known, without the sensor's part.
+
+        For a solution in which the sensor may err.
+        """
+        whole = covariance_over_noise(
+            self.placed.residual_mm, self.jacobian, self.components, self.known, self.noise
+        )
+        by_sensor = self.problem.sensor_covariance(self.placed)
+        return np.asarray(whole - self.linear.gain @ by_sensor @ self.linear.gain.T)
+
+    @property
+    def surface_after(self) -> FloatArray:
+        """(K,) parameters of the surface as the scan and what was known of it give them."""
+        prior = self.problem.surface.prior(self.problem.options)
+        if prior is None:
+            return self.state.surface
+        return np.asarray(self.state.surface - prior @ self.placed.by_surface.T @ self.explained)
+
+
+def minimise_distances(
+    problem: Problem, start: HandEyeState, covariance: FloatArray, columns: IntArray | None = None
+) -> Minimum[HandEyeState, DenseSystem] | None:
+    """Minimise ``e' C^-1 e`` over the unknowns; None where the covariance is not definite.
+
+    Parameters
+    ----------
+    problem
+        Data and reference.
     start
-        (C,) standard deviations to begin with; those of the components if None.
+        Where to begin.
+    covariance
+        (M, M) of the residuals e, eq. 2.74.
+    columns
+        Which entries of a step are solved for; those of the problem if None.
     """
-    typical = np.array([component.sigma for component in components])
-    free = np.flatnonzero([c.is_estimated for c in components]).astype(np.int64)
-    sigmas = typical.copy() if start is None else start.copy()
-    spread = np.zeros((len(components), len(components)))
-    if len(free) == 0:
-        return NoiseEstimate(sigmas, spread)
-    widths = np.array([components[k].log_width for k in free])
-    reach = np.log(sigmas[free] / typical[free])
-    posterior, solution = _posterior(residual, slopes, components, fixed, sigmas)
-    posterior -= 0.5 * float(((reach / widths) ** 2).sum())
-    information = np.diag(1.0 / widths**2)
-    for _ in range(MAX_ROUNDS):
-        if solution is None:
+    try:
+        whiten = Whitening(covariance)
+    except LinAlgError:
+        return None
+    free = problem.columns if columns is None else columns
+    n_all = N_HAND_EYE + len(start.surface) + 1
+
+    def linearise(state: HandEyeState) -> tuple[FloatArray, FloatArray]:
+        placed = problem.place(state)
+        return whiten(placed.residual_mm), whiten(placed.jacobian[:, free])
+
+    def retract(state: HandEyeState, step: FloatArray) -> HandEyeState:
+        whole = np.zeros(n_all)
+        whole[free] = step
+        return state.retract(whole)
+
+    return levenberg_marquardt(start, linearise, retract, settled=SETTLED, max_steps=MAX_STEPS)
+
+
+def estimate(
+    problem: Problem,
+    start: HandEyeState,
+    sigmas: FloatArray | None = None,
+    *,
+    hold_noise: bool = False,
+) -> HandEyeSolution | None:
+    """Solve, and estimate the scatter, in turn; None where the data leave unknowns open.
+
+    Parameters
+    ----------
+    problem
+        Data, reference and noise model.
+    start
+        Close to the solution.
+    sigmas
+        Standard deviations to begin with; typical ones if None.
+    hold_noise
+        Keep these standard deviations.
+    """
+    state = start
+    rounds, settled = NOISE_ROUNDS[problem.surface.method]
+    # On a sphere the typical scatter may be far from the true one, and would lead away from it.
+    is_solved_first = problem.surface.method == "plate"
+    for _ in range(rounds):
+        placed = problem.place(state)
+        components = problem.components(placed)
+        if sigmas is None:
+            sigmas = first_sigmas(problem, components, placed)
+        known = problem.surface_covariance(placed) + problem.sensor_covariance(placed)
+        before = sigmas
+        for is_solving in (is_solved_first, not is_solved_first):
+            if is_solving:
+                total = total_covariance(components, sigmas) + known
+                found = minimise_distances(problem, state, total)
+                if found is None:
+                    return None
+                state, placed = found.state, problem.place(found.state)
+            elif hold_noise:
+                noise = NoiseEstimate(sigmas, np.zeros((len(sigmas), len(sigmas))))
+            else:
+                jacobian = placed.jacobian[:, problem.columns]
+                noise = estimate_noise(placed.residual_mm, jacobian, components, known, sigmas)
+                sigmas = noise.sigmas
+        change = np.log((sigmas + 1e-12) / (before + 1e-12))
+        if float(np.abs(change).max()) < settled:
             break
-        score, information = _score(residual, solution, components, sigmas, free)
-        score -= reach / widths**2
-        information += np.diag(1.0 / widths**2)
-        step = np.linalg.solve(information, score)
-        step *= min(1.0, LONGEST_STEP / float(np.abs(step).max()))
-        for _ in range(6):
-            trial = np.clip(reach + step, -MAX_LOG, MAX_LOG)
-            tried = sigmas.copy()
-            tried[free] = typical[free] * np.exp(trial)
-            value, at_trial = _posterior(residual, slopes, components, fixed, tried)
-            value -= 0.5 * float(((trial / widths) ** 2).sum())
-            if value >= posterior - 1e-9:
-                break
-            step *= 0.3
-        else:
-            break
-        reach, sigmas, posterior, solution = trial, tried, value, at_trial
-        if float(np.abs(step).max()) < SETTLED:
-            break
-    spread[np.ix_(free, free)] = np.linalg.inv(information)
-    return NoiseEstimate(sigmas, spread)
+    return _solution(problem, state, components, noise, known)
 
 
-def _posterior(
-    residual: FloatArray,
-    slopes: FloatArray,
-    components: tuple[NoiseComponent, ...],
-    fixed: FloatArray,
-    sigmas: FloatArray,
-) -> tuple[float, LinearSolution | None]:
-    solution = solve_linear(residual, slopes, total_covariance(components, sigmas) + fixed)
-    return (-np.inf if solution is None else solution.log_likelihood), solution
-
-
-def _score(
-    residual: FloatArray,
-    solution: LinearSolution,
-    components: tuple[NoiseComponent, ...],
-    sigmas: FloatArray,
-    free: IntArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Derivative of the restricted log-likelihood by log sigma, and its expected curvature."""
-    explained = solution.projected @ residual
-    products = [2.0 * sigmas[k] ** 2 * solution.projected @ components[k].covariance for k in free]
-    score = np.array(
-        [
-            sigmas[k] ** 2 * float(explained @ components[k].covariance @ explained)
-            - 0.5 * float(np.trace(product))
-            for k, product in zip(free, products, strict=True)
-        ]
-    )
-    information = np.array(
-        [[0.5 * float((one * other.T).sum()) for other in products] for one in products]
-    )
-    return score, information
-
-
-def covariance_over_noise(
-    residual: FloatArray,
-    slopes: FloatArray,
-    components: tuple[NoiseComponent, ...],
-    fixed: FloatArray,
-    estimate: NoiseEstimate,
+def first_sigmas(
+    problem: Problem, components: tuple[NoiseComponent, ...], placed: Placed
 ) -> FloatArray:
-    """(K, K) covariance of the solution with the estimated scatter not taken as known.
+    """Standard deviations to begin with: typical; on a sphere all residuals count as the arm's."""
+    sigmas = np.array([component.sigma for component in components])
+    if not isinstance(problem.surface, PlateSurface) and components[0].is_estimated:
+        sigmas[0] = max(float(np.sqrt(np.mean(placed.residual_mm**2))), 1e-4)
+    return sigmas
 
-    The mean covariance over the spread of the standard deviations, plus the spread of the
-    solutions that they lead to, by two sigma points along each axis of ``log_covariance``. Errors
-    of uncertain scatter have longer tails than a normal distribution of the same covariance; it is
-    widened until the usual 95 % region of the hand-eye holds 95 % of them.
+
+def _solution(
+    problem: Problem,
+    start: HandEyeState,
+    components: tuple[NoiseComponent, ...],
+    noise: NoiseEstimate,
+    known: FloatArray,
+) -> HandEyeSolution | None:
+    total = total_covariance(components, noise.sigmas) + known
+    found = minimise_distances(problem, start, total)
+    if found is None:
+        return None
+    placed = problem.place(found.state)
+    linear = solve_linear(placed.residual_mm, placed.jacobian[:, problem.columns], total)
+    if linear is None:
+        return None
+    return HandEyeSolution(
+        problem=problem,
+        state=found.state,
+        placed=placed,
+        components=components,
+        noise=noise,
+        known=known,
+        linear=linear,
+        is_settled=found.is_settled,
+    )
+
+
+def hold_sensor(solution: HandEyeSolution) -> HandEyeSolution | None:
+    """The hand-eye that belongs to the sensor as it is stored, under the scatter of ``solution``.
+
+    A solution that knows the sensor's covariance explains a part of the residuals by a sensor that
+    is moved within it: its hand-eye is that of the moved sensor, and beside the stored one it makes
+    wrong points. Here the sensor stands still and the hand-eye takes up what it can of the
+    sensor's errors. Its ``known`` is without the sensor's part.
     """
-    values, axes = np.linalg.eigh(estimate.log_covariance)
-    used = np.flatnonzero(values > 1e-12)
-    centre = solve_linear(residual, slopes, total_covariance(components, estimate.sigmas) + fixed)
-    if centre is None or len(used) == 0:
-        return np.zeros((slopes.shape[1],) * 2) if centre is None else centre.covariance
-    covariances, steps = [], []
-    for k in used:
-        for sign in (-1.0, 1.0):
-            reach = sign * np.sqrt(len(used) * values[k]) * axes[:, k]
-            sigmas = estimate.sigmas * np.exp(reach)
-            solution = solve_linear(residual, slopes, total_covariance(components, sigmas) + fixed)
-            if solution is not None:
-                covariances.append(solution.covariance)
-                steps.append(solution.step - centre.step)
-    if not steps:
-        return centre.covariance
-    own, moved = np.array(covariances), np.array(steps)
-    mixed = own.mean(axis=0) + moved.T @ moved / len(moved)
-    return np.asarray(_widening(mixed, own + moved[:, :, None] * moved[:, None, :]) * mixed)
+    problem = solution.problem
+    if problem.observations.sensor_covariance is None:
+        return solution
+    known = problem.surface_covariance(solution.placed)
+    held = _solution(problem, solution.state, solution.components, solution.noise, known)
+    if held is None:
+        return None
+    return replace(held, is_settled=held.is_settled and solution.is_settled)
 
 
-def _widening(mixed: FloatArray, parts: FloatArray) -> float:
-    """Factor on a covariance that makes its joint 95 % region hold 95 % of a mixture (M, K, K).
+def held_covariance(checked: HandEyeSolution, held: HandEyeSolution) -> FloatArray:
+    """(F, F) covariance of a hand-eye whose sensor is held, without the sensor's errors.
 
-    Within one part the quadratic form is a weighted sum of chi-squares, taken as one chi-square of
-    equal mean and variance (Satterthwaite).
+    What the sensor's errors leave in the residuals of ``checked``, where it may err, is the part of
+    `dhand_eye_dsensor`, not the scatter's.
     """
-    block = slice(0, N_HAND_EYE)
-    shapes = np.linalg.solve(mixed[block, block], parts[:, block, block])
-    mean = np.einsum("mii->m", shapes)
-    square = np.einsum("mij,mji->m", shapes, shapes)
-    limit = float(chi2.ppf(REGION, N_HAND_EYE))
+    by_sensor = checked.problem.sensor_covariance(checked.placed)
+    own = checked.placed.residual_mm - by_sensor @ checked.explained
+    return covariance_over_noise(own, held.jacobian, held.components, held.known, held.noise)
 
-    def excess(factor: float) -> float:
-        held = chi2.cdf(factor * limit * mean / square, mean**2 / square)
-        return float(np.mean(held)) - REGION
 
-    return 1.0 if excess(1.0) >= 0.0 else float(brentq(excess, 1.0, 100.0))
+def dhand_eye_dsensor(solution: HandEyeSolution) -> FloatArray | None:
+    """(6, P) derivative of the hand-eye by the sensor's parameters, where the points carry it."""
+    by_sensor = dresidual_dsensor(solution.problem.observations, solution.placed)
+    return None if by_sensor is None else -solution.linear.gain[:N_HAND_EYE] @ by_sensor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,372 +365,158 @@ class LeftOut:
     Parameters
     ----------
     change
-        (K,) change of the solution when the posture is left out.
+        (F,) change of the solution when the posture is left out.
     normalised
         Root mean square of its predicted residuals over their standard deviation.
+    pose_sigmas
+        Size of the error of its pose that they ask for, over its standard deviation: of a shift and
+        a slope of its stripes on a plate, of a shift on a sphere.
     probability
-        Of a shift and slope of its stripe as large as these, if its pose errs as the others do.
-    shift_mm
-        Mean distance of its points from where the others predict them.
+        Of such an error as large as this, if its pose errs as the others do.
     """
 
     change: FloatArray
     normalised: float
+    pose_sigmas: float
     probability: float
-    shift_mm: float
 
 
-def leave_out(
-    residual_mm: FloatArray, solution: LinearSolution, own: IntArray, along_mm: FloatArray
-) -> LeftOut:
-    """Leave the nodes ``own`` (M,) out of a generalised least-squares solution.
+def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
+    """Leave a posture out of the linearised solution, without solving again.
 
     Leaving observations out is giving each of them an unknown of its own: with P of
     `LinearSolution` the prediction error of the block is ``P_kk^-1 (P e)_k`` and has covariance
-    ``P_kk^-1``. What the others tell of the plate's flatness there is taken into account.
-
-    Parameters
-    ----------
-    residual_mm
-        (N,) residuals at the minimum.
-    solution
-        Linearised there.
-    own
-        Nodes of the posture.
-    along_mm
-        (M,) place of these nodes along the stripe.
+    ``P_kk^-1``. What the others tell of the plate's flatness there is taken into account. A weight
+    of the posture is undone.
     """
-    block = solution.projected[np.ix_(own, own)]
-    explained = (solution.projected @ residual_mm)[own]
+    observations, weights = solution.problem.observations, solution.problem.weights
+    rows = np.flatnonzero(observations.posture == posture)
+    block, explained = solution.linear.projected[np.ix_(rows, rows)], solution.explained[rows]
     values, vectors = np.linalg.eigh(block)
     used = values > 1e-10 * values[-1]
-    inverse = (vectors[:, used] / values[used]) @ vectors[:, used].T
-    predicted = inverse @ explained
-    shape = np.column_stack([np.ones(len(own)), along_mm - along_mm.mean()])
-    score = shape.T @ explained
-    weight = shape.T @ block @ shape
-    statistic = float(score @ np.linalg.pinv(weight, rcond=1e-10) @ score)
+    spread = (vectors[:, used] / values[used]) @ vectors[:, used].T
+    predicted = spread @ explained
+    shape = _pose_errors(solution, rows)
+    weighted = block @ shape
+    if weights is not None and weights[posture] < 1.0:
+        arm, sigma = solution.components[0], float(solution.noise.sigmas[0])
+        lent = (1.0 - weights[posture]) * sigma**2 * arm.covariance[np.ix_(rows, rows)]
+        weighted = np.linalg.pinv(spread - lent, rcond=1e-10, hermitian=True) @ shape
+    weight, score = shape.T @ weighted, weighted.T @ predicted
+    strength = np.linalg.eigvalsh(weight)
+    rank = max(int((strength > 1e-6 * strength[-1]).sum()), 1)
+    statistic = float(score @ np.linalg.pinv(weight, rcond=1e-6, hermitian=True) @ score)
+    size = float(explained @ predicted)
     return LeftOut(
-        solution.gain[:, own] @ predicted,
-        float(np.sqrt(max(float(explained @ predicted), 0.0) / max(int(used.sum()), 1))),
-        float(chi2_distribution.sf(statistic, 2)),
-        float(predicted.mean()),
+        change=solution.linear.gain[:, rows] @ predicted,
+        normalised=float(np.sqrt(max(size, 0.0) / max(int(used.sum()), 1))),
+        pose_sigmas=float(np.sqrt(max(statistic, 0.0) / rank)),
+        probability=float(chi2_distribution.sf(statistic, shape.shape[1])),
     )
 
 
-def leave_each_out(
-    nodes: PlateNodes, residual_mm: FloatArray, solution: LinearSolution
-) -> dict[int, LeftOut]:
+def _pose_errors(solution: HandEyeSolution, rows: IntArray) -> FloatArray:
+    """(n, 2) or (n, 3) what an error of a posture's pose does to its residuals."""
+    if not isinstance(solution.problem.surface, PlateSurface):
+        return np.asarray(solution.placed.dresidual_dpose[rows, :3])
+    points = solution.problem.observations.points_mm[rows]
+    centred = points - points.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    along = centred @ axes[0] / ROTATION_LEVER_MM
+    return np.column_stack([np.ones(len(rows)), along - along.mean()])
+
+
+def leave_each_out(solution: HandEyeSolution) -> dict[int, LeftOut]:
     """Leave out every posture in turn; keys are posture numbers."""
-    result = {}
-    for posture in nodes.used_postures:
-        own = np.flatnonzero(nodes.posture == posture)
-        points = nodes.points_mm[own] - nodes.points_mm[own].mean(axis=0)
-        _, _, axes = np.linalg.svd(points, full_matrices=False)
-        result[int(posture)] = leave_out(residual_mm, solution, own, points @ axes[0])
-    return result
+    used = solution.problem.observations.used_postures
+    return {int(posture): leave_out(solution, int(posture)) for posture in used}
 
 
-PLATE_FIT_MAX_ROUNDS = 4
-SETTLED_LOG = 0.02
+def estimate_robustly(problem: Problem, start: HandEyeState) -> HandEyeSolution | None:
+    """Estimate; postures whose pose errs far more than the others' lose weight.
+
+    Weights fall with the fourth power of the error, so that a gross one does not swell the arm's
+    scatter.
+    """
+    weights = np.ones(len(problem.observations.postures))
+    solution = estimate(replace(problem, weights=weights), start)
+    for _ in range(ROBUST_ROUNDS):
+        if solution is None or len(weights) < LEAST_FOR_WEIGHTS:
+            return solution
+        errors = np.array([left.pose_sigmas for left in leave_each_out(solution).values()])
+        limit = problem.options.posture_sigmas
+        updated = np.minimum(1.0, (limit / np.maximum(errors, 1e-9)) ** 4)
+        if float(np.abs(updated - weights).max()) < WEIGHTS_SETTLED:
+            break
+        weights = updated
+        solution = estimate(replace(problem, weights=weights), solution.state)
+    return solution
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlateFit:
-    """A refined hand-eye with its noise model.
+class Conditioning:
+    """How well the hand-eye's six parameters are determined.
 
     Parameters
     ----------
-    refined
-        Minimum; its plane is the probed one unless it was solved along.
-    slopes
-        (N, K) derivative of the residuals, K = 6 or 9.
-    components, noise
-        Causes of scatter and their standard deviations.
-    total
-        (N, N) covariance of the residuals, by the probed plane and, unless it is held
-        (`hold_sensor`), by the sensor too.
-    linear
-        Solution linearised at the minimum.
-    covariance
-        (K, K) of the parameters, estimated scatter not taken as known, without the sensor's part.
+    singular_values
+        (6,) of the whitened system, largest first, in 1/mm: turns are scaled by what they move at
+        100 mm (`LEVER_MM`).
+    rank, condition
+        Of that system; the condition is infinite below rank 6.
+    weakest
+        The combination of parameters that is known least, in words.
     """
 
-    refined: Refined
-    slopes: FloatArray
-    components: tuple[NoiseComponent, ...]
-    noise: NoiseEstimate
-    total: FloatArray
-    linear: LinearSolution
-    covariance: FloatArray
-
-    @property
-    def degrees_of_freedom(self) -> int:
-        """Residuals less unknowns."""
-        n_residuals, n_unknowns = self.slopes.shape
-        return int(n_residuals - n_unknowns)
+    singular_values: FloatArray
+    rank: int
+    condition: float
+    weakest: str
 
 
-def fit_plate(
-    nodes: PlateNodes,
-    plate: PlateReference,
-    start: PlateState,
-    options: HandEyeOptions,
-    sigmas: FloatArray | None = None,
-    *,
-    hold_noise: bool = False,
-) -> PlateFit | FitFailure:
-    """Refine a hand-eye.
+def conditioning_at(
+    problem: Problem, state: HandEyeState, sigmas: FloatArray | None = None
+) -> Conditioning:
+    """Rank and condition of the hand-eye at a state, other unknowns eliminated; of any rank.
 
     Parameters
     ----------
-    nodes, plate
-        Data and reference.
-    start
-        Close to the solution.
-    options
-        Noise model, and whether the plate is solved along.
+    problem, state
+        Where.
     sigmas
-        Standard deviations to begin with; typical ones if None.
-    hold_noise
-        Keep these standard deviations.
-    """
-    state = start
-    placed = place_nodes(nodes, plate.plane, state)
-    components = noise_components(nodes, placed, plate.plane, options)
-    if sigmas is None:
-        sigmas = np.array([component.sigma for component in components])
-    for _ in range(PLATE_FIT_MAX_ROUNDS):
-        placed = place_nodes(nodes, plate.plane, state)
-        components = noise_components(nodes, placed, plate.plane, options)
-        fixed = known_covariance(nodes, placed, plate, options)
-        total = total_covariance(components, sigmas) + fixed
-        try:
-            refined = refine(nodes, plate.plane, state, total, solve_plate=options.solve_plate)
-        except LinAlgError:
-            return _no_solution()
-        slopes = design(refined.placed, options.solve_plate)
-        noise = NoiseEstimate(sigmas, np.zeros((len(sigmas), len(sigmas))))
-        if not hold_noise:
-            noise = estimate_noise(refined.placed.residual_mm, slopes, components, fixed, sigmas)
-        change = np.log((noise.sigmas + 1e-12) / (sigmas + 1e-12))
-        state, sigmas = refined.state, noise.sigmas
-        if float(np.abs(change).max()) < SETTLED_LOG:
-            break
-    total = total_covariance(components, sigmas) + fixed
-    refined = refine(nodes, plate.plane, state, total, solve_plate=options.solve_plate)
-    slopes, residual = design(refined.placed, options.solve_plate), refined.placed.residual_mm
-    linear = solve_linear(residual, slopes, total)
-    if linear is None:
-        return _no_solution()
-    covariance = covariance_over_noise(residual, slopes, components, fixed, noise)
-    by_sensor = sensor_covariance(nodes, placed)
-    if by_sensor is not None:
-        covariance -= linear.gain @ by_sensor @ linear.gain.T
-    return PlateFit(refined, slopes, components, noise, total, linear, covariance)
-
-
-def known_covariance(
-    nodes: PlateNodes, placed: PlacedNodes, plate: PlateReference, options: HandEyeOptions
-) -> FloatArray:
-    """(N, N) covariance of the residuals by the probed plane and by the sensor's calibration.
-
-    Both err alike in all postures. The plane is left out where it is solved along or exact.
-    """
-    by_plane = _covariance_by_plane(placed, plate, options)
-    by_sensor = sensor_covariance(nodes, placed)
-    return by_plane if by_sensor is None else by_plane + by_sensor
-
-
-def _covariance_by_plane(
-    placed: PlacedNodes, plate: PlateReference, options: HandEyeOptions
-) -> FloatArray:
-    if options.solve_plate or plate.covariance is None:
-        return np.zeros((len(placed.residual_mm), len(placed.residual_mm)))
-    return plane_covariance(placed, plate.covariance)
-
-
-def hold_sensor(
-    nodes: PlateNodes, plate: PlateReference, fit: PlateFit, options: HandEyeOptions
-) -> PlateFit | FitFailure:
-    """The hand-eye that belongs to the sensor as it is stored, under the scatter of ``fit``.
-
-    A fit that knows the sensor's covariance explains a part of the residuals by a sensor that is
-    moved within it: its hand-eye is that of the moved sensor, and beside the stored one it makes
-    wrong points. Here the sensor stands still and the hand-eye takes up what it can of the
-    sensor's errors. Its ``total`` and ``covariance`` are without the sensor's part.
-    """
-    placed = fit.refined.placed
-    by_sensor = sensor_covariance(nodes, placed)
-    if by_sensor is None:
-        return fit
-    by_plane = _covariance_by_plane(placed, plate, options)
-    total = total_covariance(fit.components, fit.noise.sigmas) + by_plane
-    try:
-        refined = refine(
-            nodes, plate.plane, fit.refined.state, total, solve_plate=options.solve_plate
-        )
-    except LinAlgError:
-        return _no_solution()
-    slopes = design(refined.placed, options.solve_plate)
-    linear = solve_linear(refined.placed.residual_mm, slopes, total)
-    if linear is None:
-        return _no_solution()
-    # What the sensor's errors leave in the residuals is the coupling's part, not the scatter's.
-    own = placed.residual_mm - by_sensor @ fit.linear.projected @ placed.residual_mm
-    covariance = covariance_over_noise(own, slopes, fit.components, by_plane, fit.noise)
-    return replace(
-        fit, refined=refined, slopes=slopes, total=total, linear=linear, covariance=covariance
-    )
-
-
-def plane_after(fit: PlateFit, plate: PlateReference) -> FloatArray:
-    """(3,) tilts and offset of the plate as the scan and the probing together give them."""
-    if len(fit.linear.step) > N_HAND_EYE or plate.covariance is None:
-        return fit.refined.state.plane
-    explained = fit.linear.projected @ fit.refined.placed.residual_mm
-    return np.asarray(-plate.covariance @ fit.refined.placed.by_plane.T @ explained)
-
-
-def hand_eye_information(slopes: FloatArray, total: FloatArray) -> FloatArray:
-    """(6, 6) inverse covariance of the hand-eye, a free plane eliminated; any rank.
+        Standard deviations of the causes of scatter; those to begin with if None.
 
     Raises
     ------
     LinAlgError
-        If the covariance ``total`` is not positive definite.
+        If the covariance of the residuals is not positive definite.
     """
-    whitened = solve_triangular(np.linalg.cholesky(total), slopes, lower=True)
+    placed = problem.place(state)
+    components = problem.components(placed)
+    if sigmas is None:
+        total = total_covariance(components, first_sigmas(problem, components, placed))
+    else:
+        known = problem.surface_covariance(placed) + problem.sensor_covariance(placed)
+        total = total_covariance(components, sigmas) + known
+    whitened = Whitening(total)(placed.jacobian[:, problem.columns])
     hand_eye, others = whitened[:, :N_HAND_EYE], whitened[:, N_HAND_EYE:]
     if others.shape[1]:
         basis, _ = np.linalg.qr(others)
         hand_eye = hand_eye - basis @ (basis.T @ hand_eye)
-    return np.asarray(hand_eye.T @ hand_eye)
+    scaled = hand_eye / np.array([LEVER_MM] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(scaled.T @ scaled)
+    singular = np.sqrt(np.maximum(values[::-1], 0.0))
+    rank = int((singular > RANK_RATIO * singular[0]).sum()) if singular[0] > 0.0 else 0
+    is_full = rank == N_HAND_EYE
+    condition = float(singular[0] / singular[-1]) if is_full else float("inf")
+    sigma_mm = 1.0 / float(singular[-1]) if is_full else float("inf")
+    return Conditioning(singular, rank, condition, _weakest(vectors[:, 0], sigma_mm))
 
 
-def _no_solution() -> FitFailure:
-    return FitFailure(
-        "the refinement found no minimum: the noise model or the data are degenerate",
-        "check the standard deviations given, and the poses",
-    )
-
-
-MAX_WRONG_SHARE = 0.34
-LEAST_LEFT = 6
-SUSPECT_PROBABILITY = 0.2
-WRONG_PROBABILITY = 1e-5
-"""Probability, among as many postures, of a shift and slope like those of the posture."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CheckedFit:
-    """A refined hand-eye, the nodes it rests on, and what is weak about it, in words.
-
-    ``widening`` (6, 6) is added to the hand-eye's covariance for what contradicts it a little;
-    ``plane_check`` says what the stripes alone say of the plate.
-    """
-
-    fit: PlateFit
-    nodes: PlateNodes
-    warnings: tuple[str, ...]
-    widening: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
-    plane_check: str = ""
-
-
-def fit_without_wrong_postures(
-    nodes: PlateNodes,
-    plate: PlateReference,
-    start: Start,
-    first: PlateFit,
-    options: HandEyeOptions,
-) -> CheckedFit | FitFailure:
-    """Leave out postures whose pose is wrong.
-
-    Gross ones are known from the start. Of the rest, the posture that the others predict worst is
-    left out for trial; if the scatter of the others then makes its distance all but impossible, it
-    stays out, and the next one is tried. ``first`` is the fit without the gross ones.
-    """
-    n_all = len(nodes.used_postures)
-    wrong = start.is_wrong.copy()
-    refusal = _refuse_many(nodes, wrong, n_all)
-    if refusal is not None:
-        return refusal
-    gross = wrong.copy()
-    fit = first
-    while True:
-        kept = nodes.select(~wrong[nodes.posture])
-        suspect = _suspect(kept, fit)
-        if suspect is None or len(kept.used_postures) <= LEAST_LEFT:
-            break
-        trial = wrong.copy()
-        trial[suspect] = True
-        without = fit_plate(nodes.select(~trial[nodes.posture]), plate, fit.refined.state, options)
-        if isinstance(without, FitFailure) or not _is_contradicted(
-            kept, plate, without, options, suspect
-        ):
-            break
-        wrong, fit = trial, without
-        refusal = _refuse_many(nodes, wrong, n_all)
-        if refusal is not None:
-            return refusal
-    warnings = _in_words(nodes, wrong, gross, start.rms_mm)
-    return CheckedFit(fit, nodes.select(~wrong[nodes.posture]), warnings)
-
-
-def _suspect(nodes: PlateNodes, fit: PlateFit) -> int | None:
-    left = leave_each_out(nodes, fit.refined.placed.residual_mm, fit.linear)
-    worst = min(left, key=lambda number: left[number].probability)
-    likely = left[worst].probability * len(left)
-    return worst if likely < SUSPECT_PROBABILITY else None
-
-
-def _is_contradicted(
-    nodes: PlateNodes,
-    plate: PlateReference,
-    without: PlateFit,
-    options: HandEyeOptions,
-    suspect: int,
-) -> bool:
-    """Predict the suspect with the scatter that the other postures show."""
-    judged = fit_plate(
-        nodes, plate, without.refined.state, options, without.noise.sigmas, hold_noise=True
-    )
-    if isinstance(judged, FitFailure):
-        return False
-    left = leave_each_out(nodes, judged.refined.placed.residual_mm, judged.linear)
-    return left[suspect].probability * len(left) < WRONG_PROBABILITY
-
-
-def _refuse_many(nodes: PlateNodes, wrong: BoolArray, n_all: int) -> FitFailure | None:
-    n_wrong = int(wrong[nodes.used_postures].sum())
-    if n_wrong <= MAX_WRONG_SHARE * n_all:
-        return None
-    names = ", ".join(nodes.postures[k] for k in np.flatnonzero(wrong)[:8])
-    return FitFailure(
-        f"{n_wrong} of {n_all} postures contradict the others ({names})",
-        "check that every exposure has its own pose (none missing, doubled or swapped) and that "
-        "the plate did not move",
-    )
-
-
-def _in_words(
-    nodes: PlateNodes, wrong: BoolArray, gross: BoolArray, rms_mm: FloatArray
-) -> tuple[str, ...]:
-    """Name the postures that were left out."""
-    warnings = []
-    if gross.any():
-        named = ", ".join(
-            f"{nodes.postures[k]} ({rms_mm[k]:.2f} mm)" for k in np.flatnonzero(gross)
-        )
-        warnings.append(
-            f"left out {int(gross.sum())} postures whose stripes lie far from where the others "
-            f"put the plate: {named}; a missing, doubled or swapped pose looks like this"
-        )
-    mild = wrong & ~gross
-    if mild.any():
-        named = ", ".join(f"{nodes.postures[k]} ({rms_mm[k]:.3f} mm)" for k in np.flatnonzero(mild))
-        warnings.append(
-            f"left out {int(mild.sum())} postures that fit the others worse than their scatter "
-            f"allows: {named}; the arm may have moved during the exposure, or the plate was dirty"
-        )
-    return tuple(warnings)
+def _weakest(direction: FloatArray, sigma_mm: float) -> str:
+    names = [f"turning about tool {axis}" for axis in "xyz"]
+    names += [f"shifting along tool {axis}" for axis in "xyz"]
+    order = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= NAMED_SHARE]
+    parts = [f"{names[k]} ({abs(direction[k]):.2f})" for k in order]
+    known = "not determined" if not np.isfinite(sigma_mm) else f"known to {sigma_mm:.3g} mm"
+    return f"{' with '.join(parts)}: {known}, turns counted at {LEVER_MM:.0f} mm"

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the hand-eye calibrations are given: stripes with the pose of their exposure, what is
-known of the plate, the options; straight pieces of each stripe condensed to a few points on
-the plate, and the residuals of those from a plane.
+"""What a hand-eye calibration is given: stripes with poses, the plate, options.
+
+Stripes on a plate are straight, stripes on a sphere are circles; what lies off them is left out.
+The rest is condensed to some ten observations a stripe, so that dense covariances stay small.
 """
 
 from __future__ import annotations
@@ -13,15 +14,48 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
-from armscan.geometry.poses import Base, Pose, Sensor, Tool
-from armscan.geometry.rotations import nearest_rotation, rotation_from_vector
-from armscan.geometry.shapes import Plane
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    ints,
+)
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.shapes import Plane, fit_circle, fit_plane
+
+FLATNESS_LENGTH_MM = 30.0
+"""Length over which a plate's flatness error stays alike; need not be exact."""
+OUTLIER_SIGMAS = 5.0
+"""Points further than this many robust sigmas from their line or circle are left out."""
+MIN_POINTS = 20
+"""Fewest points that make a stripe."""
+LINE_TOLERANCE_MM = 0.5
+"""Half width of the band about a line in which points belong together, before robust statistics
+tighten it: more than the bow of any sheet."""
+MIN_ARC_DEG = 20.0
+"""Shortest arc that makes a section of a sphere: a shorter one hardly tells its radius."""
+SAME_POSTURE_MM = 1.0
+SAME_POSTURE_RAD = float(np.radians(0.2))
+"""An arm that stands still reports its pose to some 0.02 mm and 0.002 degrees; a robot of 0.2 mm
+is within it too."""
+STANDING_SIGMAS = 10.0
+N_PAIRS, MAX_COUNTED = 80, 400
+"""Lines through so many pairs of points are tried, each counted on so many points."""
+LEAST_SIGMA_MM = 1e-4
+LARGEST_SECTION, SMALLEST_SECTION = 1.05, 0.05
+"""Radius of a section over the sphere's: beyond them, something else was seen."""
+METRES = 0.002
+MAX_OBSERVATIONS, LEAST_A_STRIPE = 600, 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HandEyeOptions:
-    """How stripes on a flat plate become a hand-eye, and how much everything scatters.
+    """How stripes on a plate or a sphere become a hand-eye, and how much everything scatters.
 
     A standard deviation that is None is estimated from the data.
 
@@ -31,32 +65,29 @@ class HandEyeOptions:
         Scatter of the scan point by the arm's pose, an axis, common to a posture.
     arm_rotation_rad
         Scatter of the arm's orientation, an axis, common to a posture. None follows the position
-        (see `armscan.calibration.hand_eye.solve.ROTATION_LEVER_MM`).
+        (`armscan.calibration.hand_eye.noise.ROTATION_LEVER_MM`).
     exposure_position_mm, exposure_rotation_rad
-        The parts of both that are new in every exposure. None: none if the arm's position is
-        given; else estimated where a posture has several exposures.
+        The parts of both that are new in every exposure, on a plate. None: none if the arm's
+        position is given; else estimated where a posture has several exposures.
     plate_flatness_mm
         Standard deviation of the plate's smooth flatness error.
-    flatness_length_mm
-        Length over which it stays alike; need not be exact.
     sheet_shape_mm
         Standard deviation of the light sheets' own shape, beyond what their parameters describe.
     stripe_noise_factor
         What the stripes' own noise is multiplied with.
     solve_plate
         Solve the plate's plane along, without regard to where it was probed.
-    nodes_per_stripe
-        Mean points that an exposure's stripe is condensed to before the refinement.
-    line_tolerance_mm
-        Half width of the band in which points belong to one stripe on the plate, before robust
-        statistics tighten it.
-    outlier_sigma
-        Points further than this many robust sigmas from their stripe are rejected.
-    min_points
-        Fewest points that make a stripe.
+    solve_diameter
+        Solve the sphere's diameter along, without regard to the one given.
+    solve_scale
+        Solve a common scale of the sensor's points along.
+    per_stripe
+        Observations that a stripe is condensed to; None for 12 on a plate and 24 on a sphere.
+    posture_sigmas
+        Postures on a sphere whose pose errs by more than this many standard deviations lose weight.
     max_rms_mm
-        Typical distance of a posture's points from the plate above which the data contradict each
-        other and no hand-eye is returned.
+        Typical distance of a posture's points from the reference above which the data contradict
+        each other and no hand-eye is returned.
     """
 
     arm_position_mm: float | None = None
@@ -64,69 +95,33 @@ class HandEyeOptions:
     exposure_position_mm: float | None = None
     exposure_rotation_rad: float | None = None
     plate_flatness_mm: float | None = None
-    flatness_length_mm: float = 30.0
     sheet_shape_mm: float | None = None
     stripe_noise_factor: float | None = None
     solve_plate: bool = False
-    nodes_per_stripe: int = 12
-    line_tolerance_mm: float = 0.5
-    outlier_sigma: float = 5.0
-    min_points: int = 20
+    solve_diameter: bool = False
+    solve_scale: bool = False
+    per_stripe: int | None = None
+    posture_sigmas: float = 2.5
     max_rms_mm: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in (
-            "arm_position_mm",
-            "arm_rotation_rad",
-            "exposure_position_mm",
-            "exposure_rotation_rad",
-            "plate_flatness_mm",
-            "sheet_shape_mm",
-            "stripe_noise_factor",
-        ):
-            value = getattr(self, name)
-            _require(
-                value is None or (math.isfinite(value) and value >= 0.0),
-                f"{name} is {value}",
-                "give 0 or more, or leave it out to have it estimated",
-            )
+        scatters = ("arm_position_mm", "exposure_position_mm", "plate_flatness_mm")
+        for name in (*scatters, "sheet_shape_mm", "stripe_noise_factor"):
+            self._check(name, 0.0, math.inf, "give 0 or more, or leave it out to have it estimated")
         for name in ("arm_rotation_rad", "exposure_rotation_rad"):
-            value = getattr(self, name)
-            _require(
-                value is None or value < 0.1,
-                f"{name} is {value} rad",
-                "an arm's orientation scatters by less than 0.1 rad: give rad, not degrees",
-            )
-        _require(
-            1.0 <= self.flatness_length_mm <= 1000.0,
-            f"flatness length of {self.flatness_length_mm} mm",
-            "give 1 to 1000 mm",
-        )
-        _require(
-            4 <= self.nodes_per_stripe <= 60,
-            f"{self.nodes_per_stripe} nodes a stripe",
-            "give 4 to 60",
-        )
-        for name in ("line_tolerance_mm", "max_rms_mm"):
-            value = getattr(self, name)
-            _require(
-                math.isfinite(value) and value > 0.0, f"{name} is {value}", "give a positive length"
-            )
-        _require(
-            self.outlier_sigma >= 2.0,
-            f"outlier limit of {self.outlier_sigma} sigma",
-            "give at least 2, or good points are lost",
-        )
-        _require(self.min_points >= 5, f"{self.min_points} points a stripe", "give at least 5")
+            self._check(name, 0.0, 0.1, "0 or more, below 0.1 rad: give rad, not degrees")
+        self._check("per_stripe", 4, 100, "give 4 to 100")
+        self._check("posture_sigmas", 1.5, math.inf, "give at least 1.5")
+        self._check("max_rms_mm", 1e-6, 1000.0, "give a positive length")
+
+    def _check(self, name: str, least: float, below: float, remedy: str) -> None:
+        value = getattr(self, name)
+        if value is not None and not least <= value < below:
+            fact = f"{name} is {value}"
+            raise OptionError(fact, where="hand-eye options", remedy=remedy)
 
 
-def _require(holds: bool, what: str, remedy: str) -> None:
-    if not holds:
-        raise OptionError(what, where="hand-eye options", remedy=remedy)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedStripe:
+class PosedStripe(RowRecord):
     """Points of one exposure, with the pose that the arm reported for it.
 
     Parameters
@@ -144,7 +139,7 @@ class PosedStripe:
         acts: one of each camera that saw the point.
     sheet
         (N,) index of the light sheet that each point lies on.
-    by_sensor
+    dpoint_dsensor
         (N, 3, P) derivative of the points by all the sensor's parameters, or None where the
         sensor delivered points.
     """
@@ -152,25 +147,13 @@ class PosedStripe:
     source: str
     posture: str
     base_from_tool: Pose[Base, Tool]
-    points_mm: FloatArray
-    noise_mm: FloatArray
-    sheet: IntArray
-    by_sensor: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        points = frozen_floats(self.points_mm, (None, 3), "points_mm")
-        object.__setattr__(self, "points_mm", points)
-        noise = frozen_floats(self.noise_mm, (len(points), 3, None), "noise_mm")
-        object.__setattr__(self, "noise_mm", noise)
-        object.__setattr__(self, "sheet", frozen_ints(self.sheet, (len(points),), "sheet"))
-
-    def __len__(self) -> int:
-        """Count of points."""
-        return len(self.points_mm)
+    points_mm: FloatArray = floats("N", 3)
+    noise_mm: FloatArray = floats("N", 3, "J")
+    sheet: IntArray = ints("N")
+    dpoint_dsensor: FloatArray | None = floats("N", 3, "P", default=None)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlateReference:
+class PlateReference(ArrayRecord):
     """The flat plate in Base, as it was probed (eq. 2.55).
 
     Parameters
@@ -191,129 +174,112 @@ class PlateReference:
     """
 
     plane: Plane
-    covariance: FloatArray | None = None
+    covariance: FloatArray | None = floats(3, 3, default=None)
     rms_mm: float | None = None
     n_points: int = 0
     source: str = ""
     tip_diameter_mm: float = 0.0
 
-    def __post_init__(self) -> None:
-        if self.covariance is not None:
-            covariance = frozen_floats(self.covariance, (3, 3), "covariance")
-            object.__setattr__(self, "covariance", covariance)
 
-
-SAME_POSTURE_MM = 1.0
-SAME_POSTURE_RAD = float(np.radians(0.2))
-"""An arm that stands still reports its pose to some 0.02 mm and 0.002 degrees; a robot of 0.2 mm
-is within it too."""
-STANDING_SIGMAS = 10.0
-
-
-def check_postures(
-    stripes: Sequence[PosedStripe],
-    exposure_mm: float | None = None,
-    exposure_rad: float | None = None,
-) -> None:
+def check_postures(stripes: Sequence[PosedStripe], options: HandEyeOptions) -> None:
     """Refuse a posture's name that stands for different poses of the arm.
 
-    Parameters
-    ----------
-    stripes
-        With their postures and poses.
-    exposure_mm, exposure_rad
-        Scatter of the pose from exposure to exposure where it was given: a worse arm may move
-        that much more.
+    An arm of which a larger scatter from exposure to exposure was given may move that much more.
 
     Raises
     ------
     InputError
         If two exposures of one posture are further apart than an arm that stands still.
     """
-    most_mm = max(SAME_POSTURE_MM, STANDING_SIGMAS * (exposure_mm or 0.0))
-    most_rad = max(SAME_POSTURE_RAD, STANDING_SIGMAS * (exposure_rad or 0.0))
-    seen: dict[str, PosedStripe] = {}
+    exposure_mm = options.exposure_position_mm or 0.0
+    exposure_rad = options.exposure_rotation_rad or 0.0
+    most_mm = max(SAME_POSTURE_MM, STANDING_SIGMAS * exposure_mm)
+    most_rad = max(SAME_POSTURE_RAD, STANDING_SIGMAS * exposure_rad)
+    first_of: dict[str, PosedStripe] = {}
     for stripe in stripes:
-        first = seen.setdefault(stripe.posture, stripe)
+        first = first_of.setdefault(stripe.posture, stripe)
         change: Pose[Tool, Tool] = first.base_from_tool.inverse() @ stripe.base_from_tool
-        moved_mm = float(np.linalg.norm(change.translation_mm))
-        turned_rad = float(np.linalg.norm(change.rotation_vector_rad))
-        if moved_mm > most_mm or turned_rad > most_rad:
+        shift_mm = float(np.linalg.norm(change.translation_mm))
+        turn_rad = float(np.linalg.norm(change.rotation_vector_rad))
+        if shift_mm > most_mm or turn_rad > most_rad:
             raise InputError(
                 f"posture '{stripe.posture}' has different poses: the arm moved by "
-                f"{moved_mm:.1f} mm and {np.degrees(turned_rad):.1f} deg from {first.source} to "
+                f"{shift_mm:.1f} mm and {np.degrees(turn_rad):.1f} deg from {first.source} to "
                 f"{stripe.source}",
                 remedy="give every posture of the arm a view of its own; if the arm stood still, "
                 "check that both exposures have their own poses",
             )
 
 
-N_PAIRS = 80
-MAX_COUNTED = 400
-LEAST_SIGMA_MM = 1e-4
-MAD_TO_SIGMA = 1.4826
+def check_diameter(diameter_mm: float) -> None:
+    """Refuse a sphere that is none.
+
+    Raises
+    ------
+    OptionError
+        If the diameter is not between 1 and 1000 mm.
+    """
+    if not 1.0 <= diameter_mm <= 1000.0:
+        raise OptionError(
+            f"a sphere of {diameter_mm} mm diameter",
+            where="hand-eye options",
+            remedy="give the diameter in mm, 1 to 1000",
+        )
 
 
-def find_straight_points(
-    points_mm: FloatArray, tolerance_mm: float, outlier_sigma: float
-) -> BoolArray:
-    """Mark the points of the one straight, slightly bowed stripe that most points lie on.
+def straight_stripes(stripes: Sequence[PosedStripe]) -> tuple[BoolArray, ...]:
+    """Mark, stripe by stripe, the points that lie on one straight line of their sheet."""
+    marks = []
+    for stripe in stripes:
+        kept = np.zeros(len(stripe), dtype=np.bool_)
+        for sheet in np.unique(stripe.sheet):
+            of_sheet = np.flatnonzero(stripe.sheet == sheet)
+            straight = find_straight_points(stripe.points_mm[of_sheet])
+            if int(straight.sum()) >= MIN_POINTS:
+                kept[of_sheet] = straight
+        marks.append(kept)
+    return tuple(marks)
+
+
+def find_straight_points(points_mm: FloatArray) -> BoolArray:
+    """Mark those of (N, 3) points that lie on one straight, slightly bowed stripe: the most common.
 
     A sheet of light may be bowed by a tenth of a millimetre, so the points are finally compared
     with a parabola; edges of the plate and whatever lies beyond it are left out.
-
-    Parameters
-    ----------
-    points_mm
-        (N, 3) points of one sheet in one exposure.
-    tolerance_mm
-        Half width of the band about a straight line in which points belong together.
-    outlier_sigma
-        Robust sigmas from the parabola that are accepted.
     """
     if len(points_mm) < 3:
         return np.zeros(len(points_mm), dtype=np.bool_)
-    kept = _most_common_line(points_mm, tolerance_mm)
+    kept = _most_common_line(points_mm)
     for _ in range(4):
         if int(kept.sum()) < 4:
             return kept
         off = _off_parabola_mm(points_mm, kept)
-        sigma = max(MAD_TO_SIGMA * float(np.median(off[kept])), LEAST_SIGMA_MM)
-        updated = off <= min(outlier_sigma * sigma, tolerance_mm)
+        sigma = max(robust_sigma(off[kept]), LEAST_SIGMA_MM)
+        updated = off <= min(OUTLIER_SIGMAS * sigma, LINE_TOLERANCE_MM)
         if bool((updated == kept).all()):
             break
         kept = updated
     return kept
 
 
-def bow_mm(points_mm: FloatArray) -> float:
-    """Root mean square distance of (N, 3) points from their straight line."""
-    spread = np.linalg.svd(points_mm - points_mm.mean(axis=0), compute_uv=False)
-    return float(np.sqrt((spread[1:] ** 2).sum() / len(points_mm)))
-
-
-def _most_common_line(points_mm: FloatArray, tolerance_mm: float) -> BoolArray:
+def _most_common_line(points_mm: FloatArray) -> BoolArray:
     """Points within the tolerance of the line through two points that has most of them."""
     sample = points_mm[:: max(1, len(points_mm) // MAX_COUNTED)]
     draw = np.random.default_rng(0).integers(0, len(sample), (N_PAIRS, 2))
     start, chord = sample[draw[:, 0]], sample[draw[:, 1]] - sample[draw[:, 0]]
     length = np.linalg.norm(chord, axis=1)
-    usable = length > 5.0 * tolerance_mm
+    usable = length > 5.0 * LINE_TOLERANCE_MM
     if not bool(usable.any()):
         return np.ones(len(points_mm), dtype=np.bool_)
     start, direction = start[usable], chord[usable] / length[usable, None]
-    counts = [
-        int((_off_line_mm(sample, p, d) <= tolerance_mm).sum())
-        for p, d in zip(start, direction, strict=True)
-    ]
-    best = int(np.argmax(counts))
-    return np.asarray(_off_line_mm(points_mm, start[best], direction[best]) <= tolerance_mm)
 
+    def near(points: FloatArray, k: int) -> BoolArray:
+        offset = points - start[k]
+        across = offset - (offset @ direction[k])[:, None] * direction[k]
+        return np.asarray(np.linalg.norm(across, axis=1) <= LINE_TOLERANCE_MM)
 
-def _off_line_mm(points_mm: FloatArray, start: FloatArray, direction: FloatArray) -> FloatArray:
-    offset = points_mm - start
-    across = offset - (offset @ direction)[:, None] * direction
-    return np.asarray(np.linalg.norm(across, axis=1))
+    counts = [int(near(sample, k).sum()) for k in range(len(start))]
+    return near(points_mm, int(np.argmax(counts)))
 
 
 def _off_parabola_mm(points_mm: FloatArray, kept: BoolArray) -> FloatArray:
@@ -326,265 +292,336 @@ def _off_parabola_mm(points_mm: FloatArray, kept: BoolArray) -> FloatArray:
     return np.asarray(np.linalg.norm(local[:, 1:] - basis @ fitted, axis=1))
 
 
-MAX_NODES = 600
-LEAST_NODES = 3
+class CircleSection(ArrayRecord):
+    """The part of one exposure's stripe that lies on a sphere: an arc of a circle.
+
+    Parameters
+    ----------
+    stripe
+        The exposure.
+    rows
+        Indices of the points used, ordered along the arc.
+    off_circle_mm
+        (n,) their distance from the section circle.
+    centre_mm
+        (3,) the circle's centre in the Sensor frame.
+    normal
+        (3,) unit normal of the light sheet, alike for all exposures of a sheet.
+    radius_mm
+        Of the circle.
+    arc_deg
+        Extent of the arc.
+    n_rejected
+        Count of the exposure's points off the circle.
+    """
+
+    stripe: PosedStripe
+    rows: IntArray = ints("n")
+    off_circle_mm: FloatArray = floats("n")
+    centre_mm: FloatArray = floats(3)
+    normal: FloatArray = floats(3)
+    radius_mm: float
+    arc_deg: float
+    n_rejected: int
+
+    @property
+    def points_mm(self) -> FloatArray:
+        """(n, 3) points used, in the Sensor frame."""
+        return np.asarray(self.stripe.points_mm[self.rows])
+
+    def thinned(self, n_points: int) -> CircleSection:
+        """About ``n_points`` of the points, evenly along the arc."""
+        step = max(len(self.rows) // n_points, 1)
+        return replace(self, rows=self.rows[::step], off_circle_mm=self.off_circle_mm[::step])
+
+    def height_mm(self, sphere_radius_mm: float) -> float:
+        """Distance of the sphere's centre from the sheet; zero where the circle is a great one."""
+        return float(np.sqrt(max(sphere_radius_mm**2 - self.radius_mm**2, 0.0)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlateNodes:
-    """Mean points of short pieces of stripe; for a given pose they say what their points say.
+def find_sections(
+    stripes: Sequence[PosedStripe], radius_mm: float
+) -> tuple[tuple[CircleSection, ...], tuple[str, ...]]:
+    """Fit a section circle to the stripe of every exposure and sheet.
+
+    Parameters
+    ----------
+    stripes
+        Exposures of the sphere.
+    radius_mm
+        Of the sphere, to tell it from whatever else was seen.
+
+    Returns
+    -------
+    sections
+        One for each usable stripe.
+    left_out
+        Stripes that were not used, each with the reason, in words.
+    """
+    planes = _sheet_planes(stripes)
+    sections, left_out = [], []
+    for stripe in stripes:
+        for sheet in np.unique(stripe.sheet).tolist():
+            rows = np.flatnonzero(stripe.sheet == sheet)
+            found = _find_section(stripe, rows, planes.get(sheet), radius_mm)
+            if isinstance(found, CircleSection):
+                sections.append(found)
+            else:
+                left_out.append(f"{stripe.source}: {found}")
+        if len(stripe) == 0:
+            left_out.append(f"{stripe.source}: no points")
+    return tuple(sections), tuple(left_out)
+
+
+def _sheet_planes(stripes: Sequence[PosedStripe]) -> dict[int, Plane]:
+    """Plane of each sheet's points in the Sensor frame; the bow of a sheet is neglected here."""
+    planes = {}
+    for sheet in sorted({int(k) for stripe in stripes for k in stripe.sheet}):
+        points = np.concatenate([stripe.points_mm[stripe.sheet == sheet] for stripe in stripes])
+        fit = fit_plane(points)
+        if not isinstance(fit, FitFailure):
+            planes[sheet] = fit.value
+    return planes
+
+
+def _find_section(
+    stripe: PosedStripe, rows: IntArray, plane: Plane | None, sphere_radius_mm: float
+) -> CircleSection | str:
+    if len(rows) < MIN_POINTS:
+        return f"{len(rows)} points, fewer than {MIN_POINTS}"
+    if plane is None:
+        return "its points and those of all others of the sheet lie on one line"
+    flat = (stripe.points_mm[rows] - plane.point_mm) @ plane.axes[:2].T
+    fit = fit_circle(flat, outlier_sigmas=OUTLIER_SIGMAS)
+    if isinstance(fit, FitFailure):
+        return fit.reason
+    circle = fit.value
+    unlike = _unlike_sphere(circle.radius_mm, sphere_radius_mm)
+    if unlike:
+        return unlike
+    # The points that the fit used: as many of the nearest as it has freedom for.
+    size = np.abs(fit.residuals)
+    kept = size <= np.sort(size)[min(fit.degrees_of_freedom + 3, len(size)) - 1]
+    arc_deg, along = _along_arc(flat[kept], circle.centre_mm)
+    if len(along) < MIN_POINTS or arc_deg < MIN_ARC_DEG:
+        return f"an arc of {arc_deg:.0f} degrees with {len(along)} points is too short"
+    order = np.argsort(along)
+    return CircleSection(
+        stripe=stripe,
+        rows=rows[kept][order],
+        off_circle_mm=fit.residuals[kept][order],
+        centre_mm=plane.point_mm + circle.centre_mm @ plane.axes[:2],
+        normal=plane.normal,
+        radius_mm=circle.radius_mm,
+        arc_deg=arc_deg,
+        n_rejected=len(rows) - int(kept.sum()),
+    )
+
+
+def _unlike_sphere(radius_mm: float, sphere_radius_mm: float) -> str:
+    """Why a circle of that radius is no section of the sphere, or nothing."""
+    if radius_mm > LARGEST_SECTION * sphere_radius_mm:
+        return (
+            f"its section has a radius of {radius_mm:.2f} mm, more than the sphere's "
+            f"{sphere_radius_mm:g} mm"
+        )
+    if radius_mm < METRES * sphere_radius_mm:
+        return f"its section has a radius of {radius_mm:.3g} mm: are the points in metres?"
+    if radius_mm < SMALLEST_SECTION * sphere_radius_mm:
+        return f"its section has a radius of {radius_mm:.3g} mm only"
+    return ""
+
+
+def _along_arc(flat: FloatArray, centre: FloatArray) -> tuple[float, FloatArray]:
+    """Extent of the arc in degrees and (n,) angle of each point from its middle."""
+    towards = flat - centre
+    middle = towards.mean(axis=0)
+    cross = middle[0] * towards[:, 1] - middle[1] * towards[:, 0]
+    angle = np.degrees(np.arctan2(cross, towards @ middle))
+    low, high = np.percentile(angle, [1.0, 99.0])
+    return float(high - low), np.asarray(angle)
+
+
+class CondensedObservations(ArrayRecord):
+    """Stripes condensed: each observation is the mean distance of some points from the reference.
+
+    On a plate the mean of the distances is the distance of the mean point, so that one point stands
+    for each piece of a stripe; on a curved stripe it is not, and the points stay.
 
     Parameters
     ----------
     points_mm
-        (N, 3) in the Sensor frame.
+        (N, 3) in the Sensor frame, the points of an observation one after another.
+    first, count
+        (M,) row of each observation's first point, and count of its points.
     noise_mm2
-        (N, 3, 3) covariance by the stripe's own noise, points taken as independent.
-    by_sensor
-        (N, 3, P) derivative by the sensor's parameters; None where there is none.
-    sheet
-        (N,) light sheet.
-    stripe
-        (N,) index into ``sources``, ``rotations`` and ``translations_mm``.
-    posture
-        (N,) index into ``postures``.
+        (M, 3, 3) covariance by the stripe's own noise.
+    sheet, stripe, posture
+        (M,) light sheet; index into ``sources``, ``rotations``, ``translations_mm``; into
+        ``postures``.
     rotations, translations_mm
         (S, 3, 3) and (S, 3) ``base_from_tool`` of each stripe.
     sources, postures
         Names.
+    dpoint_dsensor
+        (N, 3, P) derivative of the points by the sensor's parameters; None where there is none.
     sensor_covariance
         (P, P) of the sensor's parameters; None where it is taken as exact.
     """
 
-    points_mm: FloatArray
-    noise_mm2: FloatArray
-    by_sensor: FloatArray | None
-    sheet: IntArray
-    stripe: IntArray
-    posture: IntArray
-    rotations: FloatArray
-    translations_mm: FloatArray
+    points_mm: FloatArray = floats("N", 3)
+    first: IntArray = ints("M")
+    count: IntArray = ints("M")
+    noise_mm2: FloatArray = floats("M", 3, 3)
+    sheet: IntArray = ints("M")
+    stripe: IntArray = ints("M")
+    posture: IntArray = ints("M")
+    rotations: FloatArray = floats("S", 3, 3)
+    translations_mm: FloatArray = floats("S", 3)
     sources: tuple[str, ...]
     postures: tuple[str, ...]
-    sensor_covariance: FloatArray | None = None
+    dpoint_dsensor: FloatArray | None = floats("N", 3, "P", default=None)
+    sensor_covariance: FloatArray | None = floats("P", "P", default=None)
 
     def __len__(self) -> int:
-        """Count of nodes."""
-        return len(self.points_mm)
+        """Count of observations."""
+        return len(self.first)
 
-    def select(self, kept: BoolArray) -> PlateNodes:
-        """Keep some nodes; stripes and postures keep their numbers."""
+    def mean(self, values: FloatArray) -> FloatArray:
+        """(M, ...) mean over each observation of (N, ...) values of its points."""
+        if len(values) == len(self):
+            return values
+        sums = np.add.reduceat(values, self.first, axis=0)
+        return np.asarray(sums / self.count.reshape(-1, *([1] * (values.ndim - 1))))
+
+    def of_points(self, values: IntArray) -> IntArray:
+        """(N,) values of the points from (M,) of their observations."""
+        return np.repeat(values, self.count)
+
+    def select(self, kept: BoolArray) -> CondensedObservations:
+        """Keep some observations (M,); stripes and postures keep their numbers."""
+        rows, count = np.repeat(kept, self.count), self.count[kept]
+        by_sensor = self.dpoint_dsensor
         return replace(
             self,
-            points_mm=self.points_mm[kept],
+            points_mm=self.points_mm[rows],
+            first=np.cumsum(count) - count,
+            count=count,
             noise_mm2=self.noise_mm2[kept],
-            by_sensor=None if self.by_sensor is None else self.by_sensor[kept],
             sheet=self.sheet[kept],
             stripe=self.stripe[kept],
             posture=self.posture[kept],
+            dpoint_dsensor=None if by_sensor is None else by_sensor[rows],
         )
-
-    def moved(self, rotations: FloatArray, translations_mm: FloatArray) -> PlateNodes:
-        """Give the stripes other poses, (S, 3, 3) and (S, 3)."""
-        return replace(self, rotations=rotations, translations_mm=translations_mm)
 
     @property
     def used_postures(self) -> IntArray:
-        """Numbers of the postures that have nodes."""
+        """Numbers of the postures that have observations, ascending."""
         return np.unique(self.posture)
 
 
-def straight_stripes(
-    stripes: Sequence[PosedStripe], options: HandEyeOptions
-) -> tuple[BoolArray, ...]:
-    """Mark, stripe by stripe, the points that lie on one straight line of their sheet."""
-    marks = []
-    for stripe in stripes:
-        kept = np.zeros(len(stripe), dtype=np.bool_)
-        for sheet in np.unique(stripe.sheet):
-            own = np.flatnonzero(stripe.sheet == sheet)
-            straight = find_straight_points(
-                stripe.points_mm[own], options.line_tolerance_mm, options.outlier_sigma
-            )
-            if int(straight.sum()) >= options.min_points:
-                kept[own] = straight
-        marks.append(kept)
-    return tuple(marks)
-
-
-def condense(
-    stripes: Sequence[PosedStripe], kept: Sequence[BoolArray], nodes_per_stripe: int
-) -> PlateNodes:
-    """Turn the marked points into nodes; at most about `MAX_NODES` of them."""
-    n_pieces = sum(
+def condense_plate(
+    stripes: Sequence[PosedStripe], kept: Sequence[BoolArray], per_stripe: int
+) -> CondensedObservations:
+    """Mean points of pieces of equal length of the marked points; about 600 of them at most."""
+    n_lines = sum(
         len(np.unique(stripe.sheet[mark])) for stripe, mark in zip(stripes, kept, strict=True)
     )
-    n_nodes = max(LEAST_NODES, min(nodes_per_stripe, MAX_NODES // max(n_pieces, 1)))
+    n_pieces = max(LEAST_A_STRIPE, min(per_stripe, MAX_OBSERVATIONS // max(n_lines, 1)))
     names = tuple(dict.fromkeys(stripe.posture for stripe in stripes))
-    parts: list[tuple[FloatArray, FloatArray, FloatArray | None]] = []
+    points, noises, by_sensor = [], [], []
     labels: list[tuple[int, int, int]] = []
     for number, (stripe, mark) in enumerate(zip(stripes, kept, strict=True)):
         for sheet in np.unique(stripe.sheet[mark]):
-            own = np.flatnonzero(mark & (stripe.sheet == sheet))
-            for piece in _pieces(stripe.points_mm[own], n_nodes):
-                parts.append(_mean(stripe, own[piece]))
+            line = np.flatnonzero(mark & (stripe.sheet == sheet))
+            for piece in _pieces(stripe.points_mm[line], n_pieces):
+                weights, noise = _mean_noise(stripe.noise_mm[line[piece]])
+                points.append(weights @ stripe.points_mm[line[piece]])
+                noises.append(noise)
+                if stripe.dpoint_dsensor is not None:
+                    by_sensor.append(np.tensordot(weights, stripe.dpoint_dsensor[line[piece]], 1))
                 labels.append((int(sheet), number, names.index(stripe.posture)))
     labelled = np.array(labels, dtype=np.int64).reshape(-1, 3)
-    sensors = [part[2] for part in parts if part[2] is not None]
-    return PlateNodes(
-        np.array([part[0] for part in parts]).reshape(-1, 3),
-        np.array([part[1] for part in parts]).reshape(-1, 3, 3),
-        np.array(sensors) if sensors and len(sensors) == len(parts) else None,
-        labelled[:, 0],
-        labelled[:, 1],
-        labelled[:, 2],
-        np.array([stripe.base_from_tool.rotation for stripe in stripes]).reshape(-1, 3, 3),
-        np.array([stripe.base_from_tool.translation_mm for stripe in stripes]).reshape(-1, 3),
-        tuple(stripe.source for stripe in stripes),
-        names,
+    return CondensedObservations(
+        points_mm=np.array(points).reshape(-1, 3),
+        first=np.arange(len(points)),
+        count=np.ones(len(points), dtype=np.int64),
+        noise_mm2=np.array(noises).reshape(-1, 3, 3),
+        sheet=labelled[:, 0],
+        stripe=labelled[:, 1],
+        posture=labelled[:, 2],
+        rotations=np.array([one.base_from_tool.rotation for one in stripes]).reshape(-1, 3, 3),
+        translations_mm=np.array([o.base_from_tool.translation_mm for o in stripes]).reshape(-1, 3),
+        sources=tuple(stripe.source for stripe in stripes),
+        postures=names,
+        dpoint_dsensor=np.array(by_sensor) if 0 < len(by_sensor) == len(points) else None,
     )
 
 
-def _pieces(points_mm: FloatArray, n_nodes: int) -> list[IntArray]:
-    """Places of the points in ``n_nodes`` pieces of equal length along the stripe."""
+def _pieces(points_mm: FloatArray, n_pieces: int) -> list[IntArray]:
+    """Rows of the points in ``n_pieces`` pieces of equal length along the stripe."""
     centred = points_mm - points_mm.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     along = centred @ axes[0]
     low, high = float(along.min()), float(along.max())
-    piece = ((along - low) / max(high - low, 1e-12) * n_nodes).astype(np.int64)
-    piece = np.minimum(piece, n_nodes - 1)
+    piece = ((along - low) / max(high - low, 1e-12) * n_pieces).astype(np.int64)
+    piece = np.minimum(piece, n_pieces - 1)
     return [np.flatnonzero(piece == k) for k in np.unique(piece)]
 
 
-def _mean(stripe: PosedStripe, own: IntArray) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    noise = stripe.noise_mm[own]
-    variance = (noise**2).sum(axis=(1, 2))
+def _mean_noise(noise_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weights (n,) of points by their noise (n, 3, J), and covariance (3, 3) of their mean."""
+    variance = (noise_mm**2).sum(axis=(1, 2))
     floor = max(1e-2 * float(np.median(variance)), 1e-12)
     weights = 1.0 / np.maximum(variance, floor)
     weights /= weights.sum()
-    spread = noise * weights[:, None, None]
-    by_sensor = None
-    if stripe.by_sensor is not None:
-        by_sensor = np.tensordot(weights, stripe.by_sensor[own], axes=1)
-    return weights @ stripe.points_mm[own], np.einsum("nij,nkj->ik", spread, spread), by_sensor
+    shares = noise_mm * weights[:, None, None]
+    return weights, np.einsum("nij,nkj->ik", shares, shares)
 
 
-N_HAND_EYE = 6
-N_PLANE = 3
+def condense_sphere(sections: Sequence[CircleSection], per_stripe: int) -> CondensedObservations:
+    """Cut sections into observations of nearly equal count of points.
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlateState:
-    """A hand-eye, and the plate as two tilts (rad) and an offset (mm) from the probed one.
-
-    The tilts and the offset are `armscan.geometry.shapes.PLANE_PARAMETERS`.
+    Their own noise is taken from how the means leave the section circle: errors of neighbouring
+    points are alike, so that dividing the scatter of single points by the root of their count would
+    promise too much.
     """
-
-    tool_from_sensor: Pose[Tool, Sensor]
-    plane: FloatArray
-
-    def stepped(self, step: FloatArray) -> PlateState:
-        """Add a step of (6,) or (9,): hand-eye, and the plate's plane where it is free."""
-        pose = step_hand_eye(self.tool_from_sensor, step[:N_HAND_EYE])
-        plane = self.plane if len(step) == N_HAND_EYE else self.plane + step[N_HAND_EYE:]
-        return PlateState(pose, plane)
-
-
-def step_hand_eye(pose: Pose[Tool, Sensor], step: FloatArray) -> Pose[Tool, Sensor]:
-    """Add (6,) increments in the order of `armscan.models.calibration.HAND_EYE_PARAMETER_NAMES`."""
-    rotation = nearest_rotation(rotation_from_vector(step[:3]) @ pose.rotation)
-    return Pose(rotation, pose.translation_mm + step[3:6])
-
-
-def hand_eye_difference(pose: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> FloatArray:
-    """(6,) increments that lead from ``other`` to ``pose``."""
-    turn: Pose[Tool, Tool] = Pose(pose.rotation @ other.rotation.T, np.zeros(3))
-    return np.concatenate([turn.rotation_vector_rad, pose.translation_mm - other.translation_mm])
-
-
-def shifted_plane(plate: Plane, plane: FloatArray) -> Plane:
-    """Apply two tilts and an offset (3,) to the plate."""
-    raised = plate.axes[2] - plane[0] * plate.axes[0] - plane[1] * plate.axes[1]
-    normal = raised / np.linalg.norm(raised)
-    across = np.cross(normal, plate.axes[0])
-    across /= np.linalg.norm(across)
-    return Plane(
-        plate.point_mm + plane[2] * normal, np.stack([np.cross(across, normal), across, normal])
+    names = tuple(dict.fromkeys(section.stripe.posture for section in sections))
+    firsts, counts, owners, variances = [], [], [], []
+    start = 0
+    for k, section in enumerate(sections):
+        n = len(section.rows)
+        n_pieces = min(per_stripe, n // 2)
+        edges = np.linspace(0, n, n_pieces + 1).astype(np.int64)
+        count = np.diff(edges)
+        means = np.add.reduceat(section.off_circle_mm, edges[:-1]) / count
+        form = float(means @ means) / max(n_pieces - 3, 1)
+        noise = (section.stripe.noise_mm[section.rows] ** 2).sum(axis=(1, 2)).mean() / count
+        firsts.append(edges[:-1] + start)
+        counts.append(count)
+        owners.append(np.full(n_pieces, k))
+        variances.append(np.maximum(noise, max(form, 1e-12)))
+        start += n
+    owner = np.concatenate(owners)
+    poses = [section.stripe.base_from_tool for section in sections]
+    sheets = [section.stripe.sheet[section.rows[0]] for section in sections]
+    posture_of = np.array([names.index(section.stripe.posture) for section in sections])
+    by_sensor = [
+        one.stripe.dpoint_dsensor[one.rows]
+        for one in sections
+        if one.stripe.dpoint_dsensor is not None
+    ]
+    return CondensedObservations(
+        points_mm=np.concatenate([section.points_mm for section in sections]),
+        first=np.concatenate(firsts),
+        count=np.concatenate(counts),
+        noise_mm2=np.concatenate(variances)[:, None, None] * np.eye(3),
+        sheet=np.array(sheets)[owner],
+        stripe=owner,
+        posture=posture_of[owner],
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations_mm=np.array([pose.translation_mm for pose in poses]),
+        sources=tuple(section.stripe.source for section in sections),
+        postures=names,
+        dpoint_dsensor=np.concatenate(by_sensor) if len(by_sensor) == len(sections) else None,
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlacedNodes:
-    """Nodes placed in Base, and what their distances depend on.
-
-    Parameters
-    ----------
-    points_base_mm
-        (N, 3).
-    scan_points_base_mm
-        (N, 3) middle of the sensor's working range, as the node's exposure had it.
-    normals_tool, normals_sensor
-        (N, 3) the plate's normal in Tool (eq. 2.57) and in Sensor.
-    residual_mm
-        (N,) signed distance from the plate: the misclosure of eq. 2.74.
-    by_hand_eye
-        (N, 6) its derivative by the hand-eye.
-    by_plane
-        (N, 3) its derivative by the plate's tilts and offset.
-    """
-
-    points_base_mm: FloatArray
-    scan_points_base_mm: FloatArray
-    normals_tool: FloatArray
-    normals_sensor: FloatArray
-    residual_mm: FloatArray
-    by_hand_eye: FloatArray
-    by_plane: FloatArray
-
-
-def place_nodes(nodes: PlateNodes, plate: Plane, state: PlateState) -> PlacedNodes:
-    """Place the nodes with a hand-eye and compare them with the plate."""
-    rotations = nodes.rotations[nodes.stripe]
-    translations = nodes.translations_mm[nodes.stripe]
-    hand_eye = state.tool_from_sensor
-    turned = nodes.points_mm @ hand_eye.rotation.T
-    middle = hand_eye.rotation @ nodes.points_mm.mean(axis=0) + hand_eye.translation_mm
-    placed = np.einsum("nij,nj->ni", rotations, turned + hand_eye.translation_mm) + translations
-    local = (placed - plate.point_mm) @ plate.axes.T
-    tilt_1, tilt_2, offset = state.plane
-    scale = np.sqrt(1.0 + tilt_1**2 + tilt_2**2)
-    height = (local[:, 2] - tilt_1 * local[:, 0] - tilt_2 * local[:, 1]) / scale
-    normal = (plate.axes[2] - tilt_1 * plate.axes[0] - tilt_2 * plate.axes[1]) / scale
-    normals_tool = np.einsum("nij,i->nj", rotations, normal)
-    by_plane = -np.column_stack(
-        [
-            local[:, 0] / scale + height * tilt_1 / scale**2,
-            local[:, 1] / scale + height * tilt_2 / scale**2,
-            np.ones(len(nodes)),
-        ]
-    )
-    by_hand_eye = np.concatenate([np.cross(turned, normals_tool), normals_tool], axis=1)
-    return PlacedNodes(
-        placed,
-        rotations @ middle + translations,
-        normals_tool,
-        normals_tool @ hand_eye.rotation,
-        height - offset,
-        by_hand_eye,
-        by_plane,
-    )
-
-
-def residual_by_sensor(nodes: PlateNodes, placed: PlacedNodes) -> FloatArray | None:
-    """(N, P) derivative of the residuals by the sensor's parameters; None where not known."""
-    if nodes.by_sensor is None:
-        return None
-    return np.asarray(np.einsum("ni,nip->np", placed.normals_sensor, nodes.by_sensor))
-
-
-def sensor_covariance(nodes: PlateNodes, placed: PlacedNodes) -> FloatArray | None:
-    """(N, N) covariance of the residuals by the sensor's calibration; None where not known."""
-    by_sensor = residual_by_sensor(nodes, placed)
-    if by_sensor is None or nodes.sensor_covariance is None:
-        return None
-    return np.asarray(by_sensor @ nodes.sensor_covariance @ by_sensor.T)

@@ -279,12 +279,12 @@ def fit_probed_plate(
     surface = compensate_tip(points, facing.normal, tip_mm)
     at = compensate_tip(facing.point_mm[None], facing.normal, tip_mm)[0]
     reference = PlateReference(
-        Plane(at, facing.axes),
-        plane.covariance,
-        float(np.sqrt(np.mean(plane.residuals**2))),
-        int(is_used.sum()),
-        probed.source,
-        probed.tip_diameter_mm,
+        plane=Plane(at, facing.axes),
+        covariance=plane.covariance,
+        rms_mm=float(np.sqrt(np.mean(plane.residuals**2))),
+        n_points=int(is_used.sum()),
+        source=probed.source,
+        tip_diameter_mm=probed.tip_diameter_mm,
     )
     residual = reference.plane.distance_mm(surface)
     rows = tuple(probed.rows[k] for k in np.flatnonzero(of_feature))
@@ -315,7 +315,7 @@ def plate_from_coefficients(
     oriented = face_towards(plane, towards_mm, side)
     if isinstance(oriented, FitFailure):
         return oriented
-    return PlateReference(oriented[0], source=source)
+    return PlateReference(plane=oriented[0], source=source)
 
 
 def _fit(points: FloatArray, options: ProbingOptions) -> Estimate[Plane] | FitFailure:

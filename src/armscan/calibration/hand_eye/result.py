@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Result of a hand-eye calibration: calibration with joint covariance, residuals of stripes and
-postures, diagnostics.
-"""
+"""What a hand-eye calibration returns: the hand-eye with its covariance, and all evidence."""
 
 from __future__ import annotations
 
@@ -9,51 +7,46 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
 
+from armscan.calibration.hand_eye.checks import CheckedFit
 from armscan.calibration.hand_eye.estimate import (
-    CheckedFit,
-    LeftOut,
-    PlateFit,
-    covariance_over_noise,
-    estimate_noise,
-    plane_after,
-)
-from armscan.calibration.hand_eye.observations import (
-    HandEyeOptions,
-    PlateNodes,
-    PlateReference,
-    PosedStripe,
-    residual_by_sensor,
-    sensor_covariance,
-    shifted_plane,
-)
-from armscan.calibration.hand_eye.solve import (
     Conditioning,
+    HandEyeSolution,
+    LeftOut,
+    dhand_eye_dsensor,
+    held_covariance,
+)
+from armscan.calibration.hand_eye.noise import (
     arm_noise,
+    estimate_noise,
     solve_linear,
     total_covariance,
 )
-from armscan.calibration.hand_eye.sphere_estimate import (
-    RADIUS_COLUMN,
-    SCALE_COLUMN,
-    LeftOutPosture,
-    SphereNodes,
-    SphereSolution,
-    SphereState,
-    leave_out,
+from armscan.calibration.hand_eye.observations import (
+    FLATNESS_LENGTH_MM,
+    CircleSection,
+    PosedStripe,
 )
-from armscan.calibration.hand_eye.sphere_estimate import (
-    residual_by_sensor as sphere_estimate_residual_by_sensor,
-)
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
-from armscan.geometry.poses import Points, Pose, Sensor, Tool
+from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, RowRecord, floats
+from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.shapes import Plane
 from armscan.models.calibration import HandEyeCalibration, HandEyeDiagnostics
 
+FINITE_CONDITION = 1e12
+RADIUS_COLUMN, SCALE_COLUMN = N_HAND_EYE + 3, N_HAND_EYE + 4
+"""Of a step on a sphere."""
+OUTLYING = 3.0
+"""A posture whose pose errs by this many standard deviations is named."""
+WRONG_DIAMETER = 4.0
+"""A diameter given that lies this many standard deviations off what the points ask for is named."""
+REJECTED_SHARE = 0.015
+"""A stripe that loses more than this part of its points is named."""
+SHORT_ARC = 0.6
+"""A stripe whose arc is shorter than this part of the usual one is named."""
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StripeResidual:
+
+class StripeResidual(RowRecord):
     """What one exposure left over.
 
     Parameters
@@ -68,17 +61,11 @@ class StripeResidual:
 
     source: str
     posture: str
-    points_base_mm: FloatArray
-    residual_mm: FloatArray
-
-    def __post_init__(self) -> None:
-        points = frozen_floats(self.points_base_mm, (None, 3), "points_base_mm")
-        object.__setattr__(self, "points_base_mm", points)
-        residual = frozen_floats(self.residual_mm, (len(points),), "residual_mm")
-        object.__setattr__(self, "residual_mm", residual)
+    points_base_mm: FloatArray = floats("N", 3)
+    residual_mm: FloatArray = floats("N")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PostureResult:
     """One posture of the arm.
 
@@ -101,7 +88,7 @@ class PostureResult:
         Change of the hand-eye if this posture is left out.
     left_out_normalised
         Size of the residuals of the posture when it took no part, over their predicted standard
-        deviation; 1 is usual.
+        deviation; on a sphere, of the error of its pose. 1 is usual.
     """
 
     posture: str
@@ -118,8 +105,7 @@ class PostureResult:
     left_out_normalised: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeFit:
+class HandEyeFit(ArrayRecord):
     """A hand-eye calibration and its evidence.
 
     Parameters
@@ -127,7 +113,7 @@ class HandEyeFit:
     calibration
         The result.
     start
-        Where the refinement started: the linear solution.
+        Where the refinement started: on a plate the linear solution.
     stripes, postures
         What each exposure and each posture left over.
     singular_values
@@ -142,163 +128,148 @@ class HandEyeFit:
     start: Pose[Tool, Sensor]
     stripes: tuple[StripeResidual, ...]
     postures: tuple[PostureResult, ...]
-    singular_values: FloatArray
+    singular_values: FloatArray = floats(None)
     reference: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        values = frozen_floats(self.singular_values, (None,), "singular_values")
-        object.__setattr__(self, "singular_values", values)
+
+def hand_eye_calibration(
+    checked: CheckedFit,
+    held: HandEyeSolution,
+    conditioning: Conditioning,
+    *,
+    stripes: Sequence[StripeResidual],
+    postures: Sequence[PostureResult],
+) -> HandEyeCalibration:
+    """The document's part: hand-eye, covariance, coupling to the sensor, noise.
+
+    ``held`` is the hand-eye of the sensor as it is (`hold_sensor`); whether all is as given is
+    told by ``checked``, where the sensor may err.
+    """
+    used = {posture.posture for posture in postures}
+    distances = np.concatenate([one.residual_mm for one in stripes if one.posture in used])
+    components, plane = held.components, plane_after(held)
+    is_estimated = [component.is_estimated for component in components]
+    diagnostics = HandEyeDiagnostics(
+        method=held.problem.surface.method,
+        rank=conditioning.rank,
+        condition=min(conditioning.condition, FINITE_CONDITION),
+        weakest=conditioning.weakest,
+        plate_flatness_mm=held.sigma_of("flatness"),
+        flatness_length_mm=0.0 if plane is None else FLATNESS_LENGTH_MM,
+        # On a sphere the form of the stripes is always estimated; what counts is the arm.
+        is_noise_estimated=is_estimated[0] if plane is None else any(is_estimated),
+        left_out_rotation_deg=max(one.left_out_rotation_deg for one in postures),
+        left_out_translation_mm=max(one.left_out_translation_mm for one in postures),
+        chi2_probability=checked.fit.probability,
+    )
+    covariance = held_covariance(checked.fit, held)
+    return HandEyeCalibration(
+        tool_from_sensor=held.state.tool_from_sensor,
+        covariance=covariance[:N_HAND_EYE, :N_HAND_EYE] + checked.widening,
+        sensor_coupling=dhand_eye_dsensor(held),
+        arm_noise=arm_noise(components, held.noise.sigmas),
+        rms_mm=float(np.sqrt((distances**2).mean())),
+        n_postures=len(postures),
+        n_exposures=sum(posture.n_exposures for posture in postures),
+        n_points=sum(posture.n_points for posture in postures),
+        plate=plane,
+        diagnostics=diagnostics,
+    )
 
 
-FINITE_CONDITION = 1e12
+def plane_after(held: HandEyeSolution) -> Plane | None:
+    """The plate as scan and probing together give it; None for a sphere."""
+    surface = held.problem.surface
+    return surface.plane_at(held.surface_after) if isinstance(surface, PlateSurface) else None
 
 
 def stripe_residuals(
-    stripes: Sequence[PosedStripe],
-    kept: Sequence[BoolArray],
-    tool_from_sensor: Pose[Tool, Sensor],
-    plane: Plane,
+    stripes: Sequence[tuple[PosedStripe, IntArray]], held: HandEyeSolution
 ) -> tuple[StripeResidual, ...]:
-    """Place the kept points of every stripe and compare them with the plane."""
-    result = []
-    for stripe, mark in zip(stripes, kept, strict=True):
-        points: Points[Sensor] = Points(stripe.points_mm[mark])
-        placed = (stripe.base_from_tool @ tool_from_sensor @ points).xyz_mm
+    """Place the used points (rows) of every exposure and compare them with the reference."""
+    surface, parameters, result = held.problem.surface, held.surface_after, []
+    for stripe, rows in stripes:
+        base_from_sensor = stripe.base_from_tool @ held.state.tool_from_sensor
+        placed = base_from_sensor.apply(held.state.scale * stripe.points_mm[rows])
         result.append(
-            StripeResidual(stripe.source, stripe.posture, placed, plane.distance_mm(placed))
+            StripeResidual(
+                source=stripe.source,
+                posture=stripe.posture,
+                points_base_mm=placed,
+                residual_mm=surface.distance(placed, parameters)[0],
+            )
         )
     return tuple(result)
 
 
 def posture_results(
-    nodes: PlateNodes,
-    fit: PlateFit,
-    residuals: Sequence[StripeResidual],
-    left_out: dict[int, LeftOut],
-    plane: Plane,
+    held: HandEyeSolution, stripes: Sequence[StripeResidual], left_out: dict[int, LeftOut]
 ) -> tuple[PostureResult, ...]:
-    """Summarise every posture that took part; ``plane`` is the one that the residuals are from."""
-    pose = fit.refined.state.tool_from_sensor
-    spread = fitted_covariance(nodes, fit)
+    """Summarise every posture that took part.
+
+    The hand-eye and the surface follow the errors that they can explain. With ``P`` of
+    `LinearSolution` and ``D`` the covariance of the scatter alone, the residuals that are left are
+    ``D P e``. The errors ``e`` are those that the solution weighed, and the sensor's, which was
+    held.
+    """
+    observations, plane = held.problem.observations, plane_after(held)
+    errors = held.scatter + held.known
+    if observations.sensor_covariance is not None:
+        errors = errors + held.problem.sensor_covariance(held.placed)
     results = []
     for number, left in left_out.items():
-        own = nodes.posture == number
-        name = nodes.postures[number]
-        mine = [residual for residual in residuals if residual.posture == name]
-        distances = np.concatenate([residual.residual_mm for residual in mine])
-        share = own / own.sum()
-        sigma_mm = float(np.sqrt(max(share @ spread @ share, 1e-18)))
-        axis = nodes.rotations[nodes.stripe[own][0]] @ pose.rotation[:, 2]
-        local = plane.axes @ axis
+        rows = observations.posture == number
+        name = observations.postures[number]
+        of_posture = [stripe for stripe in stripes if stripe.posture == name]
+        distances = np.concatenate([stripe.residual_mm for stripe in of_posture])
+        share = rows * observations.count / observations.count[rows].sum()
+        remaining = share @ held.scatter @ held.linear.projected
+        sigma_mm = float(np.sqrt(max(remaining @ errors @ remaining, 1e-18)))
+        tilt_deg = azimuth_deg = float("nan")
+        if plane is not None:
+            rotation = observations.rotations[observations.stripe[rows][0]]
+            axis = plane.axes @ rotation @ held.state.tool_from_sensor.rotation[:, 2]
+            tilt_deg = float(np.degrees(np.arccos(np.clip(abs(axis[2]), 0.0, 1.0))))
+            azimuth_deg = float(np.degrees(np.arctan2(axis[1], axis[0])))
+        points = observations.points_mm[observations.of_points(observations.posture) == number]
         results.append(
             PostureResult(
-                name,
-                len(mine),
-                len(distances),
-                float(distances.mean()),
-                float(np.sqrt((distances**2).mean())),
-                float(distances.mean()) / sigma_mm,
-                float(np.degrees(np.arccos(np.clip(abs(local[2]), 0.0, 1.0)))),
-                float(np.degrees(np.arctan2(local[1], local[0]))),
-                float(np.linalg.norm(nodes.points_mm[own], axis=1).mean()),
-                float(np.degrees(np.linalg.norm(left.change[:3]))),
-                float(np.linalg.norm(left.change[3:6])),
-                left.normalised,
+                posture=name,
+                n_exposures=len(of_posture),
+                n_points=len(distances),
+                mean_mm=float(distances.mean()),
+                rms_mm=float(np.sqrt((distances**2).mean())),
+                normalised_mean=float(distances.mean()) / sigma_mm,
+                tilt_deg=tilt_deg,
+                azimuth_deg=azimuth_deg,
+                stand_off_mm=float(np.linalg.norm(points, axis=1).mean()),
+                left_out_rotation_deg=float(np.degrees(np.linalg.norm(left.change[:3]))),
+                left_out_translation_mm=float(np.linalg.norm(left.change[3:6])),
+                left_out_normalised=left.pose_sigmas if plane is None else left.normalised,
             )
         )
     return tuple(results)
 
 
-def fitted_covariance(nodes: PlateNodes, fit: PlateFit) -> FloatArray:
-    """(N, N) covariance of the residuals from the plane that scan and probing give together.
-
-    The hand-eye and the plane follow the errors that they can explain. With ``P`` of
-    `LinearSolution` and ``D`` the covariance of the scatter alone, these residuals are ``D P e``.
-    The errors ``e`` are those that the fit weighed, and the sensor's, which was held.
-    """
-    scatter = total_covariance(fit.components, fit.noise.sigmas)
-    left = scatter @ fit.linear.projected
-    spread = left @ scatter
-    by_sensor = sensor_covariance(nodes, fit.refined.placed)
-    return np.asarray(spread if by_sensor is None else spread + left @ by_sensor @ left.T)
-
-
-def hand_eye_calibration(
-    checked: CheckedFit,
-    stored: PlateFit,
-    plate: PlateReference,
-    options: HandEyeOptions,
-    *,
-    conditioning: Conditioning,
-    residuals: Sequence[StripeResidual],
-    postures: Sequence[PostureResult],
-) -> HandEyeCalibration:
-    """The document's part: hand-eye, covariance, coupling to the sensor, noise.
-
-    ``stored`` is the hand-eye of the sensor as it is (`hold_sensor`); whether all is as given is
-    told by ``checked``, where the sensor may err.
-    """
-    fit = checked.fit
-    by_sensor = residual_by_sensor(checked.nodes, stored.refined.placed)
-    coupling = None if by_sensor is None else -stored.linear.gain[:6] @ by_sensor
-    used = {posture.posture for posture in postures}
-    distances = np.concatenate([r.residual_mm for r in residuals if r.posture in used])
-    return HandEyeCalibration(
-        tool_from_sensor=stored.refined.state.tool_from_sensor,
-        covariance=stored.covariance[:6, :6] + checked.widening,
-        sensor_coupling=coupling,
-        arm_noise=arm_noise(fit.components, fit.noise.sigmas),
-        rms_mm=float(np.sqrt((distances**2).mean())),
-        n_postures=len(postures),
-        n_exposures=sum(posture.n_exposures for posture in postures),
-        n_points=sum(posture.n_points for posture in postures),
-        plate=shifted_plane(plate.plane, plane_after(stored, plate)),
-        diagnostics=HandEyeDiagnostics(
-            method="plate",
-            rank=conditioning.rank,
-            condition=min(conditioning.condition, FINITE_CONDITION),
-            weakest=conditioning.weakest,
-            plate_flatness_mm=sigma_of(fit, "flatness"),
-            flatness_length_mm=options.flatness_length_mm,
-            is_noise_estimated=any(component.is_estimated for component in fit.components),
-            left_out_rotation_deg=max(posture.left_out_rotation_deg for posture in postures),
-            left_out_translation_mm=max(posture.left_out_translation_mm for posture in postures),
-            chi2_probability=float(chi2_distribution.sf(fit.refined.chi2, fit.degrees_of_freedom)),
-        ),
-    )
-
-
-def sigma_of(fit: PlateFit, name: str) -> float:
-    """Standard deviation of one cause of scatter."""
-    for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
-        if component.name == name:
-            return float(sigma)
-    return 0.0
-
-
-def reference_facts(
-    plate: PlateReference, options: HandEyeOptions, fit: PlateFit, plane_check: str
-) -> tuple[tuple[str, str], ...]:
-    """What the plate was, and what was taken for scatter, as (label, value).
-
-    ``plane_check`` is what the stripes alone say of the probed plane.
-    """
+def plate_facts(checked: CheckedFit, plate: PlateSurface) -> tuple[tuple[str, str], ...]:
+    """What the plate was, and what was taken for scatter, as (label, value)."""
+    reference, fit = plate.reference, checked.fit
     a, b, c, d = plate.plane.coefficients
     facts = [("plate", f"{a:.6f} x {_signed(b)} y {_signed(c)} z {_signed(d, 4)} = 0 in Base (mm)")]
-    if plate.n_points:
-        rms = "" if plate.rms_mm is None else f", {plate.rms_mm:.4f} mm rms from it"
-        facts.append(("probed", f"{plate.n_points} points{rms}"))
-    if options.solve_plate:
+    if reference.n_points:
+        rms = "" if reference.rms_mm is None else f", {reference.rms_mm:.4f} mm rms from it"
+        facts.append(("probed", f"{reference.n_points} points{rms}"))
+    if fit.problem.options.solve_plate:
         facts.append(("plane", "solved along, without regard to the probing"))
-    elif plate.covariance is None and plate.n_points:
+    elif reference.covariance is None and reference.n_points:
         facts.append(("plane", "taken as exact: the probed plate's uncertainty is not known"))
-    elif plate.covariance is None:
+    elif reference.covariance is None:
         facts.append(("plane", "taken as exact: only A, B, C, D were given"))
     else:
         facts.append(("plane", "as probed, weighted by its uncertainty"))
-    if plane_check:
-        facts.append(("plane, checked", plane_check))
+    if checked.plane_check:
+        facts.append(("plane, checked", checked.plane_check))
     for component, sigma in zip(fit.components, fit.noise.sigmas, strict=True):
         unit = {"stripe": "times its own sigma"}.get(component.name, "mm")
         if component.name.endswith("rotation"):
@@ -312,233 +283,90 @@ def _signed(value: float, digits: int = 6) -> str:
     return f"{'-' if value < 0.0 else '+'} {abs(value):.{digits}f}"
 
 
-OUTLYING = 3.0
-"""A posture whose pose errs by this many standard deviations is named."""
-WRONG_DIAMETER = 4.0
-"""A diameter given that lies this many standard deviations off what the points ask for is named."""
-REJECTED_SHARE = 0.015
-"""A stripe that loses more than this part of its points is named."""
-SHORT_ARC = 0.6
-"""A stripe whose arc is shorter than this part of the usual one is named."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Evidence:
-    """What is stored, ``solution``, and what it was ``checked`` by, where the sensor may err.
-
-    ``covariance`` (F, F) of all unknowns, and without the sensor's part (`own_covariance`).
-    """
-
-    nodes: SphereNodes
-    checked: SphereSolution
-    solution: SphereSolution
-    covariance: FloatArray
-    own_covariance: FloatArray
-    postures: tuple[PostureResult, ...]
-
-
-def sphere_fit(
-    nodes: SphereNodes,
-    checked: SphereSolution,
-    solution: SphereSolution,
-    conditioning: Conditioning,
-    *,
-    start: SphereState,
-    warnings: tuple[str, ...],
-) -> HandEyeFit:
-    """Gather what a reader and a scanner document need.
-
-    Parameters
-    ----------
-    nodes
-        Data.
-    checked
-        Minimum with noise model, where the sensor may err within its covariance.
-    solution
-        The one to be stored, of the sensor as it is (`hold_sensor`).
-    conditioning
-        How well the hand-eye is determined.
-    start
-        Where the refinement started, with the sphere's radius as given.
-    warnings
-        What was noticed before.
-    """
-    residual = checked.placed.residual_mm
-    # What the sensor's errors leave in the residuals is the coupling's part, not the scatter's.
-    own = residual - checked.by_sensor @ checked.linear.projected @ residual
-    own_covariance = covariance_over_noise(
-        own, solution.slopes, solution.components, np.zeros_like(solution.total), solution.noise
-    )
-    gain = solution.linear.gain
-    covariance = own_covariance + gain @ solution.by_sensor @ gain.T
-    postures = tuple(
-        _posture(nodes, solution, k, leave_out(nodes, checked, k))
-        for k in range(len(nodes.postures))
-    )
-    evidence = _Evidence(nodes, checked, solution, covariance, own_covariance, postures)
-    return HandEyeFit(
-        _calibration(evidence, conditioning),
-        start.tool_from_sensor,
-        _stripes(nodes, solution),
-        postures,
-        conditioning.singular_values,
-        _reference(evidence, 2.0 * start.radius_mm),
-        (*warnings, *_warnings(evidence)),
-    )
-
-
-def _calibration(evidence: _Evidence, conditioning: Conditioning) -> HandEyeCalibration:
-    nodes, checked, solution = evidence.nodes, evidence.checked, evidence.solution
-    residual = checked.placed.residual_mm
-    chi2 = float(residual @ checked.linear.projected @ residual)
-    freedom = len(nodes) - len(solution.free)
-    diagnostics = HandEyeDiagnostics(
-        method="sphere",
-        rank=conditioning.rank,
-        condition=conditioning.condition,
-        weakest=conditioning.weakest,
-        plate_flatness_mm=0.0,
-        flatness_length_mm=0.0,
-        is_noise_estimated=solution.components[0].is_estimated,
-        left_out_rotation_deg=max(one.left_out_rotation_deg for one in evidence.postures),
-        left_out_translation_mm=max(one.left_out_translation_mm for one in evidence.postures),
-        chi2_probability=float(chi2_distribution.sf(chi2, freedom)),
-    )
-    points = solution.placed.point_residual_mm
-    return HandEyeCalibration(
-        tool_from_sensor=solution.state.tool_from_sensor,
-        covariance=evidence.own_covariance[:6, :6],
-        sensor_coupling=_coupling(nodes, solution),
-        arm_noise=arm_noise(solution.components, solution.noise.sigmas),
-        rms_mm=float(np.sqrt(np.mean(points**2))),
-        n_postures=len(nodes.postures),
-        n_exposures=len({section.stripe.source for section in nodes.sections}),
-        n_points=len(points),
-        diagnostics=diagnostics,
-    )
-
-
-def _coupling(nodes: SphereNodes, solution: SphereSolution) -> FloatArray | None:
-    """(6, P) derivative of the hand-eye by the sensor's parameters, where the points carry it."""
-    by_sensor = sphere_estimate_residual_by_sensor(nodes, solution.placed)
-    return None if by_sensor is None else -solution.linear.gain[:6] @ by_sensor
-
-
-def _posture(
-    nodes: SphereNodes, solution: SphereSolution, posture: int, left_out: LeftOutPosture
-) -> PostureResult:
-    own = np.flatnonzero(nodes.posture == posture)
-    points = np.flatnonzero(np.repeat(nodes.posture, nodes.count) == posture)
-    residual = solution.placed.point_residual_mm[points]
-    share = nodes.count[own] / nodes.count[own].sum()
-    left = share @ solution.total[own] @ solution.linear.projected
-    mean_sigma = float(np.sqrt(max(left @ (solution.total + solution.by_sensor) @ left, 1e-18)))
-    sources = {nodes.sections[k].stripe.source for k in nodes.section[own]}
-    return PostureResult(
-        posture=nodes.postures[posture],
-        n_exposures=len(sources),
-        n_points=len(points),
-        mean_mm=float(residual.mean()),
-        rms_mm=float(np.sqrt(np.mean(residual**2))),
-        normalised_mean=float(residual.mean()) / mean_sigma,
-        tilt_deg=float("nan"),
-        azimuth_deg=float("nan"),
-        stand_off_mm=float(np.linalg.norm(nodes.points_mm[points], axis=1).mean()),
-        left_out_rotation_deg=float(np.degrees(np.linalg.norm(left_out.change[:3]))),
-        left_out_translation_mm=float(np.linalg.norm(left_out.change[3:6])),
-        left_out_normalised=left_out.pose_sigmas,
-    )
-
-
-def _stripes(nodes: SphereNodes, solution: SphereSolution) -> tuple[StripeResidual, ...]:
-    placed = solution.placed
-    found = []
-    for k, section in enumerate(nodes.sections):
-        own = nodes.point_section == k
-        found.append(
-            StripeResidual(
-                section.stripe.source,
-                section.stripe.posture,
-                placed.points_base_mm[own],
-                placed.point_residual_mm[own],
-            )
-        )
-    return tuple(found)
-
-
-def _reference(evidence: _Evidence, diameter_mm: float) -> tuple[tuple[str, str], ...]:
-    solution = evidence.solution
-    state, sigma = solution.state, np.sqrt(np.diag(evidence.covariance))
-    x, y, z = state.centre_mm
+def sphere_facts(
+    fit: HandEyeSolution, held: HandEyeSolution, diameter_mm: float
+) -> tuple[tuple[str, str], ...]:
+    """What the sphere was, as (label, value)."""
+    by_sensor = held.problem.sensor_covariance(held.placed)
+    gain = held.linear.gain
+    covariance = held_covariance(fit, held) + gain @ by_sensor @ gain.T
+    sigma = dict(zip(held.problem.columns.tolist(), np.sqrt(np.diag(covariance)), strict=True))
+    x, y, z, radius_mm = held.state.surface
     rows = [
         ("Sphere's diameter, given", f"{diameter_mm:g} mm"),
         ("Sphere's centre in Base", f"{x:.3f}, {y:.3f}, {z:.3f} mm"),
-        ("Its standard deviation", ", ".join(f"{one:.3f}" for one in sigma[6:9]) + " mm"),
+        ("Its standard deviation", ", ".join(f"{sigma[k]:.3f}" for k in range(6, 9)) + " mm"),
     ]
-    found, uncertainty = diameter_asked(evidence.checked)
-    if RADIUS_COLUMN not in solution.free:
+    if RADIUS_COLUMN not in sigma:
+        found, uncertainty = diameter_asked(fit)
         text = f"{found:.3f} mm, standard deviation {uncertainty:.3f} mm"
         rows.append(("Diameter that the points ask for", text))
-    extra = dict(zip(solution.free.tolist(), sigma, strict=True))
-    if RADIUS_COLUMN in extra:
-        spread = 2.0 * extra[RADIUS_COLUMN]
-        text = f"{2.0 * state.radius_mm:.3f} mm, standard deviation {spread:.3f} mm"
+    else:
+        deviation = 2.0 * sigma[RADIUS_COLUMN]
+        text = f"{2.0 * radius_mm:.3f} mm, standard deviation {deviation:.3f} mm"
         rows.append(("Sphere's diameter, solved along", text))
-    if SCALE_COLUMN in extra:
-        text = f"{state.scale:.6f}, standard deviation {extra[SCALE_COLUMN]:.6f}"
+    if SCALE_COLUMN in sigma:
+        text = f"{held.state.scale:.6f}, standard deviation {sigma[SCALE_COLUMN]:.6f}"
         rows.append(("Scale of the sensor's points", text))
     return tuple(rows)
 
 
-def diameter_asked(solution: SphereSolution) -> tuple[float, float]:
+def diameter_asked(fit: HandEyeSolution) -> tuple[float, float]:
     """Diameter that the points themselves ask for, and its standard deviation, both in mm.
 
     The scatter is estimated anew: as long as the diameter is held, a wrong one counts as form of
     the stripes, and is hidden by it.
     """
-    columns = np.union1d(solution.free, [RADIUS_COLUMN])
-    residual, slopes = solution.placed.residual_mm, solution.placed.slopes[:, columns]
-    components, by_sensor = solution.components, solution.by_sensor
-    noise = estimate_noise(residual, slopes, components, by_sensor, solution.noise.sigmas)
-    total = total_covariance(components, noise.sigmas) + by_sensor
-    freed = solve_linear(residual, slopes, total)
+    columns = np.union1d(fit.problem.columns, [RADIUS_COLUMN])
+    residual, jacobian = fit.placed.residual_mm, fit.placed.jacobian[:, columns]
+    known, sigmas = fit.problem.sensor_covariance(fit.placed), fit.noise.sigmas
+    noise = estimate_noise(residual, jacobian, fit.components, known, sigmas)
+    total = total_covariance(fit.components, noise.sigmas) + known
+    freed = solve_linear(residual, jacobian, total)
+    radius_mm = float(fit.state.surface[3])
     if freed is None:
-        return 2.0 * solution.state.radius_mm, float("inf")
+        return 2.0 * radius_mm, float("inf")
     k = int(np.flatnonzero(columns == RADIUS_COLUMN)[0])
-    found = 2.0 * (solution.state.radius_mm + float(freed.step[k]))
-    return found, 2.0 * float(np.sqrt(freed.covariance[k, k]))
+    sigma_mm = float(np.sqrt(freed.covariance[k, k]))
+    return 2.0 * (radius_mm + float(freed.step[k])), 2.0 * sigma_mm
 
 
-def _warnings(evidence: _Evidence) -> tuple[str, ...]:
-    nodes, solution = evidence.nodes, evidence.solution
-    found = []
-    for result, weight in zip(evidence.postures, solution.posture_weights, strict=True):
-        if result.left_out_normalised > OUTLYING:
+def sphere_warnings(
+    fit: HandEyeSolution,
+    held: HandEyeSolution,
+    sections: Sequence[CircleSection],
+    postures: Sequence[PostureResult],
+) -> tuple[str, ...]:
+    """What is weak about postures, stripes and diameter."""
+    found, weights = [], held.problem.weights
+    for k, posture in enumerate(postures):
+        if posture.left_out_normalised > OUTLYING:
+            weight = 1.0 if weights is None else weights[k]
             found.append(
-                f"posture {result.posture} contradicts the others: its pose errs by "
-                f"{result.left_out_normalised:.1f} standard deviations (weight {weight:.2f})"
+                f"posture {posture.posture} contradicts the others: its pose errs by "
+                f"{posture.left_out_normalised:.1f} standard deviations (weight {weight:.2f})"
             )
-    for section in nodes.sections:
+    for section in sections:
         n = len(section.rows) + section.n_rejected
         if section.n_rejected > REJECTED_SHARE * n:
             found.append(
                 f"{section.stripe.source}: {section.n_rejected} of {n} points lie off its section "
                 "of the sphere and are left out"
             )
-    arcs = np.array([section.arc_deg for section in nodes.sections])
-    for section, arc in zip(nodes.sections, arcs, strict=True):
-        if arc < SHORT_ARC * float(np.median(arcs)):
+    usual_deg = float(np.median([section.arc_deg for section in sections]))
+    for section in sections:
+        if section.arc_deg < SHORT_ARC * usual_deg:
             found.append(
-                f"{section.stripe.source} is weak: its arc of {arc:.0f} degrees is short, "
-                f"{np.median(arcs):.0f} are usual"
+                f"{section.stripe.source} is weak: its arc of {section.arc_deg:.0f} degrees is "
+                f"short, {usual_deg:.0f} are usual"
             )
-    asked, uncertainty = diameter_asked(evidence.checked)
-    given = 2.0 * solution.state.radius_mm
+    asked, uncertainty = diameter_asked(fit)
+    given = 2.0 * float(held.state.surface[3])
     if abs(asked - given) > WRONG_DIAMETER * uncertainty:
         found.append(
             f"the points ask for a sphere of {asked:.2f} mm diameter (standard deviation "
             f"{uncertainty:.2f} mm), not {given:g} mm: check the diameter and the sensor's scale"
         )
-    if not solution.is_settled:
+    if not held.is_settled:
         found.append("the refinement had not settled when its steps ran out")
     return tuple(found)

@@ -1,0 +1,286 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference surface of a hand-eye calibration: a plate or a sphere.
+
+The distance of placed points from it, with its derivatives, is all that tells one from the other;
+the estimator is the same (`armscan.calibration.hand_eye.estimate`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from armscan.calibration.hand_eye.observations import (
+    CondensedObservations,
+    HandEyeOptions,
+    PlateReference,
+)
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.poses import Pose, Sensor, Tool
+from armscan.geometry.shapes import Plane
+from armscan.models.calibration import HandEyeMethod
+
+N_HAND_EYE = 6
+
+
+class ReferenceSurface(Protocol):
+    """A surface in Base, described by K parameters that may be solved along."""
+
+    @property
+    def method(self) -> HandEyeMethod:
+        """Name of the calibration on it."""
+        ...
+
+    @property
+    def start(self) -> FloatArray:
+        """(K,) parameters as given."""
+        ...
+
+    @property
+    def per_stripe(self) -> int:
+        """Observations that a stripe is condensed to."""
+        ...
+
+    def distance(
+        self, points_mm: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signed distance (..., N) of points (..., N, 3) for parameters (..., K).
+
+        With its gradient (..., N, 3) and its derivative (..., N, K) by the parameters.
+        """
+        ...
+
+    def scan_points(
+        self,
+        observations: CondensedObservations,
+        points_base_mm: FloatArray,
+        tool_from_sensor: Pose[Tool, Sensor],
+    ) -> FloatArray:
+        """(N, 3) about which an error of the arm's pose turns each placed point."""
+        ...
+
+    def free_parameters(self, options: HandEyeOptions) -> tuple[int, ...]:
+        """Which of the K parameters are solved along."""
+        ...
+
+    def prior(self, options: HandEyeOptions) -> FloatArray | None:
+        """(K, K) covariance of parameters that are held; None where they are exact or solved."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PlateSurface:
+    """A flat plate: two tilts (rad) and an offset (mm) from the probed plane.
+
+    These are `armscan.geometry.shapes.PLANE_PARAMETERS`.
+    """
+
+    reference: PlateReference
+    method: HandEyeMethod = "plate"
+    per_stripe: int = 12
+
+    @property
+    def start(self) -> FloatArray:
+        """(3,) zeros: the probed plane."""
+        return np.zeros(3)
+
+    @property
+    def plane(self) -> Plane:
+        """The probed plane."""
+        return self.reference.plane
+
+    def distance(
+        self, points_mm: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As of `ReferenceSurface`; the distance is the misclosure of eq. 2.74."""
+        local = (points_mm - self.plane.point_mm) @ self.plane.axes.T
+        tilt_1, tilt_2, offset = (parameters[..., k, None] for k in range(3))
+        scale = np.sqrt(1.0 + tilt_1**2 + tilt_2**2)
+        height = (local[..., 2] - tilt_1 * local[..., 0] - tilt_2 * local[..., 1]) / scale
+        by_parameters = -np.stack(
+            [
+                local[..., 0] / scale + height * tilt_1 / scale**2,
+                local[..., 1] / scale + height * tilt_2 / scale**2,
+                np.ones(height.shape),
+            ],
+            axis=-1,
+        )
+        raised = np.stack([-tilt_1, -tilt_2, np.ones_like(scale)], axis=-1) / scale[..., None]
+        return (
+            height - offset,
+            np.broadcast_to(raised @ self.plane.axes, local.shape),
+            by_parameters,
+        )
+
+    def scan_points(
+        self,
+        observations: CondensedObservations,
+        points_base_mm: FloatArray,
+        tool_from_sensor: Pose[Tool, Sensor],
+    ) -> FloatArray:
+        """The middle of the sensor's working range, where each exposure has it."""
+        stripe = observations.of_points(observations.stripe)
+        middle = tool_from_sensor.apply(observations.points_mm.mean(axis=0))
+        return (observations.rotations @ middle + observations.translations_mm)[stripe]
+
+    def free_parameters(self, options: HandEyeOptions) -> tuple[int, ...]:
+        """All three, or none."""
+        return (0, 1, 2) if options.solve_plate else ()
+
+    def prior(self, options: HandEyeOptions) -> FloatArray | None:
+        """(3, 3) of the probed plane."""
+        return None if options.solve_plate else self.reference.covariance
+
+    def plane_at(self, parameters: FloatArray) -> Plane:
+        """The plane of two tilts and an offset (3,)."""
+        plane = self.plane
+        raised = np.array([-parameters[0], -parameters[1], 1.0]) @ plane.axes
+        normal = raised / np.linalg.norm(raised)
+        across = np.cross(normal, plane.axes[0])
+        across /= np.linalg.norm(across)
+        axes = np.stack([np.cross(across, normal), across, normal])
+        return Plane(plane.point_mm + parameters[2] * normal, axes)
+
+
+@dataclass(frozen=True, eq=False)
+class SphereSurface:
+    """A sphere: centre in Base (mm) and radius (mm), of which the centre is always solved."""
+
+    radius_mm: float
+    method: HandEyeMethod = "sphere"
+    per_stripe: int = 24
+
+    @property
+    def start(self) -> FloatArray:
+        """(4,) about the origin, of the radius given."""
+        return np.array([0.0, 0.0, 0.0, self.radius_mm])
+
+    def distance(
+        self, points_mm: FloatArray, parameters: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As of `ReferenceSurface`, positive outside."""
+        towards = points_mm - parameters[..., None, :3]
+        length = np.linalg.norm(towards, axis=-1)
+        normals = towards / np.maximum(length, 1e-12)[..., None]
+        by_parameters = -np.concatenate([normals, np.ones((*length.shape, 1))], axis=-1)
+        return length - parameters[..., 3, None], normals, by_parameters
+
+    def scan_points(
+        self,
+        observations: CondensedObservations,
+        points_base_mm: FloatArray,
+        tool_from_sensor: Pose[Tool, Sensor],
+    ) -> FloatArray:
+        """The middle of each posture's points."""
+        posture = observations.of_points(observations.posture)
+        sums = np.zeros((len(observations.postures), 3))
+        np.add.at(sums, posture, points_base_mm)
+        count = np.bincount(posture, minlength=len(sums))
+        return np.asarray((sums / np.maximum(count, 1)[:, None])[posture])
+
+    def free_parameters(self, options: HandEyeOptions) -> tuple[int, ...]:
+        """The centre, and the radius if it is asked for."""
+        return (0, 1, 2, 3) if options.solve_diameter else (0, 1, 2)
+
+    def prior(self, options: HandEyeOptions) -> FloatArray | None:
+        """None: the radius is exact where it is held."""
+        return None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEyeState:
+    """Unknowns: hand-eye, parameters (K,) of the surface, scale of the sensor's points."""
+
+    tool_from_sensor: Pose[Tool, Sensor]
+    surface: FloatArray
+    scale: float = 1.0
+
+    def retract(self, step: FloatArray) -> HandEyeState:
+        """The state after a step (6 + K + 1,): `Pose.retract`, surface, scale."""
+        return HandEyeState(
+            self.tool_from_sensor.retract(step[:N_HAND_EYE]),
+            self.surface + step[N_HAND_EYE:-1],
+            self.scale + float(step[-1]),
+        )
+
+
+def hand_eye_difference(pose: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> FloatArray:
+    """(6,) step of `Pose.retract` that leads from ``other`` to ``pose``."""
+    turn: Pose[Tool, Tool] = Pose(pose.rotation @ other.rotation.T, np.zeros(3))
+    return np.concatenate([turn.rotation_vector_rad, pose.translation_mm - other.translation_mm])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """Condensed observations placed in Base, and what their distances depend on.
+
+    Parameters
+    ----------
+    points_base_mm
+        (N, 3) all points.
+    dresidual_dpoint
+        (N, 3) gradient of the points' distances in the Sensor frame.
+    residual_mm
+        (M,) distance of the observations from the surface.
+    jacobian
+        (M, 6 + K + 1) its derivative by a step of `HandEyeState.retract`.
+    dresidual_dpose
+        (M, 6) its derivative by a shift of the arm's pose in Base, and by its turn about
+        `ReferenceSurface.scan_points`.
+    """
+
+    points_base_mm: FloatArray
+    dresidual_dpoint: FloatArray
+    residual_mm: FloatArray
+    jacobian: FloatArray
+    dresidual_dpose: FloatArray
+
+    @property
+    def by_surface(self) -> FloatArray:
+        """(M, K) derivative of the residuals by the surface's parameters."""
+        return np.asarray(self.jacobian[:, N_HAND_EYE:-1])
+
+
+def place(
+    observations: CondensedObservations, surface: ReferenceSurface, state: HandEyeState
+) -> Placed:
+    """Place the observations with a hand-eye (eq. 2.46) and compare them with the surface."""
+    stripe = observations.of_points(observations.stripe)
+    rotations = observations.rotations[stripe]
+    hand_eye = state.tool_from_sensor
+    turned = state.scale * observations.points_mm @ hand_eye.rotation.T
+    in_tool = turned + hand_eye.translation_mm
+    base = np.einsum("nij,nj->ni", rotations, in_tool) + observations.translations_mm[stripe]
+    residual, normals, by_surface = surface.distance(base, state.surface)
+    in_tool_normals = np.einsum("nij,ni->nj", rotations, normals)
+    by_scale = np.einsum("ni,ni->n", in_tool_normals, turned) / state.scale
+    jacobian = np.column_stack(
+        [np.cross(turned, in_tool_normals), in_tool_normals, by_surface, by_scale]
+    )
+    by_pose = np.column_stack(
+        [normals, np.cross(base - surface.scan_points(observations, base, hand_eye), normals)]
+    )
+    return Placed(
+        points_base_mm=base,
+        dresidual_dpoint=state.scale * in_tool_normals @ hand_eye.rotation,
+        residual_mm=observations.mean(residual),
+        jacobian=observations.mean(jacobian),
+        dresidual_dpose=observations.mean(by_pose),
+    )
+
+
+def dresidual_dsensor(observations: CondensedObservations, placed: Placed) -> FloatArray | None:
+    """(M, P) derivative of the residuals by the sensor's parameters; None where not known."""
+    if observations.dpoint_dsensor is None:
+        return None
+    by_points = np.einsum("ni,nip->np", placed.dresidual_dpoint, observations.dpoint_dsensor)
+    return observations.mean(by_points)
+
+
+def free_columns(surface: ReferenceSurface, options: HandEyeOptions) -> IntArray:
+    """Which entries of a step are solved for."""
+    last = N_HAND_EYE + len(surface.start)
+    extra = [N_HAND_EYE + k for k in surface.free_parameters(options)]
+    return np.array([*range(N_HAND_EYE), *extra, *[last] * options.solve_scale], dtype=np.int64)

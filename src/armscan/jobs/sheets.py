@@ -11,13 +11,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
-import numpy as np
-
 from armscan.calibration.sheets.result import (
     LaserFit,
     PointUse,
     SheetFit,
-    SheetImage,
     SkippedImage,
     reasons_to_refuse,
 )
@@ -36,7 +33,6 @@ from armscan.pipeline.laser import (
 )
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile, StripeFlag
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, Table, sentence, without_source
 from armscan.report.sheets import TITLE, laser_page, sheet_facts
@@ -53,7 +49,7 @@ from armscan.storage.documents import (
 from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.observations import pack_observations
+from armscan.storage.observations import pack_board_stripes
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.vision.targets.target import Target, parse_target
@@ -159,11 +155,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         exposure.source: item.sha256
         for exposure, item in zip(exposures, provenance.inputs[: len(exposures)], strict=True)
     }
-    observations = pack_observations(
-        [image.view for image in fit.images],
-        [_with_edge_flags(image) for image in fit.images],
-        hashes,
-    )
+    observations = pack_board_stripes(fit, hashes)
     document = sensor_document(
         fit.to_calibration(provenance), (files.observations.name, observations)
     )
@@ -337,16 +329,6 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
         (*recording.warnings, *recording.session.assumed),
         _skipped([one for one in exposures if one.lasers], gone),
     )
-
-
-def _with_edge_flags(image: SheetImage) -> Profile:
-    """The stripe points with those flagged that lay along an edge of the target.
-
-    The edges themselves are not kept, and without them the sheet could not be solved again.
-    """
-    is_on_edge = image.use == int(PointUse.ON_EDGE)
-    flags = image.profile.flags | np.where(is_on_edge, int(StripeFlag.TARGET_EDGE), 0)
-    return replace(image.profile, flags=flags)
 
 
 def all_warnings(fit: LaserFit) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import cast, get_args
 
 import numpy as np
 
@@ -32,18 +32,19 @@ from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
-from armscan.models.calibration import CameraCalibration
+from armscan.models.calibration import CameraCalibration, SensorCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.targets import cached_profile, cached_target, wrong_count
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
+from armscan.storage.observations import Observations
 from armscan.vision.stripe.image import SIGMA_RANGE_PX, LaserColour, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
-from armscan.vision.targets.target import Target, TargetView
+from armscan.vision.targets.target import CircleEdges, Target, TargetView
 
 BOARDS_STAGE = "boards"
 STRIPES_STAGE = "stripes"
@@ -171,6 +172,45 @@ def calibrate_sheets_from_pairs(
         return FitFailure(f"{fit.reason} (not used: {lost})", fit.remedy) if lost else fit
     skipped += fit.skipped
     return replace(fit, skipped=tuple(skipped), laser_colour=colour, channel_reason=reason)
+
+
+def calibrate_sheets_again(
+    found: Observations, sensor: SensorCalibration, options: SheetOptions | None = None
+) -> LaserFit | FitFailure:
+    """Solve the sheets of a sensor again from the observations that lie beside its document."""
+    if len(found.contexts) != len(found.profiles) or not found.contexts:
+        return FitFailure(
+            "the observations do not say which laser and camera took part: an older version of "
+            "armscan wrote them, or they are of a camera",
+            "calibrate again from the images",
+        )
+    cameras = HeadCameras.of(sensor)
+    boards = []
+    for view, profile, context in zip(found.views, found.profiles, found.contexts, strict=True):
+        rims = CircleEdges(
+            points_px=np.zeros((0, 2)), circle=np.zeros(0, dtype=np.int64), sigma_px=np.zeros(0)
+        )
+        board = replace(view, edges=rims if context.has_rims else None)
+        pose = estimate_board_pose(board, cameras.model(context.camera))
+        if isinstance(pose, FitFailure):
+            return pose
+        flags = profile.flags & ~int(StripeFlag.TARGET_EDGE)
+        boards.append(
+            BoardStripes(
+                profile=replace(profile, flags=flags),
+                view=board,
+                sensor_from_board=pose,
+                lasers=context.lasers,
+                on_edge=context.on_edge,
+                camera=context.camera,
+                placed=context.placed,
+                placement=context.placement,
+            )
+        )
+    fit = calibrate_sheets(boards, sensor, options)
+    if isinstance(fit, FitFailure):
+        return fit
+    return replace(fit, laser_colour=cast(LaserColour, sensor.laser_colour))
 
 
 def _poor_images(

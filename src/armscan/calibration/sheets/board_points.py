@@ -18,7 +18,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew, vector_from_rotation
-from armscan.models.calibration import CameraCalibration, SecondCamera
+from armscan.models.calibration import CameraCalibration, SecondCamera, SensorCalibration
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration
@@ -51,10 +51,15 @@ class HeadCameras:
     covariance: FloatArray
 
     @staticmethod
-    def of(calibration: CameraCalibration | StereoCalibration) -> HeadCameras:
-        """The cameras of a calibration of one or of two."""
+    def of(calibration: CameraCalibration | StereoCalibration | SensorCalibration) -> HeadCameras:
+        """The cameras of a calibration of one or of two, or of a calibrated sensor."""
         if isinstance(calibration, CameraCalibration):
             return HeadCameras(calibration, None, calibration.covariance)
+        if isinstance(calibration, SensorCalibration):
+            places = np.arange(len(calibration.covariance))
+            places = np.append(places[:N_CAMERA], places[calibration.second_parameter_slice])
+            covariance = calibration.covariance[np.ix_(places, places)]
+            return HeadCameras(calibration.camera, calibration.second, covariance)
         second = SecondCamera(
             camera=calibration.right, right_from_sensor=calibration.right_from_left
         )

@@ -176,6 +176,7 @@ KNOWN_NOISE = HandEyeOptions(
     arm_position_mm=ARM_MM,
     arm_rotation_rad=float(ARM_RAD),
     plate_flatness_mm=FLATNESS_MM,
+    flatness_length_mm=FLATNESS_LENGTH_MM,
     stripe_noise_factor=1.0,
 )
 

@@ -10,7 +10,9 @@ import pytest
 
 from armscan.calibration.sheets.result import LaserFit, PointUse
 from armscan.errors import EstimationError, OptionError
-from armscan.jobs.sheets import LaserRequest, run_laser_calibration
+from armscan.jobs.job import Job
+from armscan.jobs.sheets import SheetImages
+from armscan.jobs.sheets import calibrate_sheets as calibrate_sheets_of_files
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.instants import pair_exposures
@@ -105,9 +107,8 @@ def test_a_recording_gives_the_same_sheets(laser: LaserFit, tmp_path: Path) -> N
     camera = tmp_path / "camera.json"
     camera.write_bytes(camera_document(laser.camera))
     output = tmp_path / "sensor.json"
-    summary = run_laser_calibration(
-        LaserRequest(camera, (), (), "chessboard:11x6:13", output, scan=scan)
-    )
+    board, images = "chessboard:11x6:13", SheetImages(scan=scan)
+    summary = calibrate_sheets_of_files(Job(output), camera, board, images)
     found = read_sensor_calibration(output)
     assert [sheet.name for sheet in found.sheets] == ["A", "B"]
     for ours, theirs in zip(found.sheets, laser.sheets, strict=True):
@@ -115,10 +116,9 @@ def test_a_recording_gives_the_same_sheets(laser: LaserFit, tmp_path: Path) -> N
     assert len(found.provenance.inputs) == 4 + 2 + 1
     assert summary.data["cameras"] == 1
     with pytest.raises(OptionError, match="a recording and images"):
-        run_laser_calibration(
-            LaserRequest(camera, ("x.png",), (), "chessboard:11x6:13", output, scan=scan,
-                         is_overwriting=True)
-        )  # fmt: skip
+        calibrate_sheets_of_files(
+            Job(output, is_overwriting=True), camera, board, SheetImages(on=("x.png",), scan=scan)
+        )
 
 
 def test_the_sheets_lie_as_the_scanner_is_built(laser: LaserFit) -> None:

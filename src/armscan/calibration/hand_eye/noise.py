@@ -25,7 +25,6 @@ from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.observations import (
-    FLATNESS_LENGTH_MM,
     CondensedObservations,
     HandEyeOptions,
 )
@@ -140,7 +139,7 @@ def noise_components(
             (TYPICAL_EXPOSURE_MM, WIDE),
         )
     on_plate = (placed.points_base_mm - surface.plane.point_mm) @ surface.plane.axes[:2].T
-    alike = _alike(on_plate, FLATNESS_LENGTH_MM)
+    alike = _alike(on_plate, options.flatness_length_mm)
     return (
         *components,
         _component("flatness", alike, options.plate_flatness_mm, TYPICAL_FLATNESS_MM),

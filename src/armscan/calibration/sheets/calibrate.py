@@ -57,6 +57,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
 from armscan.models.calibration import (
     CameraCalibration,
+    SensorCalibration,
     SensorDiagnostics,
     SheetCalibration,
     SheetDiagnostics,
@@ -79,7 +80,7 @@ class _Refused:
 
 def calibrate_sheets(
     boards: Sequence[BoardStripes],
-    camera: CameraCalibration | StereoCalibration,
+    camera: CameraCalibration | StereoCalibration | SensorCalibration,
     options: SheetOptions | None = None,
 ) -> LaserFit | FitFailure:
     """Calibrate one or several light sheets that lie on boards of known pose.
@@ -95,8 +96,8 @@ def calibrate_sheets(
     boards
         One entry an image; images of one placement share its board's pose and the error of that.
     camera
-        One camera, or the two of a stereo head. Their covariance goes into the weights and into
-        the result.
+        One camera, the two of a stereo head, or those of a sensor whose sheets are solved again.
+        Their covariance goes into the weights and into the result.
     options
         Defaults if None.
 

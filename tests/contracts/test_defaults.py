@@ -1,128 +1,92 @@
 # SPDX-License-Identifier: Apache-2.0
 """A command without options does what the library does without options.
 
-Help texts show a default, so the command line repeats it; here the two are held together.
+A default stands once, in the class that the option sets: an option that is not given is None on
+the command line, and help reads the default from that class.
 """
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Iterator
+from dataclasses import MISSING, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
-from armscan.calibration.cameras.result import CameraOptions
-from armscan.calibration.hand_eye.observations import HandEyeOptions
-from armscan.calibration.hand_eye.probed_plate import ProbingOptions
-from armscan.calibration.sheets.result import SheetOptions
 from armscan.cli.app import command
-from armscan.inspection.selection import InspectionOptions, StepOptions
+from armscan.cli.options import DefaultOf
 from armscan.jobs.demo import DemoRequest
-from armscan.jobs.hand_eye import HandEyeRequest
-from armscan.markers.alignments import MarkerMatchOptions
-from armscan.markers.candidates import RingMatchOptions
-from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.register import RegisterOptions
-from armscan.pipeline.simulate import SimulateOptions
-from armscan.pipeline.verify import VerifyOptions
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.label_stereo import StereoLabelOptions
-from armscan.storage.images import ImageOptions
-from armscan.vision.rings import RingOptions
-from armscan.vision.stripe.image import StripeOptions
+from armscan.reconstruction.triangulate import CALIBRATED_DEPTHS, LABEL_DEPTHS
 
 
-def default_of(request: type[Any], name: str) -> Any:
-    """Default of one field of a request."""
-    return {field.name: field.default for field in fields(request)}[name]
+def commands(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All commands with their paths."""
+    if getattr(node, "commands", None):
+        for name, child in node.commands.items():
+            yield from commands(child, (*path, name))
+    else:
+        yield path, node
 
 
-STRIPES = {
-    "stripe_method": StripeOptions().method,
-    "laser_colour": StripeOptions().laser_colour,
-}
-IMAGES = {"bits_used": ImageOptions().bits_used, "bits_align": ImageOptions().align}
-FEATURE = {"feature_mm": InspectionOptions().feature_mm}
-EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
-    ("calibrate", "camera"): {
-        "distortion": CameraOptions().distortion,
-        "auto_leave_out": CameraOptions().leave_out_misfits,
-        "board_warp": CameraOptions().solve_warp,
-        **IMAGES,
-    },
-    ("calibrate", "laser"): {
-        "sheets": SheetOptions().n_sheets,
-        "margin_mm": SheetOptions().margin_mm,
-        **STRIPES,
-        **IMAGES,
-    },
-    ("simulate",): {
-        "preset": SimulateOptions().preset,
-        "seed": SimulateOptions().seed,
-        "processes": SimulateOptions().processes,
-    },
-    ("register",): {
-        "sigma_mm": RegisterOptions().sigma_mm,
-        "least_common": MarkerMatchOptions().least_common,
-        "by_id": RegisterOptions().is_by_id,
-    },
-    ("probe",): {
-        "side": ProbingOptions().side,
-        "feature": ProbingOptions().feature,
-        "leave_out": ProbingOptions().leave_out_outliers,
-    },
-    ("inspect", "plane"): FEATURE,
-    ("inspect", "sphere"): FEATURE,
-    ("inspect", "step"): {**FEATURE, "margin": StepOptions().margin_mm},
-    ("markers",): {
-        "diameter": RingMatchOptions().diameter_mm,
-        "min_perimeter": RingOptions().min_perimeter_px,
-        "max_perimeter": RingOptions().max_perimeter_px,
-        "max_roundness": RingOptions().max_roundness,
-        "disc": RingOptions().disc,
-        **IMAGES,
-    },
-    ("verify",): {
-        **FEATURE,
-        "mpe": VerifyOptions().mpe_mm,
-        "uncertainty": VerifyOptions().reference_u_mm,
-    },
-    ("calibrate", "hand-eye"): {
-        "arm_position_mm": HandEyeOptions().arm_position_mm,
-        "arm_rotation_deg": HandEyeOptions().arm_rotation_rad,
-        "plate_flatness_mm": HandEyeOptions().plate_flatness_mm,
-        "solve_plate": HandEyeOptions().solve_plate,
-        "euler": default_of(HandEyeRequest, "euler"),
-        "side": default_of(HandEyeRequest, "side"),
-        **STRIPES,
-    },
-    ("demo",): {
-        "seed": default_of(DemoRequest, "seed"),
-        "preset": default_of(DemoRequest, "preset"),
-    },
-    ("reconstruct",): {"sheet": MeasureOptions().sheet, **STRIPES, **IMAGES},
-}
+COMMANDS = dict(commands(command()))
 
 
-def parameters(path: tuple[str, ...]) -> dict[str, Any]:
-    node: Any = command()
-    for word in path:
-        node = node.commands[word]
-    return {parameter.name: parameter for parameter in node.params}
+def read_by_help(path: tuple[str, ...]) -> dict[str, Any]:
+    """Options whose default help reads from a class."""
+    return {
+        option.name: option
+        for option in COMMANDS[path].params
+        if isinstance(getattr(option, "show_default", None), DefaultOf)
+    }
 
 
-@pytest.mark.parametrize("path", EXPECTED, ids=" ".join)
-def test_defaults_of_a_command_are_those_of_its_options(path: tuple[str, ...]) -> None:
-    found = parameters(path)
-    assert {name: found[name].default for name in EXPECTED[path]} == EXPECTED[path]
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_help_shows_the_default_of_the_class(path: tuple[str, ...]) -> None:
+    context = typer.Context(COMMANDS[path], info_name=" ".join(path))
+    shown = "".join(COMMANDS[path].get_help(context).split())
+    for name, option in read_by_help(path).items():
+        module, _, place = str(option.show_default).partition(":")
+        owner, _, field = place.partition(".")
+        known = {item.name: item for item in fields(getattr(import_module(module), owner))}
+        assert option.default is None, name
+        assert known[field].default not in (None, MISSING), name
+        assert f"({known[field].default})" in shown, name
+
+
+def test_no_option_with_a_default_of_its_own_is_a_field_of_a_class() -> None:
+    """What a command decides by itself is listed here; all else is read from a class."""
+    known = {
+        ("demo", "scene"), ("demo", "output"), ("demo", "seed"), ("demo", "preset"),
+        ("calibrate stereo", "intrinsics"),
+    }  # fmt: skip
+    own = {
+        (" ".join(path), option.name)
+        for path, node in COMMANDS.items()
+        for option in node.params
+        if option.default not in (None, False, "", ()) and option.name != "cache"
+    }
+    assert {item for item in own if item[1] != "output" and not _is_required(*item)} <= known
+
+
+def _is_required(path: str, name: str) -> bool:
+    return any(p.name == name and p.required for p in COMMANDS[tuple(path.split())].params)
+
+
+def test_the_demo_without_options_is_the_library_s() -> None:
+    options = {option.name: option for option in COMMANDS["demo",].params}
+    defaults = {item.name: item.default for item in fields(DemoRequest)}
+    for name in ("seed", "preset"):
+        assert options[name].default == defaults[name]
 
 
 def test_the_depth_margin_that_texts_name_is_the_default() -> None:
-    text = f"{DepthRange().margin:g}"
-    option = parameters(("reconstruct",))["depth_margin"]
+    text = f"{CALIBRATED_DEPTHS.margin:g}"
+    option = {item.name: item for item in COMMANDS["reconstruct",].params}["depth_margin"]
     assert option.default is None
-    stereo = f"{StereoLabelOptions().depths.margin:g}"
+    stereo = f"{LABEL_DEPTHS.margin:g}"
     assert f"Without it {text}; with two cameras {stereo};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())

@@ -12,7 +12,8 @@ import pytest
 
 from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.cli.run import main
-from armscan.jobs.probe import ProbeRequest, run_probing
+from armscan.jobs.job import Job
+from armscan.jobs.probe import probe
 from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration
@@ -146,7 +147,7 @@ def test_a_tip_compensated_to_the_wrong_side_is_told_by_its_diameter(
     centres.write_bytes(
         probed_points_csv(ProbedPoints(points_mm=flat + 3.0 * PLATE, tip_diameter_mm=6.0))
     )
-    run_probing(ProbeRequest(centres, wrong, options=ProbingOptions(side="-z")))
+    probe(Job(wrong), centres, options=ProbingOptions(side="-z"))
     words = ["calibrate", "hand-eye", scan, "--sensor", calibrated.sensor, "--plate", wrong]
     said = fails(*words, "-o", tmp_path / "s.json")
     assert "that is the tip's diameter (6 mm)" in said

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
-from armscan.cli import info, main
+from armscan.cli import main
 from armscan.cli.app import command
+from armscan.jobs import info
 
 HELP_SECONDS = 0.6
 HELP_SECONDS_ON_A_BUSY_MACHINE = 4 * HELP_SECONDS
@@ -129,7 +130,7 @@ def test_failures_become_codes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("ARMSCAN_DEBUG", raising=False)
-    monkeypatch.setattr(info, "describe", _raiser(failure))
+    monkeypatch.setattr(info, "describe_files", _raiser(failure))
     assert main(["info", "x"]) == code
     out, err = capsys.readouterr()
     assert out == ""
@@ -139,7 +140,7 @@ def test_failures_become_codes(
 
 def test_a_bug_shows_its_traceback_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ARMSCAN_DEBUG", "1")
-    monkeypatch.setattr(info, "describe", _raiser(ZeroDivisionError()))
+    monkeypatch.setattr(info, "describe_files", _raiser(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):
         main(["info", "x"])
 

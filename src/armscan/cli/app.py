@@ -9,25 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import (
-    calibrate_camera,
-    calibrate_hand_eye,
-    calibrate_laser,
-    calibrate_stereo,
-    convert,
-    demo,
-    doctor,
-    info,
-    inspect_plane,
-    inspect_sphere,
-    inspect_step,
-    markers,
-    probe,
-    reconstruct,
-    register,
-    simulate,
-    verify,
-)
+from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -72,33 +54,33 @@ calibrate = typer.Typer(
     callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
-calibrate.command("camera", epilog=calibrate_camera.EXAMPLE)(calibrate_camera.camera)
-calibrate.command("stereo", epilog=calibrate_stereo.EXAMPLE)(calibrate_stereo.stereo)
-calibrate.command("laser", epilog=calibrate_laser.EXAMPLE)(calibrate_laser.laser)
-inspect = typer.Typer(
+calibrate.command("camera", epilog=calibrate_cameras.CAMERA_EXAMPLE)(calibrate_cameras.camera)
+calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_cameras.stereo)
+calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
+calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
+inspect_group = typer.Typer(
     help="Compare measured points with a plane, a ball or a step.",
-    epilog=inspect_sphere.EXAMPLE,
+    epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
     callback=_help_unless_a_command_follows,
     rich_markup_mode=None,
 )
-inspect.command("plane", epilog=inspect_plane.EXAMPLE)(inspect_plane.plane)
-inspect.command("sphere", epilog=inspect_sphere.EXAMPLE)(inspect_sphere.sphere)
-inspect.command("step", epilog=inspect_step.EXAMPLE)(inspect_step.step)
-calibrate.command("hand-eye", epilog=calibrate_hand_eye.EXAMPLE)(calibrate_hand_eye.hand_eye)
+inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
+inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
+inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
 app.add_typer(calibrate, name="calibrate")
-app.add_typer(inspect, name="inspect")
-app.command("demo", epilog=demo.EXAMPLE)(demo.demo)
-app.command("simulate", epilog=simulate.EXAMPLE)(simulate.simulate)
-app.command("probe", epilog=probe.EXAMPLE)(probe.probe)
-app.command("reconstruct", epilog=reconstruct.EXAMPLE)(reconstruct.reconstruct)
-app.command("register", epilog=register.EXAMPLE)(register.register)
-app.command("markers", epilog=markers.EXAMPLE)(markers.markers)
-app.command("verify", epilog=verify.EXAMPLE)(verify.verify)
-app.command("convert", epilog=convert.EXAMPLE)(convert.convert)
-app.command("info", epilog=info.EXAMPLE)(info.info)
-app.command("doctor", epilog=doctor.EXAMPLE)(doctor.doctor)
+app.add_typer(inspect_group, name="inspect")
+app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)
+app.command("simulate", epilog=measure.SIMULATE_EXAMPLE)(measure.simulate)
+app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
+app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
+app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
+app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
+app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
+app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
+app.command("info", epilog=files.INFO_EXAMPLE)(files.info)
+app.command("doctor", epilog=files.DOCTOR_EXAMPLE)(files.doctor)
 
 
 def _print_version(is_asked: bool) -> None:

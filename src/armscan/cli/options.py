@@ -1,22 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share, the report on standard output and progress on standard
-error.
+"""Options that several commands have, and how a command runs its job and shows what came out.
+
+A default stands once, in the class that the option sets: an option that is not given is None here
+and left to that class, and help reads it from there when it is printed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Annotated
+from dataclasses import fields
+from enum import StrEnum
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
+    from armscan.jobs.job import Job
     from armscan.pipeline.progress import Progress, ProgressEvent
     from armscan.report.quantity import Summary
 
+T = TypeVar("T")
+
+
+class DefaultOf(str):
+    """A default that help shows, as ``package.module:Class.field`` of a dataclass.
+
+    Help formats it; only then is the module imported and the field's default read.
+    """
+
+    __slots__ = ()
+
+    def __format__(self, spec: str) -> str:
+        module, _, place = self.partition(":")
+        name, _, wanted = place.partition(".")
+        known = fields(getattr(import_module(module), name))
+        return str({field.name: field.default for field in known}[wanted])
+
+
+class Side(StrEnum):
+    """Axis of Base along which a plate's face looks."""
+
+    PLUS_X = "+x"
+    MINUS_X = "-x"
+    PLUS_Y = "+y"
+    MINUS_Y = "-y"
+    PLUS_Z = "+z"
+    MINUS_Z = "-z"
+
+
+STRIPES = "armscan.vision.stripe.image:StripeOptions."
+PIXELS = "armscan.storage.images:ImageOptions."
+INSPECTION = "armscan.inspection.selection:InspectionOptions."
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print the report as JSON, for programs.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
 ForceBad = Annotated[
     bool,
     typer.Option(
@@ -28,7 +69,139 @@ Cache = Annotated[
     bool,
     typer.Option("--cache/--no-cache", help="Keep the points found in images beside the document."),
 ]
-Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
+Document = Annotated[
+    Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
+]
+Target = Annotated[
+    str,
+    typer.Option(
+        "--target",
+        show_default=False,
+        help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
+        "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
+    ),
+]
+BitsUsed = Annotated[
+    int | None,
+    typer.Option("--bits-used", help="Significant bits of 16-bit images, such as 10 or 12."),
+]
+BitsAlign = Annotated[
+    str | None,
+    typer.Option(
+        "--bits-align",
+        help="Where they lie in 16 bits: low, or high.",
+        show_default=DefaultOf(PIXELS + "align"),
+    ),
+]
+
+
+class Method(StrEnum):
+    """Whose way a result is found."""
+
+    ARMSCAN = "armscan"
+    THESIS = "thesis"
+
+
+MethodOption = Annotated[
+    Method,
+    typer.Option("--method", help="thesis: as the thesis prints it, to set it beside armscan's."),
+]
+StripeMethodOption = Annotated[
+    str | None,
+    typer.Option(
+        "--stripe-method",
+        help="fit, or the thesis's threshold, centroid, template, hessian.",
+        show_default=DefaultOf(STRIPES + "method"),
+    ),
+]
+LaserColourOption = Annotated[
+    str | None,
+    typer.Option(
+        "--laser-colour",
+        help="What of colour images to use: auto; red, green, blue, grey; a difference (green-red) "
+        "or an excess over the others (green-excess).",
+        show_default=DefaultOf(STRIPES + "laser_colour"),
+    ),
+]
+ArmFile = Annotated[
+    Path | None, typer.Option(help="arm.toml, for recordings of joint angles.", show_default=False)
+]
+RegionOption = Annotated[
+    str,
+    typer.Option(
+        "--region", help="Look only inside xmin,xmax,ymin,ymax,zmin,zmax (mm).", show_default=False
+    ),
+]
+FeatureOption = Annotated[
+    float | None,
+    typer.Option(
+        "--feature-mm",
+        help="Points this near to the surface belong to it, outliers included.",
+        show_default=DefaultOf(INSPECTION + "feature_mm"),
+    ),
+]
+SideOption = Annotated[
+    Side | None,
+    typer.Option(
+        "--side",
+        help="Axis that the face of --plate looks along, for centres of the tip.",
+        show_default=False,
+    ),
+]
+PageOption = Annotated[
+    Path | None,
+    typer.Option("-o", "--output", help="Page to write, .html; without it none is written."),
+]
+
+
+def given(options: type[T], **values: Any) -> T:
+    """Options of which only those that are not None were given."""
+    return options(**{name: value for name, value in values.items() if value is not None})
+
+
+def numbers(text: str, option: str) -> tuple[float, ...]:
+    """Numbers between commas.
+
+    Raises
+    ------
+    OptionError
+        If a word is no number.
+    """
+    from armscan.errors import OptionError
+
+    try:
+        return tuple(float(word) for word in text.split(",")) if text else ()
+    except ValueError as error:
+        raise OptionError(
+            f"'{text}' is not a list of numbers", where=option, remedy="put commas between them"
+        ) from error
+
+
+def run(
+    work: Callable[[Job], Summary],
+    *,
+    as_json: bool,
+    output: Path | None = None,
+    force: bool = False,
+    force_bad: bool = False,
+    cache: bool = False,
+) -> Summary:
+    """Run a job under a progress bar, and show what came out."""
+    from armscan.jobs.job import Job
+
+    with progress_bar() as progress:
+        summary = work(
+            Job(
+                output=output,
+                is_overwriting=force,
+                is_forced=force_bad,
+                is_caching=cache,
+                command=("armscan", *sys.argv[1:]),
+                progress=progress,
+            )
+        )
+    show(summary, as_json=as_json)
+    return summary
 
 
 def show(summary: Summary, *, as_json: bool) -> None:
@@ -43,7 +216,7 @@ def progress_bar() -> Iterator[Progress]:
     """Show progress events on standard error while the block runs; nothing if it is no terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bars
+    from rich.progress import Progress as ProgressBars
 
     from armscan.pipeline.progress import silent
 
@@ -51,7 +224,7 @@ def progress_bar() -> Iterator[Progress]:
     if not console.is_terminal:
         yield silent
         return
-    bars = Bars(
+    bars = ProgressBars(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -70,61 +243,3 @@ def progress_bar() -> Iterator[Progress]:
 
     with bars:
         yield advance
-
-
-Target = Annotated[
-    str,
-    typer.Option(
-        "--target",
-        show_default=False,
-        help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
-        "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
-    ),
-]
-BitsUsed = Annotated[
-    int | None,
-    typer.Option("--bits-used", help="Significant bits of 16-bit images, such as 10 or 12."),
-]
-BitsAlign = Annotated[
-    str, typer.Option("--bits-align", help="Where they lie in 16 bits: low, or high.")
-]
-StripeMethodOption = Annotated[
-    str,
-    typer.Option(
-        "--stripe-method", help="fit, or the thesis's threshold, centroid, template, hessian."
-    ),
-]
-LaserColourOption = Annotated[
-    str,
-    typer.Option(
-        "--laser-colour",
-        help="What of colour images to use: auto; red, green, blue, grey; a difference (green-red) "
-        "or an excess over the others (green-excess).",
-    ),
-]
-
-
-Background = Annotated[
-    list[str] | None, typer.Option(help="The same views without laser; repeatable.")
-]
-Right = Annotated[
-    list[str] | None,
-    typer.Option(help="Right camera's images of the same instants; of a stereo head."),
-]
-RightBackground = Annotated[
-    list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
-]
-Sheet = Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")]
-DepthMargin = Annotated[
-    float | None,
-    typer.Option(
-        help="Widen the calibrated depth range by this part of its width at either end; "
-        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
-        "extrapolated.",
-        show_default=False,
-    ),
-]
-Volume = Annotated[
-    str,
-    typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm."),
-]

@@ -17,25 +17,25 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.devices.sources import Preset, Twin, TwinScene
-from armscan.errors import EstimationError, OptionError, OutputError
+from armscan.errors import OptionError, OutputError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.estimate import FitFailure
 from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import StepInspection
 from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
-from armscan.jobs.camera import CameraRequest, run_camera_calibration
-from armscan.jobs.hand_eye import HandEyeRequest, run_hand_eye_calibration
+from armscan.jobs.camera import calibrate_camera
+from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye
 from armscan.jobs.inspect import read_plate
-from armscan.jobs.probe import ProbeRequest, run_probing
-from armscan.jobs.reconstruct import CloudRequest, run_reconstruction
-from armscan.jobs.sheets import LaserRequest, run_laser_calibration
-from armscan.jobs.stereo import StereoRequest, run_stereo_calibration
+from armscan.jobs.job import Job, solved
+from armscan.jobs.probe import probe
+from armscan.jobs.reconstruct import StillPaths
+from armscan.jobs.reconstruct import reconstruct as reconstruct_files
+from armscan.jobs.sheets import SheetImages, calibrate_sheets
+from armscan.jobs.stereo import calibrate_stereo
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.adaptive_scan import record_adaptively
-from armscan.pipeline.measure import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
 from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
 from armscan.pipeline.truth import (
@@ -47,8 +47,8 @@ from armscan.pipeline.truth import (
     part_errors,
     true_names,
 )
-from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.cloud import PointCloud
 from armscan.report.demo import (
     FRACTION_RULE,
@@ -61,7 +61,16 @@ from armscan.report.demo import (
     truth_table,
 )
 from armscan.report.page import footer, render_page
-from armscan.report.quantity import Summary, Table, sentence, significant, summary_json, with_sigma
+from armscan.report.quantity import (
+    Quantity,
+    Summary,
+    Table,
+    fact,
+    sentence,
+    significant,
+    summary_json,
+    with_sigma,
+)
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import (
     new_provenance,
@@ -194,6 +203,10 @@ class _Run:
         self.seconds[stage] = round(self.seconds.get(stage, 0.0) + perf_counter() - start, 2)
         return result
 
+    def job(self, output: Path) -> Job:
+        """Of a command that writes into the demo's folder."""
+        return Job(output, command=self.command, progress=self.progress)
+
     def place(self, scene: str) -> Path:
         """Folder of a recording."""
         return self.folder / RECORDINGS / scene
@@ -218,7 +231,7 @@ class _Run:
                 self.request.twin,
                 scene,
                 scanner,
-                longest_stroke=self.request.most_views.get(scene),
+                longest_pass=self.request.most_views.get(scene),
                 processes=self.request.processes,
                 progress=self.progress,
             )
@@ -251,7 +264,7 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
             own = folder / name.removeprefix("thesis-")
             own.mkdir()
             summary, demos[name] = make_head_demo(replace(request, head=name), own, progress)
-            data = dict(summary.data)
+            data = summary.data
             heads |= data["heads"]
             warnings += [f"{kind}: {text}" for text in summary.warnings]
         folders = tuple(folder / name.removeprefix("thesis-") for name in KINDS)
@@ -260,12 +273,11 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
         page, result = folder / "report.html", folder / "summary.json"
         summary = Summary(
             title="Demo of three simulated heads on the same scenes",
-            facts=(),
             tables=(comparison_table(heads),),
             warnings=tuple(warnings),
             written=(*folders, page, result),
             next_step=f"open {page} in a browser; each head has its own page in its folder",
-            data={**data, "heads": heads},
+            extra={**data, "heads": heads},
         )
         document = render_page(heads_page(heads, demos, footer(provenance)))
         write_files({page: document, result: summary_json(summary).encode()})
@@ -317,23 +329,20 @@ class Calibrated:
 
 
 def _calibrated(run: _Run) -> Calibrated:
-    target, command, folder, tell = run.twin.target, run.command, run.folder, run.progress
+    target, folder = run.twin.target, run.folder
     is_stereo = run.twin.truth.right_camera_parameters is not None
     camera = folder / ("stereo.json" if is_stereo else "camera.json")
     sensor, table, document = (folder / n for n in ("sensor.json", "plate.csv", "scanner.json"))
     scan = run.place("camera")
-    if is_stereo:
-        stereo = StereoRequest("", "", target, camera, scan, command=command)
-        run.timed("calibrate_camera", partial(run_stereo_calibration, stereo, tell))
-    else:
-        one = CameraRequest((), target, camera, scan=scan, command=command)
-        run.timed("calibrate_camera", partial(run_camera_calibration, one, tell))
-    laser = LaserRequest(camera, (), (), target, sensor, scan=run.place("laser"), command=command)
-    run.timed("calibrate_laser", partial(run_laser_calibration, laser, tell))
-    run.timed("probe_plate", partial(run_probing, ProbeRequest(run.place("probing"), table)))
-    scans = (run.place("hand-eye"),)
-    hand_eye = HandEyeRequest(document, scans, sensor, plate=table, command=command)
-    found = run.timed("calibrate_hand_eye", partial(run_hand_eye_calibration, hand_eye, tell))
+    calibrate = calibrate_stereo if is_stereo else calibrate_camera
+    run.timed("calibrate_camera", partial(calibrate, run.job(camera), target, scan=scan))
+    images = SheetImages(scan=run.place("laser"))
+    laser = partial(calibrate_sheets, run.job(sensor), camera, target, images)
+    run.timed("calibrate_laser", laser)
+    run.timed("probe_plate", partial(probe, run.job(table), run.place("probing")))
+    source = StripeSource(scans=(run.place("hand-eye"),), sensor=sensor)
+    hand_eye = partial(calibrate_hand_eye, run.job(document), source, Artefact(plate=table))
+    found = run.timed("calibrate_hand_eye", hand_eye)
     plate, _ = read_plate(table, np.zeros(3))
     return Calibrated(
         read_sensor_calibration(sensor), read_scanner_calibration(document), plate, found.warnings
@@ -349,7 +358,7 @@ def _measured(run: _Run, scenes: tuple[TwinScene, ...], instrument: Calibrated) 
         measure = partial(measure_scan, source, scanner, progress=run.progress)
         found[scene] = run.timed(scene, measure)
     steps = tuple(
-        _succeeded(inspect_step(found["steps"].cloud, height), "steps")
+        solved(inspect_step(found["steps"].cloud, height), "steps")
         for height in truth.step_heights_mm
     )
     still, normal = run.timed("still_step", partial(_still_step, run, instrument, steps[0].normal))
@@ -368,8 +377,8 @@ def _measured(run: _Run, scenes: tuple[TwinScene, ...], instrument: Calibrated) 
         sensor=sensor,
         scanner=scanner,
         scans=found,
-        plate=_succeeded(plane, "plate"),
-        ball=_succeeded(ball, "ball"),
+        plate=solved(plane, "plate"),
+        ball=solved(ball, "ball"),
         steps=steps,
         still_step=still,
         still_normal=normal,
@@ -398,13 +407,7 @@ def _still_step(
     options = MeasureOptions(depths=DepthRange(margin=STILL_MARGIN))
     cloud = reconstruct([first], sensor, rights=others, options=options).cloud
     height = STILL_HEIGHT_MM if sensor.second is None else STEREO_STILL_HEIGHT_MM
-    return _succeeded(inspect_step(cloud, height, normal=normal), source.name), normal
-
-
-def _succeeded(result: Result | FitFailure, what: str) -> Result:
-    if isinstance(result, FitFailure):
-        raise EstimationError(result.reason, where=what, remedy=result.remedy)
-    return result
+    return solved(inspect_step(cloud, height, normal=normal), source.name), normal
 
 
 def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
@@ -438,12 +441,12 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
     summary = Summary(
         title=f"Demo on a simulated {KINDS[name]} arm scanner: calibrated, used, compared with its "
         "truth",
-        facts=(("time", f"{sum(seconds.values()):.0f} s"),),
+        quantities=(fact("time", f"{sum(seconds.values()):.0f} s"),),
         tables=(comparison_table({name: head}), truth_table(demo, head), *naming, commands),
         warnings=marked,
         written=(folder / RECORDINGS, *sorted(folder.glob("*.*")), result),
         next_step=f"open {report} in a browser",
-        data={
+        extra={
             "kind": "demo",
             "simulated": True,
             "seed": request.seed,
@@ -511,15 +514,16 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
             str(path)
             for path in (lines / "on", lines / "off", still / "0001.png", still / "0002.png")
         )
-        target, command = twin.target, run.command
+        target = twin.target
         camera, sensor, cloud = (folder / n for n in ("camera.json", "sensor.json", "cloud.ply"))
-        of_camera = CameraRequest((str(boards),), target, camera, command=command)
-        of_laser = LaserRequest(camera, (on,), (off,), target, sensor, command=command)
-        of_cloud = CloudRequest(sensor, (lit,), (dark,), cloud, command=command)
+        of_camera = partial(calibrate_camera, run.job(camera), target, (str(boards),))
+        images = SheetImages((on,), (off,))
+        of_laser = partial(calibrate_sheets, run.job(sensor), camera, target, images)
+        of_cloud = partial(reconstruct_files, run.job(cloud), sensor, StillPaths((lit,), (dark,)))
         works = (
-            ("camera", "calibrate_camera", partial(run_camera_calibration, of_camera, progress)),
-            ("laser", "calibrate_laser", partial(run_laser_calibration, of_laser, progress)),
-            ("points", "reconstruct", partial(run_reconstruction, of_cloud, progress)),
+            ("camera", "calibrate_camera", of_camera),
+            ("laser", "calibrate_laser", of_laser),
+            ("points", "reconstruct", of_cloud),
         )
         stages = {name: run.timed(stage, work) for name, stage, work in works}
         errors = _photo_errors(run, read_sensor_calibration(sensor), read_ply(cloud))
@@ -533,18 +537,18 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
         summary = Summary(
             title="Demo on simulated photographs: camera, light sheet and points against their "
             "truth",
-            facts=_photo_facts(errors),
+            quantities=_photo_facts(errors),
             tables=(commands,),
             warnings=tuple(text for stage in stages.values() for text in stage.warnings),
             written=(run.place(""), *sorted(folder.glob("*.*")), result),
             next_step=f"open {folder / 'camera.html'}, {folder / 'sensor.html'} and "
             f"{folder / 'cloud.html'} in a browser",
-            data={
+            extra={
                 "kind": "demo",
                 "simulated": True,
                 "seed": request.seed,
                 "preset": request.preset,
-                **{name: dict(stage.data) for name, stage in stages.items()},
+                **{name: stage.data for name, stage in stages.items()},
                 "errors": errors,
                 "seconds": run.seconds,
             },
@@ -573,26 +577,26 @@ def _photo_errors(run: _Run, sensor: SensorCalibration, cloud: PointCloud) -> di
     }
 
 
-def _photo_facts(errors: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+def _photo_facts(errors: Mapping[str, Any]) -> tuple[Quantity, ...]:
     sheet, n_camera = errors["sheet"], errors["n_camera_parameters"]
     n_sheet = sheet["n_parameters"]
     return (
-        (
+        fact(
             "camera",
             "error of the focal length "
             f"{with_sigma(errors['focal_px'], errors['focal_sigma_px'], 'px')}",
         ),
-        (
+        fact(
             "light sheet",
             f"{significant(sheet['angle_deg'])} deg and {significant(abs(sheet['offset_mm']))} mm "
             f"off, {significant(sheet['rms_mm'])} mm rms over the boards",
         ),
-        (
+        fact(
             "object",
             f"{errors['n_on_object']} points, {significant(errors['points_median_mm'])} mm median "
             f"and {significant(errors['points_rms_mm'])} mm rms from its true surface",
         ),
-        (
+        fact(
             "in sigmas",
             f"camera {errors['camera_normalised']:.1f} ({n_camera**0.5:.1f} is usual for "
             f"{n_camera} numbers), sheet {sheet['normalised']:.1f} ({n_sheet**0.5:.1f} is usual "

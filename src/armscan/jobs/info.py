@@ -31,9 +31,9 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
-from armscan.reconstruction.sync import SyncOptions, exposure_poses, largest_gap_ns
+from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
-from armscan.report.quantity import Summary, with_sigma
+from armscan.report.quantity import Summary, fact, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
 from armscan.storage.clouds import parse_ply, read_ply
 from armscan.storage.codec import parse_json
@@ -253,7 +253,7 @@ def _steps(what: str, t_ns: IntArray) -> dict[str, float]:
 
 def _poses(scan: FolderRecording, track: ArmTrack) -> dict[str, Any]:
     """How many exposures have a pose, how it is found, and why the others have none."""
-    limit_ns = largest_gap_ns(track, SyncOptions())
+    limit_ns = largest_gap_ns(track)
     gaps = {
         "arm_gap_limit_ms": limit_ns / NS_PER_MS,
         "arm_steps_above_gap_limit": int((np.diff(track.t_ns) > limit_ns).sum()),
@@ -314,7 +314,11 @@ def describe_files(names: Sequence[str]) -> Summary:
             facts += [(str(path), "\n".join(_line(key, value) for key, value in described.items()))]
             data.append({"path": path.as_posix(), **described})
     count = f"{len(data)} item" + ("s" if len(data) != 1 else "")
-    return Summary(title=count, facts=tuple(facts), data={"kind": "info", "items": data})
+    return Summary(
+        title=count,
+        quantities=tuple(fact(*pair) for pair in facts),
+        extra={"kind": "info", "items": data},
+    )
 
 
 def _line(key: str, value: Any) -> str:
@@ -561,9 +565,9 @@ def examine_installation(*, warm: bool = False) -> Summary:
     is_ready = not problems
     return Summary(
         title="armscan is ready." if is_ready else "armscan is not ready.",
-        facts=tuple(facts),
+        quantities=tuple(fact(*pair) for pair in facts),
         warnings=tuple(problems),
-        data={"kind": "doctor", "is_ready": is_ready, "found": dict(facts)},
+        extra={"kind": "doctor", "is_ready": is_ready, "found": dict(facts)},
     )
 
 

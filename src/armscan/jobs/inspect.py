@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -16,15 +17,14 @@ from armscan.calibration.hand_eye.probed_plate import (
     fit_probed_plate,
     plate_from_coefficients,
 )
-from armscan.errors import EstimationError, OptionError
+from armscan.errors import OptionError
 from armscan.geometry.arrays import Box, FloatArray
-from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane, plane_from_coefficients
-from armscan.inspection.plane import inspect_plane
+from armscan.inspection.plane import inspect_plane as plane_of
 from armscan.inspection.selection import InspectionOptions, StepOptions
-from armscan.inspection.sphere import inspect_sphere
-from armscan.inspection.step import inspect_step
-from armscan.models.calibration import Provenance
+from armscan.inspection.sphere import inspect_sphere as sphere_of
+from armscan.inspection.step import inspect_step as step_of
+from armscan.jobs.job import Job, solved
 from armscan.records.cloud import PointCloud
 from armscan.records.points import ProbedPoints
 from armscan.report.inspect import (
@@ -34,13 +34,104 @@ from armscan.report.inspect import (
     sphere_report,
     step_report,
 )
-from armscan.report.page import render_page
-from armscan.report.quantity import Summary, sentence
+from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import read_cloud
-from armscan.storage.documents import new_provenance
-from armscan.storage.files import check_outputs, write_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import parse_plane, read_points_or_plane
+
+
+def inspect_plane(
+    job: Job,
+    path: Path,
+    *,
+    plane: str = "",
+    plate: Path | None = None,
+    side: ProbeSide | None = None,
+    region: Sequence[float] = (),
+    options: InspectionOptions | None = None,
+) -> Summary:
+    """Inspect a flat face.
+
+    Parameters
+    ----------
+    job
+        Where to write the page, if anywhere.
+    path
+        A cloud of ``armscan reconstruct``, or any PLY or text file with x, y, z in mm.
+    plane
+        ``A,B,C,D`` of the nominal plane, D in mm; empty for none.
+    plate
+        Probed points of the nominal plane, or a file with ``A,B,C,D``; None for none.
+    side
+        Side of the plate that was touched; None for where nobody said it.
+    region
+        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for the whole cloud.
+    options
+        What belongs to the feature.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, an option is wrong, or there is no such face; nothing is written
+        then.
+    """
+    options = options or InspectionOptions()
+    job.places(".html")
+    box, cloud = region_of(region), read_cloud(path)
+    reference, text, weak = _reference(cloud, plane, plate, side)
+    found = plane_of(cloud, reference, reference_text=text, region=box, options=options)
+    report = plane_report(solved(found, path), cloud)
+    report = replace(report, warnings=(*weak, *_flat_by_itself(cloud), *report.warnings))
+    inputs = (path, *(() if plate is None else (plate,)))
+    return _finished(job, cloud, report, inputs, (options,))
+
+
+def inspect_sphere(
+    job: Job,
+    path: Path,
+    diameter_mm: float,
+    *,
+    region: Sequence[float] = (),
+    options: InspectionOptions | None = None,
+) -> Summary:
+    """Inspect a ball of known diameter; the rest as `inspect_plane`."""
+    options = options or InspectionOptions()
+    job.places(".html")
+    box, cloud = region_of(region), read_cloud(path)
+    found = sphere_of(cloud, diameter_mm, region=box, options=options)
+    report = sphere_report(solved(found, path), cloud)
+    return _finished(job, cloud, report, (path,), (options,))
+
+
+def inspect_step(
+    job: Job,
+    path: Path,
+    height_mm: float,
+    *,
+    normal: Sequence[float] = (),
+    region: Sequence[float] = (),
+    options: InspectionOptions | None = None,
+    step_options: StepOptions | None = None,
+) -> Summary:
+    """Inspect a step of a nominal height.
+
+    ``normal`` is that of the faces in the cloud's frame, for a single exposure; empty for none.
+    The rest as `inspect_plane`.
+    """
+    options, step_options = options or InspectionOptions(), step_options or StepOptions()
+    job.places(".html")
+    box, cloud = region_of(region), read_cloud(path)
+    given = _normal(normal) if normal else None
+    found = step_of(
+        cloud, height_mm, normal=given, region=box, options=options, step_options=step_options
+    )
+    report = step_report(solved(found, path), cloud)
+    return _finished(job, cloud, report, (path,), (options, step_options))
+
+
+def region_of(numbers: Sequence[float]) -> Box | None:
+    """The box of ``--region``; None if none is given."""
+    return Box.from_limits(numbers, "--region") if numbers else None
 
 
 def read_plate(
@@ -71,90 +162,11 @@ def read_plate(
     """
     found = read_points_or_plane(path)
     if isinstance(found, ProbedPoints):
-        fit = fit_probed_plate(found, towards_mm, ProbingOptions(side=side))
-        if isinstance(fit, FitFailure):
-            raise EstimationError(fit.reason, where=str(path), remedy=fit.remedy)
+        fit = solved(fit_probed_plate(found, towards_mm, ProbingOptions(side=side)), path)
         return fit.reference, fit.warnings
     if side is None:
         return PlateReference(plane=plane_from_coefficients(found, near_mm), source=str(path)), ()
-    plate = plate_from_coefficients(found, near_mm, side, str(path))
-    if isinstance(plate, FitFailure):
-        raise EstimationError(plate.reason, where=str(path), remedy=plate.remedy)
-    return plate, ()
-
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class InspectRequest:
-    """What to inspect, and where to write.
-
-    Parameters
-    ----------
-    cloud
-        A cloud of ``armscan reconstruct``, or any PLY or text file with x, y, z in mm.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for the whole cloud.
-    output
-        Page to write, or None for none.
-    options
-        What belongs to the feature.
-    is_overwriting
-        Replace a page that exists.
-    command
-        The command line, for the record.
-    """
-
-    cloud: Path
-    region: tuple[float, ...] = ()
-    output: Path | None = None
-    options: InspectionOptions = field(default_factory=InspectionOptions)
-    is_overwriting: bool = False
-    command: tuple[str, ...] = ()
-
-
-def run_plane_inspection(
-    request: InspectRequest,
-    plane: str = "",
-    plate: Path | None = None,
-    side: ProbeSide | None = None,
-) -> Summary:
-    """Inspect a flat face.
-
-    Parameters
-    ----------
-    request
-        What and where.
-    plane
-        ``A,B,C,D`` of the nominal plane, D in mm; empty for none.
-    plate
-        Probed points of the nominal plane, or a file with ``A,B,C,D``; None for none.
-    side
-        Side of the plate that was touched; None for where nobody said it.
-
-    Raises
-    ------
-    ArmscanError
-        If a file is unreadable, an option is wrong, or there is no such face; nothing is written
-        then.
-    """
-    cloud, region = _read(request)
-    reference, text, weak = _reference(cloud, plane, plate, side)
-    found = _found(
-        inspect_plane(
-            cloud,
-            reference,
-            reference_text=text,
-            region=region,
-            options=request.options,
-        ),
-        request,
-    )
-    inputs = (request.cloud, *(() if plate is None else (plate,)))
-    report = plane_report(found, cloud)
-    report = replace(report, warnings=(*weak, *_flat_by_itself(cloud), *report.warnings))
-    return _finished(request, cloud, report, inputs)
+    return solved(plate_from_coefficients(found, near_mm, side, str(path)), path), ()
 
 
 def _flat_by_itself(cloud: PointCloud) -> tuple[str, ...]:
@@ -167,79 +179,14 @@ def _flat_by_itself(cloud: PointCloud) -> tuple[str, ...]:
     )
 
 
-def run_sphere_inspection(request: InspectRequest, diameter_mm: float) -> Summary:
-    """Inspect a ball of known diameter; raises as `run_plane_inspection`."""
-    cloud, region = _read(request)
-    found = _found(
-        inspect_sphere(cloud, diameter_mm, region=region, options=request.options), request
-    )
-    return _finished(request, cloud, sphere_report(found, cloud), (request.cloud,))
-
-
-def run_step_inspection(
-    request: InspectRequest,
-    height_mm: float,
-    normal: tuple[float, ...] = (),
-    step_options: StepOptions | None = None,
-) -> Summary:
-    """Inspect a step.
-
-    Parameters
-    ----------
-    request
-        What and where.
-    height_mm
-        Nominal height.
-    normal
-        Normal of the faces in the cloud's frame, for a single exposure; empty for none.
-    step_options
-        How the faces are found.
-
-    Raises
-    ------
-    ArmscanError
-        As `run_plane_inspection`.
-    """
-    steps = step_options or StepOptions()
-    cloud, region = _read(request)
-    given = _normal(normal) if normal else None
-    found = _found(
-        inspect_step(
-            cloud,
-            height_mm,
-            normal=given,
-            region=region,
-            options=request.options,
-            step_options=steps,
-        ),
-        request,
-    )
-    return _finished(request, cloud, step_report(found, cloud), (request.cloud,), (steps,))
-
-
-def _read(request: InspectRequest) -> tuple[PointCloud, Box | None]:
-    if request.output is not None:
-        if request.output.suffix.lower() != ".html":
-            raise OptionError(
-                f"the output's name ends in '{request.output.suffix}'",
-                where=f"-o {request.output}",
-                remedy="end it in .html",
-            )
-        check_outputs((request.output,), is_overwriting=request.is_overwriting)
-    region = None
-    if request.region:
-        region = Box.from_limits(request.region, "--region")
-    return read_cloud(request.cloud), region
-
-
-def _normal(values: tuple[float, ...]) -> FloatArray:
+def _normal(values: Sequence[float]) -> FloatArray:
     remedy = "give the three numbers x,y,z of the faces' normal, not all 0"
     if len(values) != 3:
-        fact = f"{len(values)} numbers where 3 are needed"
-        raise OptionError(fact, where="--normal", remedy=remedy)
+        what = f"{len(values)} numbers where 3 are needed"
+        raise OptionError(what, where="--normal", remedy=remedy)
     if not (np.isfinite(values).all() and any(values)):
-        fact = f"the normal is {', '.join(f'{value:g}' for value in values)}"
-        raise OptionError(fact, where="--normal", remedy=remedy)
+        what = f"the normal is {', '.join(f'{value:g}' for value in values)}"
+        raise OptionError(what, where="--normal", remedy=remedy)
     return np.array(values, dtype=np.float64)
 
 
@@ -260,54 +207,26 @@ def _reference(
     return probed.plane, f"the plane of {plate.name}", weak
 
 
-def _found(result: T | FitFailure, request: InspectRequest) -> T:
-    if isinstance(result, FitFailure):
-        raise EstimationError(result.reason, where=str(request.cloud), remedy=result.remedy)
-    return result
-
-
 def _finished(
-    request: InspectRequest,
+    job: Job,
     cloud: PointCloud,
     report: InspectionReport,
-    inputs: tuple[Path, ...],
-    more_options: tuple[StepOptions, ...] = (),
+    inputs: Sequence[Path],
+    options: Sequence[Any],
 ) -> Summary:
     is_simulated = cloud.is_simulated or are_simulated(inputs)
     written: tuple[Path, ...] = ()
-    if request.output is not None:
-        provenance = _provenance(request, report, inputs, more_options, cloud.forced)
+    if job.output is not None:
+        provenance = job.provenance(inputs, options, warnings=report.warnings, forced=cloud.forced)
         page = inspection_page(report, provenance, is_simulated=is_simulated)
-        write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
-        written = (request.output,)
+        written = job.write({job.output: page})
     return Summary(
         title=report.title + (" (simulated data)." if is_simulated else "."),
-        facts=report.facts,
-        tables=report.brief_tables,
-        warnings=tuple(sentence(warning) for warning in report.warnings),
+        quantities=report.quantities,
+        tables=(report.brief_table,),
+        warnings=sentences(report.warnings),
         written=written,
-        next_step=f"open {request.output}" if request.output else "",
+        next_step=f"open {job.output}" if job.output else "",
         forced=cloud.forced,
-        data={
-            "kind": "inspection",
-            "simulated": is_simulated,
-            "frame": cloud.frame,
-            **report.data,
-        },
-    )
-
-
-def _provenance(
-    request: InspectRequest,
-    report: InspectionReport,
-    inputs: tuple[Path, ...],
-    more_options: tuple[StepOptions, ...],
-    forced: tuple[str, ...],
-) -> Provenance:
-    return new_provenance(
-        inputs,
-        command=request.command,
-        options=(request.options, *more_options),
-        warnings=report.warnings,
-        forced=forced,
+        extra={"kind": "inspection", "simulated": is_simulated, "frame": cloud.frame},
     )

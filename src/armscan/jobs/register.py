@@ -1,289 +1,142 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From marker lists and clouds of several places of the scanner to one frame: lists, clouds, a
-document and its page.
+"""From lists of markers and clouds of several places of the scanner to one frame.
+
+Writes a folder with the clouds, the markers, the registration's document and its page.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import chi2
 
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.registration import carried_covariance_mm2, spread_mm
-from armscan.models.calibration import Provenance
-from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.register import PlaceRegistration, carry_cloud, register_place, register_views
+from armscan.geometry.registration import spread_mm
+from armscan.jobs.job import Job
+from armscan.markers.join_views import JoinedViews
+from armscan.pipeline.register import (
+    BY_ID,
+    UNCHECKED,
+    MarkerResiduals,
+    PlaceRegistration,
+    RegisterOptions,
+    ViewNumbers,
+    added_sigma_mm,
+    carry_cloud,
+    joint_markers,
+    place_residuals,
+    register_place,
+    register_views,
+    with_strays,
+)
+from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.points import MarkerSet
-from armscan.report.page import Card, render_page
-from armscan.report.quantity import Summary, Table, sentence, significant, with_sigma
+from armscan.report.page import render_page
+from armscan.report.quantity import (
+    Quantity,
+    Summary,
+    Table,
+    fact,
+    only,
+    sentences,
+    significant,
+    with_sigma,
+)
 from armscan.report.register import (
     MarkerScene,
-    NamedCloud,
     RegisterReport,
-    RegisterRequest,
-    checked,
-    cloud_beside,
-    common_frame,
-    different_names,
-    map_markers,
-    marker_view,
-    read_lists,
-    read_named_cloud,
+    drift_chart,
     registration_page,
-    residual_chart,
-    views_report,
 )
-from armscan.storage.clouds import ply_bytes
+from armscan.storage.clouds import FOREIGN_FRAME, ply_bytes, read_cloud
 from armscan.storage.documents import (
     CODEC,
     MarkerResidual,
     MovedMarker,
     Registration,
+    ScanNotJoined,
     ScanTransform,
-    new_provenance,
     registration_document,
 )
 from armscan.storage.files import check_new_folder, new_folder, path_text, write_files
 from armscan.storage.image_paths import are_simulated
-from armscan.storage.points import MarkerList, markers_csv
-
-UNLIKELY = 1e-3
-WEAK_SHARE = 0.05
-
-
-def place_report(
-    old: MarkerList,
-    new: MarkerList,
-    place: PlaceRegistration,
-    carried: Sequence[NamedCloud],
-) -> RegisterReport:
-    """Describe the registration; ``carried`` are the new clouds in the old frame."""
-    frame = old.markers.frame
-    used = place.residual_mm[place.is_used]
-    rms = float(np.sqrt((used**2).sum(axis=1).mean()))
-    at_markers = added_sigma_mm(new.markers.points_mm[place.pairs[:, 1]], place)
-    n, n_pairs = int(place.is_used.sum()), len(place.pairs)
-    of = f"of {len(old.markers)} old and {len(new.markers)} new"
-    name = new.path.stem
-    clouds = ", ".join(item.name for item in carried) or None
-    return RegisterReport(
-        title="The arm's new place in its old frame",
-        subtitle=f"{new.path.name} carried to the frame {frame} of {old.path.name}",
-        common_frame=frame,
-        common_frame_of=old.path.as_posix(),
-        cards=(
-            Card("Common markers", str(n), of),
-            Card("Residuals", significant(rms, "mm"), "root mean square, three axes together"),
-            Card(
-                "Uncertainty at the markers",
-                significant(at_markers, "mm"),
-                "one standard deviation, three axes together; common to all points",
-            ),
-            Card("Moved markers", str(len(place.moved)), "named below" if place.moved else "none"),
-        ),
-        facts=_facts(place, of, rms, at_markers),
-        scans=_scan_table(place, carried, at_markers),
-        residuals_table=_residual_table(old, new, place),
-        pictures=(
-            marker_view(_scene(old, new, place, carried)),
-            residual_chart(
-                np.linalg.norm(place.residual_mm, axis=1), _expected(old, new, place), place.is_used
-            ),
-        ),
-        warnings=_warnings(old, new, place),
-        transforms=(
-            ScanTransform(
-                name=name,
-                markers=path_text(new.path),
-                own_frame=new.markers.frame,
-                rotation_rows=place.fit.value.rotation,
-                translation_mm=place.fit.value.translation_mm,
-                covariance=place.fit.covariance,
-                n_markers=n,
-                rms_mm=rms,
-                cloud=clouds,
-            ),
-        ),
-        residuals=tuple(
-            MarkerResidual(
-                name=name,
-                id=int(new.markers.ids[k]),
-                common_id=int(old.markers.ids[i]),
-                residual_mm=residual,
-                is_used=bool(is_used),
-            )
-            for (i, k), residual, is_used in zip(
-                place.pairs, place.residual_mm, place.is_used, strict=True
-            )
-        ),
-        moved=tuple(
-            MovedMarker(id=item.new_id, common_id=item.old_id, offset_mm=item.offset_mm)
-            for item in place.moved
-        ),
-        not_joined=(),
-        chi2=place.fit.chi2,
-        degrees_of_freedom=place.fit.degrees_of_freedom,
-        data=_data(place, rms, at_markers, n, n_pairs),
-    )
-
-
-def added_sigma_mm(points_mm: FloatArray, place: PlaceRegistration) -> float:
-    """Root mean square uncertainty that the registration adds to (N, 3) points of the new frame."""
-    none = np.zeros((len(points_mm), 3, 3))
-    added = carried_covariance_mm2(points_mm, none, place.fit.value, place.fit.covariance)
-    return float(np.sqrt(np.trace(added, axis1=1, axis2=2).mean()))
-
-
-def _facts(
-    place: PlaceRegistration, of: str, rms: float, at_markers: float
-) -> tuple[tuple[str, str], ...]:
-    pose, sigma = place.fit.value, place.fit.sigma
-    shift = [with_sigma(value, s) for value, s in zip(pose.translation_mm, sigma[3:], strict=True)]
-    turn = np.degrees(pose.rotation_vector_rad)
-    tilt = ", ".join(with_sigma(v, s) for v, s in zip(turn, np.degrees(sigma[:3]), strict=True))
-    rival = (
-        "given by their ids"
-        if place.n_rival < 0
-        else f"found by distances; no other way explains more than {max(place.n_rival, 3)}"
-    )
-    return (
-        ("common markers", f"{int(place.is_used.sum())} {of}, {rival}"),
-        ("residuals", f"{significant(rms, 'mm')} rms, three axes together"),
-        ("uncertainty", f"{significant(at_markers, 'mm')} at the markers, common to all points"),
-        ("translation", f"{', '.join(shift)} mm"),
-        ("rotation vector", f"{tilt} degrees"),
-    )
-
-
-def _scan_table(
-    place: PlaceRegistration, carried: Sequence[NamedCloud], at_markers: float
-) -> Table:
-    rows = [("markers", f"{int(place.is_used.sum())}", significant(at_markers))]
-    for item in carried:
-        original = place.fit.value.inverse()
-        points = item.cloud.points_mm @ original.rotation.T + original.translation_mm
-        rows.append((item.name, f"{len(points):,}", significant(added_sigma_mm(points, place))))
-    return Table(("carried", "points", "uncertainty added, mm"), tuple(rows))
-
-
-def _residual_table(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> Table:
-    length = np.linalg.norm(place.residual_mm, axis=1)
-    rows: list[tuple[str, ...]] = []
-    for row in np.argsort(-length):
-        i, k = place.pairs[row]
-        x, y, z = place.residual_mm[row]
-        rows.append(
-            (
-                str(int(old.markers.ids[i])),
-                str(int(new.markers.ids[k])),
-                f"{x:+.4f}",
-                f"{y:+.4f}",
-                f"{z:+.4f}",
-                f"{length[row]:.4f}",
-                "" if place.is_used[row] else "moved, left out",
-            )
-        )
-    matched = {int(n) for n in old.markers.ids[place.pairs[:, 0]]}
-    for item in place.moved:
-        if item.old_id not in matched:
-            x, y, z = -item.offset_mm
-            length_mm = float(np.linalg.norm(item.offset_mm))
-            rows.insert(
-                0,
-                (
-                    str(item.old_id),
-                    str(item.new_id),
-                    *(f"{value:+.4f}" for value in (x, y, z)),
-                    f"{length_mm:.4f}",
-                    "moved, left out",
-                ),
-            )
-    columns = ("old", "new", "dx mm", "dy mm", "dz mm", "length mm", "")
-    return Table(columns, tuple(rows), "Old minus carried new", (6,))
-
-
-def _scene(
-    old: MarkerList, new: MarkerList, place: PlaceRegistration, carried: Sequence[NamedCloud]
-) -> MarkerScene:
-    pose = place.fit.value
-    lonely_old = old.markers.points_mm[np.isin(old.markers.ids, place.only_old)]
-    lonely_new = new.markers.points_mm[np.isin(new.markers.ids, place.only_new)]
-    stations = [("old base", np.zeros(3)), ("new base", np.array(pose.translation_mm))]
-    matched = set(old.markers.ids[place.pairs[:, 0]].tolist())
-    strays = [item for item in place.moved if item.old_id not in matched]
-    at = np.isin(old.markers.ids, [item.old_id for item in strays])
-    return MarkerScene(
-        np.concatenate([old.markers.points_mm[place.pairs[:, 0]], old.markers.points_mm[at]]),
-        np.concatenate([-place.residual_mm, np.zeros((int(at.sum()), 3))]),
-        np.concatenate([place.is_used, np.zeros(int(at.sum()), dtype=bool)]),
-        np.concatenate([lonely_old, lonely_new @ pose.rotation.T + pose.translation_mm]),
-        stations,
-        [item.cloud for item in carried],
-        is_z_up=old.markers.frame != "Sensor",
-    )
-
-
-def _expected(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> FloatArray:
-    i, k = place.pairs[:, 0], place.pairs[:, 1]
-    trace = np.trace(
-        old.markers.covariance_mm2[i] + new.markers.covariance_mm2[k], axis1=1, axis2=2
-    )
-    share = max(place.fit.degrees_of_freedom, 0) / (place.fit.degrees_of_freedom + 6)
-    return np.asarray(np.sqrt(trace * share))
-
-
-def _warnings(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> tuple[str, ...]:
-    found = [
-        f"{item.path.name} gives no covariance: {sigma:g} mm an axis is assumed for a marker"
-        for item in (old, new)
-        if item.is_sigma_assumed
-        for sigma in (float(np.sqrt(item.markers.covariance_mm2[0, 0, 0])),)
-    ]
-    found += [
-        f"marker {item.old_id} (new {item.new_id}) moved by "
-        f"{significant(float(np.linalg.norm(item.offset_mm)), 'mm')} and was left out; "
-        "markers.csv has its new place"
-        for item in place.moved
-    ]
-    if place.chi2_probability < UNLIKELY:
-        ratio = float(np.sqrt(place.fit.chi2 / place.fit.degrees_of_freedom))
-        found.append(
-            f"the residuals are {ratio:.2g} times what the covariances let expect: the stated "
-            "uncertainty is too small by about that factor"
-        )
-    across = spread_mm(old.markers.points_mm[place.pairs[place.is_used][:, 0]])
-    if across[1] < WEAK_SHARE * across[0]:
-        found.append(
-            f"the common markers lie nearly on a line ({significant(float(across[1]), 'mm')} to "
-            "either side): the turn about it is weak"
-        )
-    return tuple(found)
-
-
-def _data(
-    place: PlaceRegistration, rms: float, at_markers: float, n: int, n_pairs: int
-) -> dict[str, object]:
-    return {
-        "n_common": n,
-        "n_matched": n_pairs,
-        "n_only_old": len(place.only_old),
-        "n_only_new": len(place.only_new),
-        "only_old_ids": list(place.only_old),
-        "only_new_ids": list(place.only_new),
-        "rms_mm": rms,
-        "sigma_at_markers_mm": at_markers,
-        "chi2_probability": place.chi2_probability,
-    }
-
+from armscan.storage.points import MarkerList, markers_csv, read_marker_list
 
 DOCUMENT, PAGE, MARKERS = "registration.json", "registration.html", "markers.csv"
+UNLIKELY = 1e-3
+"""Chance of the residuals below which the stated uncertainty is called too small."""
+WEAK_SHARE = 0.05
+"""Markers whose width is a smaller share of their length lie nearly on a line."""
+LEAST_MM = 1e-6
 
 
-def run_registration(request: RegisterRequest, progress: Progress = silent) -> Summary:
+@dataclass(frozen=True, slots=True, eq=False)
+class _NamedCloud:
+    """A cloud and the name of its file in the new folder."""
+
+    name: str
+    path: Path
+    cloud: PointCloud
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """What goes into the folder.
+
+    Parameters
+    ----------
+    frame
+        Name of the common frame.
+    report
+        For page and terminal.
+    lists
+        What was read; the first one defines the common frame.
+    carried, markers
+        Clouds and markers in the common frame.
+    transforms, residuals, moved, not_joined, chi2, degrees_of_freedom
+        Of the document.
+    """
+
+    frame: str
+    report: RegisterReport
+    lists: Sequence[MarkerList]
+    carried: Sequence[_NamedCloud]
+    markers: MarkerSet
+    transforms: tuple[ScanTransform, ...]
+    residuals: tuple[MarkerResidual, ...]
+    moved: tuple[MovedMarker, ...]
+    not_joined: tuple[ScanNotJoined, ...]
+    chi2: float
+    degrees_of_freedom: int
+
+
+def register(
+    job: Job,
+    lists: Sequence[Path],
+    *,
+    moved: Path | None = None,
+    clouds: Sequence[Path] = (),
+    options: RegisterOptions | None = None,
+) -> Summary:
     """Read the lists, join them, carry the clouds, write the folder and say what came out.
+
+    Parameters
+    ----------
+    job
+        Which new folder to write.
+    lists
+        Lists of markers: one for each view, or the old one of an arm that moved.
+    moved
+        List of the markers that the arm measured at its new place; None for views.
+    clouds
+        Clouds of the new place; empty to take those beside the lists.
+    options
+        How to match.
 
     Raises
     ------
@@ -291,144 +144,508 @@ def run_registration(request: RegisterRequest, progress: Progress = silent) -> S
         If a file is unreadable, an option is wrong, or the markers do not join the scans; nothing
         is written then.
     """
-    check_new_folder(request.output)
-    request = checked(request)
-    if request.moved is None:
-        return _join_views(request, progress)
-    return _join_place(request, request.moved)
-
-
-def _join_views(request: RegisterRequest, progress: Progress) -> Summary:
-    lists = read_lists(request.lists, "Sensor", request.options)
-    names = different_names(request.lists)
-    clouds = {
-        k: read_named_cloud(path, names[k], item)
-        for k, item in enumerate(lists)
-        if (path := cloud_beside(item.path)) is not None
+    options = options or RegisterOptions()
+    folder = job.output or Path("registered")
+    check_new_folder(folder)
+    _check(lists, moved, clouds, options)
+    if moved is None:
+        joined = _join_views(job, lists, options)
+    else:
+        joined = _join_place(lists[0], moved, clouds, options)
+    report, carried = joined.report, joined.carried
+    inputs = [*(item.path for item in joined.lists), *(item.path for item in carried)]
+    is_simulated = are_simulated(inputs) or any(item.cloud.is_simulated for item in carried)
+    forced = [reason for item in carried for reason in item.cloud.forced]
+    provenance = job.provenance(inputs, (options,), warnings=report.warnings, forced=forced)
+    document = Registration(
+        kind="views" if moved is None else "moved arm",
+        simulated=is_simulated,
+        common_frame=joined.frame,
+        common_frame_of=joined.lists[0].path.as_posix(),
+        transforms=joined.transforms,
+        residuals=joined.residuals,
+        moved=joined.moved,
+        not_joined=joined.not_joined,
+        chi2=joined.chi2,
+        degrees_of_freedom=joined.degrees_of_freedom,
+        provenance=provenance,
+    )
+    contents = {
+        DOCUMENT: registration_document(document),
+        MARKERS: markers_csv(joined.markers),
+        **{item.name: ply_bytes(item.cloud) for item in carried},
+        PAGE: render_page(registration_page(report, provenance, is_simulated=is_simulated)),
     }
-    joined = register_views([item.markers for item in lists], request.options, progress)
-    frame = common_frame(lists[0])
+    with new_folder(folder) as place:
+        write_files({place / name: content for name, content in contents.items()})
+    return Summary(
+        title=report.title + (" (simulated data)." if is_simulated else "."),
+        quantities=report.quantities,
+        tables=(report.scans,),
+        warnings=sentences(report.warnings),
+        written=tuple(folder / name for name in contents),
+        next_step=f"open {folder / PAGE}",
+        forced=provenance.forced,
+        extra={
+            "kind": "registration",
+            "of": document.kind,
+            "simulated": is_simulated,
+            "common_frame": joined.frame,
+            "chi2": joined.chi2,
+            "degrees_of_freedom": joined.degrees_of_freedom,
+            "transforms": [CODEC.write(item) for item in joined.transforms],
+            "moved": [CODEC.write(item) for item in joined.moved],
+        },
+    )
+
+
+def _check(
+    lists: Sequence[Path], moved: Path | None, clouds: Sequence[Path], options: RegisterOptions
+) -> None:
+    """Raise if the lists or the options do not go together."""
+    if moved is None:
+        if len(lists) < 2:
+            raise OptionError(
+                "one list of markers cannot be joined to anything",
+                where=str(lists[0]) if lists else "",
+                remedy="name two views or more, or give --moved NEW for an arm that moved",
+            )
+        for is_given, option in (
+            (bool(clouds), "--cloud"),
+            (options.is_by_id, "--by-id"),
+            (options.method == "thesis", "--method"),
+        ):
+            if is_given:
+                raise OptionError("it needs --moved", where=option, remedy="leave it out")
+    elif len(lists) != 1:
+        raise OptionError(
+            f"{len(lists)} lists for one old place",
+            where="--moved",
+            remedy="give one list of the old place and one of the new",
+        )
+    paths = [*lists, *(() if moved is None else (moved,))]
+    twice = [path for path, n in Counter(path.resolve() for path in paths).items() if n > 1]
+    if twice:
+        raise OptionError("the list is given twice", where=str(twice[0]), remedy="name it once")
+
+
+def _cloud_beside(path: Path) -> Path | None:
+    """The cloud ``NAME.ply`` beside the list ``NAME.csv``, if there is one."""
+    beside = path.with_suffix(".ply")
+    return beside if beside.is_file() else None
+
+
+def _read_cloud(path: Path, name: str, markers: MarkerList) -> _NamedCloud:
+    """The cloud of a list of markers, which must be in its frame."""
+    cloud = read_cloud(path)
+    if cloud.frame not in (markers.markers.frame, FOREIGN_FRAME):
+        raise InputError(
+            f"the cloud is in {cloud.frame}, its markers are in {markers.markers.frame}",
+            where=f"{path} and {markers.path}",
+            remedy="measure both in one frame, or correct '# frame =' in the list",
+        )
+    return _NamedCloud(f"{name}.ply", path, cloud)
+
+
+def _different_names(paths: Sequence[Path]) -> tuple[str, ...]:
+    """A short name for each path: its stem, with the folder before it where stems repeat."""
+    stems = Counter(path.stem for path in paths)
+    names = [
+        path.stem if stems[path.stem] == 1 else f"{path.resolve().parent.name}-{path.stem}"
+        for path in paths
+    ]
+    repeated = {name for name, n in Counter(names).items() if n > 1}
+    return tuple(f"{k + 1}-{name}" if name in repeated else name for k, name in enumerate(names))
+
+
+def _common_frame(markers: MarkerList) -> CloudFrame:
+    """Frame of the result: Base stays Base; what a handheld sensor measured is on the part."""
+    return "Base" if markers.markers.frame == "Base" else "Part"
+
+
+def _assumed_sigma(lists: Sequence[MarkerList]) -> str:
+    """What is assumed of the markers of lists that give no covariance, all alike."""
+    sigma = float(np.sqrt(lists[0].markers.covariance_mm2[0, 0, 0]))
+    return f"{sigma:g} mm an axis is assumed for a marker"
+
+
+def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
+    """Warn of residuals that the stated covariances do not allow."""
+    if float(chi2.sf(chi2_sum, max(degrees_of_freedom, 1))) >= UNLIKELY:
+        return ()
+    ratio = float(np.sqrt(chi2_sum / degrees_of_freedom))
+    return (
+        f"the residuals are {ratio:.2g} times what the covariances let expect: the stated "
+        "uncertainty is too small by about that factor",
+    )
+
+
+def _residual_bodies(found: MarkerResiduals) -> tuple[MarkerResidual, ...]:
+    return tuple(
+        MarkerResidual(
+            name=found.scans[k],
+            id=int(found.ids[k]),
+            common_id=int(found.common_ids[k]),
+            residual_mm=found.residual_mm[k],
+            is_used=bool(found.is_used[k]),
+        )
+        for k in range(len(found.scans))
+    )
+
+
+def _rms(residual_mm: FloatArray) -> float:
+    """Root mean square length, three axes together."""
+    return float(np.sqrt((residual_mm**2).sum(axis=1).mean()))
+
+
+# ---- views of a handheld scanner
+
+
+def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _Joined:
+    lists = [read_marker_list(path, frame="Sensor", sigma_mm=options.sigma_mm) for path in paths]
+    names = _different_names(paths)
+    clouds = {
+        k: _read_cloud(path, names[k], item)
+        for k, item in enumerate(lists)
+        if (path := _cloud_beside(item.path)) is not None
+    }
+    views = [item.markers for item in lists]
+    joined = register_views(views, options, job.progress)
+    found, frame = joined.map, _common_frame(lists[0])
     carried = [
         replace(
             clouds[view],
             cloud=carry_cloud(
-                clouds[view].cloud,
-                joined.map.part_from_view[k],
-                joined.map.pose_covariance[k],
-                frame,
+                clouds[view].cloud, found.part_from_view[k], found.pose_covariance[k], frame
             ),
         )
         for k, view in enumerate(joined.placed)
         if view in clouds
     ]
-    report = views_report(lists, names, joined, carried, frame)
-    return _written(request, report, lists, carried, map_markers(joined, frame))
+    numbers = ViewNumbers.of(joined, lists, names)
+    sigma, shift = joined.sigma_mm(views), joined.shift_mm(views)
+    told = _views_quantities(joined, names, numbers, sigma, shift)
+    report = RegisterReport(
+        title="Views joined by markers",
+        subtitle=f"{len(joined.placed)} of {len(views)} views in the frame of {lists[0].path.name}",
+        quantities=told,
+        cards=only(told, "n_joined", "n_markers", "rms_mm", "drift_sigma_mm"),
+        scans=_view_table(joined, numbers, sigma, shift),
+        residuals=numbers.shared,
+        residuals_are="Carried sighting minus marker",
+        scene=_views_scene(joined, numbers, [item.cloud for item in carried], frame),
+        drift=drift_chart(numbers.placed, sigma, numbers.rms_mm),
+        warnings=_views_warnings(joined, lists, names),
+    )
+    cloud_of = {item.name.removesuffix(".ply"): item.name for item in carried}
+    return _Joined(
+        frame=frame,
+        report=report,
+        lists=lists,
+        carried=carried,
+        markers=MarkerSet(
+            ids=np.arange(1, len(found.markers_mm) + 1),
+            points_mm=found.markers_mm,
+            covariance_mm2=found.marker_covariance_mm2,
+            frame=frame,
+        ),
+        transforms=tuple(
+            ScanTransform(
+                name=name,
+                markers=path_text(lists[view].path),
+                own_frame=lists[view].markers.frame,
+                rotation_rows=found.part_from_view[k].rotation,
+                translation_mm=found.part_from_view[k].translation_mm,
+                covariance=found.pose_covariance[k],
+                n_markers=int(numbers.n_shared[k]),
+                rms_mm=float(numbers.rms_mm[k]),
+                cloud=cloud_of.get(name),
+            )
+            for k, (view, name) in enumerate(zip(joined.placed, numbers.placed, strict=True))
+        ),
+        residuals=_residual_bodies(numbers.shared),
+        moved=tuple(
+            MovedMarker(
+                id=int(numbers.ids[k]),
+                common_id=int(joined.sightings.marker[k]) + 1,
+                offset_mm=found.residual_mm[k],
+            )
+            for k in np.flatnonzero(~found.is_used)
+        ),
+        not_joined=tuple(
+            ScanNotJoined(name=names[item.view], reason=item.reason) for item in joined.left
+        ),
+        chi2=found.chi2,
+        degrees_of_freedom=found.degrees_of_freedom,
+    )
 
 
-def _join_place(request: RegisterRequest, moved: Path) -> Summary:
-    old, new = read_lists((request.lists[0], moved), "Base", request.options)
-    paths = request.clouds
-    if not paths and (beside := cloud_beside(moved)) is not None:
+def _views_quantities(
+    joined: JoinedViews,
+    names: Sequence[str],
+    numbers: ViewNumbers,
+    sigma: FloatArray,
+    shift: FloatArray,
+) -> tuple[Quantity, ...]:
+    last, largest = int(np.argmax(sigma)), float(shift.max())
+    drift_of = names[joined.placed[last]]
+    moved = f"solving together moved a view by {significant(largest, 'mm')} at most"
+    if largest < LEAST_MM:
+        moved = "solving together changed nothing: no loop closes"
+    n_seen = len(joined.sightings)
+    return (
+        Quantity(
+            "n_joined",
+            "Views joined",
+            len(joined.placed),
+            shown=f"{len(joined.placed)} of {len(names)}",
+            meaning=f"{joined.n_links} pairs match",
+        ),
+        Quantity("n_views", "", len(names)),
+        Quantity("not_joined", "", [names[item.view] for item in joined.left]),
+        Quantity("n_links", "", joined.n_links),
+        Quantity(
+            "n_markers",
+            "Markers",
+            len(joined.map.markers_mm),
+            meaning=f"seen {n_seen} times, one by {int(numbers.n_seen.max())} views at most",
+        ),
+        Quantity("n_sightings", "", n_seen),
+        Quantity("n_left_out", "", int((~joined.map.is_used).sum())),
+        Quantity("n_contradictions", "", joined.n_contradictions),
+        Quantity(
+            "rms_mm",
+            "Residuals",
+            _rms(numbers.shared.residual_mm[numbers.shared.is_used]),
+            unit="mm",
+            meaning="root mean square, three axes together",
+        ),
+        Quantity(
+            "drift_sigma_mm",
+            "Drift",
+            float(sigma[last]),
+            unit="mm",
+            meaning=f"uncertainty of {drift_of} against the first view; {moved}",
+        ),
+        Quantity("drift_of", "", drift_of),
+        Quantity("largest_shift_mm", "", largest),
+    )
+
+
+def _view_table(
+    joined: JoinedViews, numbers: ViewNumbers, sigma: FloatArray, shift: FloatArray
+) -> Table:
+    heads = ("view", "markers", "shared", "rms mm", "uncertainty mm", "moved by joint solve mm")
+    rows = tuple(
+        (
+            name,
+            str(len(joined.marker_of[k])),
+            str(int(numbers.n_shared[k])),
+            *(f"{value[k]:.4f}" for value in (numbers.rms_mm, sigma, shift)),
+        )
+        for k, name in enumerate(numbers.placed)
+    )
+    return Table(heads, rows, "In the order in which they were placed")
+
+
+def _views_scene(
+    joined: JoinedViews, numbers: ViewNumbers, clouds: Sequence[PointCloud], frame: CloudFrame
+) -> MarkerScene:
+    """Each shared marker once, by its first sighting, and every sighting that was left out."""
+    marker, found = joined.sightings.marker, joined.map
+    first = np.unique(marker, return_index=True)[1]
+    shared = first[numbers.n_seen[marker[first]] > 1]
+    rows = np.union1d(shared, np.flatnonzero(~found.is_used)).astype(int)
+    return MarkerScene(
+        points_mm=found.markers_mm[marker[rows]],
+        residual_mm=found.residual_mm[rows],
+        is_used=found.is_used[rows],
+        lonely_mm=found.markers_mm[numbers.n_seen == 1],
+        stations=[
+            (name, np.array(pose.translation_mm))
+            for name, pose in zip(numbers.placed, found.part_from_view, strict=True)
+        ],
+        clouds=clouds,
+        is_z_up=frame == "Base",
+    )
+
+
+def _views_warnings(
+    joined: JoinedViews, lists: Sequence[MarkerList], names: Sequence[str]
+) -> tuple[str, ...]:
+    found = [
+        f"{names[item.view]} is not joined: {item.reason}; {item.remedy}" for item in joined.left
+    ]
+    assumed = [item for item in lists if item.is_sigma_assumed]
+    if assumed:
+        found.append(f"{len(assumed)} lists give no covariance: {_assumed_sigma(assumed)}")
+    if n := int((~joined.map.is_used).sum()):
+        found.append(f"{n} sightings do not fit the others and were left out")
+    if joined.n_contradictions:
+        found.append(
+            f"{joined.n_contradictions} pairs of markers contradict stronger ones and were dropped"
+        )
+    return (*found, *_too_small(joined.map.chi2, joined.map.degrees_of_freedom))
+
+
+# ---- an arm that moved to a new place
+
+
+def _join_place(
+    old_path: Path, new_path: Path, paths: Sequence[Path], options: RegisterOptions
+) -> _Joined:
+    old, new = (
+        read_marker_list(path, frame="Base", sigma_mm=options.sigma_mm)
+        for path in (old_path, new_path)
+    )
+    if not paths and (beside := _cloud_beside(new_path)) is not None:
         paths = (beside,)
-    named = zip(paths, different_names(paths), strict=True)
-    clouds = [read_named_cloud(path, name, new) for path, name in named]
-    place = register_place(old, new, request.options)
-    frame = common_frame(old)
+    clouds = [
+        _read_cloud(path, name, new)
+        for path, name in zip(paths, _different_names(paths), strict=True)
+    ]
+    place = register_place(old, new, options)
+    fit, frame = place.fit, _common_frame(old)
     carried = [
-        replace(item, cloud=carry_cloud(item.cloud, place.fit.value, place.fit.covariance, frame))
+        replace(item, cloud=carry_cloud(item.cloud, fit.value, fit.covariance, frame))
         for item in clouds
     ]
-    report = place_report(old, new, place, carried)
-    return _written(request, report, (old, new), carried, _joint_markers(old, new, place))
-
-
-def _joint_markers(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> MarkerSet:
-    """The old markers, and behind them those that only the new place saw, in the old frame.
-
-    A marker that moved keeps its number and has its new place.
-    """
-    pose = place.fit.value
-    carried = new.markers.points_mm @ pose.rotation.T + pose.translation_mm
-    covariance = carried_covariance_mm2(
-        new.markers.points_mm, new.markers.covariance_mm2, pose, place.fit.covariance
+    residuals = place_residuals(old, new, place)
+    n_used, rms = int(place.is_used.sum()), _rms(place.residual_mm[place.is_used])
+    at_markers = added_sigma_mm(new.markers.points_mm[place.pairs[:, 1]], place)
+    rows = [("markers", str(n_used), significant(at_markers))]
+    for item in clouds:
+        added = added_sigma_mm(item.cloud.points_mm, place)
+        rows.append((item.name, f"{len(item.cloud):,}", significant(added)))
+    told = _place_quantities(old, new, place, rms, at_markers)
+    moved = fact("Moved markers", str(len(place.moved)), "named below" if place.moved else "")
+    report = RegisterReport(
+        title="The arm's new place in its old frame",
+        subtitle=f"{new.path.name} carried to the frame {old.markers.frame} of {old.path.name}",
+        quantities=told,
+        cards=(*only(told, "n_common", "rms_mm", "sigma_at_markers_mm"), moved),
+        scans=Table(("carried", "points", "uncertainty added, mm"), tuple(rows)),
+        residuals=with_strays(residuals, old, place),
+        residuals_are="Old minus carried new",
+        scene=_place_scene(old, new, place, [item.cloud for item in carried]),
+        drift=None,
+        warnings=_place_warnings(old, new, place),
     )
-    points, covariances = old.markers.points_mm.copy(), old.markers.covariance_mm2.copy()
-    for item in place.moved:
-        i = np.flatnonzero(old.markers.ids == item.old_id)
-        k = np.flatnonzero(new.markers.ids == item.new_id)
-        points[i], covariances[i] = carried[k], covariance[k]
-    added = np.isin(new.markers.ids, place.only_new)
-    last = int(old.markers.ids.max())
-    return MarkerSet(
-        ids=np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
-        points_mm=np.concatenate([points, carried[added]]),
-        covariance_mm2=np.concatenate([covariances, covariance[added]]),
+    transform = ScanTransform(
+        name=new.path.stem,
+        markers=path_text(new.path),
+        own_frame=new.markers.frame,
+        rotation_rows=fit.value.rotation,
+        translation_mm=fit.value.translation_mm,
+        covariance=fit.covariance,
+        n_markers=n_used,
+        rms_mm=rms,
+        cloud=", ".join(item.name for item in carried) or None,
+    )
+    return _Joined(
         frame=old.markers.frame,
-    )
-
-
-def _written(
-    request: RegisterRequest,
-    report: RegisterReport,
-    lists: tuple[MarkerList, ...] | list[MarkerList],
-    carried: list[NamedCloud],
-    markers: MarkerSet,
-) -> Summary:
-    inputs = (*(item.path for item in lists), *(item.path for item in carried))
-    is_simulated = are_simulated(inputs) or any(item.cloud.is_simulated for item in carried)
-    provenance = new_provenance(
-        inputs,
-        command=request.command,
-        options=(request.options,),
-        warnings=report.warnings,
-        forced=[reason for item in carried for reason in item.cloud.forced],
-    )
-    page = registration_page(report, provenance, is_simulated=is_simulated)
-    contents = {
-        DOCUMENT: registration_document(
-            _document(request, report, provenance, is_simulated=is_simulated)
+        report=report,
+        lists=(old, new),
+        carried=carried,
+        markers=joint_markers(old, new, place),
+        transforms=(transform,),
+        residuals=_residual_bodies(residuals),
+        moved=tuple(
+            MovedMarker(id=item.new_id, common_id=item.old_id, offset_mm=item.offset_mm)
+            for item in place.moved
         ),
-        MARKERS: markers_csv(markers),
-        **{item.name: ply_bytes(item.cloud) for item in carried},
-        PAGE: render_page(page),
-    }
-    with new_folder(request.output) as folder:
-        write_files({folder / name: content for name, content in contents.items()})
-    return Summary(
-        title=report.title + (" (simulated data)." if is_simulated else "."),
-        facts=report.facts,
-        tables=(report.scans,),
-        warnings=tuple(sentence(warning) for warning in report.warnings),
-        written=tuple(request.output / name for name in contents),
-        next_step=f"open {request.output / PAGE}",
-        forced=provenance.forced,
-        data={
-            "kind": "registration",
-            "of": "views" if request.moved is None else "moved arm",
-            "simulated": is_simulated,
-            "common_frame": report.common_frame,
-            **report.data,
-            "chi2": report.chi2,
-            "degrees_of_freedom": report.degrees_of_freedom,
-            "transforms": [CODEC.write(item) for item in report.transforms],
-            "moved": [CODEC.write(item) for item in report.moved],
-        },
+        not_joined=(),
+        chi2=fit.chi2,
+        degrees_of_freedom=fit.degrees_of_freedom,
     )
 
 
-def _document(
-    request: RegisterRequest, report: RegisterReport, provenance: Provenance, *, is_simulated: bool
-) -> Registration:
-    return Registration(
-        kind="views" if request.moved is None else "moved arm",
-        simulated=is_simulated,
-        common_frame=report.common_frame,
-        common_frame_of=report.common_frame_of,
-        transforms=report.transforms,
-        residuals=report.residuals,
-        moved=report.moved,
-        not_joined=report.not_joined,
-        chi2=report.chi2,
-        degrees_of_freedom=report.degrees_of_freedom,
-        provenance=provenance,
+def _place_quantities(
+    old: MarkerList, new: MarkerList, place: PlaceRegistration, rms: float, at_markers: float
+) -> tuple[Quantity, ...]:
+    pose, sigma = place.fit.value, place.fit.sigma
+    turns = np.degrees(pose.rotation_vector_rad), np.degrees(sigma[:3])
+    shift = zip(pose.translation_mm, sigma[3:], strict=True)
+    rival = {
+        BY_ID: "given by their ids",
+        UNCHECKED: "paired by the thesis's eight steps, unchecked",
+    }.get(
+        place.n_rival,
+        f"found by distances; no other way explains more than {max(place.n_rival, 3)}",
     )
+    return (
+        Quantity(
+            "n_common",
+            "Common markers",
+            int(place.is_used.sum()),
+            meaning=f"of {len(old.markers)} old and {len(new.markers)} new, {rival}",
+        ),
+        Quantity("n_matched", "", len(place.pairs)),
+        Quantity("n_only_old", "", len(place.only_old)),
+        Quantity("n_only_new", "", len(place.only_new)),
+        Quantity("only_old_ids", "", list(place.only_old)),
+        Quantity("only_new_ids", "", list(place.only_new)),
+        Quantity(
+            "rms_mm",
+            "Residuals",
+            rms,
+            unit="mm",
+            meaning="root mean square, three axes together",
+        ),
+        Quantity(
+            "sigma_at_markers_mm",
+            "Uncertainty at the markers",
+            at_markers,
+            unit="mm",
+            meaning="one standard deviation, three axes together; common to all points",
+        ),
+        fact("Translation", f"{', '.join(with_sigma(v, s) for v, s in shift)} mm"),
+        fact(
+            "Rotation vector",
+            f"{', '.join(with_sigma(v, s) for v, s in zip(*turns, strict=True))} degrees",
+        ),
+        Quantity("chi2_probability", "", place.chi2_probability),
+    )
+
+
+def _place_scene(
+    old: MarkerList, new: MarkerList, place: PlaceRegistration, clouds: Sequence[PointCloud]
+) -> MarkerScene:
+    pose, points = place.fit.value, old.markers.points_mm
+    matched = old.markers.ids[place.pairs[:, 0]]
+    strays = [item for item in place.moved if item.old_id not in set(matched.tolist())]
+    at = np.isin(old.markers.ids, [item.old_id for item in strays])
+    lonely_old = points[np.isin(old.markers.ids, place.only_old)]
+    lonely_new = new.markers.points_mm[np.isin(new.markers.ids, place.only_new)]
+    none = np.zeros((int(at.sum()), 3))
+    return MarkerScene(
+        points_mm=np.concatenate([points[place.pairs[:, 0]], points[at]]),
+        residual_mm=np.concatenate([-place.residual_mm, none]),
+        is_used=np.concatenate([place.is_used, np.zeros(len(none), dtype=bool)]),
+        lonely_mm=np.concatenate([lonely_old, pose.apply(lonely_new)]),
+        stations=[("old base", np.zeros(3)), ("new base", np.array(pose.translation_mm))],
+        clouds=clouds,
+        is_z_up=old.markers.frame != "Sensor",
+    )
+
+
+def _place_warnings(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> tuple[str, ...]:
+    found = [
+        f"{item.path.name} gives no covariance: {_assumed_sigma([item])}"
+        for item in (old, new)
+        if item.is_sigma_assumed
+    ]
+    found += [
+        f"marker {item.old_id} (new {item.new_id}) moved by "
+        f"{significant(float(np.linalg.norm(item.offset_mm)), 'mm')} and was left out; "
+        "markers.csv has its new place"
+        for item in place.moved
+    ]
+    found += _too_small(place.fit.chi2, place.fit.degrees_of_freedom)
+    across = spread_mm(old.markers.points_mm[place.pairs[place.is_used][:, 0]])
+    if across[1] < WEAK_SHARE * across[0]:
+        found.append(
+            f"the common markers lie nearly on a line ({significant(float(across[1]), 'mm')} to "
+            "either side): the turn about it is weak"
+        )
+    return tuple(found)

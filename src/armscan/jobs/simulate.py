@@ -9,7 +9,7 @@ from pathlib import Path
 from armscan.devices.sources import TwinScene
 from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene
-from armscan.report.quantity import Summary
+from armscan.report.quantity import Summary, fact
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +41,15 @@ def run_simulation(request: SimulateRequest, progress: Progress = silent) -> Sum
         As `simulate_scene`.
     """
     found = simulate_scene(request.folder, request.head, request.scene, request.options, progress)
-    counts = [("images", str(found.n_images))] if found.n_images else []
-    counts += [("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []
+    counts = [fact("images", str(found.n_images))] if found.n_images else []
+    counts += [fact("arm samples", str(found.n_arm_samples))] if found.n_arm_samples else []
     return Summary(
         title=f"Simulated: head {request.head}, scene {request.scene}, preset "
         f"{request.options.preset}, seed {request.options.seed}",
-        facts=(*counts, ("target", found.target)),
+        quantities=(*counts, fact("target", found.target)),
         written=(found.folder, found.truth),
         next_step=_next_step(request.scene, found),
-        data={
+        extra={
             "kind": "simulate",
             "simulated": True,
             "head": request.head,

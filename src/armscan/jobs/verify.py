@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a recording of a probed artefact to verdicts on a scanner, and the page about them."""
+"""From a scan of a ball or plate to the verdict on a scanner, and the page about it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armscan.calibration.hand_eye.probed_plate import ProbeSide
@@ -13,8 +14,9 @@ from armscan.geometry.arrays import Box, FloatArray
 from armscan.inspection.conformity import RULE, Check, Verdict
 from armscan.inspection.results import SphereInspection
 from armscan.inspection.selection import InspectionOptions
-from armscan.jobs.inspect import read_plate
-from armscan.pipeline.progress import Progress, silent
+from armscan.jobs.inspect import read_plate, region_of
+from armscan.jobs.job import Job
+from armscan.pipeline.progress import Progress
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.pipeline.verify import (
     Measured,
@@ -23,13 +25,22 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
-from armscan.reconstruction.sync import PoseStatus
 from armscan.report.inspect import InspectionReport, inspection_page, plane_report, sphere_report
-from armscan.report.page import Card, Section, Text, render_page
-from armscan.report.quantity import Summary, Table, sentence, significant
+from armscan.report.page import Section, Text
+from armscan.report.quantity import (
+    Quantity,
+    Summary,
+    Table,
+    fact,
+    for_people,
+    only,
+    sentence,
+    sentences,
+    significant,
+    values,
+)
 from armscan.storage.clouds import read_cloud
-from armscan.storage.documents import new_provenance, read_scanner_calibration
-from armscan.storage.files import check_outputs, write_files
+from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
@@ -43,52 +54,67 @@ ADVICE: dict[Verdict, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class VerifyRequest:
-    """What to verify, on what, and where to write.
+class Standard:
+    """What was scanned to verify a scanner.
 
     Parameters
     ----------
-    scan
-        A recording's folder, or a cloud in Base.
-    scanner
-        ``scanner.json``; may be None for a cloud only.
     ball_mm
         Diameter of the standard ball; None if a plate was scanned.
     plate
         Probed points of the plate, or its coefficients; None if a ball was scanned.
-    region
-        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for all.
-    options
-        How it is judged.
-    output
-        Page to write, or None for none.
-    inspection
-        What belongs to ball or plate.
-    is_overwriting
-        Replace a page that exists.
-    command
-        The command line, for the record.
     side
         Side of the plate that was touched; None to take it from where the tool was.
+
+    Raises
+    ------
+    OptionError
+        If it is not one of them.
     """
 
-    scan: Path
-    scanner: Path | None
     ball_mm: float | None = None
     plate: Path | None = None
-    region: tuple[float, ...] = ()
-    options: VerifyOptions = field(default_factory=VerifyOptions)
-    output: Path | None = None
-    inspection: InspectionOptions = field(default_factory=InspectionOptions)
-    is_overwriting: bool = False
-    command: tuple[str, ...] = ()
     side: ProbeSide | None = None
 
+    def __post_init__(self) -> None:
+        if (self.ball_mm is None) == (self.plate is None):
+            raise OptionError(
+                "a check needs one standard", remedy="give either --ball DIAMETER or --plate FILE"
+            )
+        if self.side is not None and self.plate is None:
+            raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
+        if self.ball_mm is not None and not 0.0 < self.ball_mm < math.inf:
+            raise OptionError(
+                f"a diameter of {self.ball_mm} mm", where="--ball", remedy="give the diameter in mm"
+            )
 
-def run_verification(
-    request: VerifyRequest, progress: Progress = silent
-) -> tuple[Summary, Verdict]:
+
+def verify(
+    job: Job,
+    scan: Path,
+    scanner: Path | None,
+    standard: Standard,
+    *,
+    region: Sequence[float] = (),
+    options: VerifyOptions | None = None,
+    inspection: InspectionOptions | None = None,
+) -> Summary:
     """Measure, compare with what the calibration predicts, and judge.
+
+    Parameters
+    ----------
+    job
+        Where to write the page, if anywhere.
+    scan
+        A recording's folder, or a cloud in Base.
+    scanner
+        ``scanner.json``; may be None for a cloud only.
+    standard
+        What was scanned.
+    region
+        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm; empty for all.
+    options, inspection
+        How it is judged, and what belongs to ball or plate.
 
     Raises
     ------
@@ -96,134 +122,81 @@ def run_verification(
         If a file is unreadable, an option is wrong, or the standard is not found; nothing is
         written then.
     """
-    _check(request)
-    measured, is_simulated = _measured(request, progress)
-    result = _verified(request, measured)
-    report = _report(request, result, measured)
-    written: tuple[Path, ...] = ()
-    if request.output is not None:
-        provenance = new_provenance(
-            _inputs(request),
-            command=request.command,
-            options=(request.options, request.inspection),
-            warnings=report.warnings,
-            forced=measured.cloud.forced,
-        )
-        blocks = (
-            Text(verdict_sentence(result)),
-            checks_table(result.checks),
-            definitions_table(result.checks),
-        )
-        first = (Section("Verdict", blocks),)
-        page = inspection_page(report, provenance, is_simulated=is_simulated, first=first)
-        write_files({request.output: render_page(page)}, is_overwriting=request.is_overwriting)
-        written = (request.output,)
-    summary = _summary(result, report, written, is_simulated=is_simulated)
-    return replace(summary, forced=measured.cloud.forced), result.verdict
-
-
-def verdict_sentence(result: Verification) -> str:
-    """Verdict, advice and rule."""
-    return f"{sentence(result.verdict)} {sentence(ADVICE[result.verdict])} Rule: {RULE}."
-
-
-def checks_table(checks: tuple[Check, ...]) -> Table:
-    """Every check with its limit and verdict."""
-    rows = tuple(
-        (
-            check.name,
-            _value(check, check.error),
-            _value(check, check.predicted),
-            _value(check, check.limit),
-            _value(check, check.uncertainty),
-            check.verdict,
-        )
-        for check in checks
-    )
-    heads = ("check", "error E", "predicted spread", "limit MPE", "uncertainty U", "verdict")
-    return Table(heads, rows, "", (5,))
-
-
-def definitions_table(checks: tuple[Check, ...]) -> Table:
-    """What the numbers of the checks are."""
-    rows = tuple(
-        (check.name, check.definition, check.limit_rule, check.uncertainty_rule) for check in checks
-    )
-    return Table(("check", "E is", "MPE is", "U holds"), rows, "", (1, 2, 3))
-
-
-def _check(request: VerifyRequest) -> None:
-    if (request.ball_mm is None) == (request.plate is None):
-        raise OptionError(
-            "a check needs one standard", remedy="give either --ball DIAMETER or --plate FILE"
-        )
-    if request.side is not None and request.plate is None:
-        raise OptionError("a side needs a plate", where="--side", remedy="give --plate")
-    if request.ball_mm is not None and not 0.0 < request.ball_mm < math.inf:
-        raise OptionError(
-            f"a diameter of {request.ball_mm} mm", where="--ball", remedy="give the diameter in mm"
-        )
-    if request.region:
-        Box.from_limits(request.region, "--region")
-    if request.scan.is_dir() and request.scanner is None:
+    options, inspection = options or VerifyOptions(), inspection or InspectionOptions()
+    box = region_of(region)
+    if scan.is_dir() and scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
-    if request.output is not None:
-        if request.output.suffix.lower() != ".html":
-            raise OptionError(
-                f"the output's name ends in '{request.output.suffix}'",
-                where=f"-o {request.output}",
-                remedy="end it in .html",
-            )
-        check_outputs((request.output,), is_overwriting=request.is_overwriting)
+    job.places(".html")
+    table = scan / EXPOSURES_FILE if scan.is_dir() else scan
+    inputs = [path for path in (table, scanner, standard.plate) if path is not None]
+    measured, is_simulated = _measured(scan, scanner, job.progress)
+    is_simulated = is_simulated or are_simulated(inputs)
+    result = _verified(measured, standard, box, options, inspection)
+    report = _report(scan.name, result, measured)
+    forced = measured.cloud.forced
+    written: tuple[Path, ...] = ()
+    if job.output is not None:
+        provenance = job.provenance(
+            inputs, (options, inspection), warnings=report.warnings, forced=forced
+        )
+        words = f"{sentence(result.verdict)} {sentence(ADVICE[result.verdict])} Rule: {RULE}."
+        checks = (Text(words), _checks_table(result.checks), _definitions_table(result.checks))
+        page = inspection_page(
+            report, provenance, is_simulated=is_simulated, first=(Section("Verdict", checks),)
+        )
+        written = job.write({job.output: page})
+    return Summary(
+        title=report.title + (" (simulated data)." if is_simulated else "."),
+        quantities=(
+            *(_check_quantity(check) for check in result.checks),
+            Quantity("", "advice", ADVICE[result.verdict]),
+            Quantity("rule", "rule", RULE),
+            *for_people(report.quantities),
+        ),
+        warnings=sentences(report.warnings),
+        written=written,
+        next_step=f"open {job.output}" if written else "",
+        extra={
+            "kind": "verification",
+            "simulated": is_simulated,
+            "verdict": result.verdict,
+            "checks": [_check_data(check) for check in result.checks],
+            "inspection": values(report.quantities),
+        },
+        forced=forced,
+    )
 
 
-def _measured(request: VerifyRequest, progress: Progress) -> tuple[Measured, bool]:
-    if not request.scan.is_dir():
-        cloud = read_cloud(request.scan)
+def _measured(scan: Path, scanner: Path | None, progress: Progress) -> tuple[Measured, bool]:
+    """The points, and whether they are of rendered images."""
+    if not scan.is_dir() or scanner is None:
+        cloud = read_cloud(scan)
         if cloud.frame == "Sensor":
             raise OptionError(
                 "the cloud is in the Sensor frame, where hand-eye and arm took no part",
-                where=str(request.scan),
+                where=str(scan),
                 remedy="give a recording with the arm's poses, or a cloud made from one",
             )
-        return Measured(cloud), cloud.is_simulated or are_simulated(_inputs(request))
-    source = read_recording(request.scan)
-    scanner = None if request.scanner is None else read_scanner_calibration(request.scanner)
-    if scanner is None:
-        raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
-    scan = measure_scan(source, scanner, ScanOptions(normals=None), progress=progress)
-    is_simulated = source.is_simulated or are_simulated(_inputs(request))
-    return Measured(scan.cloud, scan, scanner), is_simulated
+        return Measured(cloud), cloud.is_simulated
+    source, calibration = read_recording(scan), read_scanner_calibration(scanner)
+    found = measure_scan(source, calibration, ScanOptions(has_normals=False), progress=progress)
+    return Measured(found.cloud, found, calibration), source.is_simulated
 
 
-def _inputs(request: VerifyRequest) -> tuple[Path, ...]:
-    scan = request.scan / EXPOSURES_FILE if request.scan.is_dir() else request.scan
-    return tuple(path for path in (scan, request.scanner, request.plate) if path is not None)
-
-
-def _verified(request: VerifyRequest, measured: Measured) -> Verification:
-    region = None
-    if request.region:
-        region = Box.from_limits(request.region, "--region")
-    if request.ball_mm is not None:
-        return verify_on_ball(
-            measured,
-            request.ball_mm,
-            request.options,
-            region=region,
-            inspection=request.inspection,
-        )
-    if request.plate is None:
-        raise OptionError("a check needs one standard", remedy="give --ball or --plate")
-    plate, weak = read_plate(
-        request.plate,
-        measured.cloud.points_mm.mean(axis=0),
-        towards_mm=_tool_places(measured),
-        side=request.side,
-    )
-    found = verify_on_plate(
-        measured, plate, request.options, region=region, inspection=request.inspection
-    )
+def _verified(
+    measured: Measured,
+    standard: Standard,
+    region: Box | None,
+    options: VerifyOptions,
+    inspection: InspectionOptions,
+) -> Verification:
+    if standard.plate is None:
+        diameter = standard.ball_mm or math.nan
+        return verify_on_ball(measured, diameter, options, region=region, inspection=inspection)
+    middle = measured.cloud.points_mm.mean(axis=0)
+    towards = _tool_places(measured)
+    plate, weak = read_plate(standard.plate, middle, towards_mm=towards, side=standard.side)
+    found = verify_on_plate(measured, plate, options, region=region, inspection=inspection)
     return replace(found, warnings=(*weak, *found.warnings))
 
 
@@ -232,87 +205,81 @@ def _tool_places(measured: Measured) -> FloatArray | None:
     if measured.scan is None:
         return None
     poses = measured.scan.poses
-    found = poses.translations_mm[poses.fate == PoseStatus.FOUND]
+    found = poses.translations_mm[poses.has_pose]
     return found if len(found) else None
 
 
-def _report(request: VerifyRequest, result: Verification, measured: Measured) -> InspectionReport:
+def _report(name: str, result: Verification, measured: Measured) -> InspectionReport:
     found, cloud = result.found, measured.cloud
     if isinstance(found, SphereInspection):
         base = sphere_report(found, cloud)
     else:
         base = plane_report(found, cloud)
-    scan_warnings = () if measured.scan is None else measured.scan.warnings
-    cards = (
-        Card("Verdict", result.verdict, ADVICE[result.verdict]),
-        *(
-            Card(
-                check.name.capitalize(),
-                _value(check, check.error),
-                f"limit {_value(check, check.limit)}: {check.verdict}",
-            )
-            for check in result.checks
-        ),
-    )
-    return InspectionReport(
-        title=f"Scanner verified: {result.verdict}",
-        subtitle=f"{request.scan.name}: {base.subtitle}",
-        cards=(*cards, *base.cards[-1:]),
-        facts=base.facts,
-        references=base.references,
-        histograms=base.histograms,
-        views=base.views,
-        counts=base.counts,
-        geometry=base.geometry,
-        warnings=(*result.warnings, *scan_warnings, *base.warnings),
-        data=base.data,
-    )
-
-
-def _summary(
-    result: Verification,
-    report: InspectionReport,
-    written: tuple[Path, ...],
-    *,
-    is_simulated: bool,
-) -> Summary:
-    lines = tuple(
-        (
-            check.name,
-            f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
-            f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
+    of_scan = () if measured.scan is None else measured.scan.warnings
+    cards = [
+        fact(
+            check.name.capitalize(),
+            _value(check, check.error),
+            f"limit {_value(check, check.limit)}: {check.verdict}",
         )
         for check in result.checks
+    ]
+    verdict = fact("Verdict", result.verdict, ADVICE[result.verdict])
+    return replace(
+        base,
+        title=f"Scanner verified: {result.verdict}",
+        subtitle=f"{name}: {base.subtitle}",
+        cards=(verdict, *cards, *only(base.quantities, "points.n_feature")),
+        warnings=(*result.warnings, *of_scan, *base.warnings),
     )
-    return Summary(
-        title=report.title + (" (simulated data)." if is_simulated else "."),
-        facts=(*lines, ("advice", ADVICE[result.verdict]), ("rule", RULE), *report.facts),
-        warnings=tuple(sentence(warning) for warning in report.warnings),
-        written=written,
-        next_step=f"open {written[0]}" if written else "",
-        data={
-            "kind": "verification",
-            "simulated": is_simulated,
-            "verdict": result.verdict,
-            "rule": RULE,
-            "checks": [
-                {
-                    "name": check.name,
-                    "definition": check.definition,
-                    "unit": check.unit,
-                    "error": check.error,
-                    "predicted_sigma": check.predicted,
-                    "limit": check.limit,
-                    "limit_rule": check.limit_rule,
-                    "uncertainty": check.uncertainty,
-                    "uncertainty_rule": check.uncertainty_rule,
-                    "verdict": check.verdict,
-                }
-                for check in result.checks
-            ],
-            "inspection": dict(report.data),
-        },
+
+
+def _check_quantity(check: Check) -> Quantity:
+    return fact(
+        check.name,
+        f"E {_value(check, check.error)}, limit {_value(check, check.limit)} "
+        f"({check.limit_rule}), U {_value(check, check.uncertainty)}: {check.verdict}",
     )
+
+
+def _check_data(check: Check) -> dict[str, object]:
+    return {
+        "name": check.name,
+        "definition": check.definition,
+        "unit": check.unit,
+        "error": check.error,
+        "predicted_sigma": check.predicted,
+        "limit": check.limit,
+        "limit_rule": check.limit_rule,
+        "uncertainty": check.uncertainty,
+        "uncertainty_rule": check.uncertainty_rule,
+        "verdict": check.verdict,
+    }
+
+
+def _checks_table(checks: tuple[Check, ...]) -> Table:
+    """Every check with its limit and verdict."""
+    heads = ("check", "error E", "predicted spread", "limit MPE", "uncertainty U", "verdict")
+    rows = tuple(
+        (
+            check.name,
+            *(
+                _value(check, value)
+                for value in (check.error, check.predicted, check.limit, check.uncertainty)
+            ),
+            check.verdict,
+        )
+        for check in checks
+    )
+    return Table(heads, rows, "", (5,))
+
+
+def _definitions_table(checks: tuple[Check, ...]) -> Table:
+    """What the numbers of the checks are."""
+    rows = tuple(
+        (check.name, check.definition, check.limit_rule, check.uncertainty_rule) for check in checks
+    )
+    return Table(("check", "E is", "MPE is", "U holds"), rows, "", (1, 2, 3))
 
 
 def _value(check: Check, value: float) -> str:

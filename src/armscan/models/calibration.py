@@ -505,7 +505,7 @@ class ScannerCalibration:
         coupling = self.hand_eye.sensor_coupling
         n = len(self.sensor.parameter_names)
         follow = np.zeros((6, n)) if coupling is None else coupling
-        spread = np.vstack([np.eye(n), follow])
-        joint = spread @ self.sensor.covariance @ spread.T
+        follow_all = np.vstack([np.eye(n), follow])
+        joint = follow_all @ self.sensor.covariance @ follow_all.T
         joint[n:, n:] += self.hand_eye.covariance
         return np.asarray(joint)

@@ -392,22 +392,6 @@ def _same_placement(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class _ChannelEvidence:
-    """What one channel showed in a sample of photographs.
-
-    ``n_images`` of them with a stripe on the common sheet, ``n_points`` of these stripes, their
-    ``scatter_px`` (rms) about their straight stripe, and as ``weight`` the points over the square
-    of their scatter, summed: the precision that the set gets from it.
-    """
-
-    channel: LaserColour
-    n_images: int
-    n_points: int
-    scatter_px: float
-    weight: float
-
-
 def choose_channel(
     n_images: int,
     stripes_of: Callable[[int, LaserColour], BoardStripes | FitFailure],
@@ -420,22 +404,9 @@ def choose_channel(
     colours each win somewhere. Over a set the laser's line is the one that is long, straight on the
     board, narrow, and on the light sheet on which the boards agree.
 
-    Parameters
-    ----------
-    n_images
-        Photographs with a board.
-    stripes_of
-        The stripes of a photograph in a channel.
-    cameras
-        The cameras.
-    options
-        Of the light sheets.
-
-    Returns
-    -------
-    channel, reason
-        The channel and why it was taken, in words; ``auto`` and an empty reason where no channel
-        shows a straight stripe on a board.
+    ``stripes_of`` gives the stripes of one of ``n_images`` photographs with a board in a channel.
+    With the channel comes why it was taken, in words; ``auto`` and nothing where no channel shows a
+    straight stripe on a board.
     """
     sample = np.unique(np.linspace(0, n_images - 1, min(SAMPLE, n_images)).round().astype(int))
     # The middle one and both ends first: they differ most.
@@ -443,50 +414,45 @@ def choose_channel(
         range(len(sample)), key=lambda k: k not in {0, len(sample) // 2, len(sample) - 1}
     )
     found: dict[LaserColour, list[BoardStripes]] = {channel: [] for channel in CHANNELS}
-    open_channels = list(CHANNELS)
     for tried, k in enumerate(order):
-        for channel in open_channels:
-            stripes = stripes_of(int(sample[k]), channel)
-            if not isinstance(stripes, FitFailure):
-                found[channel].append(stripes)
+        for channel, stripes in found.items():
+            shown = stripes_of(int(sample[k]), channel)
+            if not isinstance(shown, FitFailure):
+                stripes.append(shown)
         if tried == FIRST - 1 and len(order) > FIRST:
-            evidence = [_weigh(c, found[c], cameras, options) for c in open_channels]
-            best = max(item.weight for item in evidence)
-            open_channels = [
-                item.channel for item in evidence if item.weight >= NEXT_TO_NOTHING * best
-            ]
-    evidence = [_weigh(channel, found[channel], cameras, options) for channel in open_channels]
-    evidence.sort(key=lambda item: -item.weight)
-    if not evidence or evidence[0].weight <= 0.0:
+            weights = {c: _weigh(stripes, cameras, options)[0] for c, stripes in found.items()}
+            least = NEXT_TO_NOTHING * max(weights.values())
+            found = {c: stripes for c, stripes in found.items() if weights[c] >= least}
+    evidence = [(_weigh(stripes, cameras, options), c) for c, stripes in found.items()]
+    evidence.sort(key=lambda item: -item[0][0])
+    (weight, n_shown, n_points, scatter_px), best = evidence[0]
+    if weight <= 0.0:
         return "auto", ""
-    first, *others = evidence
     reason = (
-        f"{first.channel}: the stripe on the common sheet in {first.n_images} of {len(sample)} "
-        f"sampled photographs, {first.n_points} points that scatter {first.scatter_px:.2f} px"
+        f"{best}: the stripe on the common sheet in {n_shown} of {len(sample)} "
+        f"sampled photographs, {n_points} points that scatter {scatter_px:.2f} px"
     )
-    if others and others[0].weight > 0.0:
-        second = others[0]
-        reason += (
-            f"; next {second.channel} with {second.n_images}, {second.n_points} and "
-            f"{second.scatter_px:.2f} px"
-        )
-    return first.channel, reason
+    if len(evidence) > 1 and evidence[1][0][0] > 0.0:
+        (_, n_shown, n_points, scatter_px), second = evidence[1]
+        reason += f"; next {second} with {n_shown}, {n_points} and {scatter_px:.2f} px"
+    return best, reason
 
 
 def _weigh(
-    channel: LaserColour,
-    boards: Sequence[BoardStripes],
-    cameras: HeadCameras,
-    options: SheetOptions,
-) -> _ChannelEvidence:
+    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
+) -> tuple[float, int, int, float]:
+    """Weight of a channel's stripes on the common sheet, their photographs, points and scatter.
+
+    The weight is the points over the square of their scatter (rms, px), summed over the stripes:
+    the precision that the set gets from the channel.
+    """
     images = observe_boards(boards, cameras, options).images if boards else ()
     stripes = [(image, stripe.rows) for image in images for stripe in image.stripes]
     n = np.array([len(rows) for _, rows in stripes], dtype=np.int64)
     square = np.array([_scatter_px(image, rows) ** 2 for image, rows in stripes])
     weight = float((n / (square + LEAST_SCATTER_PX**2)).sum())
-    scatter = float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0
-    n_shown = sum(1 for image in images if image.stripes)
-    return _ChannelEvidence(channel, n_shown, int(n.sum()), scatter, weight)
+    scatter_px = float(np.sqrt((n * square).sum() / n.sum())) if len(n) else 0.0
+    return weight, sum(1 for image in images if image.stripes), int(n.sum()), scatter_px
 
 
 def _scatter_px(image: BoardImage, rows: IntArray) -> float:
@@ -500,18 +466,8 @@ def _scatter_px(image: BoardImage, rows: IntArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPair:
-    """What an image with the laser on shows, the board perhaps in the one without.
-
-    Parameters
-    ----------
-    source
-        The image with the laser on.
-    board
-        The target, or why it was not found.
-    board_source
-        The image in which it was found.
-    profile
-        All stripe points.
+    """Stripe points of an image with the laser on, and the target found in ``board_source``, or why
+    it was not found.
     """
 
     source: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import chi2
@@ -27,12 +27,17 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.points import MarkerSet
 from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList
+from armscan.thesis.marker_rules import match_after_thesis
 
 MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
 MOVED_WITHIN_MM = 5.0
 """Two markers without partner that lie this near to each other are one that moved."""
 LEAST_LEFT = 4
+BY_ID, UNCHECKED = -1, -2
+"""In place of a count of rivals: ids said which markers are common, or nothing was checked."""
+THESIS_SIGMAS = 8.0
+"""Limit of the eight steps for distances: a distance errs by up to 4 sigmas at either end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +52,14 @@ class RegisterOptions:
         Standard deviation an axis of markers whose list gives no covariance.
     is_by_id
         Take markers with the same ``id`` in both lists as the same, instead of matching them.
+    method
+        ``thesis`` for the eight steps of section 4.3.1, which check nothing afterwards.
     """
 
     match: MarkerMatchOptions = field(default_factory=MarkerMatchOptions)
     sigma_mm: float = ASSUMED_SIGMA_MM
     is_by_id: bool = False
+    method: Literal["armscan", "thesis"] = "armscan"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sigma_mm < 100.0:
@@ -98,7 +106,7 @@ class PlaceRegistration:
     only_old, only_new
         Numbers of markers without partner.
     n_rival
-        Markers that the next best alignment explains; -1 where ids said which are common.
+        Markers that the next best alignment explains; or `BY_ID` or `UNCHECKED`.
     """
 
     fit: Estimate[Pose[Base, Base]]
@@ -172,7 +180,16 @@ def register_views(
 
 def _common(old: MarkerList, new: MarkerList, options: RegisterOptions) -> tuple[IntArray, int]:
     if options.is_by_id:
-        return _same_ids(old, new), -1
+        return _same_ids(old, new), BY_ID
+    if options.method == "thesis":
+        pairs = match_after_thesis(old.markers, new.markers, THESIS_SIGMAS * options.sigma_mm)
+        if len(pairs) < LEAST_LEFT:
+            raise EstimationError(
+                f"the eight steps pair {len(pairs)} markers, {LEAST_LEFT} are needed",
+                where=f"{old.path} and {new.path}",
+                remedy="leave --method thesis out",
+            )
+        return pairs, UNCHECKED
     found = match_markers(old.markers, new.markers, options.match)
     if not isinstance(found, Matched):
         remedy = found.remedy
@@ -290,4 +307,158 @@ def carry_cloud(
             carried_covariance_mm2(cloud.points_mm, own, a_from_b, covariance) if is_known else own
         ),
         normals=None if cloud.normals is None else cloud.normals @ a_from_b.rotation.T,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerResiduals:
+    """How far markers lie from where the other scans say.
+
+    Parameters
+    ----------
+    scans
+        K names of the scans that saw them.
+    ids, common_ids
+        (K,) their numbers in the scan and in the common frame.
+    residual_mm
+        (K, 3), in the common frame.
+    expected_mm
+        (K,) root of the trace of the covariance that a residual should have.
+    is_used
+        (K,) False where a marker moved or does not fit.
+    """
+
+    scans: tuple[str, ...]
+    ids: IntArray
+    common_ids: IntArray
+    residual_mm: FloatArray
+    expected_mm: FloatArray
+    is_used: BoolArray
+
+    @property
+    def length_mm(self) -> FloatArray:
+        """(K,) lengths of the residuals."""
+        return np.asarray(np.linalg.norm(self.residual_mm, axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewNumbers:
+    """What the residuals of joined views come to.
+
+    Parameters
+    ----------
+    placed
+        Names of the views in the order in which they were placed.
+    ids
+        (K,) number of each sighting's marker in its view.
+    n_seen
+        (M,) sightings of each marker.
+    shared
+        Sightings of markers that another view saw too: only these have a residual.
+    n_shared, rms_mm
+        (V,) number and root mean square of a view's residuals that were used.
+    """
+
+    placed: tuple[str, ...]
+    ids: IntArray
+    n_seen: IntArray
+    shared: MarkerResiduals
+    n_shared: IntArray
+    rms_mm: FloatArray
+
+    @classmethod
+    def of(
+        cls, joined: JoinedViews, lists: Sequence[MarkerList], names: Sequence[str]
+    ) -> ViewNumbers:
+        """Take them from joined views."""
+        seen, found = joined.sightings, joined.map
+        placed = tuple(names[view] for view in joined.placed)
+        in_view = np.concatenate([np.arange(len(item)) for item in joined.marker_of])
+        of_view = zip(seen.view.tolist(), in_view, strict=True)
+        ids = np.array([lists[joined.placed[view]].markers.ids[k] for view, k in of_view])
+        n_seen = np.bincount(seen.marker, minlength=len(found.markers_mm))
+        is_shared = n_seen[seen.marker] > 1
+        # a residual is its sighting's noise, less what the fit takes up
+        share = found.degrees_of_freedom / max(3 * int(is_shared.sum()), 1)
+        trace = np.trace(seen.covariance_mm2, axis1=1, axis2=2)
+        expected = np.sqrt(trace * min(max(share, 0.0), 1.0))
+        used = is_shared & found.is_used
+        squares = (found.residual_mm[used] ** 2).sum(axis=1)
+        n_shared = np.bincount(seen.view[used], minlength=len(placed))
+        total = np.bincount(seen.view[used], squares, minlength=len(placed))
+        shared = MarkerResiduals(
+            scans=tuple(placed[view] for view in seen.view[is_shared]),
+            ids=ids[is_shared],
+            common_ids=seen.marker[is_shared] + 1,
+            residual_mm=found.residual_mm[is_shared],
+            expected_mm=expected[is_shared],
+            is_used=found.is_used[is_shared],
+        )
+        rms = np.sqrt(total / np.maximum(n_shared, 1.0))
+        return cls(placed, ids, n_seen, shared, n_shared, rms)
+
+
+def joint_markers(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> MarkerSet:
+    """The old markers, and behind them those that only the new place saw, in the old frame.
+
+    A marker that moved keeps its number and has its new place.
+    """
+    pose = place.fit.value
+    carried = pose.apply(new.markers.points_mm)
+    covariance = carried_covariance_mm2(
+        new.markers.points_mm, new.markers.covariance_mm2, pose, place.fit.covariance
+    )
+    points, covariances = old.markers.points_mm.copy(), old.markers.covariance_mm2.copy()
+    for item in place.moved:
+        i = np.flatnonzero(old.markers.ids == item.old_id)
+        k = np.flatnonzero(new.markers.ids == item.new_id)
+        points[i], covariances[i] = carried[k], covariance[k]
+    added = np.isin(new.markers.ids, place.only_new)
+    last = int(old.markers.ids.max())
+    return MarkerSet(
+        ids=np.concatenate([old.markers.ids, last + 1 + np.arange(int(added.sum()))]),
+        points_mm=np.concatenate([points, carried[added]]),
+        covariance_mm2=np.concatenate([covariances, covariance[added]]),
+        frame=old.markers.frame,
+    )
+
+
+def added_sigma_mm(points_mm: FloatArray, place: PlaceRegistration) -> float:
+    """Root mean square uncertainty that the registration adds to (N, 3) points of the new frame."""
+    none = np.zeros((len(points_mm), 3, 3))
+    added = carried_covariance_mm2(points_mm, none, place.fit.value, place.fit.covariance)
+    return float(np.sqrt(np.trace(added, axis1=1, axis2=2).mean()))
+
+
+def place_residuals(old: MarkerList, new: MarkerList, place: PlaceRegistration) -> MarkerResiduals:
+    """Of the matched markers."""
+    i, k = place.pairs.T
+    covariance = old.markers.covariance_mm2[i] + new.markers.covariance_mm2[k]
+    freedom = place.fit.degrees_of_freedom
+    share = max(freedom, 0) / (freedom + 6)
+    return MarkerResiduals(
+        scans=(new.path.stem,) * len(i),
+        ids=new.markers.ids[k],
+        common_ids=old.markers.ids[i],
+        residual_mm=place.residual_mm,
+        expected_mm=np.sqrt(np.trace(covariance, axis1=1, axis2=2) * share),
+        is_used=place.is_used,
+    )
+
+
+def with_strays(
+    found: MarkerResiduals, old: MarkerList, place: PlaceRegistration
+) -> MarkerResiduals:
+    """The residuals, and those of markers that moved too far to be matched."""
+    strays = [item for item in place.moved if item.old_id not in set(found.common_ids.tolist())]
+    if not strays:
+        return found
+    n = len(strays)
+    return MarkerResiduals(
+        scans=found.scans + found.scans[:1] * n,
+        ids=np.append(found.ids, [item.new_id for item in strays]),
+        common_ids=np.append(found.common_ids, [item.old_id for item in strays]),
+        residual_mm=np.concatenate([found.residual_mm, [-item.offset_mm for item in strays]]),
+        expected_mm=np.append(found.expected_mm, np.full(n, found.expected_mm.mean())),
+        is_used=np.append(found.is_used, np.zeros(n, dtype=bool)),
     )

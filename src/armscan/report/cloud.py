@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pages of a reconstruction and of a scan, and their figures."""
+"""The pages of a reconstruction and of a scan, and their numbers."""
 
 from __future__ import annotations
 
@@ -8,17 +8,237 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from armscan.models.calibration import Provenance, SensorCalibration
-from armscan.pipeline.scan import ScanReconstruction
-from armscan.reconstruction.labels import PointStatus, Reconstruction
+from armscan.pipeline.measure import Reconstruction
+from armscan.pipeline.scan import ExposureStatus, ScanReconstruction
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
-from armscan.report.drawing import ACCENT, PALETTE, chart_markup, new_figure, raster_markup, styled
-from armscan.report.page import Card, Gallery, Page, Picture, Section, Text, footer, origin_section
-from armscan.report.quantity import Table, sentence, significant
+from armscan.report.charts import Bars, histogram_chart
+from armscan.report.drawing import ACCENT, PALETTE, new_figure, raster_markup, styled
+from armscan.report.page import Gallery, Page, Picture, Section, Text, page_of
+from armscan.report.photographs import evenly_chosen, stripe_gallery
+from armscan.report.quantity import Quantity, Table, fact, only, plural, significant
 from armscan.report.scene3d import SceneDots, ramp_colours, ramp_markup, scene_markup
-from armscan.report.stripes import evenly_chosen, stripe_gallery
 
 MAX_SHOWN = 20_000
+MAX_PROFILES = 6
+PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
+FATE_TEXT = (
+    "What became of every stripe point. Points that were flagged or left out are in no cloud; "
+    "points that were measured but are wrong would be in it, and only an inspection shows them."
+)
+
+
+def cloud_quantities(result: Reconstruction) -> tuple[Quantity, ...]:
+    """What is told of measured points."""
+    cloud = result.cloud
+    names = [name for k, name in enumerate(cloud.sheet_names) if (cloud.sheet == k).any()]
+    sheets = f"sheet{'s' if len(names) > 1 else ''} {', '.join(names)}"
+    return (
+        *_point_quantities(cloud, result.images),
+        fact("Images", str(len(result.images)), sheets),
+    )
+
+
+def _point_quantities(cloud: PointCloud, images: Sequence[LabelledProfile]) -> tuple[Quantity, ...]:
+    n_stripe = sum(len(image.profile) for image in images)
+    median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
+    low, top = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
+    return (
+        Quantity(
+            "n_points",
+            "Points",
+            len(cloud),
+            meaning=f"in the {cloud.frame} frame, of {n_stripe:,} stripe points",
+        ),
+        Quantity("frame", "", cloud.frame),
+        Quantity(
+            "sigma_median_mm",
+            "Sigma of a point",
+            median,
+            unit="mm",
+            meaning=f"median; 95 % below {significant(high)} mm",
+        ),
+        Quantity("sigma_95_mm", "", high),
+        Quantity("low_corner_mm", "", low),
+        Quantity("high_corner_mm", "", top),
+        *(fact(axis, f"{low[k]:.2f} to {top[k]:.2f} mm") for k, axis in enumerate("XYZ")),
+    )
+
+
+def scan_quantities(scan: ScanReconstruction) -> tuple[Quantity, ...]:
+    """What is told of a scan."""
+    counts = {status: scan.count(status) for status in ExposureStatus}
+    found = scan.doubt.agreement
+    passes = None
+    if found is not None:
+        passes = {
+            "distance_mm": found.distance_mm,
+            "worst_mm": found.worst_mm,
+            "claimed_mm": found.claimed_mm,
+            "ratio": found.ratio,
+            "worst_ratio": found.worst_ratio,
+            "n_pairs": len(found.pairs),
+            "cause": scan.doubt.cause,
+        }
+    return (
+        *_point_quantities(scan.cloud, scan.images),
+        Quantity(
+            "exposures",
+            "Exposures",
+            {status.name.lower(): count for status, count in counts.items()},
+            shown=", ".join(f"{count} {one.value}" for one, count in counts.items() if count),
+        ),
+        Quantity("poses_by", "Poses", scan.poses.source, shown=scan.poses.how),
+        Quantity("max_gap_ns", "", scan.poses.max_gap_ns),
+        Quantity("passes", "Passes", passes, shown=passes_text(scan)),
+        Quantity("contradictions", "", list(scan.contradictions)),
+        Quantity(
+            "without_pose",
+            "",
+            [{"source": name, "reason": why} for name, why in scan.without_pose],
+        ),
+    )
+
+
+def passes_text(scan: ScanReconstruction) -> str:
+    """How far the passes of a scan agree, in words."""
+    found = scan.doubt.agreement
+    if found is None:
+        return "no two of them overlap, so the scan cannot be checked against itself"
+    return (
+        f"{significant(found.distance_mm)} mm apart where they overlap (median of "
+        f"{len(found.pairs)} pairs; at most {significant(found.worst_mm)} mm), "
+        f"{significant(found.ratio, '', 2)} times what is expected"
+    )
+
+
+def cloud_page(
+    result: Reconstruction,
+    sensor: SensorCalibration,
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
+    *,
+    is_simulated: bool = False,
+) -> Page:
+    """Lay out the report; arguments as `armscan.report.sheets.laser_page`."""
+    cloud = result.cloud
+    told = cloud_quantities(result)
+    depth = cloud.points_mm[:, 2]
+    span = f"{depth.min():.1f} to {depth.max():.1f} mm"
+    with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
+    profiles = [profile_view(cloud, sensor, k) for k in evenly_chosen(with_points, MAX_PROFILES)]
+    stripes = (*stripe_gallery(result.images, cloud.sheet_names, exposures), fate_table(result))
+    return page_of(
+        provenance,
+        "Measured points",
+        f"{len(cloud):,} points in the {cloud.frame} frame from "
+        f"{plural(len(result.images), 'image')}",
+        (
+            Section("The points", (Gallery((cloud_view(cloud),), 560),)),
+            Section("Profiles", (Text(PROFILE_TEXT), Gallery(tuple(profiles)))),
+            Section("The stripes", stripes),
+            Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)),
+        ),
+        cards=(
+            *only(told, "n_points", "sigma_median_mm"),
+            fact("Depth", span, "Z in the Sensor frame"),
+            told[-1],
+        ),
+        warnings=result.warnings,
+        is_simulated=is_simulated,
+    )
+
+
+def fate_table(result: Reconstruction) -> Table:
+    """What became of the stripe points of each image."""
+    fates = _fates(result.images)
+    rows = tuple(
+        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.reason)
+        for image in result.images
+    )
+    columns = ("image", *(fate.label for fate in fates), "sheet chosen by")
+    return Table(columns, rows, "", (len(columns) - 1,))
+
+
+def _fates(images: Sequence[LabelledProfile]) -> list[PointStatus]:
+    return [fate for fate in PointStatus if any(image.count(fate) for image in images)]
+
+
+def scan_page(
+    scan: ScanReconstruction,
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
+    warnings: Sequence[str] = (),
+    *,
+    is_simulated: bool = False,
+) -> Page:
+    """Lay out the report.
+
+    Parameters
+    ----------
+    scan
+        The scan.
+    exposures
+        Images by source name; those that are missing are not shown.
+    provenance
+        How the cloud came to be.
+    warnings
+        What is odd about the recording and the scan.
+    is_simulated
+        True if the images were rendered.
+    """
+    cloud = scan.cloud
+    size = " × ".join(f"{value:.0f}" for value in np.ptp(cloud.points_mm, axis=0))
+    without = f"{len(scan.without_pose)} had no pose of the arm" if scan.without_pose else ""
+    sections = [
+        Section("The cloud", (Gallery((cloud_view(cloud),), 560),)),
+        Section("What became of the points", (Text(FATE_TEXT), fate_totals(scan))),
+        Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)),
+    ]
+    if scan.without_pose:
+        table = Table(("exposure", "why"), tuple(scan.without_pose), "", (1,))
+        sections.append(Section("Exposures without a pose", (table,)))
+    sections += [
+        Section("The stripes", stripe_gallery(scan.images, cloud.sheet_names, exposures)),
+        Section("Exposure by exposure", (_exposure_table(scan),), is_folded=True),
+    ]
+    return page_of(
+        provenance,
+        "Scan in Base",
+        f"{len(cloud):,} points from {len(scan.images)} exposures of a moving arm",
+        sections,
+        cards=(
+            *only(scan_quantities(scan), "n_points", "sigma_median_mm"),
+            fact(
+                "Exposures placed", str(len(scan.images)), without or "each with a pose of the arm"
+            ),
+            fact("Extent", f"{size} mm", "along X, Y, Z of Base"),
+        ),
+        warnings=warnings,
+        is_simulated=is_simulated,
+    )
+
+
+def fate_totals(scan: ScanReconstruction) -> Table:
+    """All stripe points by what became of them."""
+    counts = {fate: sum(image.count(fate) for image in scan.images) for fate in PointStatus}
+    n_all = max(sum(counts.values()), 1)
+    rows = tuple(
+        (fate.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
+        for fate, count in counts.items()
+        if count
+    )
+    return Table(("stripe points", "count", "share"), rows)
+
+
+def _exposure_table(scan: ScanReconstruction) -> Table:
+    """Every exposure with what became of its points."""
+    fates = _fates(scan.images)
+    rows = tuple(
+        (image.profile.source, *(str(image.count(fate)) for fate in fates)) for image in scan.images
+    )
+    return Table(("exposure", *(fate.label for fate in fates)), rows)
 
 
 def cloud_view(cloud: PointCloud) -> Picture:
@@ -72,195 +292,14 @@ def profile_view(cloud: PointCloud, sensor: SensorCalibration, exposure: int) ->
 def sigma_histogram(cloud: PointCloud) -> Picture:
     """How uncertain the points are, and how much of it is stripe noise."""
     sigma_um = 1000.0 * cloud.sigma_mm
-    noise_um = 1000.0 * cloud.sigma_noise_mm
-    edges = np.linspace(0.0, 1.15 * float(np.percentile(sigma_um, 99)), 61).tolist()
-    with styled():
-        figure = new_figure(5.0, 3.2)
-        axes = figure.add_subplot()
-        axes.hist(sigma_um, edges, color=ACCENT, label="all")
-        axes.hist(
-            noise_um, edges, histtype="step", color=PALETTE[1], linewidth=1.4, label="stripe noise"
-        )
-        axes.set_xlabel("standard deviation of a point, µm")
-        axes.set_ylabel("points")
-        axes.legend()
-    return Picture(
-        chart_markup(figure, "Histogram of the points' standard deviations"),
+    return histogram_chart(
+        [
+            Bars(sigma_um, ACCENT, "all"),
+            Bars(1000.0 * cloud.sigma_noise_mm, PALETTE[1], "stripe noise", is_outline=True),
+        ],
+        np.linspace(0.0, 1.15 * float(np.percentile(sigma_um, 99)), 61),
+        "standard deviation of a point, µm",
         title="How far to trust a point",
         caption="Stripe noise differs from point to point and averages out; the rest, from the "
         "calibration, moves neighbouring points together and does not.",
-    )
-
-
-MAX_PROFILES = 6
-PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
-
-
-def cloud_page(
-    result: Reconstruction,
-    sensor: SensorCalibration,
-    exposures: Mapping[str, Exposure],
-    provenance: Provenance,
-    *,
-    is_simulated: bool = False,
-) -> Page:
-    """Lay out the report; arguments as `armscan.report.sheets.laser_page`."""
-    cloud = result.cloud
-    depth = cloud.points_mm[:, 2]
-    n_stripe = sum(len(image.profile) for image in result.images)
-    used = [name for k, name in enumerate(cloud.sheet_names) if (cloud.sheet == k).any()]
-    cards = (
-        Card("Points", f"{len(cloud):,}", f"of {n_stripe:,} stripe points"),
-        Card(
-            "Sigma of a point",
-            f"{significant(float(np.median(cloud.sigma_mm)))} mm",
-            f"median; 95 % below {significant(float(np.percentile(cloud.sigma_mm, 95)))} mm",
-        ),
-        Card("Depth", f"{depth.min():.1f} to {depth.max():.1f} mm", "Z in the Sensor frame"),
-        Card(
-            "Images",
-            str(len(result.images)),
-            f"sheet{'s' if len(used) > 1 else ''} {', '.join(used)}",
-        ),
-    )
-    with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
-    profiles = tuple(
-        profile_view(cloud, sensor, k) for k in evenly_chosen(with_points, MAX_PROFILES)
-    )
-    return Page(
-        title="Measured points",
-        subtitle=f"{len(cloud):,} points in the {cloud.frame} frame from {len(result.images)} "
-        f"image{'s' if len(result.images) > 1 else ''}",
-        cards=cards,
-        warnings=tuple(sentence(warning) for warning in result.warnings),
-        sections=(
-            Section("The points", (Gallery((cloud_view(cloud),), 560),)),
-            Section("Profiles", (Text(PROFILE_TEXT), Gallery(profiles, 420))),
-            _images_section(result, exposures),
-            Section("How far to trust them", (Gallery((sigma_histogram(cloud),), 420),)),
-            origin_section(provenance),
-        ),
-        is_simulated=is_simulated,
-        footer=footer(provenance),
-        forced=provenance.forced,
-    )
-
-
-def fate_table(result: Reconstruction) -> Table:
-    """What became of the stripe points of each image."""
-    fates = [fate for fate in PointStatus if any(image.count(fate) for image in result.images)]
-    rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.naming)
-        for image in result.images
-    )
-    columns = ("image", *(fate.label for fate in fates), "sheet chosen by")
-    return Table(columns, rows, "", (len(columns) - 1,))
-
-
-def _images_section(result: Reconstruction, exposures: Mapping[str, Exposure]) -> Section:
-    blocks = stripe_gallery(result.images, result.cloud.sheet_names, exposures)
-    return Section("The stripes", (*blocks, fate_table(result)))
-
-
-FATE_TEXT = (
-    "What became of every stripe point. Points that were flagged or left out are in no cloud; "
-    "points that were measured but are wrong would be in it, and only an inspection shows them."
-)
-
-
-def scan_page(
-    scan: ScanReconstruction,
-    exposures: Mapping[str, Exposure],
-    provenance: Provenance,
-    notes: Sequence[str] = (),
-    *,
-    is_simulated: bool = False,
-) -> Page:
-    """Lay out the report.
-
-    Parameters
-    ----------
-    scan
-        The scan.
-    exposures
-        Images by source name; those that are missing are not shown.
-    provenance
-        How the cloud came to be.
-    notes
-        What is odd about the recording, in words.
-    is_simulated
-        True if the images were rendered.
-    """
-    cloud = scan.cloud
-    sections = [
-        Section("The cloud", (Gallery((cloud_view(cloud),), 560),)),
-        Section("What became of the points", (Text(FATE_TEXT), fate_totals(scan))),
-        Section("How far to trust them", (Gallery((sigma_histogram(cloud),), 420),)),
-    ]
-    if scan.without_pose:
-        sections.append(Section("Exposures without a pose", (without_pose_table(scan),)))
-    sections += [
-        Section("The stripes", stripe_gallery(scan.images, cloud.sheet_names, exposures)),
-        Section("Exposure by exposure", (exposure_table(scan),), is_folded=True),
-        origin_section(provenance),
-    ]
-    return Page(
-        title="Scan in Base",
-        subtitle=f"{len(cloud):,} points from {len(scan.images)} exposures of a moving arm",
-        cards=_cards(scan),
-        warnings=tuple(sentence(warning) for warning in (*notes, *scan.warnings)),
-        sections=tuple(sections),
-        is_simulated=is_simulated,
-        footer=footer(provenance),
-        forced=provenance.forced,
-    )
-
-
-def fate_totals(scan: ScanReconstruction) -> Table:
-    """All stripe points by what became of them."""
-    counts = {fate: sum(image.count(fate) for image in scan.images) for fate in PointStatus}
-    n_all = max(sum(counts.values()), 1)
-    rows = [
-        (fate.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
-        for fate, count in counts.items()
-        if count
-    ]
-    return Table(("stripe points", "count", "share"), tuple(rows))
-
-
-def exposure_table(scan: ScanReconstruction) -> Table:
-    """Every exposure with what became of its points."""
-    fates = [fate for fate in PointStatus if any(image.count(fate) for image in scan.images)]
-    rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates)) for image in scan.images
-    )
-    return Table(("exposure", *(fate.label for fate in fates)), rows)
-
-
-def without_pose_table(scan: ScanReconstruction) -> Table:
-    """Exposures that could not be placed, and why."""
-    return Table(("exposure", "why"), tuple(scan.without_pose), "", (1,))
-
-
-def _cards(scan: ScanReconstruction) -> tuple[Card, ...]:
-    cloud = scan.cloud
-    n_stripe = sum(len(image.profile) for image in scan.images)
-    size = np.ptp(cloud.points_mm, axis=0)
-    return (
-        Card("Points", f"{len(cloud):,}", f"of {n_stripe:,} stripe points"),
-        Card(
-            "Sigma of a point",
-            f"{significant(float(np.median(cloud.sigma_mm)))} mm",
-            f"median; 95 % below {significant(float(np.percentile(cloud.sigma_mm, 95)))} mm",
-        ),
-        Card(
-            "Exposures placed",
-            str(len(scan.images)),
-            f"{len(scan.without_pose)} had no pose of the arm"
-            if scan.without_pose
-            else "each with a pose of the arm",
-        ),
-        Card(
-            "Extent", " × ".join(f"{value:.0f}" for value in size) + " mm", "along X, Y, Z of Base"
-        ),
     )

@@ -18,17 +18,17 @@ from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.cloud import cloud_view
 from armscan.report.drawing import Marks, photo_markup
-from armscan.report.hand_eye import hand_eye_facts, total_covariance
+from armscan.report.hand_eye import hand_eye_quantities, total_covariance
 from armscan.report.inspect import (
     deviation_histogram,
     deviation_view,
     height_histogram,
     share_text,
 )
-from armscan.report.page import Card, Facts, Gallery, Page, Picture, Section, Text
-from armscan.report.quantity import Table, significant
+from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text
+from armscan.report.photographs import sheet_colour
+from armscan.report.quantity import Quantity, Table, fact, for_people, significant
 from armscan.report.scene3d import scene_markup, uniform_dots
-from armscan.report.stripes import sheet_colour
 
 Figures = Mapping[str, Any]
 """What `head_data` gives of one head."""
@@ -152,7 +152,7 @@ def _instants(scans: Sequence[ScanReconstruction]) -> list[tuple[int, int]]:
         for row, image in zip(scan.image_rows, scan.images, strict=True):
             key = (number, scan.exposures[row].row.t_ns)
             sheets, count = found.get(key, (set(), 0))
-            measured = image.fate == int(PointStatus.MEASURED)
+            measured = image.status == PointStatus.MEASURED
             found[key] = (
                 sheets | set(image.sheet[measured].tolist()),
                 count + int(measured.sum()),
@@ -402,7 +402,7 @@ def head_demo_page(
             Section(
                 "Where the sensor sits on the arm",
                 (
-                    Facts(hand_eye_facts(demo.scanner)),
+                    Facts(for_people(hand_eye_quantities(demo.scanner))),
                     Text("scanner.html tells how it was found, posture by posture."),
                 ),
             ),
@@ -417,34 +417,34 @@ def head_demo_page(
     )
 
 
-def _cards(head: Figures) -> tuple[Card, ...]:
+def _cards(head: Figures) -> tuple[Quantity, ...]:
     plate, ball, hand_eye = head["plate"], head["sphere"], head["hand_eye"]
     still = next(step for step in head["steps"] if step["frame"] == "Sensor")
     return (
-        Card(
+        fact(
             "Plate",
             f"{_share(plate, '05')} within 0.05 mm",
             f"std {1000.0 * plate['std_mm']:.1f} µm, {plate['n_points']:,} points",
         ),
-        Card(
+        fact(
             "Ball",
             f"{1000.0 * ball['diameter_error_mm']:+.1f} µm",
             f"error of the diameter, sigma {1000.0 * ball['diameter_sigma_mm']:.1f} µm; "
             f"{_share(ball, '05')} within 0.05 mm",
         ),
-        Card(
+        fact(
             "Step, one exposure",
             f"{1000.0 * (still['mean_mm'] - still['nominal_mm']):+.1f} µm",
             f"error of {still['nominal_mm']:g} mm; std {1000.0 * still['std_mm']:.1f} µm",
         ),
-        Card(
+        fact(
             "Hand-eye",
             f"{1000.0 * hand_eye['translation_error_mm']:.0f} µm, "
             f"{hand_eye['rotation_error_deg']:.3f}°",
             f"off; expected {1000.0 * hand_eye['sigma_translation_mm']:.0f} µm, "
             f"{hand_eye['sigma_rotation_deg']:.3f}°",
         ),
-        Card(
+        fact(
             "Free-form part",
             f"{1000.0 * head['part']['rms_mm']:.1f} µm rms",
             f"{_share(head['part'], '05')} within 0.05 mm of the truth",
@@ -465,7 +465,7 @@ def _photographs(demo: HeadDemo, photographs: Mapping[str, Exposure]) -> Gallery
         marks, text = [], SCENE_TEXTS[scene]
         for (of_scene, source), image in profiles.items():
             if (of_scene, source) == (scene, exposure.source):
-                measured = image.fate == int(PointStatus.MEASURED)
+                measured = image.status == PointStatus.MEASURED
                 marks = [
                     Marks(image.profile.points_px[measured & (image.sheet == k)], sheet_colour(k))
                     for k in sorted(set(image.sheet[measured].tolist()))

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One HTML page: cards, figures, tables, text, and where its content came from."""
+"""A report as one self-contained HTML page: what it is made of, and how it is rendered."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TypeAlias
@@ -11,16 +11,7 @@ from typing import TypeAlias
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from armscan.models.calibration import Provenance
-from armscan.report.quantity import SIGMA_NOTE, Table
-
-
-@dataclass(frozen=True, slots=True)
-class Card:
-    """A key figure: what, how much, and what that means in a few words."""
-
-    label: str
-    value: str
-    note: str = ""
+from armscan.report.quantity import SIGMA_NOTE, Quantity, Table, fact, sentences
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +43,9 @@ class Gallery:
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """Labels with values, below a title if there is one."""
+    """Quantities one below the other, under a title if there is one."""
 
-    rows: tuple[tuple[str, str], ...]
+    quantities: tuple[Quantity, ...]
     title: str = ""
 
 
@@ -110,13 +101,71 @@ class Page:
 
     title: str
     subtitle: str
-    cards: tuple[Card, ...]
+    cards: tuple[Quantity, ...]
     warnings: tuple[str, ...]
     sections: tuple[Section, ...]
     is_simulated: bool
     footer: str
     forced: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
+
+
+def page_of(
+    provenance: Provenance,
+    title: str,
+    subtitle: str,
+    sections: Sequence[Section],
+    *,
+    cards: Sequence[Quantity] = (),
+    warnings: Sequence[str] = (),
+    is_simulated: bool = False,
+) -> Page:
+    """A page that ends with where its content came from.
+
+    Parameters
+    ----------
+    provenance
+        Told in the last section and in the foot; its ``forced`` marks the page.
+    title, subtitle, sections, cards, warnings, is_simulated
+        As of `Page`; warnings become sentences.
+    """
+    return Page(
+        title=title,
+        subtitle=subtitle,
+        cards=tuple(cards),
+        warnings=sentences(warnings),
+        sections=(*sections, _origin_section(provenance)),
+        is_simulated=is_simulated,
+        footer=footer(provenance),
+        forced=provenance.forced,
+    )
+
+
+def _origin_section(provenance: Provenance) -> Section:
+    """Inputs with hashes, options, parents, command."""
+    facts = Facts(
+        (
+            fact("Document", provenance.document_id),
+            fact("Written", f"{provenance.created_utc} by armscan {provenance.armscan_version}"),
+            fact("Command", " ".join(provenance.command)),
+            fact("Rests on", ", ".join(provenance.parent_ids) or "no other document"),
+        )
+    )
+    inputs = tuple((item.path, item.sha256[:16] + "…") for item in provenance.inputs)
+    blocks = (
+        facts,
+        Table(("file", "SHA-256"), inputs, "Files that went in", (1,)),
+        Table(("option", "value"), provenance.options, "Options in force", (1,)),
+    )
+    return Section("Origin", blocks, is_folded=True)
+
+
+def footer(provenance: Provenance) -> str:
+    """One line for the foot of a page."""
+    return (
+        f"Written {provenance.created_utc} by armscan {provenance.armscan_version}. "
+        f"{SIGMA_NOTE} This page holds all its pictures and asks no other host for anything."
+    )
 
 
 def render_page(page: Page) -> bytes:
@@ -135,41 +184,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    kinds: Mapping[str, type] = {
-        "gallery": Gallery,
-        "facts": Facts,
-        "legend": Legend,
-        "text": Text,
-        "table": Table,
-    }
-    for name, kind in kinds.items():
+    for kind in (Gallery, Facts, Legend, Text, Table):
+        name = kind.__name__.lower()
         environment.tests[name] = lambda block, kind=kind: isinstance(block, kind)
     return environment
-
-
-def origin_section(provenance: Provenance) -> Section:
-    """Inputs with hashes, options, parents, command."""
-    facts = Facts(
-        (
-            ("Document", provenance.document_id),
-            ("Written", f"{provenance.created_utc} by armscan {provenance.armscan_version}"),
-            ("Command", " ".join(provenance.command)),
-            ("Rests on", ", ".join(provenance.parent_ids) or "no other document"),
-        )
-    )
-    options = Table(("option", "value"), provenance.options, "Options in force", (1,))
-    inputs = Table(
-        ("file", "SHA-256"),
-        tuple((item.path, item.sha256[:16] + "…") for item in provenance.inputs),
-        "Files that went in",
-        (1,),
-    )
-    return Section("Origin", (facts, inputs, options), is_folded=True)
-
-
-def footer(provenance: Provenance) -> str:
-    """One line for the foot of a page."""
-    return (
-        f"Written {provenance.created_utc} by armscan {provenance.armscan_version}. "
-        f"{SIGMA_NOTE} This page holds all its pictures and asks no other host for anything."
-    )

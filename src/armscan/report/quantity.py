@@ -1,17 +1,202 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as people read them, and a report in brief: the same content as text and as JSON."""
+"""A result as people and programs read it: its quantities, its tables, and a command's summary.
+
+A quantity is stated once. The terminal, ``--json``, the cards and the lists of a page all take it
+from there.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 SIGMA_NOTE = "± is one standard deviation."
 """Said once on every report: no other range is written with this sign."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """One value of a result.
+
+    Parameters
+    ----------
+    key
+        Its name in ``--json``, with the unit, or a path ``a.b``; empty if it is for people only.
+    label
+        Its name for people; empty if it is for programs only.
+    value
+        A number, a text, or what JSON can hold.
+    sigma
+        Its standard deviation; NaN if none is known.
+    unit
+        Written behind the number.
+    meaning
+        What it says, in a few words.
+    shown
+        How people read the value; empty for three digits, or two of its sigma, with the unit.
+    """
+
+    key: str
+    label: str
+    value: Any
+    sigma: float = math.nan
+    unit: str = ""
+    meaning: str = ""
+    shown: str = ""
+
+    @property
+    def text(self) -> str:
+        """The value as people read it."""
+        if self.shown or isinstance(self.value, str):
+            return self.shown or str(self.value)
+        if isinstance(self.value, int):
+            return f"{self.value:,} {self.unit}".rstrip()
+        if math.isnan(self.sigma):
+            return significant(self.value, self.unit)
+        return with_sigma(self.value, self.sigma, self.unit)
+
+    @property
+    def line(self) -> str:
+        """The value and what it says."""
+        return f"{self.text}, {self.meaning}" if self.meaning else self.text
+
+
+def fact(label: str, text: str, meaning: str = "") -> Quantity:
+    """A quantity in words, for people only."""
+    return Quantity("", label, text, meaning=meaning)
+
+
+def values(quantities: Iterable[Quantity]) -> dict[str, Any]:
+    """Values by their keys, for programs; a key ``a.b`` is ``b`` inside ``a``."""
+    found: dict[str, Any] = {}
+    for item in quantities:
+        *path, last = item.key.split(".")
+        place = found
+        for word in path:
+            place = place.setdefault(word, {})
+        if last:
+            place[last] = item.value
+    return found
+
+
+def only(quantities: Sequence[Quantity], *keys: str) -> tuple[Quantity, ...]:
+    """The quantities of some keys, in the order of the keys; without those that are missing."""
+    by_key = {item.key: item for item in quantities}
+    return tuple(by_key[key] for key in keys if key in by_key)
+
+
+def for_people(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
+    """The quantities that have a label, without their keys."""
+    return tuple(replace(item, key="") for item in quantities if item.label)
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of ready-made texts.
+
+    Parameters
+    ----------
+    columns, rows
+        Heads and cells.
+    title
+        Above the table; empty for none.
+    word_columns
+        Columns of words, flush left as the first always is; numbers stand flush right.
+    """
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+    word_columns: tuple[int, ...] = ()
+
+
+def quantity_table(heads: tuple[str, str, str], quantities: Iterable[Quantity]) -> Table:
+    """Label, value and meaning of quantities."""
+    return Table(heads, tuple((q.label, q.text, q.meaning) for q in quantities), "", (2,))
+
+
+def matrix_table(corner: str, names: Sequence[str], matrix: Iterable[Iterable[float]]) -> Table:
+    """A square matrix with its names at both sides."""
+    rows = ((name, *(f"{x:.3g}" for x in row)) for name, row in zip(names, matrix, strict=True))
+    return Table((corner, *names), tuple(rows))
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """What a command found.
+
+    Parameters
+    ----------
+    title
+        One line.
+    quantities
+        The result, in the order to show.
+    tables
+        Tables below them.
+    warnings
+        Sentences that a person should read.
+    written
+        Files that now exist.
+    next_step
+        A command that comes next; empty for none.
+    extra
+        More for programs: plain values only, units in the keys; NaN stands for "not known".
+    forced
+        Why the result, or what it rests on, was refused and made all the same (``--force-bad``).
+    """
+
+    title: str
+    quantities: tuple[Quantity, ...] = ()
+    tables: tuple[Table, ...] = ()
+    warnings: tuple[str, ...] = ()
+    written: tuple[Path, ...] = ()
+    next_step: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+    forced: tuple[str, ...] = ()
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """All that it holds for programs, by key."""
+        return {**values(self.quantities), **self.extra}
+
+
+def summary_json(summary: Summary) -> str:
+    """JSON text of a summary in ASCII; what is not known is ``null``."""
+    content = {
+        **summary.data,
+        "forced": list(summary.forced),
+        "warnings": list(summary.warnings),
+        "written": [path.as_posix() for path in summary.written],
+    }
+    return json.dumps(_plain(content), indent=2, allow_nan=False)
+
+
+def summary_text(summary: Summary) -> str:
+    """Readable text of a summary."""
+    lines = [summary.title, *(f"FORCED: {sentence(reason)}" for reason in summary.forced)]
+    shown = [item for item in summary.quantities if item.label]
+    width = max((len(item.label) for item in shown), default=0)
+    for item in shown:
+        first, *rest = item.line.splitlines() or [""]
+        lines.append(f"  {item.label:<{width}}  {first}".rstrip())
+        lines += [f"  {'':<{width}}  {line}" for line in rest]
+    if any("±" in item.line for item in shown):
+        lines.append(f"  {SIGMA_NOTE}")
+    for table in summary.tables:
+        lines += ["", *_table_lines(table)]
+    if summary.warnings:
+        lines.append("")
+    lines += [f"warning: {warning}" for warning in summary.warnings]
+    if summary.written:
+        lines.append("")
+    lines += [f"wrote {path}" for path in summary.written]
+    if summary.next_step:
+        lines.append(f"next: {summary.next_step}")
+    return "\n".join(lines)
 
 
 def with_sigma(value: float, sigma: float, unit: str = "") -> str:
@@ -52,97 +237,19 @@ def sentence(text: str) -> str:
     return f"{start}{text[1:].rstrip('.')}."
 
 
+def sentences(texts: Iterable[str]) -> tuple[str, ...]:
+    """Each text as a sentence."""
+    return tuple(sentence(text) for text in texts)
+
+
+def plural(n: int, noun: str) -> str:
+    """A count with its noun."""
+    return f"{n:,} {noun}" if n == 1 else f"{n:,} {noun}s"
+
+
 def without_source(source: str, reason: str) -> str:
     """A reason without the image's name in front, for places that show the name beside it."""
     return reason.removeprefix(f"{source}: ")
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table of ready-made texts.
-
-    Parameters
-    ----------
-    columns, rows
-        Heads and cells.
-    title
-        Above the table; empty for none.
-    word_columns
-        Columns of words, flush left as the first always is; numbers stand flush right.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    title: str = ""
-    word_columns: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a command found.
-
-    Parameters
-    ----------
-    title
-        One line.
-    facts
-        Label and value, in the order to show.
-    tables
-        Tables below the facts.
-    warnings
-        Sentences that a person should read.
-    written
-        Files that now exist.
-    next_step
-        A command that comes next; empty for none.
-    data
-        The same for programs: plain values only, units in the keys; NaN stands for "not known".
-    forced
-        Why the result, or what it rests on, was refused and made all the same (``--force-bad``).
-    """
-
-    title: str
-    facts: tuple[tuple[str, str], ...] = ()
-    tables: tuple[Table, ...] = ()
-    warnings: tuple[str, ...] = ()
-    written: tuple[Path, ...] = ()
-    next_step: str = ""
-    data: Mapping[str, Any] = field(default_factory=dict)
-    forced: tuple[str, ...] = ()
-
-
-def summary_json(summary: Summary) -> str:
-    """JSON text of a summary in ASCII; what is not known is ``null``."""
-    content = {
-        **summary.data,
-        "forced": list(summary.forced),
-        "warnings": list(summary.warnings),
-        "written": [path.as_posix() for path in summary.written],
-    }
-    return json.dumps(_plain(content), indent=2, allow_nan=False)
-
-
-def summary_text(summary: Summary) -> str:
-    """Readable text of a summary."""
-    lines = [summary.title, *(f"FORCED: {sentence(reason)}" for reason in summary.forced)]
-    width = max((len(label) for label, _ in summary.facts), default=0)
-    for label, value in summary.facts:
-        first, *rest = value.splitlines() or [""]
-        lines.append(f"  {label:<{width}}  {first}".rstrip())
-        lines += [f"  {'':<{width}}  {line}" for line in rest]
-    if any("±" in value for _, value in summary.facts):
-        lines.append(f"  {SIGMA_NOTE}")
-    for table in summary.tables:
-        lines += ["", *_table_lines(table)]
-    if summary.warnings:
-        lines.append("")
-    lines += [f"warning: {warning}" for warning in summary.warnings]
-    if summary.written:
-        lines.append("")
-    lines += [f"wrote {path}" for path in summary.written]
-    if summary.next_step:
-        lines.append(f"next: {summary.next_step}")
-    return "\n".join(lines)
 
 
 def _table_lines(table: Table) -> list[str]:

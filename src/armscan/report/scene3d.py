@@ -10,13 +10,13 @@ from html import escape
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.colors import to_rgb
+from matplotlib.colors import Colormap, to_rgb
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
 
 RAMP = "viridis"
-RAMP_STOPS = 8
+RAMP_STOPS = 11
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,18 +40,29 @@ def uniform_dots(points_mm: FloatArray, colour: str) -> SceneDots:
     return SceneDots(points_mm, np.tile(_bytes(colour), (len(points_mm), 1)))
 
 
+def closed_outline(corners_mm: FloatArray) -> FloatArray:
+    """(2 N, 3) ends of the sides of a closed outline of N corners."""
+    sides = np.stack([corners_mm, np.roll(corners_mm, -1, axis=0)], axis=1)
+    return np.asarray(sides.reshape(-1, 3))
+
+
+def pyramid(rim_mm: FloatArray) -> FloatArray:
+    """(4 N, 3) ends of the edges of a pyramid from the origin to a rim of N corners."""
+    spokes = np.stack([np.zeros_like(rim_mm), rim_mm], axis=1).reshape(-1, 3)
+    return np.concatenate([closed_outline(rim_mm), spokes])
+
+
 def ramp_colours(values: FloatArray, low: float, high: float) -> NDArray[np.uint8]:
     """(N, 3) colours of a ramp that runs from ``low`` to ``high``."""
     share = np.clip((values - low) / max(high - low, 1e-12), 0.0, 1.0)
     return np.asarray(colormaps[RAMP](share, bytes=True), dtype=np.uint8)[:, :3]
 
 
-def ramp_markup(low_text: str, high_text: str) -> str:
-    """The ramp with its two ends named."""
-    stops = [
-        "#{:02x}{:02x}{:02x}".format(*colormaps[RAMP](k / (RAMP_STOPS - 1), bytes=True)[:3])
-        for k in range(RAMP_STOPS)
-    ]
+def ramp_markup(low_text: str, high_text: str, ramp: Colormap | None = None) -> str:
+    """A ramp of colours, that of `ramp_colours` if none is given, with its two ends named."""
+    colour = ramp or colormaps[RAMP]
+    places = np.linspace(0.0, 1.0, RAMP_STOPS)
+    stops = ["#{:02x}{:02x}{:02x}".format(*colour(place, bytes=True)[:3]) for place in places]
     return (
         f'<p class="ramp">{escape(low_text)}<span style="background: '
         f'linear-gradient(to right, {", ".join(stops)})"></span>{escape(high_text)}</p>'

@@ -16,16 +16,17 @@ from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit, PointUse
 from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
-from armscan.jobs.sheets import laser_summary
+from armscan.jobs.sheets import sheets_summary
 from armscan.models.calibration import FTest
 from armscan.pipeline.documents import camera_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
-from armscan.report.camera import ARROW_SHARE, camera_page, residual_magnification
+from armscan.report.camera import camera_page
+from armscan.report.charts import ARROW_SHARE, magnification
 from armscan.report.page import render_page
+from armscan.report.photographs import FLAG_COLOURS
 from armscan.report.quantity import with_sigma
 from armscan.report.sheets import USE_COLOURS, lack_of_fit_text, laser_page
-from armscan.report.stripes import FLAG_COLOURS
 from rigs.camera_scene import Scene, make_views
 from rigs.sheet_rig import PROVENANCE, thesis_rig
 
@@ -76,7 +77,7 @@ def test_camera_page_shows_numbers_views_and_reasons() -> None:
 
 def test_residual_arrows_are_enlarged_by_a_round_number() -> None:
     fit = camera_fit()
-    scale = residual_magnification(fit)
+    scale = magnification(fit.camera, fit.rms_px)
     assert f"{scale:.0e}"[0] in "125"
     three_sigma = 3.0 * fit.rms_px * scale / fit.camera.width_px
     assert ARROW_SHARE / 2.5 <= three_sigma <= ARROW_SHARE
@@ -158,12 +159,13 @@ def test_laser_page_names_the_points_along_an_edge_and_gives_every_fate_a_colour
 def test_laser_summary_has_the_sheet_with_its_sigmas() -> None:
     fit = laser_fit()
     written = (Path("s.json"), Path("s.npz"), Path("s.html"))
-    summary = laser_summary(fit, written, is_simulated=True)
+    summary = sheets_summary(fit, written, ("odd",), is_simulated=True)
     (sheet,) = summary.data["sheets"]
     assert sheet["plane_sensor_a_b_c_d_mm"] == fit.sheets[0].sheet.plane.tolist()
     sigmas = np.sqrt(np.diag(fit.sheets[0].covariance))[:3]
     np.testing.assert_array_equal(list(sheet["plane_sigma_mm"].values()), sigmas)
     assert "simulated" in summary.title
+    assert summary.warnings[0] == "Odd."
     assert "s.json" in summary.next_step
 
 

@@ -13,7 +13,6 @@ import pytest
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.report.drawing import Marks, display_levels, photo_markup
 from armscan.report.page import (
-    Card,
     Facts,
     Gallery,
     Legend,
@@ -23,7 +22,7 @@ from armscan.report.page import (
     Text,
     render_page,
 )
-from armscan.report.quantity import Table
+from armscan.report.quantity import Table, fact
 from armscan.report.scene3d import SceneLines, ramp_colours, scene_markup, uniform_dots
 
 HOSTILE = '<script>alert("1")</script>&'
@@ -32,7 +31,7 @@ HOSTILE = '<script>alert("1")</script>&'
 def page(is_simulated: bool = False) -> Page:
     blocks = (
         Text(HOSTILE),
-        Facts(((HOSTILE, HOSTILE),), HOSTILE),
+        Facts((fact(HOSTILE, HOSTILE, HOSTILE),), HOSTILE),
         Legend((("#123456", HOSTILE),)),
         Table((HOSTILE,), ((HOSTILE,),), HOSTILE),
         Gallery((Picture("<img>", HOSTILE, HOSTILE),)),
@@ -40,7 +39,7 @@ def page(is_simulated: bool = False) -> Page:
     return Page(
         title=HOSTILE,
         subtitle=HOSTILE,
-        cards=(Card(HOSTILE, HOSTILE, HOSTILE),),
+        cards=(fact(HOSTILE, HOSTILE, HOSTILE),),
         warnings=(HOSTILE,),
         sections=(Section(HOSTILE, blocks), Section("Folded", blocks, is_folded=True)),
         is_simulated=is_simulated,

@@ -15,7 +15,8 @@ from armscan.cli.run import main
 from armscan.errors import ArmscanError, EstimationError, InputError, OptionError, OutputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
-from armscan.jobs.probe import ProbeRequest, read_touches, run_probing
+from armscan.jobs.job import Job
+from armscan.jobs.probe import probe, read_touches
 from armscan.records.points import ProbedPoints
 from armscan.records.recording import ArmTrack
 from armscan.storage.arm import ProbeTip, write_probing
@@ -52,7 +53,7 @@ def track(n: int = 9) -> ArmTrack:
 def test_a_folder_of_touches(tmp_path: Path) -> None:
     write_probing(tmp_path / "touches", track(), TIP, is_simulated=True)
     output = tmp_path / "plate.csv"
-    summary = run_probing(ProbeRequest(tmp_path / "touches", output))
+    summary = probe(Job(output), tmp_path / "touches")
     np.testing.assert_allclose(summary.data["plane"], PLANE, atol=1e-9)
     assert summary.data["side"] == "where the tool was"
     assert summary.data["simulated"] is True
@@ -68,11 +69,11 @@ def test_a_table_of_centres_gives_the_same(tmp_path: Path) -> None:
     table = tmp_path / "centres.csv"
     centres = on_plate() + 3.0 * PLANE[:3]
     table.write_bytes(probed_points_csv(ProbedPoints(points_mm=centres, tip_diameter_mm=6.0)))
-    summary = run_probing(ProbeRequest(table))
+    summary = probe(Job(), table)
     np.testing.assert_allclose(summary.data["plane"], PLANE, atol=1e-9)
     assert summary.written == ()
     assert any("taken for granted" in warning for warning in summary.warnings)
-    other = run_probing(ProbeRequest(table, options=ProbingOptions(side="-z")))
+    other = probe(Job(), table, options=ProbingOptions(side="-z"))
     np.testing.assert_allclose(other.data["plane"][:3], -PLANE[:3], atol=1e-9)
     assert other.data["plane"][3] + PLANE[3] == pytest.approx(6.0), "the face below the ball"
     assert other.warnings == ()
@@ -115,18 +116,18 @@ def test_what_stands_in_the_way_is_said_and_nothing_is_written(tmp_path: Path) -
             )
         )
     )
-    cases: list[tuple[ProbeRequest, type[ArmscanError], str]] = [
-        (ProbeRequest(folder, output), EstimationError, "three points"),
-        (ProbeRequest(table, output), InputError, "block, plate"),
-        (ProbeRequest(table, output, probe=table), OptionError, "--probe"),
-        (ProbeRequest(table, tmp_path / "plate.txt"), OptionError, r"\.csv"),
-        (ProbeRequest(table, table), OutputError, "centres"),
-        (ProbeRequest(tmp_path / "none", output), ArmscanError, "none"),
+    cases: list[tuple[Path, Path, Path | None, type[ArmscanError], str]] = [
+        (folder, output, None, EstimationError, "three points"),
+        (table, output, None, InputError, "block, plate"),
+        (table, output, table, OptionError, "--probe"),
+        (table, tmp_path / "plate.txt", None, OptionError, r"\.csv"),
+        (table, table, None, OutputError, "centres"),
+        (tmp_path / "none", output, None, ArmscanError, "none"),
     ]
-    for request, kind, words in cases:
+    for source, place, tip, kind, words in cases:
         with pytest.raises(kind, match=words):
-            run_probing(request)
+            probe(Job(place), source, tip)
     assert not output.exists()
     (folder / "probe.toml").unlink()
     with pytest.raises(ArmscanError, match=r"probe\.toml"):
-        run_probing(ProbeRequest(folder, output))
+        probe(Job(output), folder)

@@ -10,12 +10,17 @@ from pathlib import Path
 import pytest
 
 from armscan.report.quantity import (
+    Quantity,
     Summary,
     Table,
+    fact,
+    for_people,
+    only,
     sentence,
     significant,
     summary_json,
     summary_text,
+    values,
     with_sigma,
 )
 
@@ -66,14 +71,14 @@ def test_names_at_the_start_of_a_sentence_stay_as_they_are() -> None:
 def summary() -> Summary:
     return Summary(
         title="Done.",
-        facts=(("points", "12"), ("path", "a\nb")),
+        quantities=(Quantity("n_points", "points", 12), fact("path", "a\nb")),
         tables=(
             Table(("name", "rms", "why"), (("a", "1.0", "x"), ("long", "12.0", "")), "T", (2,)),
         ),
         warnings=("Careful.",),
         written=(Path("out") / "c.json",),
         next_step="look",
-        data={"rms": math.nan, "list": (1, 2.5, math.inf), "nested": {"path": "ü"}},
+        extra={"rms": math.nan, "list": (1, 2.5, math.inf), "nested": {"path": "ü"}},
     )
 
 
@@ -99,6 +104,7 @@ def test_text_is_aligned() -> None:
 def test_json_is_strict_and_says_null_for_what_is_not_known() -> None:
     text = summary_json(summary())
     assert json.loads(text, parse_constant=pytest.fail) == {
+        "n_points": 12,
         "rms": None,
         "list": [1, 2.5, None],
         "nested": {"path": "ü"},
@@ -106,3 +112,22 @@ def test_json_is_strict_and_says_null_for_what_is_not_known() -> None:
         "warnings": ["Careful."],
         "written": ["out/c.json"],
     }
+
+
+def test_one_quantity_feeds_people_and_programs() -> None:
+    length = Quantity("fitted.length_mm", "Length", 1.5, 0.012, "mm", "at 20 degrees")
+    unknown = Quantity("hold_out_px", "", None)
+    assert (length.text, length.line) == ("1.500 ± 0.012 mm", "1.500 ± 0.012 mm, at 20 degrees")
+    assert Quantity("n", "Points", 12345).text == "12,345"
+    assert Quantity("rms", "Rms", 0.0123456, unit="px").text == "0.0123 px"
+    assert values((length, fact("Only", "words"), unknown)) == {
+        "fitted": {"length_mm": 1.5},
+        "hold_out_px": None,
+    }
+    told = (length, fact("Only", "words"), unknown)
+    assert [item.label for item in for_people(told)] == ["Length", "Only"]
+    assert values(for_people(told)) == {}
+    assert only(told, "hold_out_px", "fitted.length_mm", "absent") == (unknown, length)
+    done = Summary(title="Done.", quantities=told)
+    assert "± is one standard deviation" in summary_text(done)
+    assert done.data["fitted"] == {"length_mm": 1.5}

@@ -16,8 +16,8 @@ from armscan.calibration.sheets.result import PlacedBoard
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate
-from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.geometry.rotations import rotation_from_vector, skew, vector_from_rotation
+from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import skew, vector_from_rotation
 from armscan.models.calibration import CameraCalibration, SecondCamera, SensorCalibration
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.light_sheet import LightSheet
@@ -25,7 +25,7 @@ from armscan.models.two_views import StereoCalibration
 from armscan.vision.targets.target import TargetView
 
 N_CAMERA = len(PARAMETER_NAMES)
-RIGHT_CAMERA = slice(9, 18)
+LEFT_CAMERA, RIGHT_CAMERA = slice(0, 9), slice(9, 18)
 RIGHT_POSE = slice(18, 24)
 GRAZING = 1e-6
 """Rays within this sine of the board's plane do not meet it."""
@@ -38,12 +38,7 @@ SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
 class HeadCameras:
     """Camera 0, whose frame is Sensor, and camera 1 of a stereo head.
 
-    Parameters
-    ----------
-    left, second
-        Camera 0, and camera 1 if there is one.
-    covariance
-        (P, P) of the P parameters that all images have in common: 9, or 24.
+    ``covariance`` (P, P) is that of the P parameters that all images have in common: 9, or 24.
     """
 
     left: CameraCalibration
@@ -81,12 +76,15 @@ class HeadCameras:
         """The model of camera 0 or 1; `InputError` if there is no such camera."""
         return self.left.camera if camera == 0 else self.right(camera).camera.camera
 
+    def camera_from_sensor(self, camera: int) -> Pose[CameraRight, Sensor]:
+        """Where the Sensor frame lies in that of camera 0, which it is, or of camera 1."""
+        if camera == 0:
+            return Pose(np.eye(3), np.zeros(3))
+        return self.right(camera).right_from_sensor
+
     def centre_mm(self, camera: int) -> FloatArray:
         """(3,) where the rays of camera 0 or 1 start, in Sensor."""
-        if camera == 0:
-            return np.zeros(3)
-        place = self.right(camera).right_from_sensor
-        return np.asarray(-place.translation_mm @ place.rotation)
+        return self.camera_from_sensor(camera).inverse().translation_mm
 
     def right(self, camera: int = 1) -> SecondCamera:
         """Camera 1; `InputError` if there is none."""
@@ -97,10 +95,15 @@ class HeadCameras:
             )
         return self.second
 
-    def by_parameters(self, by_left: FloatArray) -> FloatArray:
-        """Derivatives (..., 9) by camera 0's parameters as derivatives (..., P) by all."""
-        wide = np.zeros((*by_left.shape[:-1], self.n_parameters))
-        wide[..., :N_CAMERA] = by_left
+    def by_parameters(self, camera: int, by_camera: FloatArray, by_pose: FloatArray) -> FloatArray:
+        """Derivatives (..., P) by all parameters from those by a camera's own 9 and its pose's 6.
+
+        Camera 0 has no pose: it stands where the Sensor frame is.
+        """
+        wide = np.zeros((*by_camera.shape[:-1], self.n_parameters))
+        wide[..., RIGHT_CAMERA if camera else LEFT_CAMERA] = by_camera
+        if camera:
+            wide[..., RIGHT_POSE] = by_pose
         return wide
 
 
@@ -165,37 +168,29 @@ def intersect_board_of(
     q_px: FloatArray, camera: int, sensor_from_board: Pose[Sensor, Board], cameras: HeadCameras
 ) -> BoardPoints:
     """As `intersect_board` for camera 0 or 1: points in Sensor, derivatives by all cameras."""
-    if camera == 0:
-        points = intersect_board(q_px, sensor_from_board, cameras.left.camera)
-        return BoardPoints(
-            points.points_mm,
-            points.is_valid,
-            points.dpoint_dq,
-            points.dpoint_dpose,
-            cameras.by_parameters(points.dpoint_dcamera),
-        )
-    second = cameras.right()
-    turn, shift = second.right_from_sensor.rotation, second.right_from_sensor.translation_mm
-    right_from_board = second.right_from_sensor @ sensor_from_board
-    # The function knows one frame: to it, the right camera's is the sensor's.
+    place = cameras.camera_from_sensor(camera)
+    turn, shift = place.rotation, place.translation_mm
+    camera_from_board = place @ sensor_from_board
+    # The function knows one frame: to it, the camera's is the sensor's.
     as_sensor: Pose[Sensor, Board] = Pose(
-        right_from_board.rotation, right_from_board.translation_mm
+        camera_from_board.rotation, camera_from_board.translation_mm
     )
-    found = intersect_board(q_px, as_sensor, second.camera.camera)
+    found = intersect_board(q_px, as_sensor, cameras.model(camera))
     follow = np.eye(6)
     follow[3:, :3] = -skew(turn @ sensor_from_board.translation_mm)
     carried = np.concatenate(
         [skew(found.points_mm - shift), np.tile(-np.eye(3), (len(q_px), 1, 1))], axis=2
     )
-    by_cameras = np.zeros((len(q_px), 3, cameras.n_parameters))
-    by_cameras[:, :, RIGHT_CAMERA] = turn.T @ found.dpoint_dcamera
-    by_cameras[:, :, RIGHT_POSE] = turn.T @ (found.dpoint_dpose @ follow + carried)
     return BoardPoints(
         (found.points_mm - shift) @ turn,
         found.is_valid,
         turn.T @ found.dpoint_dq,
         turn.T @ found.dpoint_dpose @ _twice(turn),
-        by_cameras,
+        cameras.by_parameters(
+            camera,
+            turn.T @ found.dpoint_dcamera,
+            turn.T @ (found.dpoint_dpose @ follow + carried),
+        ),
     )
 
 
@@ -207,12 +202,12 @@ def intersect_sheet_of(
     With the second value (N,), False where there is none; what reconstruction does with a stripe.
     """
     xy, has_ray = cameras.model(camera).undistort(q_px)
-    if camera == 0:
-        points, is_met = sheet.intersect(xy)
-        return points, is_met & has_ray
-    place = cameras.right().right_from_sensor
-    points, is_met = sheet.in_frame(place.rotation, place.translation_mm).intersect(xy)
-    return (points - place.translation_mm) @ place.rotation, is_met & has_ray
+    if camera:
+        place = cameras.camera_from_sensor(camera)
+        points, is_met = sheet.in_frame(place.rotation, place.translation_mm).intersect(xy)
+        return (points - place.translation_mm) @ place.rotation, is_met & has_ray
+    points, is_met = sheet.intersect(xy)
+    return points, is_met & has_ray
 
 
 def dpose_dcamera(
@@ -249,10 +244,7 @@ def place_board(seen: Sequence[SeenBoard], cameras: HeadCameras) -> PlacedBoard:
     covariance = np.linalg.inv(information[0] + information[1])
     gain = covariance @ information[1]
     a = first.sensor_from_board
-    step = gain @ _step(a, second.sensor_from_board)
-    pose: Pose[Sensor, Board] = Pose(
-        rotation_from_vector(step[:3]) @ a.rotation, a.translation_mm + step[3:]
-    )
+    pose = a.retract(gain @ _step(a, second.sensor_from_board))
     follow = first.by_cameras + gain @ (second.by_cameras - first.by_cameras)
     return PlacedBoard(pose, 0.5 * (covariance + covariance.T), follow)
 
@@ -268,19 +260,16 @@ def poses_chi2(left: SeenBoard, right: SeenBoard, cameras: HeadCameras) -> float
 
 def _in_sensor(seen: SeenBoard, cameras: HeadCameras) -> PlacedBoard:
     camera, view, found = seen
-    by_own = dpose_dcamera(view, found.value, cameras.model(camera))
-    if camera == 0:
-        return PlacedBoard(found.value, found.covariance, cameras.by_parameters(by_own))
-    place = cameras.right().right_from_sensor
+    place = cameras.camera_from_sensor(camera)
     back, offset = place.rotation.T, found.value.translation_mm - place.translation_mm
     turned = _twice(back)
-    follow = np.zeros((6, cameras.n_parameters))
-    follow[:, RIGHT_CAMERA] = turned @ by_own
-    follow[:3, 18:21] = -back
-    follow[3:, 18:21] = back @ skew(offset)
-    follow[3:, 21:24] = -back
+    by_pose = np.zeros((6, 6))
+    by_pose[:3, :3] = by_pose[3:, 3:] = -back
+    by_pose[3:, :3] = back @ skew(offset)
+    by_camera = turned @ dpose_dcamera(view, found.value, cameras.model(camera))
     pose: Pose[Sensor, Board] = Pose(back @ found.value.rotation, back @ offset)
-    return PlacedBoard(pose, turned @ found.covariance @ turned.T, follow)
+    by_cameras = cameras.by_parameters(camera, by_camera, by_pose)
+    return PlacedBoard(pose, turned @ found.covariance @ turned.T, by_cameras)
 
 
 def _twice(turn: FloatArray) -> FloatArray:

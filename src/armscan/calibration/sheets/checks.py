@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from armscan.calibration.sheets.solve import (
     NormalSolution,
     SheetObservations,
     SheetSolution,
-    StripeRows,
 )
 from armscan.calibration.sheets.stripes_on_board import BoardImage
 from armscan.geometry.arrays import BoolArray, FloatArray
@@ -39,19 +39,10 @@ def check_points(
     images: Sequence[BoardImage],
     cameras: HeadCameras,
 ) -> tuple[SheetPointCheck, ...]:
-    """Reconstruct the stripes with the solution and compare them with their boards.
+    """Reconstruct the stripes with a solution of held cameras and compare them with their boards.
 
-    Parameters
-    ----------
-    observations
-        The points used.
-    solution
-        Sheets that belong to the cameras as calibrated.
-    noise_px
-        (N,) scatter of single points; the weights hold the larger one with which they count as
-        independent.
-    images, cameras
-        As the fit had them.
+    ``noise_px`` (N,) is the scatter of the single points used; the solution's weights hold the
+    larger one with which they count as independent.
     """
     case = _Case(observations, solution, noise_px, images, cameras)
     fitted = _Claim(case, solution.normal, is_in_fit=True)
@@ -90,7 +81,7 @@ def _pooled(parts: Sequence[tuple[int, float]]) -> float:
     return float(np.sqrt(sum(n * rms**2 for n, rms in parts) / count)) if count else float("nan")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Case:
     """The points used and the solution, as `check_points` has them."""
 
@@ -119,6 +110,7 @@ class _Case:
             found[of] = np.where(is_met, distance, np.nan)
         return found
 
+    @cached_property
     def mm_per_px(self) -> FloatArray:
         """(N,) change of that distance for one pixel of residual.
 
@@ -167,64 +159,40 @@ class _Claim:
 
     def __init__(self, case: _Case, normal: NormalSolution, *, is_in_fit: bool) -> None:
         self._case, self._normal, self._is_in_fit = case, normal, is_in_fit
-        self._mm_per_px = case.mm_per_px()
 
     def distances(self, rows: BoolArray, distance_mm: FloatArray) -> BoardDistances:
         """Figures of the points ``rows`` (N,), with the claims for them."""
         rows = rows & np.isfinite(distance_mm)
         n = int(rows.sum())
-        per_px = self._mm_per_px
-        variance = np.where(rows, per_px**2 * self._point_variances(rows), 0.0)
+        solution, mm_per_px = self._case.solution, self._case.mm_per_px
+        # The mean: points count with the noise of the weights.
+        share = np.where(rows, mm_per_px / n, 0.0)
+        pull = solution.system.transposed(share)[None]
+        noise = np.array([(share**2 / solution.weight).sum()])
+        variance = np.zeros(len(rows))
+        for stripe in solution.system.stripes:
+            if rows[stripe.rows].any():
+                design = np.zeros((len(stripe.rows), solution.system.n_columns))
+                design[:, stripe.columns] = stripe.design
+                noise_px2 = self._case.noise_px[stripe.rows] ** 2
+                variance[stripe.rows] = self._variances(design, noise_px2)
         return BoardDistances(
             n,
             float(distance_mm[rows].mean()),
-            float(np.sqrt(self._variance_of_sum(np.where(rows, per_px / n, 0.0)))),
+            float(np.sqrt(self._variances(pull, noise)[0])),
             float(np.sqrt((distance_mm[rows] ** 2).mean())),
-            float(np.sqrt(variance.sum() / n)),
+            float(np.sqrt((mm_per_px**2 * variance)[rows].sum() / n)),
         )
 
-    def _variance_of_sum(self, factor: FloatArray) -> float:
-        """Variance of ``factor @ r``, points counting with the noise of the weights."""
-        normal, n_sheet = self._normal, self._normal.n_sheet
-        solution = self._case.solution
-        pull = solution.system.transposed(factor)
-        by_sheet, by_board = pull[:n_sheet], pull[n_sheet : normal.n_free]
-        by_camera = pull[normal.n_free :] + normal.follow.T @ by_sheet
-        total = float((factor**2 / solution.weight).sum() + by_camera @ by_camera)
-        if not self._is_in_fit:
-            return total + float(by_board @ by_board + by_sheet @ normal.covariance @ by_sheet)
-        by_board = by_board + normal.by_boards.T @ by_sheet
-        fitted = by_sheet @ (
-            normal.by_stripes @ by_sheet - 2.0 * normal.gain @ pull[: normal.n_free]
-        )
-        return max(total + float(by_board @ by_board + fitted), 0.0)
-
-    def _point_variances(self, rows: BoolArray) -> FloatArray:
-        """(N,) variance of single residuals; zero for stripes of which no point is asked for."""
-        found = np.zeros(len(rows))
-        for stripe in self._case.solution.system.stripes:
-            if rows[stripe.rows].any():
-                found[stripe.rows] = self._stripe_variances(stripe)
-        return found
-
-    def _stripe_variances(self, stripe: StripeRows) -> FloatArray:
+    def _variances(self, pull: FloatArray, noise: FloatArray) -> FloatArray:
+        """(K,) of sums of residuals with derivatives (K, n_columns) by the unknowns, and noise."""
         normal = self._normal
-        is_sheet = stripe.columns < normal.n_sheet
-        is_free = stripe.columns < normal.n_free
-        of_sheet = stripe.columns[is_sheet]
-        by_sheet = stripe.design[:, is_sheet]
-        by_board = stripe.design[:, is_free & ~is_sheet]
-        by_camera = stripe.design[:, ~is_free] + by_sheet @ normal.follow[of_sheet]
-        total = self._case.noise_px[stripe.rows] ** 2 + (by_camera**2).sum(axis=1)
-        if not self._is_in_fit:
-            sheet = normal.covariance[np.ix_(of_sheet, of_sheet)]
-            return np.asarray(
-                total + (by_board**2).sum(axis=1) + ((by_sheet @ sheet) * by_sheet).sum(axis=1)
-            )
-        moved = by_sheet @ normal.by_boards[of_sheet]
-        moved[:, stripe.columns[is_free & ~is_sheet] - normal.n_sheet] += by_board
-        stripes = by_sheet @ normal.by_stripes[np.ix_(of_sheet, of_sheet)]
-        gain = normal.gain[np.ix_(of_sheet, stripe.columns[is_free])]
-        lever = stripe.design[:, is_free] @ gain.T
-        total = total + (moved**2).sum(axis=1) + ((stripes - 2.0 * lever) * by_sheet).sum(axis=1)
+        by_sheet, by_board = pull[:, : normal.n_sheet], pull[:, normal.n_sheet : normal.n_free]
+        by_camera = pull[:, normal.n_free :] + by_sheet @ normal.follow
+        covariance, lever = normal.covariance, np.zeros_like(by_sheet)
+        if self._is_in_fit:
+            covariance, lever = normal.by_stripes, 2.0 * pull[:, : normal.n_free] @ normal.gain.T
+            by_board = by_board + by_sheet @ normal.by_boards
+        total = noise + (by_camera**2).sum(axis=1) + (by_board**2).sum(axis=1)
+        total = total + ((by_sheet @ covariance - lever) * by_sheet).sum(axis=1)
         return np.asarray(np.maximum(total, 0.0))

@@ -37,16 +37,8 @@ PARALLEL_DEG = 2.0
 class CommonPlane:
     """Plane through the ends of L stripes, each weighted by its covariance.
 
-    Parameters
-    ----------
-    plane
-        The plane.
-    chi2
-        Weighted sum of squares of what the ends miss it by.
-    degrees_of_freedom
-        ``2 L - 3``: one for two stripes, because any two coplanar lines fit.
-    largest_mm, sigma_largest_mm
-        Largest distance of an end from the plane and that distance's standard deviation.
+    ``chi2`` of what the ends miss it by has ``2 L - 3`` degrees of freedom: one for two stripes,
+    because any two coplanar lines fit. ``largest_mm`` is the largest distance of an end.
     """
 
     plane: Plane
@@ -101,18 +93,8 @@ def _tilted(plane: Plane, step: FloatArray) -> Plane:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetGeometry:
-    """How the boards of one sheet lie.
-
-    Parameters
-    ----------
-    n_boards
-        Board placements.
-    board_angle_deg
-        Largest angle between two boards.
-    depth_range_mm
-        Smallest and largest Z of the points.
-    spread_mm
-        (2,) root mean square extent of the points along the stripes and across them, in the sheet.
+    """How the boards of one sheet lie: the largest angle between two, smallest and largest Z of the
+    points, and their ``spread_mm`` (2,), rms along the stripes and across them in the sheet.
     """
 
     n_boards: int

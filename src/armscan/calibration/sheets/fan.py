@@ -87,22 +87,10 @@ class FanAssignment:
 def number_fan(
     stripes: Sequence[Sequence[StripeObservation]], boards: Sequence[int], n_sheets: int = 0
 ) -> FanAssignment | FitFailure:
-    """Number the stripes of one source with several sheets.
+    """Number the stripes of one source with several sheets, 0 if it is not known how many.
 
-    Parameters
-    ----------
-    stripes
-        Of each image.
-    boards
-        Number of each image's board placement: two images may show one.
-    n_sheets
-        How many sheets the source has; 0 if that is not known.
-
-    Returns
-    -------
-    FanAssignment or FitFailure
-        A failure where the placements leave open which stripes belong together: nothing is
-        guessed.
+    ``stripes`` are those of each image and ``boards`` the numbers of the images' board placements.
+    Where the placements leave open which stripes belong together, nothing is guessed.
     """
     if len({board for board, shown in zip(boards, stripes, strict=True) if shown}) < 2:
         return FitFailure("fewer than two board placements show a stripe", REMEDY)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -91,7 +90,8 @@ def assign_sheets(
     counts = [len(image.stripes) for image in images if image.stripes]
     wanted = options.n_sheets or len(options.sheet_names)
     together = next(iter(lasers)) if len(lasers) == 1 else ()
-    n_sheets = wanted or len(together) or _most_frequent(counts)
+    usual = max(counts, key=lambda n: (counts.count(n), n), default=0)
+    n_sheets = wanted or len(together) or usual
     if not any(len(names) > 1 for names in lasers) and max([n_sheets, *counts]) >= LEAST_FAN:
         return _one_fan(images, wanted, options.sheet_names or tuple(ALPHABET))
     if len(lasers) > 1:
@@ -109,12 +109,6 @@ def assign_sheets(
         return _by_coplanarity([image.stripes for image in images], names)
     sheets = tuple(_longest_only(image) for image in images)
     return SheetAssignment(names, sheets, "one stripe an image, hence one sheet")
-
-
-def _most_frequent(counts: Sequence[int]) -> int:
-    """The count that most images show, the larger of two."""
-    images = Counter(counts)
-    return max(images, key=lambda n: (images[n], n)) if images else 0
 
 
 def _one_fan(

@@ -21,7 +21,6 @@ from armscan.calibration.sheets.solve import (
     SheetObservations,
     SheetSolution,
     solve_sheets,
-    square_matrix_root,
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -49,15 +48,10 @@ FEWEST_BOARDS = 4
 class StripeNoise:
     """Scatter of the points around a smooth course of each stripe.
 
-    Parameters
-    ----------
-    factor
-        Standard deviation over what the stripes' sigmas claim.
-    correlation_points
-        Variance of a mean over that of independent points: 1 + 2 sum of the correlations.
-    degrees_of_freedom
-        Of ``factor``, counted in points: each shape term of a stripe takes the noise of as many
-        points as count as one.
+    ``factor`` is their standard deviation over what the stripes' sigmas claim, and
+    ``correlation_points`` the variance of a mean over that of independent points: 1 + 2 sum of the
+    correlations. ``degrees_of_freedom`` of the factor are counted in points: each shape term of a
+    stripe takes the noise of as many points as count as one.
     """
 
     factor: float
@@ -168,12 +162,8 @@ def lack_of_fit(
 class BoardScatter:
     """Likeliest scatter of the boards under a model of the sheet.
 
-    Parameters
-    ----------
-    factor
-        Standard deviations of the boards' poses over what is claimed for them, at least 1.
-    log_likelihood
-        Of the stripes' shapes at this factor, up to a constant that all models share.
+    ``factor``, at least 1, is the standard deviations of the boards' poses over what is claimed for
+    them; ``log_likelihood`` that of the stripes' shapes, up to a constant that all models share.
     """
 
     factor: float
@@ -188,22 +178,14 @@ def board_scatter(
 ) -> BoardScatter:
     """Estimate by restricted likelihood how much the boards of one sheet scatter.
 
-    Parameters
-    ----------
-    observations
-        Points of one sheet.
-    solution
-        A model fitted to them, with the cameras free.
-    errors
-        Claimed covariance of boards and cameras.
-    noise
-        Of the points along the stripes.
+    ``solution`` is a model fitted to the sheet's points with the cameras free, ``errors`` the
+    claimed covariance of boards and cameras, ``noise`` that of the points along the stripes.
     """
     _, residual, _, by_point = observations.residuals_px(solution.sheets)
     by_pose = np.einsum("ni,nij->nj", by_point, observations.dpoint_dpose)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
     moved = solution.common[len(solution.common) - errors.n_camera :]
-    residual = residual + by_camera @ (square_matrix_root(errors.camera_covariance) @ moved)
+    residual = residual + by_camera @ (errors.camera_root @ moved)
     stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
     n = BOARD_SHAPES * len(stripes)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
@@ -214,7 +196,7 @@ def board_scatter(
         weighted = design / (stripe.sigma_px * noise.sigma_factor)[:, None] ** 2
         covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
         gain = covariance @ weighted.T
-        root = square_matrix_root(errors.pose_covariances[int(stripe.board[0])])
+        root = errors.pose_roots[int(stripe.board[0])]
         log_likelihood += _log_likelihood(
             gain @ (lost * residual[of]), covariance, gain @ by_pose[of] @ root
         )

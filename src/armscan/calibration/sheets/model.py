@@ -14,7 +14,6 @@ from scipy import stats
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.coplanarity import (
     SheetGeometry,
-    refuse_few_boards,
     refuse_lost_spread,
 )
 from armscan.calibration.sheets.lack_of_fit import (
@@ -65,25 +64,12 @@ MIN_CROSSING_SINE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetModel:
-    """The model chosen for one sheet, fitted to this sheet's points alone.
+    """The model chosen for one sheet, fitted to this sheet's points alone: where the joint fit
+    starts.
 
-    Parameters
-    ----------
-    sheet
-        Start of the joint fit.
-    is_bowed
-        Whether the bow is free.
-    noise
-        Scatter along its stripes.
-    plane_test, final_test
-        Lack of fit of the plane, and of the model chosen.
-    decision
-        Why there is a bow, or none.
-    sigma_factor
-        By which the stripes' sigmas are multiplied in the joint fit: their noise, its correlation,
-        and what the model leaves unexplained.
-    board_factor
-        By which the sigmas of the boards' poses are multiplied in the joint fit.
+    ``decision`` tells why there is a bow, or none. In the joint fit the stripes' sigmas are
+    multiplied by ``sigma_factor`` (their noise, its correlation, and what the model leaves
+    unexplained), those of the boards' poses by ``board_factor``.
     """
 
     sheet: LightSheet
@@ -111,9 +97,6 @@ def start_sheet(
     name: str, observations: SheetObservations, images: Sequence[BoardImage]
 ) -> LightSheet | FitFailure:
     """Total least squares plane of one sheet's points; refused where they are one line."""
-    few = refuse_few_boards(name, len(np.unique(observations.board)))
-    if few is not None:
-        return few
     plane = fit_plane(observations.points_mm)
     if isinstance(plane, FitFailure):
         return FitFailure(f"sheet {name}: {plane.reason}", plane.remedy)
@@ -136,14 +119,7 @@ def start_sheet(
 def sheet_from_plane(plane: Plane, points_mm: FloatArray, directions: FloatArray) -> LightSheet:
     """Flat sheet on a plane, u along the stripes' mean direction and v towards larger depth.
 
-    Parameters
-    ----------
-    plane
-        The plane.
-    points_mm
-        (N, 3) points that the sheet's origin and scale should cover.
-    directions
-        (L, 3) directions of the stripes; their signs do not matter.
+    Its origin and scale cover the points (N, 3); signs of the directions (L, 3) do not matter.
     """
     normal = plane.normal
     mean = np.linalg.eigh(directions.T @ directions)[1][:, -1]
@@ -398,18 +374,8 @@ def cross_ratio_points(view: TargetView, stripe_px: FloatArray, camera: CameraMo
     their cross ratio, so the known points of the row give the board coordinate of the crossing;
     three suffice, more are used by least squares of the row's projective map.
 
-    Parameters
-    ----------
-    view
-        The target; rows and columns are points with equal y, or equal x, on the board.
-    stripe_px
-        (K, 2) points of one straight stripe, full-sensor pixels.
-    camera
-        For undistortion.
-
-    Returns
-    -------
-    (C, 2) crossings in the Board frame, mm.
+    Rows and columns of the view are points with equal y, or equal x, on the board; ``stripe_px``
+    (K, 2) are points of one straight stripe. The crossings (C, 2) are in the Board frame, mm.
     """
     stripe_xy, is_valid = camera.undistort(stripe_px)
     stripe = fit_line(stripe_xy[is_valid]) if is_valid.sum() >= 2 else FitFailure("no stripe")

@@ -90,25 +90,17 @@ class SheetOptions:
 
 
 class PointUse(IntEnum):
-    """What became of a stripe point."""
+    """What became of a stripe point; `Profile.flags` says why one is flagged."""
 
     USED = 0
     FLAGGED = 1
-    """Rejected by the stripe extraction; `Profile.flags` says why."""
     NO_RAY = 2
-    """The lens model has no inverse there, or the ray misses the board's plane."""
     OFF_BOARD = 3
-    """Outside the rectangle of the target's points, where nothing says that the board is flat."""
     OFF_LINE = 4
-    """Not on a straight stripe of the flat board: another reflection, or an outlier."""
     UNNAMED = 5
-    """On a straight stripe that could not be given to a sheet."""
     OFF_SHEET = 6
-    """Given to a sheet and too far from it."""
     ON_EDGE = 7
-    """Next to a reflectance edge of the target that runs along the stripe and pulls its centre."""
     OUTVOTED = 8
-    """On a straight line that does not lie on the sheet on which the boards agree."""
 
     @property
     def label(self) -> str:
@@ -119,11 +111,14 @@ class PointUse(IntEnum):
 _USE_LABELS = {
     PointUse.USED: "used",
     PointUse.FLAGGED: "flagged by the stripe extraction",
+    # The lens model has no inverse there, or the ray misses the board's plane.
     PointUse.NO_RAY: "no ray meets the board",
     PointUse.OFF_BOARD: "off the known region of the board",
+    # Another reflection, or an outlier.
     PointUse.OFF_LINE: "off the straight stripe on the flat board",
     PointUse.UNNAMED: "stripe not given to a sheet",
     PointUse.OFF_SHEET: "off the sheet",
+    # The edge runs along the stripe and pulls its centre.
     PointUse.ON_EDGE: "along an edge of the target",
     PointUse.OUTVOTED: "on a line off the common sheet",
 }
@@ -255,16 +250,8 @@ PlaneMethod: TypeAlias = Literal["algebraic", "total least squares", "cross rati
 class PlaneComparison:
     """How the plane of a simpler method lies to the sheet in use, over the calibrated region.
 
-    Parameters
-    ----------
-    method
-        ``algebraic`` is eq. 2.44; ``cross ratio`` is the thesis's way to the points.
-    plane
-        ``a b c D`` with a unit normal and D in mm.
-    angle_deg
-        Between the planes.
-    largest_mm
-        Largest distance between the two over the points used.
+    ``algebraic`` is eq. 2.44, ``cross ratio`` the thesis's way to the points. The plane is ``a b c
+    D`` with a unit normal and D in mm; ``largest_mm`` is the largest distance over the points used.
     """
 
     method: PlaneMethod
@@ -289,18 +276,10 @@ class BoardDistances:
 
 @dataclass(frozen=True, slots=True)
 class BoardPointCheck:
-    """Points of one sheet on one board.
+    """Points of one sheet on one board, at their mean Z; ``source`` is the first image of them.
 
-    Parameters
-    ----------
-    source
-        Image of its stripe, the first one.
-    depth_mm
-        Mean Z of the points.
-    fitted
-        The board took part in the fit.
-    left_out
-        It did not; None where the other boards do not determine the sheet.
+    ``fitted`` if the board took part in the fit, ``left_out`` if it did not; None where the other
+    boards do not determine the sheet.
     """
 
     source: str
@@ -311,17 +290,10 @@ class BoardPointCheck:
 
 @dataclass(frozen=True, slots=True)
 class SheetPointCheck:
-    """Points of one sheet.
+    """Points of one sheet: all, every board having taken part in the fit, and board by board.
 
-    Parameters
-    ----------
-    fitted
-        All points, every board having taken part in the fit.
-    left_out_rms_mm, left_out_claimed_mm
-        Root mean square of the distances when each point's own board is left out, and what the
-        calibration claims for it; NaN where no board can be left out.
-    boards
-        One entry a board.
+    ``left_out_rms_mm`` is the root mean square of the distances when each point's own board is left
+    out, with what the calibration claims for it; NaN where no board can be left out.
     """
 
     fitted: BoardDistances

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -45,24 +46,16 @@ class SheetObservations(RowRecord):
 
     Parameters
     ----------
-    image, row
-        (N,) image, and row of its profile.
-    board
-        (N,) board placement: images of one placement share it.
-    sheet
-        (N,) index of the sheet.
-    stripe
-        (N,) number of the stripe (one image, one sheet) that the point belongs to.
+    image, row, board, sheet, stripe
+        Numbers of the image, of the row of its profile, of the board placement, which images may
+        share, of the sheet, and of the stripe (one image, one sheet).
     points_mm
-        (N, 3) in the Sensor frame, boards as measured.
-    across_mm_px
-        (N, 3) movement of the point for one pixel across the stripe.
-    sigma_px
-        (N,) stripe noise across the stripe.
-    dpoint_dpose
-        (N, 3, 6) derivative by the pose of the point's own board.
-    dpoint_dcamera
-        (N, 3, P) total derivative by the cameras' parameters, the boards' poses following them.
+        In the Sensor frame, boards as measured.
+    across_mm_px, sigma_px
+        Movement of the point for one pixel across the stripe, and the stripe's noise there.
+    dpoint_dpose, dpoint_dcamera
+        Derivative by the pose of the point's own board, and total derivative by the cameras'
+        parameters, the boards' poses following them.
     """
 
     image: IntArray = ints("N")
@@ -149,21 +142,26 @@ def stack_observations(
     return SheetObservations.concat(parts)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class CommonErrors:
     """What the boards and the cameras are known to.
 
-    Parameters
-    ----------
-    pose_covariances
-        (6, 6) for each board placement.
-    camera_covariance
-        (P, P) of the cameras' parameters, P = 9 for one camera; rows of parameters that are taken
-        as exact are zero.
+    A covariance (6, 6) of each board placement's pose, and that (P, P) of the cameras' parameters,
+    in which rows of parameters that are taken as exact are zero; with their square roots.
     """
 
     pose_covariances: Sequence[FloatArray]
     camera_covariance: FloatArray
+
+    @cached_property
+    def pose_roots(self) -> list[FloatArray]:
+        """(6, 6) for each board placement."""
+        return [square_matrix_root(covariance) for covariance in self.pose_covariances]
+
+    @cached_property
+    def camera_root(self) -> FloatArray:
+        """(P, P) of the cameras' parameters."""
+        return square_matrix_root(self.camera_covariance)
 
     @staticmethod
     def of(images: Sequence[BoardImage]) -> CommonErrors:
@@ -191,20 +189,17 @@ def square_matrix_root(covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetSolution:
-    """Sheets at the optimum.
+    """S sheets at the optimum, of N points on M boards seen by cameras with P parameters.
 
     Parameters
     ----------
-    sheets
-        S sheets.
     covariance
         (P + 8 S, P + 8 S) of the errors of the cameras, as calibrated, and of these sheets.
     remaining_px
-        (N,) residuals after the boards, and the cameras if free, are moved within their
-        uncertainty.
+        (N,) residuals after boards, and cameras if free, are moved within their uncertainty.
     common
-        (6 M + P,) estimated common errors of M boards and the cameras, in their own sigmas; zero
-        for cameras that are held.
+        (6 M + P,) estimated common errors of boards and cameras, in their own sigmas; zero for
+        cameras that are held.
     chi2
         Weighted squares of ``remaining_px`` plus squares of ``common``.
     last_step_sigma
@@ -214,8 +209,7 @@ class SheetSolution:
     weight
         (N,) of the points, 1/px^2.
     system, normal
-        The linearised residuals at the solution, with boards and camera as measured, and the last
-        normal equations.
+        The residuals, linearised with boards and camera as measured, and the last normal equations.
     """
 
     sheets: tuple[LightSheet, ...]
@@ -340,10 +334,9 @@ def _linearised(
 ) -> StripeSystem:
     height, residual, by_sheet, by_point = observations.residuals_px(sheets)
     by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
-    by_camera = by_camera @ square_matrix_root(errors.camera_covariance)
+    by_camera = by_camera @ errors.camera_root
     by_pose = np.einsum("ni,nij->nj", by_point, observations.dpoint_dpose)
-    pose_roots = [square_matrix_root(covariance) for covariance in errors.pose_covariances]
-    n_active, n_boards = int(active.sum()), len(pose_roots)
+    n_active, n_boards = int(active.sum()), len(errors.pose_roots)
     n_columns = n_active + 6 * n_boards + errors.n_camera
     column = np.cumsum(active) - 1
     order = np.argsort(observations.stripe, kind="stable")
@@ -359,7 +352,11 @@ def _linearised(
                 np.arange(n_columns - errors.n_camera, n_columns),
             ]
         )
-        design = [by_sheet[rows][:, free], by_pose[rows] @ pose_roots[board], by_camera[rows]]
+        design = [
+            by_sheet[rows][:, free],
+            by_pose[rows] @ errors.pose_roots[board],
+            by_camera[rows],
+        ]
         stripes.append(StripeRows(rows, board, columns, np.concatenate(design, axis=1)))
     return StripeSystem(tuple(stripes), n_active, n_boards, n_columns, residual, height)
 
@@ -382,7 +379,7 @@ def _joint_covariance(
     joint[:p, :p] = errors.camera_covariance
     places = p + np.flatnonzero(active)
     joint[np.ix_(places, places)] = of_sheets
-    cross = by_camera @ square_matrix_root(errors.camera_covariance).T
+    cross = by_camera @ errors.camera_root.T
     joint[np.ix_(places, np.arange(p))] = cross
     joint[np.ix_(np.arange(p), places)] = cross.T
     return 0.5 * (joint + joint.T)
@@ -404,17 +401,10 @@ class StripeRows:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StripeSystem:
-    """All residuals with their derivatives.
+    """All residuals (N,), in the image and in space, with their derivatives stripe by stripe.
 
-    Parameters
-    ----------
-    stripes
-        One entry a stripe.
-    n_sheet, n_boards, n_columns
-        Free parameters of all sheets, which come first; boards, with six unknowns each; count of
-        all unknowns.
-    residual_px, height_mm
-        (N,) distance of the points from their sheets, in the image and in space.
+    Of the ``n_columns`` unknowns the ``n_sheet`` free parameters of all sheets come first, then six
+    for each of ``n_boards`` boards.
     """
 
     stripes: tuple[StripeRows, ...]
@@ -517,18 +507,11 @@ def _inverse(matrix: FloatArray, scaled_by: FloatArray) -> FloatArray | None:
 class NormalSolution:
     """Solution of the normal equations of U unknowns that are free and some that are held.
 
-    Parameters
-    ----------
-    step
-        (n_columns,) of the unknowns; zero for those that are held.
-    gain
-        (S, U) the rows of the inverse that belong to the S parameters of the sheets, which come
-        first: their covariance with all that is free. Their step is minus this times the design's
-        weighted transpose times the residuals.
-    follow
-        (S, n_held) how they follow the unknowns that are held.
-    n_board
-        Unknowns of all boards, which come next.
+    ``step`` (n_columns,) is zero for those that are held. ``gain`` (S, U) are the rows of the
+    inverse that belong to the S parameters of the sheets, which come first: their covariance with
+    all that is free; their step is minus this times the design's weighted transpose times the
+    residuals. ``follow`` (S, n_held) is how they follow the unknowns that are held; the ``n_board``
+    unknowns of all boards come next.
     """
 
     step: FloatArray

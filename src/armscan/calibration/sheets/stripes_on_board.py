@@ -55,23 +55,16 @@ stripe's width."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StripeObservation:
-    """One straight stripe of one image.
+    """One straight stripe of one image, its points being ``rows`` (K,) of the image's profile.
 
     Parameters
     ----------
-    rows
-        (K,) rows of the image's profile, ordered along the stripe.
-    ends_mm
-        (2, 3) ends of the fitted straight piece, Sensor frame.
-    dends_dpose
-        (2, 3, 6) their derivative by the board's pose.
-    dends_dcamera
-        (2, 3, P) their derivative by the cameras' parameters, the board's pose following them.
-    noise_ends_mm2
-        (2, 2) covariance of the ends across the stripe by the stripe's noise alone: one end goes
-        up where the other goes down.
-    across
-        (3,) unit vector on the board across the stripe, in which this noise acts.
+    ends_mm, dends_dpose, dends_dcamera
+        (2, 3) ends of the fitted straight piece, Sensor frame, with their derivatives (2, 3, 6) by
+        the board's pose and (2, 3, P) by the cameras' parameters, the pose following them.
+    noise_ends_mm2, across
+        (2, 2) covariance of the ends by the stripe's noise alone, one going up where the other goes
+        down, along (3,) the unit vector on the board across the stripe.
     middle_px, direction_px
         (2,) middle and unit direction of the stripe in the image.
     pose_covariance, camera_covariance
@@ -105,18 +98,15 @@ class StripeObservation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardImage:
-    """All stripe points of one image on its board, and the straight stripes among them.
+    """All N stripe points of one image on its board, and the straight stripes among them.
 
     Parameters
     ----------
-    data
-        What was given.
-    placed
-        The board's pose in Sensor.
-    points
-        The N points on the board.
-    dpoint_dcamera
-        (N, 3, P) their derivative by the cameras' parameters, the board's pose following them.
+    data, placed
+        What was given, and the board's pose in Sensor.
+    points, dpoint_dcamera
+        The points on the board, and their derivative (N, 3, P) by the cameras' parameters, the
+        board's pose following them.
     sigma_mm
         (N,) stripe noise across the stripe, in space.
     use
@@ -124,7 +114,7 @@ class BoardImage:
     camera_covariance
         (P, P) of the cameras' parameters.
     stripes
-        The straight stripes, in their order across the image.
+        In their order across the image.
     """
 
     data: BoardStripes
@@ -163,17 +153,9 @@ def observe_board_stripes(
     Points that an edge beside the stripe may pull are left out. Where nothing else shows a stripe,
     because it runs along the target's pattern, they are used as what they are: less certain.
 
-    Parameters
-    ----------
-    data
-        The image's stripe points and its board.
-    cameras
-        The cameras.
-    margin_mm
-        Points so far outside the rectangle of the target's points count as on the board; what the
-        print covers if None.
-    n_lines
-        Stripes to look for, those with the most points; 0 for all.
+    Points up to ``margin_mm`` outside the rectangle of the target's points count as on the board,
+    those on the print if None. Of ``n_lines`` stripes those with the most points are looked for; 0
+    for all.
     """
     if margin_mm is None:
         margin_mm = printed_margin_mm(data.view)
@@ -290,23 +272,17 @@ def find_straight_stripes(
 
     Parameters
     ----------
-    points_mm
-        (N, 2) points in the board's plane.
-    sigma_mm
-        (N,) standard deviation across the stripe.
-    segment
-        (N,) connected segment of each point.
-    shortest_mm
-        Least length of a stripe.
-    tolerance_mm
-        Half width of a stripe's band.
+    points_mm, sigma_mm, segment
+        (N, 2) points in the board's plane, (N,) their standard deviation across the stripe, and
+        (N,) their connected segment.
+    shortest_mm, tolerance_mm
+        Least length of a stripe, and half the width of its band.
     n_lines
         Most stripes to look for; 0 for all.
 
     Returns
     -------
-    list of (K,) arrays
-        Rows of each stripe's points, ordered along it.
+    Rows (K,) of each stripe's points, ordered along it.
     """
     stripes: list[IntArray] = []
     lines: list[Line] = []

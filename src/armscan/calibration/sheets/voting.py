@@ -59,16 +59,8 @@ SEED = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetVote:
-    """What the boards agreed on.
-
-    Parameters
-    ----------
-    images
-        The images with the stripes that lie on a common sheet; without vote, as they were given.
-    outlying
-        Images whose stripes lie on none, with how far off.
-    warnings
-        What is doubtful about the vote.
+    """What the boards agreed on: the images with the stripes that lie on a common sheet, without
+    vote as they were given, and the outlying ones whose stripes lie on none.
     """
 
     images: tuple[BoardImage, ...]
@@ -83,6 +75,14 @@ def observe_boards(
 
     Stripes are looked for on the print and, where three boards can vote, on the carrier around it
     as far as the print is long: a board may go on beyond its print by the print's own length.
+
+    Of each image the stripes stay that lie on a sheet on which at least three boards agree. Those
+    on the print vote. Of images that show none there, a stripe beside the print is kept if it lies
+    on one of these sheets. Only where the prints show no sheet, the stripes beside them vote, and
+    then on one sheet unless the options say how many there are: the walls and floors behind show
+    lines, too. Images whose one laser is named vote among themselves. Nothing is decided where no
+    three boards agree, or where the lines of a fan are coplanar in too many ways: their numbering
+    (`armscan.calibration.sheets.fan`) then judges.
     """
     can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
     n_lines = 0 if can_vote else options.n_sheets
@@ -98,40 +98,12 @@ def observe_boards(
             observe_board_stripes(board, cameras, length)
             for board, length in zip(boards, lengths, strict=True)
         ]
-    return vote_on_sheets(on_print, around, cameras, options)
-
-
-def vote_on_sheets(
-    on_print: Sequence[BoardImage],
-    around: Sequence[BoardImage],
-    cameras: HeadCameras,
-    options: SheetOptions,
-) -> SheetVote:
-    """Keep of each image the stripes that lie on a sheet on which at least three boards agree.
-
-    The stripes on the print vote. Of images that show none there, a stripe beside the print is kept
-    if it lies on one of these sheets. Only where the prints show no sheet, the stripes beside them
-    vote, and then on one sheet unless the options say how many there are: the walls and floors
-    behind show lines, too. Images whose one laser is named vote among themselves. Nothing is
-    decided where no three boards agree, or where the lines of a fan are coplanar in too many ways:
-    their numbering (`armscan.calibration.sheets.fan`) then judges.
-
-    Parameters
-    ----------
-    on_print, around
-        The images with the stripes on the print, and with those on print and carrier.
-    cameras
-        The cameras.
-    options
-        In force.
-    """
     images: list[BoardImage] = list(on_print)
     outlying: list[SkippedImage] = []
     warnings: list[str] = []
     groups: dict[tuple[str, ...], list[int]] = {}
-    for i, image in enumerate(on_print):
-        lasers = image.data.lasers
-        groups.setdefault(lasers if len(lasers) == 1 else (), []).append(i)
+    for i, board in enumerate(boards):
+        groups.setdefault(board.lasers if len(board.lasers) == 1 else (), []).append(i)
     for group in groups.values():
         inner, wide = [on_print[i] for i in group], [around[i] for i in group]
         if _most_lines(inner) >= LEAST_FAN:

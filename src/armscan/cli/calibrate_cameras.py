@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan calibrate camera`` and ``stereo``: photographs of a flat target."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import (
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    Cache,
+    DefaultOf,
+    Document,
+    Force,
+    ForceBad,
+    Target,
+    given,
+    run,
+)
+
+CAMERA_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n\n"
+    "\b\nTake 12 or more photos: the board fills most of the image, reaches every corner in some,\n"
+    "and is tilted by 20 to 45 degrees to all sides. Focus and zoom stay as they are."
+)
+STEREO_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate stereo 'photos/left*.png' 'photos/right*.png' \\\n"
+    "      --target chessboard:9x6:25 -o stereo.json\n\n"
+    "\b\nTake 10 to 20 pairs at rest, both images at one instant; the board is tilted by 20 to 45\n"
+    "degrees to all sides and reaches the corners of both images. Lists pair in their order."
+)
+Distortion = Annotated[
+    str | None,
+    typer.Option(
+        help="auto, none, k1, k1k2, k1k2p1p2 or k1k2p1p2k3.",
+        show_default=DefaultOf("armscan.calibration.cameras.result:CameraOptions.distortion"),
+    ),
+]
+
+
+def camera(
+    *,
+    images: Annotated[
+        list[str] | None,
+        typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
+    ] = None,
+    target: Target,
+    output: Document = Path("camera.json"),
+    scan: Annotated[
+        Path | None, typer.Option(help="Recording of the target instead of images.")
+    ] = None,
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
+    ] = None,
+    auto_leave_out: Annotated[
+        bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
+    ] = False,
+    distortion: Distortion = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(help="Hold 'aspect' (fx = fy) or 'centre'; repeatable.")
+    ] = None,
+    board_warp: Annotated[
+        bool, typer.Option("--board-warp", help="Also solve a bow of the board.")
+    ] = False,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    force: Force = False,
+    force_bad: ForceBad = False,
+    cache: Cache = True,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a camera from photographs of a flat target."""
+    from armscan.calibration.cameras.result import CameraOptions
+    from armscan.errors import OptionError
+    from armscan.jobs.camera import calibrate_camera
+    from armscan.storage.images import ImageOptions
+
+    held = set(fix or ())
+    if unknown := sorted(held - {"aspect", "centre"}):
+        raise OptionError(f"--fix {unknown[0]} is not known", remedy="choose aspect or centre")
+    options = given(
+        CameraOptions,
+        distortion=distortion,
+        is_aspect_fixed="aspect" in held,
+        is_principal_point_fixed="centre" in held,
+        solve_warp=board_warp,
+        leave_out=tuple(leave_out or ()),
+        leave_out_misfits=auto_leave_out,
+    )
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    run(
+        lambda job: calibrate_camera(
+            job, target, images or (), scan=scan, options=options, image_options=pixels
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+        force_bad=force_bad,
+        cache=cache,
+    )
+
+
+def stereo(
+    *,
+    left: Annotated[
+        str, typer.Argument(help="Left images: a folder or a quoted pattern.", show_default=False)
+    ] = "",
+    right: Annotated[
+        str, typer.Argument(help="Right images, in the same order.", show_default=False)
+    ] = "",
+    target: Target,
+    output: Document = Path("stereo.json"),
+    scan: Annotated[
+        Path | None,
+        typer.Option(help="Recording of cameras 0 and 1 instead of images; paired by instant."),
+    ] = None,
+    left_camera: Annotated[
+        Path | None, typer.Option("--left", help="Calibration of the left camera by itself.")
+    ] = None,
+    right_camera: Annotated[
+        Path | None, typer.Option("--right", help="Calibration of the right camera by itself.")
+    ] = None,
+    intrinsics: Annotated[
+        str, typer.Option(help="What these are for: prior (beside the images) or fixed (held).")
+    ] = "prior",
+    leave_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Image whose pair is not used, by name or quoted pattern; repeat for more."
+        ),
+    ] = None,
+    auto_leave_out: Annotated[
+        bool, typer.Option("--auto-leave-out", help="Take pairs apart that disagree.")
+    ] = False,
+    distortion: Distortion = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    force: Force = False,
+    force_bad: ForceBad = False,
+    cache: Cache = True,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate two cameras and where they are to each other."""
+    from armscan.calibration.cameras.pairs import StereoOptions
+    from armscan.calibration.cameras.result import CameraOptions
+    from armscan.errors import OptionError
+    from armscan.jobs.stereo import calibrate_stereo
+    from armscan.storage.images import ImageOptions
+
+    cameras = (left_camera, right_camera)
+    is_given = any(path is not None for path in cameras)
+    if intrinsics == "fixed" and not is_given:
+        raise OptionError(
+            "there is nothing to hold", where="--intrinsics fixed", remedy="give --left and --right"
+        )
+    options = given(
+        StereoOptions,
+        camera=given(CameraOptions, distortion=distortion),
+        intrinsics=intrinsics,
+        leave_out=tuple(leave_out or ()),
+        leave_out_misfits=auto_leave_out,
+    )
+    if not is_given:
+        options = replace(options, intrinsics="free")
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    run(
+        lambda job: calibrate_stereo(
+            job,
+            target,
+            left,
+            right,
+            scan=scan,
+            cameras=cameras,
+            options=options,
+            image_options=pixels,
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+        force_bad=force_bad,
+        cache=cache,
+    )

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan calibrate laser`` and ``hand-eye``: light sheets, and where the sensor sits."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import (
+    ArmFile,
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    Cache,
+    DefaultOf,
+    Document,
+    Force,
+    ForceBad,
+    LaserColourOption,
+    Method,
+    MethodOption,
+    Side,
+    StripeMethodOption,
+    Target,
+    given,
+    run,
+)
+
+LASER_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate laser --camera camera.json --on 'on/*.png' --off 'off/*.png' \\\n"
+    "      --target chessboard:11x6:13 -o sensor.json\n\n"
+    "\b\nPut the board at several depths and tilts in the laser. If the laser outshines it,\n"
+    "take each placement twice, with and without laser; images pair by name, else by order.\n"
+    "Of a source of many lines no image need show them all; a recording (--scan) says which\n"
+    "laser and which camera took part."
+)
+HAND_EYE_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate hand-eye scan --sensor sensor.json --plate plate.csv -o scanner.json\n"
+    "  armscan calibrate hand-eye --profiles 'p*.yml' --poses RobPoses.rob \\\n"
+    "      --euler extrinsic-xyz --sphere-diameter 80 -o scanner.json\n\n"
+    "\b\nLay the plate down, probe it, and take 12 or more postures at rest: tilted by 30 to 45\n"
+    "degrees in several directions, nearer and farther."
+)
+LaserScan = Annotated[
+    Path | None,
+    typer.Option(help="Recording of the board instead of images; paired by its views."),
+]
+Sheets = Annotated[
+    int | None,
+    typer.Option(
+        "--sheets",
+        "--lines",
+        help="Light sheets that were on together, or lines of each source; 0 finds out.",
+        show_default=DefaultOf("armscan.calibration.sheets.result:SheetOptions.n_sheets"),
+    ),
+]
+SheetNames = Annotated[
+    list[str] | None,
+    typer.Option("--name", help="Name of a sheet, from left to right; repeat for each."),
+]
+LeaveOut = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Image, or view of a recording, not to use, by name or quoted pattern; repeatable."
+    ),
+]
+TargetMargin = Annotated[
+    float | None,
+    typer.Option(
+        help="Use stripe points this far outside the target's points; else as the boards agree."
+    ),
+]
+Scans = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Folders of recordings; several are calibrated one by one and together.",
+        show_default=False,
+    ),
+]
+SensorFile = Annotated[
+    Path | None, typer.Option(help="Calibration of camera and sheets.", show_default=False)
+]
+PlateFile = Annotated[
+    Path | None,
+    typer.Option(help="Probed points of the plate, or its A,B,C,D.", show_default=False),
+]
+PlaneText = Annotated[
+    str, typer.Option(help="The plate as A,B,C,D in Base, mm, in place of --plate.")
+]
+PlateSide = Annotated[
+    Side | None,
+    typer.Option(help="Where the plate's face looks, roughly; left out, to the arm's tool."),
+]
+SphereDiameter = Annotated[
+    float | None,
+    typer.Option(help="A sphere of this diameter, mm, in place of a plate.", show_default=False),
+]
+Profiles = Annotated[
+    list[str] | None,
+    typer.Option(help="Profiles of a sensor that delivers points, one a posture; repeatable."),
+]
+PoseTable = Annotated[
+    Path | None,
+    typer.Option(help="Table of the robot's poses, one a profile.", show_default=False),
+]
+EulerAngles = Annotated[
+    str | None,
+    typer.Option(
+        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
+        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
+    ),
+]
+
+
+def laser(
+    *,
+    camera: Annotated[
+        Path,
+        typer.Option(
+            help="Camera calibration, also of OpenCV or ROS; stereo.json for two cameras.",
+            show_default=False,
+        ),
+    ],
+    target: Target,
+    on: Annotated[
+        list[str] | None,
+        typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
+    ] = None,
+    off: Annotated[
+        list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
+    ] = None,
+    scan: LaserScan = None,
+    output: Document = Path("sensor.json"),
+    sheets: Sheets = None,
+    name: SheetNames = None,
+    leave_out: LeaveOut = None,
+    plane_only: Annotated[
+        bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
+    ] = False,
+    margin_mm: TargetMargin = None,
+    stripe_method: StripeMethodOption = None,
+    laser_colour: LaserColourOption = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    force: Force = False,
+    force_bad: ForceBad = False,
+    cache: Cache = True,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate light sheets from images of laser lines on a flat target."""
+    from armscan.calibration.sheets.result import SheetOptions
+    from armscan.jobs.sheets import SheetImages, calibrate_sheets
+    from armscan.pipeline.laser import LaserOptions
+    from armscan.storage.images import ImageOptions
+    from armscan.vision.stripe.image import StripeOptions
+
+    images = SheetImages(tuple(on or ()), tuple(off or ()), scan, tuple(leave_out or ()))
+    options = LaserOptions(
+        stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
+        sheets=given(
+            SheetOptions,
+            margin_mm=margin_mm,
+            n_sheets=sheets,
+            sheet_names=tuple(name or ()),
+            is_bow_allowed=not plane_only,
+        ),
+    )
+    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
+    run(
+        lambda job: calibrate_sheets(
+            job, camera, target, images, options=options, image_options=pixels
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+        force_bad=force_bad,
+        cache=cache,
+    )
+
+
+def hand_eye(
+    *,
+    scans: Scans = None,
+    sensor: SensorFile = None,
+    plate: PlateFile = None,
+    plane: PlaneText = "",
+    side: PlateSide = None,
+    solve_plate: Annotated[
+        bool,
+        typer.Option("--solve-plate", help="Solve the plate along; a rough plane is enough then."),
+    ] = False,
+    sphere_diameter: SphereDiameter = None,
+    profiles: Profiles = None,
+    poses: PoseTable = None,
+    euler: EulerAngles = None,
+    arm: ArmFile = None,
+    arm_position_mm: Annotated[
+        float | None, typer.Option(help="Scatter of the arm, mm an axis; left out, estimated.")
+    ] = None,
+    arm_rotation_deg: Annotated[
+        float | None,
+        typer.Option(help="Scatter of its orientation; left out, from the position."),
+    ] = None,
+    plate_flatness_mm: Annotated[
+        float | None,
+        typer.Option(help="Scatter of the plate's surface; left out, estimated."),
+    ] = None,
+    method: MethodOption = Method.ARMSCAN,
+    output: Document = Path("scanner.json"),
+    stripe_method: StripeMethodOption = None,
+    laser_colour: LaserColourOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find where the sensor sits on the arm, from postures over a flat plate or a sphere."""
+    from armscan.calibration.hand_eye.observations import HandEyeOptions
+    from armscan.geometry.rotations import check_convention
+    from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye
+    from armscan.vision.stripe.image import StripeOptions
+
+    source = given(
+        StripeSource,
+        scans=tuple(scans or ()),
+        sensor=sensor,
+        arm=arm,
+        profiles=tuple(profiles or ()),
+        poses=poses,
+        euler=None if euler is None else check_convention(euler),
+    )
+    artefact = Artefact(plate, plane, None if side is None else side.value, sphere_diameter)
+    rotation_rad = None if arm_rotation_deg is None else math.radians(arm_rotation_deg)
+    options = given(
+        HandEyeOptions,
+        arm_position_mm=arm_position_mm,
+        arm_rotation_rad=rotation_rad,
+        plate_flatness_mm=plate_flatness_mm,
+        solve_plate=solve_plate,
+    )
+    stripes = given(StripeOptions, method=stripe_method, laser_colour=laser_colour)
+    run(
+        lambda job: calibrate_hand_eye(
+            job,
+            source,
+            artefact,
+            options=options,
+            stripe_options=stripes,
+            is_beside_thesis=method is Method.THESIS,
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan info``, ``convert`` and ``doctor``: what files are, other formats, the installation."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import AsJson, Force, show
+
+INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
+CONVERT_EXAMPLE = "\b\nExample:\n  armscan convert camera.json camera_info.yaml"
+DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
+
+
+def info(
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            help="Images, calibrations, clouds, recordings, folders.", show_default=False
+        ),
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Say what files are: image, calibration, cloud, observations, recording or folder."""
+    from armscan.jobs.info import describe_files
+
+    show(describe_files(files), as_json=as_json)
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(help="Calibration, or cloud .ply.", show_default=False)],
+    output: Annotated[
+        Path,
+        typer.Argument(help=".yaml (ROS camera_info) or .xyz.", show_default=False),
+    ],
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a calibration's camera for ROS, or a cloud as plain XYZ."""
+    from armscan.report.quantity import Summary
+    from armscan.storage.clouds import convert_file
+
+    done = convert_file(source, output, is_overwriting=force)
+    losses = f"the new file does not hold: {', '.join(done.losses)}"
+    summary = Summary(
+        title=f"Converted: {done.what}.",
+        warnings=(losses,),
+        written=(output,),
+        forced=done.forced,
+        extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
+    )
+    show(summary, as_json=as_json)
+
+
+def doctor(
+    warm: Annotated[
+        bool, typer.Option("--warm", help="Compile ahead, so that the first scan starts at once.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check versions, compiler, folders and optional packages."""
+    from armscan.jobs.info import examine_installation
+
+    summary = examine_installation(warm=warm)
+    show(summary, as_json=as_json)
+    if summary.warnings:
+        raise typer.Exit(1)

@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan inspect``: a plane, a ball or a step; ``armscan verify``: the daily check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import (
+    AsJson,
+    DefaultOf,
+    FeatureOption,
+    Force,
+    PageOption,
+    RegionOption,
+    SideOption,
+    given,
+    numbers,
+    run,
+)
+
+PLANE_EXAMPLE = (
+    "\b\nExample:\n  armscan inspect plane plate.ply --plate plate.csv -o plate-inspection.html"
+)
+SPHERE_EXAMPLE = (
+    "\b\nExample:\n  armscan inspect sphere ball.ply --diameter 34.96 -o ball-inspection.html"
+)
+STEP_EXAMPLE = (
+    "\b\nExample:\n  armscan inspect step blocks.ply --height 20 -o blocks-inspection.html\n\n"
+    "\b\nA cloud of one exposure cannot tell how far its light sheet leans on the faces;\n"
+    "without --normal it is taken to stand square."
+)
+VERIFY_EXAMPLE = (
+    "\b\nExample:\n  armscan verify ball/ --scanner scanner.json --ball 34.96 -o verify.html\n\n"
+    "\b\nExit code 0: still valid. 1: not valid, or inconclusive. 2: the input stood in the way."
+)
+EXIT_NOT_PASSED = 1
+
+CloudArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="A cloud of `armscan reconstruct`, or any .ply, .xyz, .csv with x y z in mm.",
+        show_default=False,
+    ),
+]
+
+
+def plane(
+    cloud: CloudArgument,
+    *,
+    plane: Annotated[
+        str,
+        typer.Option(
+            help="Nominal plane A,B,C,D in the cloud's frame, D in mm.", show_default=False
+        ),
+    ] = "",
+    plate: Annotated[
+        Path | None, typer.Option(help="Nominal plane: probed points (CSV), or A,B,C,D in a file.")
+    ] = None,
+    side: SideOption = None,
+    region: RegionOption = "",
+    feature_mm: FeatureOption = None,
+    output: PageOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Distances of points to a plane: fitted to them, and nominal if one is given."""
+    from armscan.calibration.hand_eye.probed_plate import ProbeSide
+    from armscan.inspection.selection import InspectionOptions
+    from armscan.jobs.inspect import inspect_plane
+
+    box = numbers(region, "--region")
+    options = given(InspectionOptions, feature_mm=feature_mm)
+    axis: ProbeSide | None = None if side is None else side.value
+    run(
+        lambda job: inspect_plane(
+            job, cloud, plane=plane, plate=plate, side=axis, region=box, options=options
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def sphere(
+    cloud: CloudArgument,
+    *,
+    diameter: Annotated[
+        float, typer.Option(help="Diameter of the standard ball, mm.", show_default=False)
+    ],
+    region: RegionOption = "",
+    feature_mm: FeatureOption = None,
+    output: PageOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find a ball in a cloud; compare it with the standard, and with the fitted ball."""
+    from armscan.inspection.selection import InspectionOptions
+    from armscan.jobs.inspect import inspect_sphere
+
+    box = numbers(region, "--region")
+    options = given(InspectionOptions, feature_mm=feature_mm)
+    run(
+        lambda job: inspect_sphere(job, cloud, diameter, region=box, options=options),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def step(
+    cloud: CloudArgument,
+    *,
+    height: Annotated[float, typer.Option(help="Nominal height, mm.", show_default=False)],
+    normal: Annotated[
+        str,
+        typer.Option(
+            help="Normal x,y,z of the faces in the cloud's frame, for a single exposure.",
+            show_default=False,
+        ),
+    ] = "",
+    margin: Annotated[
+        float | None,
+        typer.Option(
+            help="Leave out this much at the ends of the faces, mm.",
+            show_default=DefaultOf("armscan.inspection.selection:StepOptions.margin_mm"),
+        ),
+    ] = None,
+    region: RegionOption = "",
+    feature_mm: FeatureOption = None,
+    output: PageOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find two parallel faces in a cloud and measure the distance between them."""
+    from armscan.inspection.selection import InspectionOptions, StepOptions
+    from armscan.jobs.inspect import inspect_step
+
+    box = numbers(region, "--region")
+    direction = numbers(normal, "--normal")
+    options = given(InspectionOptions, feature_mm=feature_mm)
+    steps = given(StepOptions, margin_mm=margin)
+    run(
+        lambda job: inspect_step(
+            job, cloud, height, normal=direction, region=box, options=options, step_options=steps
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+
+
+def verify(
+    scan: Annotated[
+        Path,
+        typer.Argument(
+            help="A recording of a ball or plate (folder), or a cloud of one in Base.",
+            show_default=False,
+        ),
+    ],
+    *,
+    scanner: Annotated[
+        Path | None,
+        typer.Option(help="Calibration of the scanner; a recording needs it.", show_default=False),
+    ] = None,
+    ball: Annotated[
+        float | None,
+        typer.Option(help="Diameter of the standard ball, mm.", show_default=False),
+    ] = None,
+    plate: Annotated[
+        Path | None,
+        typer.Option(help="Probed points of the plate (CSV), or A,B,C,D.", show_default=False),
+    ] = None,
+    mpe: Annotated[
+        float | None,
+        typer.Option(
+            help="Limit of the error, mm; without it the calibration's own prediction.",
+            show_default=False,
+        ),
+    ] = None,
+    uncertainty: Annotated[
+        float | None,
+        typer.Option(
+            help="Expanded uncertainty (k = 2) of the standard, mm.",
+            show_default=DefaultOf("armscan.pipeline.verify:VerifyOptions.reference_u_mm"),
+        ),
+    ] = None,
+    side: SideOption = None,
+    region: RegionOption = "",
+    feature_mm: FeatureOption = None,
+    output: PageOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Say whether a scanner still measures as its calibration predicts."""
+    from armscan.inspection.selection import InspectionOptions
+    from armscan.jobs.verify import Standard
+    from armscan.jobs.verify import verify as verify_scanner
+    from armscan.pipeline.verify import VerifyOptions
+
+    box = numbers(region, "--region")
+    options = given(VerifyOptions, mpe_mm=mpe, reference_u_mm=uncertainty)
+    inspection = given(InspectionOptions, feature_mm=feature_mm)
+    standard = Standard(ball, plate, None if side is None else side.value)
+    summary = run(
+        lambda job: verify_scanner(
+            job, scan, scanner, standard, region=box, options=options, inspection=inspection
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+    return 0 if summary.data["verdict"] == "still valid" else EXIT_NOT_PASSED

@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Charts that several reports have: each kind once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from armscan.geometry.arrays import FloatArray
+from armscan.models.camera import CameraModel
+from armscan.report.drawing import ACCENT, INK, chart_markup, new_figure, styled
+from armscan.report.page import Picture
+
+DIVERGING = "RdBu_r"
+PAGE_WIDTH = 10.4
+"""Inches of a chart that fills the page's width."""
+ARROW_SHARE = 0.06
+"""Length on the picture, as a share of its longer side, of a residual of three sigma."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bars:
+    """Values to count in a histogram: filled bars, or an outline; unnamed without a label."""
+
+    values: FloatArray
+    colour: str
+    label: str | None = None
+    is_outline: bool = False
+    alpha: float = 1.0
+
+
+def histogram_chart(
+    series: Sequence[Bars],
+    edges: FloatArray,
+    axis_label: str,
+    *,
+    title: str,
+    caption: str,
+    curve: tuple[FloatArray, FloatArray, str] | None = None,
+    size: tuple[float, float] = (5.0, 3.2),
+) -> Picture:
+    """Counts of points.
+
+    Parameters
+    ----------
+    series
+        What to count; the first lies below the others.
+    edges
+        (B + 1,) of the bins.
+    axis_label
+        Of the horizontal axis.
+    title, caption
+        Of the picture.
+    curve
+        x, y and label of a line over the bars; None for none.
+    size
+        Width and height in inches.
+    """
+    bins = edges.tolist()
+    with styled():
+        figure = new_figure(*size)
+        axes = figure.add_subplot()
+        for item in series:
+            if item.is_outline:
+                axes.hist(
+                    item.values, bins, histtype="step", color=item.colour, linewidth=1.4,
+                    label=item.label,
+                )  # fmt: skip
+            else:
+                axes.hist(item.values, bins, color=item.colour, alpha=item.alpha, label=item.label)
+        if curve is not None:
+            axes.plot(curve[0], curve[1], color=INK, linewidth=1.2, label=curve[2])
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        axes.set_xlabel(axis_label)
+        axes.set_ylabel("points")
+        if any(item.label for item in series):
+            axes.set_ylim(top=1.3 * axes.get_ylim()[1])
+            axes.legend(loc="upper right")
+    return Picture(chart_markup(figure, title), caption, title)
+
+
+def correlation_chart(
+    covariance: FloatArray, names: Sequence[str], *, title: str, caption: str
+) -> Picture:
+    """Correlations of parameters as a table of colours.
+
+    Parameters
+    ----------
+    covariance
+        (N, N), positive on its diagonal.
+    names
+        N short names.
+    title, caption
+        Of the picture.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    with styled():
+        figure = new_figure(4.6, 4.2)
+        axes = figure.add_subplot()
+        correlation = covariance / np.outer(sigma, sigma)
+        axes.imshow(correlation, cmap=DIVERGING, vmin=-1.0, vmax=1.0)
+        axes.set_xticks(range(len(names)), names)
+        axes.set_yticks(range(len(names)), names)
+        axes.spines[:].set_visible(False)
+        axes.tick_params(length=0)
+        for (i, j), value in np.ndenumerate(correlation):
+            shade = "white" if abs(value) > 0.6 else INK
+            axes.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7.5, color=shade)
+    return Picture(chart_markup(figure, title), caption, title)
+
+
+def residual_field(
+    camera: CameraModel, points_px: FloatArray, arrows_px: FloatArray, *, title: str, caption: str
+) -> Picture:
+    """Residual arrows over a camera's image.
+
+    Parameters
+    ----------
+    camera
+        Whose image.
+    points_px, arrows_px
+        (N, 2) where, and the enlarged residuals.
+    title, caption
+        Of the picture.
+    """
+    with styled():
+        figure, axes = image_axes(camera)
+        axes.quiver(
+            *points_px.T, *arrows_px.T, angles="xy", scale_units="xy", scale=1.0,
+            color=ACCENT, width=0.0022, headwidth=3.5, headlength=4.5,
+        )  # fmt: skip
+    return Picture(chart_markup(figure, title), caption, title)
+
+
+def image_axes(camera: CameraModel) -> tuple[Figure, Axes]:
+    """Axes over the pixels of a camera's image; inside `styled`."""
+    ratio = camera.height_px / camera.width_px
+    width = 6.0 if ratio <= 1.0 else 6.0 / ratio
+    figure = new_figure(width + 0.6, width * ratio + 0.6)
+    axes = figure.add_subplot()
+    axes.set_xlim(-0.5, camera.width_px - 0.5)
+    axes.set_ylim(camera.height_px - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x, px")
+    axes.set_ylabel("y, px")
+    axes.spines[:].set_visible(True)
+    return figure, axes
+
+
+def named_rows(axes: Axes, names: Sequence[str], label: str) -> None:
+    """Lay out horizontal bars: a name a row, the first on top."""
+    axes.set_yticks(range(len(names)), [short(name) for name in names])
+    axes.invert_yaxis()
+    axes.set_xlabel(label)
+    axes.grid(axis="x")
+
+
+def named_columns(axes: Axes, names: Sequence[str]) -> None:
+    """Lay out upright bars: a name a column, slanted where there are many."""
+    turn = 60 if len(names) > 8 else 0
+    axes.set_xticks(range(len(names)), [short(name, 14) for name in names])
+    axes.tick_params(axis="x", labelrotation=turn, labelsize=7.5)
+
+
+def magnification(camera: CameraModel, rms_px: float) -> float:
+    """How much residual arrows are enlarged: a round number, the same in all pictures."""
+    longest = max(camera.width_px, camera.height_px)
+    return round_below(ARROW_SHARE * longest / max(3.0 * rms_px, 1e-6))
+
+
+def round_below(value: float) -> float:
+    """The power of ten times 1, 2 or 5 next below a value."""
+    power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= value * (1 + 1e-12))
+
+
+def symmetric_edges(values: FloatArray, least: float = 0.0) -> FloatArray:
+    """(61,) bin edges about zero that hold 99 % of the values with some room."""
+    reach = max(1.3 * float(np.percentile(np.abs(values), 99.0)), least)
+    return np.linspace(-reach, reach, 61)
+
+
+def short(name: str, most: int = 28) -> str:
+    """The end of a long name."""
+    return name if len(name) <= most else f"…{name[1 - most :]}"

@@ -1,0 +1,304 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs with what was found in them: target points, stripes, or nothing and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.models.calibration import Provenance
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
+from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile, StripeFlag
+from armscan.report.drawing import Marks, photo_markup
+from armscan.report.page import Block, Gallery, Legend, Page, Picture, Section, Text, page_of
+from armscan.report.quantity import Table, without_source
+from armscan.vision.targets.target import TargetView
+
+T = TypeVar("T")
+
+MAX_PICTURES = 24
+MAX_TRIED = 60
+TARGET_COLOUR, LEFT_OUT_COLOUR, STRIPE_COLOUR = "#35e0c0", "#ff8a4c", "#ff5a4f"
+ARROW_COLOUR = "#ffb000"
+SHEET_COLOURS = (
+    "#2fe6c3", "#5aa9ff", "#c58bff", "#a6e22e", "#ffc2f2", "#8fd3ff",
+    "#ffb35c", "#4dd0e1", "#f48fb1", "#dce775", "#b39ddb", "#80cbc4",
+)  # fmt: skip
+"""Bright colours of the sheets on photographs, in order, then repeated."""
+FLAG_COLOURS = {
+    StripeFlag.BACKGROUND_STEP: ("#ff9f1c", "flagged: background step"),
+    StripeFlag.ASYMMETRIC: ("#ff5a4f", "flagged: lopsided profile"),
+    StripeFlag.NEIGHBOUR: ("#e0559b", "flagged: neighbour line"),
+    StripeFlag.OUTLIER: ("#ffe14d", "flagged: off the line's course"),
+    StripeFlag.SHORT_SEGMENT: ("#b58863", "flagged: too short a piece"),
+    StripeFlag.END: ("#f4f1de", "flagged: cut off at a slant"),
+    StripeFlag.TARGET_EDGE: ("#8d7bff", "flagged: along an edge of the target"),
+}
+FATE_COLOURS = {
+    PointStatus.NO_RAY: "#8a6d5a",
+    PointStatus.OUT_OF_DEPTH: "#ff7a3c",
+    PointStatus.AMBIGUOUS: "#ffd23f",
+    PointStatus.STRAY: "#ff4d6d",
+    PointStatus.SHARED: "#7f8c99",
+    PointStatus.INCONSISTENT: "#d65db1",
+}
+OUTLINE, OUTLINE_EDGE = "#ffffff", "#1d2733"
+DOT_SIZE = 4.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriedImage:
+    """What was found in one image of a run that ended without a document.
+
+    Parameters
+    ----------
+    source
+        Name of the image.
+    remark
+        What it gave, or why it gave nothing.
+    is_used
+        False if it gave nothing.
+    target_px
+        (M, 2) target points found, in full-sensor pixels; None for none.
+    stripe_px
+        (N, 2) stripe points found; None where none were looked for.
+    """
+
+    source: str
+    remark: str
+    is_used: bool
+    target_px: FloatArray | None = None
+    stripe_px: FloatArray | None = None
+
+
+def tried_targets(
+    views: Sequence[TargetView], not_found: Sequence[tuple[str, str]], order: Sequence[str]
+) -> tuple[TriedImage, ...]:
+    """Images in which a target was looked for, in the order of their sources."""
+    tried = [
+        TriedImage(view.source, f"{len(view)} target points", True, view.points_px)
+        for view in views
+    ]
+    tried += [
+        TriedImage(source, without_source(source, reason), False) for source, reason in not_found
+    ]
+    place = {source: k for k, source in enumerate(order)}
+    return tuple(sorted(tried, key=lambda image: place[image.source]))
+
+
+def refused_page(
+    title: str,
+    images: Sequence[TriedImage],
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
+    *,
+    warnings: Sequence[str] = (),
+    is_simulated: bool,
+) -> Page:
+    """Lay out the page of a run that found no result.
+
+    Parameters
+    ----------
+    title
+        What was tried.
+    images
+        What each image gave.
+    exposures
+        The photographs by source name.
+    provenance
+        Inputs, options and command.
+    warnings
+        What is odd about the input.
+    is_simulated
+        True if the photographs were rendered.
+    """
+    n_used = sum(image.is_used for image in images)
+    return page_of(
+        replace(provenance, document_id="none was written"),
+        title,
+        f"{n_used} of {len(images)} images gave something to work with" if images else "",
+        (_tried_section(images, exposures),) if images else (),
+        warnings=warnings,
+        is_simulated=is_simulated,
+    )
+
+
+def _tried_section(images: Sequence[TriedImage], exposures: Mapping[str, Exposure]) -> Section:
+    rows = tuple((image.source, image.remark) for image in images)
+    table = Table(("image", "what it gave"), rows, "", (1,))
+    failed_first = sorted(images, key=lambda image: image.is_used)
+    shown = [image for image in failed_first if image.source in exposures][:MAX_TRIED]
+    if not shown:
+        return Section("The images", (table,))
+    kinds = (
+        (TARGET_COLOUR, "target point, the filled one is the first", [i.target_px for i in images]),
+        (STRIPE_COLOUR, "stripe point", [i.stripe_px for i in images]),
+    )
+    colours = tuple(
+        (colour, word)
+        for colour, word, points in kinds
+        if any(one is not None and len(one) for one in points)
+    )
+    text = "Images that gave nothing come first. Click a picture to enlarge it."
+    if len(shown) < len(images):
+        text += f" {len(shown)} of {len(images)} images are shown."
+    pictures = tuple(_tried_picture(image, exposures[image.source]) for image in shown)
+    return Section("The images", (table, Text(text), Legend(colours), Gallery(pictures, 300)))
+
+
+def _tried_picture(image: TriedImage, exposure: Exposure) -> Picture:
+    marks = [] if image.target_px is None else target_marks(image.target_px)
+    if image.stripe_px is not None:
+        marks.append(Marks(image.stripe_px, STRIPE_COLOUR))
+    alt = f"What was found in {image.source}"
+    is_grey = image.stripe_px is not None
+    markup = photo_markup(exposure, marks, alt, longest_px=700, is_grey=is_grey)
+    return Picture(markup, image.remark, image.source)
+
+
+def nothing_found_section(
+    title: str, reasons: Sequence[tuple[str, str]], exposures: Mapping[str, Exposure]
+) -> Section:
+    """Images that gave nothing, (source, reason), with their photographs where there are some."""
+    told = [(source, without_source(source, reason)) for source, reason in reasons]
+    pictures = tuple(
+        Picture(photo_markup(exposures[source], (), source, longest_px=500), reason, source)
+        for source, reason in told
+        if source in exposures
+    )
+    return Section(title, (Table(("image", "why"), tuple(told), "", (1,)), Gallery(pictures, 240)))
+
+
+def target_marks(
+    points_px: FloatArray, colour: str = TARGET_COLOUR, arrows_px: FloatArray | None = None
+) -> list[Marks]:
+    """Rings about (N, 2) target points, the first one filled, with (N, 2) arrows if given."""
+    marks = [Marks(points_px, colour, "ring", 15.0), Marks(points_px[:1], colour, "dot", 13.0)]
+    if arrows_px is not None:
+        ends = np.stack([points_px, points_px + arrows_px], axis=1).reshape(-1, 2)
+        marks.append(Marks(ends, ARROW_COLOUR, "line", 3.2))
+    return marks
+
+
+def stripe_gallery(
+    images: Sequence[LabelledProfile],
+    sheet_names: Sequence[str],
+    exposures: Mapping[str, Exposure],
+) -> tuple[Block, ...]:
+    """Text, legend and pictures of every stripe point, coloured by what became of it.
+
+    Parameters
+    ----------
+    images
+        Stripe points of all exposures.
+    sheet_names
+        Names of the sheets, in the order of their numbers.
+    exposures
+        Images by source name; those that are missing are not shown.
+    """
+    seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in images)}
+    fates = [(FATE_COLOURS[fate], fate.label) for fate in PointStatus if fate in seen]
+    flags = flags_of((image.profile, image.status) for image in images)
+    shown = evenly_chosen([image for image in images if image.profile.source in exposures])
+    pictures = tuple(
+        stripe_picture(
+            exposures[image.profile.source],
+            image.profile,
+            image.status,
+            image.sheet,
+            {int(fate): colour for fate, colour in FATE_COLOURS.items()},
+            caption=f"{image.count(PointStatus.MEASURED)} of {len(image.profile)} points measured",
+        )
+        for image in shown
+    )
+    text = "Every stripe point, measured or not. Dark photographs are brightened here."
+    if len(shown) < len(images):
+        text += f" {len(shown)} of {len(images)} images are shown, evenly chosen."
+    return Text(text), stripe_legend(sheet_names, fates, flags), Gallery(pictures, 420)
+
+
+def stripe_picture(
+    exposure: Exposure,
+    profile: Profile,
+    fate: IntArray,
+    sheet: IntArray,
+    fate_colours: Mapping[int, str],
+    *,
+    outline_px: FloatArray | None = None,
+    caption: str = "",
+) -> Picture:
+    """A photograph with its stripe points.
+
+    Parameters
+    ----------
+    exposure, profile
+        The image and all its stripe points.
+    fate
+        (N,) what became of each point: 0 good, 1 flagged, other values as ``fate_colours``.
+    sheet
+        (N,) index of the sheet of good points; -1 for none.
+    fate_colours
+        Colour of each fate above 1.
+    outline_px
+        (M, 2) points of the target, whose outline is drawn; None for no target.
+    caption
+        Text below.
+    """
+    points = profile.points_px
+    marks = [] if outline_px is None else _outline(outline_px)
+    for value, colour in fate_colours.items():
+        marks.append(Marks(points[fate == value], colour, "dot", DOT_SIZE))
+    is_open = fate == 1
+    for flag, (colour, _) in FLAG_COLOURS.items():
+        chosen = is_open & ((profile.flags & int(flag)) != 0)
+        marks.append(Marks(points[chosen], colour, "dot", DOT_SIZE))
+        is_open &= ~chosen
+    for index in range(int(sheet.max(initial=0)) + 1):
+        chosen = (fate == 0) & (np.maximum(sheet, 0) == index)
+        marks.append(Marks(points[chosen], sheet_colour(index), "dot", DOT_SIZE))
+    markup = photo_markup(
+        exposure, marks, f"Stripe points of {profile.source}", longest_px=1200, is_grey=True
+    )
+    return Picture(markup, caption, profile.source)
+
+
+def stripe_legend(
+    sheet_names: Sequence[str], fates: Iterable[tuple[str, str]], flags: int
+) -> Legend:
+    """Colours with their meaning: sheets, then fates (colour, label), then the flags that occur."""
+    sheets = [(sheet_colour(k), f"sheet {name}") for k, name in enumerate(sheet_names)]
+    flagged = [entry for flag, entry in FLAG_COLOURS.items() if flags & int(flag)]
+    return Legend((*sheets, *fates, *flagged))
+
+
+def flags_of(profiles: Iterable[tuple[Profile, IntArray]]) -> int:
+    """All flags of the points whose fate is 1, flagged."""
+    flags = 0
+    for profile, fate in profiles:
+        flags |= int(np.bitwise_or.reduce(profile.flags[fate == 1], initial=0))
+    return flags
+
+
+def sheet_colour(index: int) -> str:
+    """Colour of a sheet on photographs."""
+    return SHEET_COLOURS[index % len(SHEET_COLOURS)]
+
+
+def evenly_chosen(items: Sequence[T], most: int = MAX_PICTURES) -> list[T]:
+    """At most ``most`` of the items, evenly chosen."""
+    if len(items) <= most:
+        return list(items)
+    return [items[k] for k in np.linspace(0, len(items) - 1, most).astype(int)]
+
+
+def _outline(points_px: FloatArray) -> list[Marks]:
+    """A white line on a dark one, seen on bright and dark boards."""
+    hull = cv2.convexHull(points_px.astype(np.float32)).reshape(-1, 2).astype(np.float64)
+    ends = np.stack([hull, np.roll(hull, -1, axis=0)], axis=1).reshape(-1, 2)
+    return [Marks(ends, OUTLINE_EDGE, "line", 3.2), Marks(ends, OUTLINE, "line", 1.4)]

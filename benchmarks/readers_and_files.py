@@ -62,8 +62,8 @@ from armscan.storage.points import (
     read_points_or_plane,
     read_probed_points,
     read_profiles,
+    read_robot_poses,
 )
-from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import read_arm_track, read_recording
 from armscan.vision.targets.target import TargetView
 

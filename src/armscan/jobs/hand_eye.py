@@ -26,11 +26,7 @@ from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import (
-    ObservedStripes,
-    observe_stripes,
-    posed_stripes_from_profiles,
-)
+from armscan.pipeline.hand_eye import ObservedStripes, observe_stripes, posed_stripes_from_profiles
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
@@ -49,8 +45,12 @@ from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import read_sensor_calibration, scanner_document
 from armscan.storage.image_paths import are_simulated, expand_paths
-from armscan.storage.points import parse_plane, read_points_or_plane, read_profiles
-from armscan.storage.poses import read_robot_poses
+from armscan.storage.points import (
+    parse_plane,
+    read_points_or_plane,
+    read_profiles,
+    read_robot_poses,
+)
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed

@@ -23,7 +23,6 @@ from armscan.calibration.hand_eye.noise import (
     total_covariance,
 )
 from armscan.calibration.hand_eye.observations import (
-    FLATNESS_LENGTH_MM,
     CircleSection,
     PosedStripe,
 )
@@ -156,7 +155,7 @@ def hand_eye_calibration(
         condition=min(conditioning.condition, FINITE_CONDITION),
         weakest=conditioning.weakest,
         plate_flatness_mm=held.sigma_of("flatness"),
-        flatness_length_mm=0.0 if plane is None else FLATNESS_LENGTH_MM,
+        flatness_length_mm=0.0 if plane is None else held.problem.options.flatness_length_mm,
         # On a sphere the form of the stripes is always estimated; what counts is the arm.
         is_noise_estimated=is_estimated[0] if plane is None else any(is_estimated),
         left_out_rotation_deg=max(one.left_out_rotation_deg for one in postures),

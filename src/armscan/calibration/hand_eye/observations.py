@@ -224,7 +224,7 @@ def check_diameter(diameter_mm: float) -> None:
     if not 1.0 <= diameter_mm <= 1000.0:
         raise OptionError(
             f"a sphere of {diameter_mm} mm diameter",
-            where="hand-eye options",
+            where="sphere hand-eye options",
             remedy="give the diameter in mm, 1 to 1000",
         )
 

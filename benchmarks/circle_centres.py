@@ -22,12 +22,13 @@ from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
 from armscan.simulation.objects.boards import CirclePattern
-from armscan.simulation.optics.camera import RenderCamera, add_noise
+from armscan.simulation.optics.camera import RenderCamera
 from armscan.thesis.ellipse import thesis_centres
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import CircleGrid, TargetView
+from rigs.slow_renderer import add_noise
 
 TARGET = CircleGrid(13, 9, 3.75)
 DISTORTION = np.array([-0.1, 0.05, 1e-3, -5e-4, 0.0])

@@ -17,7 +17,7 @@ import numpy as np
 
 from armscan.simulation.arm.hand import HeadOrientation
 from armscan.simulation.head import Head, build_head, sheet_middle_mm
-from armscan.simulation.scenes import PLAN
+from armscan.simulation.scenes import hand_eye_plan
 
 POINTS = 21
 SCAN_POINT_MM = np.array([0.0, 0.0, 137.0])
@@ -106,10 +106,11 @@ def main() -> None:
     rng = np.random.default_rng(1)
     heads = ("plan", "turns x y z, deg", "shifts x y z, mm", "scan point, mm", "cost, mm")
     print("{:<22} {:<25} {:<25} {:<25} {}".format(*heads), "(head and draws: seed 1)")
-    show("the twin's", head, PLAN)
+    plan = tuple(hand_eye_plan(head))
+    show("the twin's", head, plan)
     for k in range(4):
-        show(f"random {k + 1}", head, tuple(drawn(rng) for _ in PLAN))
-    best, lowest = PLAN, cost(head, PLAN)
+        show(f"random {k + 1}", head, tuple(drawn(rng) for _ in plan))
+    best, lowest = plan, cost(head, plan)
     for k in range(exchanges):
         at = k % len(best)
         tilted = replace(

@@ -3,11 +3,11 @@
 
     python benchmarks/heads.py --head thesis-single --seeds 20 --preset thesis --processes 2
 
-Each seed draws another instrument, bench, hand and noise; images are rendered, calibrated from,
-measured and inspected in memory. A row a seed, then the median and the 95th percentile of each
-figure (of the 5th where more is better), beside the limit that the project demands of it. A seed
-that comes to no end counts as infinitely bad in every figure. Names are compared with the truth
-over eight instants of each scene. Everything here is simulated.
+Each seed draws another instrument, fixtures, hand and noise; images are rendered, calibrated from,
+measured and inspected, command by command. A row a seed, then the median and the 95th percentile of
+each figure (of the 5th where more is better), beside the limit that the project demands of it. A
+seed that comes to no end counts as infinitely bad in every figure. Names are compared with the
+truth over eight instants of each scene. Everything here is simulated.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import cast
 
 import cv2
 import numpy as np
 
 from armscan.devices.sources import Preset
-from armscan.pipeline.head_demo import HeadDemo, run_head
-from armscan.pipeline.simulate import TwinName
-from armscan.pipeline.truth import NamingErrors
-from armscan.report.demo import fraction_within, head_data
+from armscan.geometry.arrays import FloatArray
+from armscan.jobs.demo import DemoRequest, make_head_demo
+from armscan.pipeline.truth import HeadDemo, NamingErrors
+from armscan.report.demo import head_data
 
 HUGE = 1e30
 
@@ -44,6 +46,10 @@ class Figure:
     @property
     def failed(self) -> float:
         return math.inf if self.is_most else -math.inf
+
+
+def fraction_within(values_mm: FloatArray, limit_mm: float) -> float:
+    return float(np.mean(np.abs(values_mm) <= limit_mm))
 
 
 def plate_within(limit_mm: float) -> Callable[[HeadDemo], float]:
@@ -104,10 +110,10 @@ PLATE = (
 )
 CALIBRATION = (
     Figure("part rms um", lambda demo: 1000.0 * demo.part.rms_mm),
-    Figure("hand-eye deg", lambda demo: demo.errors.hand_eye.rotation_deg),
-    Figure("um", lambda demo: 1000.0 * demo.errors.hand_eye.translation_mm),
-    Figure("in sigmas", lambda demo: demo.errors.hand_eye.normalised),
-    Figure("sheet um", lambda demo: 1000.0 * max(s.rms_mm for s in demo.errors.sheets)),
+    Figure("hand-eye deg", lambda demo: demo.hand_eye.rotation_deg),
+    Figure("um", lambda demo: 1000.0 * demo.hand_eye.translation_mm),
+    Figure("in sigmas", lambda demo: demo.hand_eye.normalised),
+    Figure("sheet um", lambda demo: 1000.0 * max(s.rms_mm for s in demo.sheets)),
     Figure("seconds", lambda demo: sum(demo.seconds.values())),
 )
 NAMES = (
@@ -160,7 +166,9 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 def row_of(head: str, preset: str, seed: int) -> list[float]:
     # as many workers as cores: threads inside them would only wait for each other
     cv2.setNumThreads(1)
-    demo = run_head(TwinName(head, cast(Preset, preset), seed).build())
+    with TemporaryDirectory() as folder:
+        request = DemoRequest(Path(folder), head, seed, cast(Preset, preset), processes=1)
+        _, demo = make_head_demo(request, Path(folder))
     return [figure.value(demo) for figure in FIGURES[head]]
 
 

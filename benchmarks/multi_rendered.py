@@ -85,7 +85,9 @@ def true_sensor(truth: Any) -> SensorCalibration:
         )
         for name in names
     )
-    second = SecondCamera(camera(truth.right_camera_parameters), truth.right_from_sensor)
+    second = SecondCamera(
+        camera=camera(truth.right_camera_parameters), right_from_sensor=truth.right_from_sensor
+    )
     return SensorCalibration(
         camera=camera(truth.camera_parameters),
         sheets=sheets,

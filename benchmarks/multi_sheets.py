@@ -34,7 +34,7 @@ from scipy.stats import chi2
 
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.calibrate import calibrate_sheets
-from armscan.calibration.sheets.labels import SheetAssignment, name_stripes
+from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets
 from armscan.calibration.sheets.result import LaserFit, PointUse, SheetOptions
 from armscan.calibration.sheets.stripes_on_board import observe_board_stripes
 from armscan.geometry.arrays import FloatArray
@@ -67,14 +67,14 @@ def name_one(
     calibration = cameras_of(rig, rng)
     boards, truth = rig.boards(calibration, rng, dropped=dropped, n_strays=n_strays)
     cameras = HeadCameras.of(calibration)
-    images = [observe_board_stripes(board, cameras, SheetOptions()) for board in boards]
-    names = name_stripes(images, cameras.covariance, SheetOptions(n_sheets=11))
+    images = [observe_board_stripes(board, cameras) for board in boards]
+    names = assign_sheets(images, SheetOptions(n_sheets=11))
     if not isinstance(names, SheetAssignment):
         return "refused", 0, 0
     differences: list[int] = []
     n_true = n_stray = 0
     for image, row, sheets in zip(images, truth, names.sheets, strict=True):
-        for sighting, k in zip(image.sightings, sheets, strict=True):
+        for sighting, k in zip(image.stripes, sheets, strict=True):
             true = row[int(np.bincount(image.data.profile.segment[sighting.rows]).argmax())]
             n_true += true >= 0
             if k >= 0 and true >= 0:

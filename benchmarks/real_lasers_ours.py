@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from laser_sets import SETS
 
-import armscan.jobs.sheets
 import armscan.pipeline.laser
+from armscan.calibration.sheets.result import LaserFit
 from armscan.cli.run import main
 from armscan.geometry.estimate import FitFailure
 from armscan.storage.documents import sensor_document
@@ -36,8 +36,8 @@ class Kept:
 
     def listen(self) -> None:
         """Note the arguments of the estimator and of the document."""
-        pipeline, job = armscan.pipeline.laser, armscan.jobs.sheets
-        self.estimate, self.document = pipeline.calibrate_sheets, job.sensor_calibration
+        pipeline = armscan.pipeline.laser
+        self.estimate, self.document = pipeline.calibrate_sheets, LaserFit.to_calibration
 
         def estimate(*arguments: Any, **options: Any) -> Any:
             self.calls.append((arguments, options))
@@ -47,7 +47,8 @@ class Kept:
             self.documents.append((fit, provenance))
             return self.document(fit, provenance, *rest)
 
-        pipeline.calibrate_sheets, job.sensor_calibration = estimate, document
+        pipeline.calibrate_sheets = estimate
+        LaserFit.to_calibration = document  # type: ignore[method-assign]
 
 
 def run(result: dict[str, Any], name: str, *arguments: str) -> bool:

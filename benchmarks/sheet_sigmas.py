@@ -90,8 +90,15 @@ def view_of(made: Instrument, source: str, target: Target, rng: np.random.Genera
     q = camera.project(target.pattern.marks_board_mm @ pose.rotation.T + pose.translation_mm)
     q = q + rng.normal(0.0, CIRCLE_PX, q.shape)
     covariance = np.tile(CIRCLE_PX**2 * np.eye(2), (len(q), 1, 1))
-    size = (camera.width_px, camera.height_px)
-    return TargetView(source, *size, np.arange(len(q)), q, covariance, PATTERN.marks_board_mm)
+    return TargetView(
+        source=source,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        point_index=np.arange(len(q)),
+        points_px=q,
+        covariance_px2=covariance,
+        points_board_mm=PATTERN.marks_board_mm,
+    )
 
 
 def stripe_of(

@@ -24,7 +24,9 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_image import (
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.stripe.image import StripeMethod, StripeOptions
+from rigs.stripe_image import (
     CircleCurve,
     SimulatedStripe,
     StraightCurve,
@@ -32,8 +34,6 @@ from armscan.simulation.stripe_image import (
     StripeScene,
     WaveCurve,
 )
-from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import StripeMethod, StripeOptions
 
 METHODS: tuple[StripeMethod, ...] = get_args(StripeMethod)
 FALSE_PX = 1.0

@@ -18,10 +18,10 @@ import numpy as np
 
 from armscan.kernels.ridge import gaussian_taps
 from armscan.records.exposure import Exposure
-from armscan.simulation.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import find_candidates, measure_level, trace_ridges
+from rigs.stripe_image import SimulatedStripe, StripeScene, WaveCurve
 
 SIGMA_PX = 3.0
 

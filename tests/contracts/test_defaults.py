@@ -18,7 +18,7 @@ from armscan.calibration.hand_eye.probed_plate import ProbingOptions
 from armscan.calibration.sheets.result import SheetOptions
 from armscan.cli.app import command
 from armscan.inspection.selection import InspectionOptions, StepOptions
-from armscan.jobs.demo import HeadDemoRequest
+from armscan.jobs.demo import DemoRequest
 from armscan.jobs.hand_eye import HandEyeRequest
 from armscan.markers.alignments import MarkerMatchOptions
 from armscan.markers.candidates import RingMatchOptions
@@ -98,8 +98,8 @@ EXPECTED: dict[tuple[str, ...], dict[str, Any]] = {
         **STRIPES,
     },
     ("demo",): {
-        "seed": default_of(HeadDemoRequest, "seed"),
-        "preset": default_of(HeadDemoRequest, "preset"),
+        "seed": default_of(DemoRequest, "seed"),
+        "preset": default_of(DemoRequest, "preset"),
     },
     ("reconstruct",): {"sheet": MeasureOptions().sheet, **STRIPES, **IMAGES},
 }

@@ -25,7 +25,7 @@ CAMERA_TILTS = (
 )  # fmt: skip
 LASER_PLACES = ((10, -10, 122.0), (-22, 18, 150.0), (25, 20, 178.0), (-12, -20, 160.0))
 MULTI_PLACES = ((8, -8, 135.0), (-20, 12, 150.0), (22, 14, 160.0), (4, 22, 145.0))
-POSTURES = (
+POSTURES: tuple[tuple[float, float, float], ...] = (
     (0, 0, 150.0), (30, 5, 140.0), (-30, -5, 160.0), (5, 30, 165.0), (-5, -30, 138.0),
     (25, 22, 145.0), (-22, 25, 158.0), (12, -28, 152.0), (-26, -18, 148.0), (18, 12, 162.0),
 )  # fmt: skip
@@ -201,8 +201,8 @@ def draw_ball(folder: Path, random: np.random.Generator, *, is_at_rest: bool) ->
     else:
         for k in range(14):
             a, b, turn = ((6.0, -9.0, 0.2), (-12.0, 8.0, 1.3))[k // 7]
-            x = 8.4 - 2.8 * (k % 7)
-            plan.append((turn, a, b, np.array([x, 0.4, 148.0]), np.array([-28.0, 0, 0]), k))
+            centre = np.array([8.4 - 2.8 * (k % 7), 0.4, 148.0])
+            plan.append((turn, a, b, centre, np.array([-28.0, 0, 0]), k))
     down = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
     for k, (turn, a, b, centre, velocity, view) in enumerate(plan):
         base_from_sensor = cv2.Rodrigues(turn * np.array([0, 0, 1.0]))[0] @ down @ euler(a, b).T
@@ -291,8 +291,8 @@ def write_tables(folder: Path, random: np.random.Generator) -> None:
         seen += 0.01 * random.normal(size=seen.shape)
         table(folder / f"view{k + 1}.csv", seen, ",", "x_mm,y_mm,z_mm\n")
         table(folder / f"view{k + 1}.xyz", seen + np.array([0, 0, 1.0]), " ")
-    for name, turn, shift in (("before", 0.0, 0.0), ("after", 0.7, 250.0)):
-        seen = markers @ cv2.Rodrigues(np.array([0.05, 0.0, 1.0]) * turn)[0].T + [shift, 0, 0]
+    for name, angle, shift in (("before", 0.0, 0.0), ("after", 0.7, 250.0)):
+        seen = markers @ cv2.Rodrigues(np.array([0.05, 0.0, 1.0]) * angle)[0].T + [shift, 0, 0]
         seen = seen + 0.01 * random.normal(size=seen.shape)
         table(folder / f"{name}.csv", seen, ",", "x_mm,y_mm,z_mm,id\n", has_ids=True)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from hypothesis import HealthCheck, given, settings
@@ -35,8 +35,8 @@ ROTATION_TOLERANCE = 1e-14
 
 words = st.text(st.characters(categories=("L", "N"), include_characters='",; '), min_size=1)
 names = words.map(str.strip).filter(bool)
-forms = st.sampled_from(PoseForm.__args__)
-conventions = st.sampled_from(EulerConvention.__args__)
+forms = st.sampled_from(get_args(PoseForm))
+conventions = st.sampled_from(get_args(EulerConvention))
 
 
 @st.composite

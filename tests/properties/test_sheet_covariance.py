@@ -36,7 +36,7 @@ def test_normalised_errors_of_sheet_and_camera_over_200_runs() -> None:
         covariance = fit.covariance[:12, :12]
         sheet_squares.append(error @ np.linalg.solve(covariance[9:, 9:], error))
         joint_squares.append(normalised_square(np.append(camera_error, error), covariance))
-        p_values.append(fit.sheets[0].plane_test.p_value)
+        p_values.append(fit.sheets[0].diagnostics.plane_test.p_value)
     assert int((np.array(sheet_squares) < chi2.ppf(0.95, 3)).sum()) in INSIDE_95
     assert int((np.array(joint_squares) < chi2.ppf(0.95, 12)).sum()) in INSIDE_95
     # Mean of chi2 with 12 degrees over 200 runs: 12 +- 4 * sqrt(24 / 200).

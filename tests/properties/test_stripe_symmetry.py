@@ -7,8 +7,8 @@ import pytest
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
+from rigs.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 
 ANGLES_DEG = (8.0, 37.0, 71.0, 102.0)
 SAME_PX = 0.03

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
-from armscan.simulation.optics.camera import add_noise
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
+from rigs.flat_prints import ChessboardPattern
+from rigs.slow_renderer import add_noise
 from rigs.target_scenes import render
 
 CIRCLES = CircleGrid(5, 3, 3.75, is_asymmetric=True)

@@ -80,7 +80,11 @@ def camera_calibration() -> CameraCalibration:
             condition=1e3 / 7,
             noise_scale=1.1,
             covered_fraction=2 / 3,
-            board=WarpedBoard((0.1 / 3, -0.2), (1e-3, 2e-3), FTest(17.3, 2, 1e-8 / 3)),
+            board=WarpedBoard(
+                (0.1 / 3, -0.2),
+                (1e-3, 2e-3),
+                FTest(f_ratio=17.3, degrees_of_freedom=2, p_value=1e-8 / 3),
+            ),
         ),
     )
 
@@ -103,8 +107,8 @@ def sensor_calibration() -> SensorCalibration:
             is_redundant=True,
             diagnostics=SheetDiagnostics(
                 rms_px=0.1 / 3,
-                plane_test=FTest(9.1, 14, 1e-9),
-                final_test=FTest(1.1, 12, 1 / 3),
+                plane_test=FTest(f_ratio=9.1, degrees_of_freedom=14, p_value=1e-9),
+                final_test=FTest(f_ratio=1.1, degrees_of_freedom=12, p_value=1 / 3),
                 bow_decision="it pays",
                 coplanarity_mm=0.01,
                 coplanarity_sigma_mm=0.02,
@@ -129,7 +133,9 @@ def stereo_sensor_calibration() -> SensorCalibration:
     first = sensor_calibration()
     axes = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]]) / 3
     pose: Pose[CameraRight, Sensor] = Pose(axes, np.array([-117.4, 1 / 3, 63.2]))
-    second = SecondCamera(replace(camera_calibration(), rms_px=1 / 9), pose)
+    second = SecondCamera(
+        camera=replace(camera_calibration(), rms_px=1 / 9), right_from_sensor=pose
+    )
     return replace(first, second=second, covariance=covariance(40, 5))
 
 

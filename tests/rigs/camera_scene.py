@@ -76,13 +76,13 @@ def view_of(
     inside = np.flatnonzero(scene.camera.is_inside(pixels))
     m = len(inside)
     return TargetView(
-        source,
-        scene.camera.width_px,
-        scene.camera.height_px,
-        inside,
-        pixels[inside] + scene.noise_px * rng.normal(size=(m, 2)),
-        np.tile(max(scene.noise_px, 1e-3) ** 2 * np.eye(2), (m, 1, 1)),
-        scene.target.points_board_mm[inside],
+        source=source,
+        width_px=scene.camera.width_px,
+        height_px=scene.camera.height_px,
+        point_index=inside,
+        points_px=pixels[inside] + scene.noise_px * rng.normal(size=(m, 2)),
+        covariance_px2=np.tile(max(scene.noise_px, 1e-3) ** 2 * np.eye(2), (m, 1, 1)),
+        points_board_mm=scene.target.points_board_mm[inside],
     )
 
 

@@ -101,8 +101,15 @@ class SheetRig:
         q = project(self.camera, self.poses[index], board)
         q = q + rng.normal(0.0, self.sigma_corner_px, q.shape)
         covariance = np.tile(self.sigma_corner_px**2 * np.eye(2), (len(q), 1, 1))
-        size = (self.camera.width_px, self.camera.height_px)
-        return TargetView(f"board-{index}.png", *size, np.arange(len(q)), q, covariance, board)
+        return TargetView(
+            source=f"board-{index}.png",
+            width_px=self.camera.width_px,
+            height_px=self.camera.height_px,
+            point_index=np.arange(len(q)),
+            points_px=q,
+            covariance_px2=covariance,
+            points_board_mm=board,
+        )
 
     def stripe(
         self, index: int, sheet: SheetTruth, rng: np.random.Generator

@@ -238,7 +238,9 @@ class StereoHead:
             for k, (laser, sheet) in enumerate(zip(self.lasers, self.sheets, strict=True))
         )
         cov = self.covariance
-        second = SecondCamera(_document(right, cov[n - 15 : n - 6, n - 15 : n - 6]), moved)
+        second = SecondCamera(
+            camera=_document(right, cov[n - 15 : n - 6, n - 15 : n - 6]), right_from_sensor=moved
+        )
         return SensorCalibration(
             camera=_document(left, cov[:9, :9]),
             sheets=sheets,

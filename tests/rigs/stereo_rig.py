@@ -86,13 +86,13 @@ def view_in(
     inside = np.flatnonzero(camera.is_inside(pixels))
     m = len(inside)
     return TargetView(
-        source,
-        camera.width_px,
-        camera.height_px,
-        inside,
-        pixels[inside] + noise_px * rng.normal(size=(m, 2)),
-        np.tile(scene.claimed_px**2 * np.eye(2), (m, 1, 1)),
-        scene.target.points_board_mm[inside],
+        source=source,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        point_index=inside,
+        points_px=pixels[inside] + noise_px * rng.normal(size=(m, 2)),
+        covariance_px2=np.tile(scene.claimed_px**2 * np.eye(2), (m, 1, 1)),
+        points_board_mm=scene.target.points_board_mm[inside],
         is_ambiguous=scene.is_ambiguous,
     )
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.profile import Profile
-from armscan.simulation.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
+from rigs.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 
 FALSE_PX = 1.0
 """A third of the line's sigma: no noise of these scenes reaches it."""

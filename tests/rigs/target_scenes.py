@@ -12,8 +12,10 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
-from armscan.simulation.objects.boards import ChessboardPattern, FlatPattern
-from armscan.simulation.optics.camera import RenderCamera, add_noise
+from armscan.simulation.objects.boards import FlatPattern
+from armscan.simulation.optics.camera import RenderCamera
+from rigs.flat_prints import ChessboardPattern
+from rigs.slow_renderer import add_noise
 
 NOISE = 2.0
 DISTORTION = (-0.1, 0.05, 1e-3, -5e-4, 0.0)

@@ -136,13 +136,13 @@ def test_boards_of_a_laser_calibration_are_left_out_with_their_partners(
 ) -> None:
     words = ["calibrate", "laser", "--camera", calibrated.camera, "--on", calibrated.on]
     words += ["--off", calibrated.off, "--target", TARGET, "-o", tmp_path / "s.json", "--json"]
-    words = [str(word) for word in [*words, "--plane-only"]]
-    assert main([*words, "--leave-out", "off/place1.png"]) == 0
+    typed = [str(word) for word in [*words, "--plane-only"]]
+    assert main([*typed, "--leave-out", "off/place1.png"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["sheets"][0]["n_boards"] == 2
     assert [item["source"] for item in found["skipped"]] == ["on/place1.png"]
     assert "by request" in found["skipped"][0]["reason"]
-    assert "nosuch" in fails(*words, "--force", "--leave-out", "nosuch", writes=tmp_path)
+    assert "nosuch" in fails(*typed, "--force", "--leave-out", "nosuch", writes=tmp_path)
 
 
 def scan_of(bench: Bench, folder: Path, cameras: int = 1) -> Path:

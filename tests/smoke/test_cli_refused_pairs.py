@@ -47,8 +47,8 @@ def test_pixels_of_a_recording_are_described_by_it_alone(tmp_path: Path, fails: 
     words = ("calibrate", "laser", "--camera", camera, "--scan", scan, *TARGET)
     said = fails(*words, *bits, "-o", tmp_path / "sensor.json", writes=tmp_path)
     assert "a recording says itself how its pixels are stored" in said
-    words = ("reconstruct", scan, "--sensor", camera, *bits, "-o", tmp_path / "cloud.ply")
-    assert "a recording says itself how its pixels are stored" in fails(*words, writes=tmp_path)
+    other = ("reconstruct", scan, "--sensor", camera, *bits, "-o", tmp_path / "cloud.ply")
+    assert "a recording says itself how its pixels are stored" in fails(*other, writes=tmp_path)
 
 
 def test_a_single_camera_that_is_not_camera_0_is_said(tmp_path: Path, fails: Fails) -> None:

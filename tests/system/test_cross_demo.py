@@ -11,26 +11,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armscan.jobs.demo import HeadDemoRequest, run_head_demo
-from armscan.pipeline.head_demo import HeadOptions
+from armscan.devices.sources import TwinScene
+from armscan.jobs.demo import DemoRequest, run_head_demo
 from armscan.pipeline.scan import ScanOptions, measure_scan
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.recording import read_recording
 
 HEAD = "thesis-cross"
-FEW = HeadOptions(
-    {
-        "camera": 6,
-        "laser": 5,
-        "hand-eye": 6,
-        "plate": 5,
-        "ball": 4,
-        "steps": 6,
-        "part": 3,
-        "waves": 5,
-    }
-)
+FEW: dict[TwinScene, int] = {
+    "camera": 6,
+    "laser": 5,
+    "hand-eye": 6,
+    "plate": 5,
+    "ball": 4,
+    "steps": 6,
+    "part": 3,
+    "waves": 5,
+}
 """Views of the calibrations; of the scans, exposures of each stroke."""
 
 
@@ -43,7 +41,7 @@ class Done:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
     folder = tmp_path_factory.mktemp("cross") / "demo"
-    run_head_demo(HeadDemoRequest(folder, HEAD, seed=3, options=FEW, processes=1))
+    run_head_demo(DemoRequest(folder, HEAD, seed=3, most_views=FEW, processes=1))
     content = json.loads((folder / "summary.json").read_text("utf-8"))
     return Done(folder, content["heads"][HEAD])
 

@@ -16,16 +16,22 @@ from typing import Any
 import pytest
 
 from armscan.cli.run import main
-from armscan.jobs.demo import DOCUMENTS, RECORDINGS, RESULTS, TRUTH, HeadDemoRequest, run_head_demo
-from armscan.pipeline.head_demo import HeadOptions
+from armscan.devices.sources import TwinScene
+from armscan.jobs.demo import FILES, RECORDINGS, TRUTH, DemoRequest, run_head_demo
 from armscan.report.quantity import Summary
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.recording import read_recording
 
-FEW = HeadOptions(
-    {"camera": 4, "laser": 4, "hand-eye": 7, "plate": 2, "ball": 8, "steps": 4, "part": 2}
-)
+FEW: dict[TwinScene, int] = {
+    "camera": 4,
+    "laser": 4,
+    "hand-eye": 7,
+    "plate": 2,
+    "ball": 8,
+    "steps": 4,
+    "part": 2,
+}
 HEAD = "thesis-single"
 TUTORIAL = Path(__file__).parents[2] / "docs/tutorials/02-hand-eye-on-real-robot-data.md"
 CHI_6_IN_999 = math.sqrt(22.46)
@@ -42,7 +48,7 @@ class Done:
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
     folder = tmp_path_factory.mktemp("single") / "demo"
-    summary = run_head_demo(HeadDemoRequest(folder, HEAD, seed=3, options=FEW, processes=1))
+    summary = run_head_demo(DemoRequest(folder, HEAD, seed=3, most_views=FEW, processes=1))
     content = json.loads((folder / "summary.json").read_text("utf-8"))
     return Done(folder, summary, content["heads"][HEAD])
 
@@ -51,8 +57,10 @@ def test_everything_is_written_and_nothing_else(demo: Done) -> None:
     assert {path.name for path in demo.folder.iterdir()} == {
         RECORDINGS,
         TRUTH,
-        *DOCUMENTS,
-        *RESULTS,
+        FILES,
+        *(f"{name}.{end}" for name in ("camera", "sensor") for end in ("json", "npz", "html")),
+        *("plate.csv", "scanner.json", "scanner.html"),
+        *("cloud.ply", "report.html", "summary.json"),
     }
     scanner = read_scanner_calibration(demo.folder / "scanner.json")
     assert scanner.provenance.parent_ids == (scanner.sensor.provenance.document_id,)
@@ -166,7 +174,8 @@ def test_the_page_shows_the_chain_and_says_that_it_is_simulated(demo: Done) -> N
     assert "simulated data" in page
     for scene in ("camera", "hand-eye", "still-step"):
         assert f'<p class="figure-title">{scene}</p>' in page
-    assert page.count("<canvas") == 3
+    assert page.count("<canvas") == 2
+    assert "<canvas" in (demo.folder / "scanner.html").read_text("utf-8")
     for part in (demo.head["plate"], demo.head["sphere"], demo.head["part"]):
         assert f"measured, {part['n_beyond_1mm']:,} beyond 1 mm" in page
     for word in ("5.12", "5.14", "5.19", "97.9 %", "armscan calibrate hand-eye"):

@@ -14,7 +14,8 @@ from armscan.errors import EstimationError, OptionError
 from armscan.jobs.sheets import LaserRequest, run_laser_calibration
 from armscan.models.calibration import CameraCalibration, Provenance, SensorCalibration
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
-from armscan.pipeline.laser import calibrate_sheets_from_exposures
+from armscan.pipeline.instants import pair_exposures
+from armscan.pipeline.laser import calibrate_sheets_from_pairs
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.reconstruct import reconstruct
 from armscan.reconstruction.label_single import DepthRange
@@ -60,12 +61,11 @@ def laser() -> LaserFit:
         provenance=NO_PROVENANCE,
     )
     folder = DATA / "laser_pattern"
-    found = calibrate_sheets_from_exposures(
+    pairs = pair_exposures(
         [read_exposure(folder / f"laser-{name}.png") for name in PLACEMENTS],
-        BOARD,
-        camera,
-        backgrounds=[read_exposure(folder / f"laser-background-{name}.png") for name in PLACEMENTS],
+        [read_exposure(folder / f"laser-background-{name}.png") for name in PLACEMENTS],
     )
+    found = calibrate_sheets_from_pairs(pairs, BOARD, camera)
     assert isinstance(found, LaserFit), found
     return found
 
@@ -80,9 +80,9 @@ def test_both_sheets_fit_their_two_boards(laser: LaserFit) -> None:
     for sheet in laser.sheets:
         assert sheet.calibration.n_boards == 2
         assert sheet.calibration.n_points > 300
-        assert sheet.rms_px < STRIPE_PX
-        assert sheet.coplanarity_mm < 3.0 * sheet.coplanarity_sigma_mm
-        assert 15.0 < sheet.board_angle_deg < 30.0
+        assert sheet.diagnostics.rms_px < STRIPE_PX
+        assert sheet.diagnostics.coplanarity_mm < 3.0 * sheet.diagnostics.coplanarity_sigma_mm
+        assert 15.0 < sheet.diagnostics.board_angle_deg < 30.0
         assert not sheet.calibration.is_redundant
         assert any("two boards only" in warning for warning in sheet.warnings)
         assert sheet.tilt_sigma_deg < 1.5

@@ -3,6 +3,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.skipif(
     reason="test data not found: set ARMSCAN_DATA to the folder that holds ciclop",
 )
 # (y, x) knots of the two laser lines on the board, read off the photographs by eye, +-2 px
-BOARDS = {
+BOARDS: dict[str, Any] = {
     "8": {"top": 470, "bottom": 1000, "lines": ((276, 273), (597, 588)), "lean": 4.0},
     "8-x": {"top": 475, "bottom": 990, "lines": ((316, 314), (645, 632)), "lean": 4.0},
 }

@@ -30,7 +30,7 @@ def demo(
         typer.Argument(
             help="single, cross, multi: a scanner of one, two crossed or eleven lines on a "
             "measuring arm, with plate, ball, blocks and part; all: the three beside each other; "
-            "photos: a camera, a line laser, a board and a bust."
+            "photos: photographs as a laboratory without an arm has them."
         ),
     ] = Scene.SINGLE,
     output: Annotated[
@@ -44,22 +44,16 @@ def demo(
 ) -> None:
     """Render images, calibrate from them, measure things, and state the errors."""
     from armscan.devices.sources import Preset
-    from armscan.jobs.demo import (
-        DemoRequest,
-        HeadDemoRequest,
-        run_head_demo,
-        run_photo_demo,
-        run_three_heads,
-    )
+    from armscan.jobs.demo import DemoRequest, run_all_heads, run_head_demo, run_photo_demo
 
+    is_head = scene not in (Scene.ALL, Scene.PHOTOS)
+    head = f"thesis-{scene.value}" if is_head else "thesis-single"
+    request = DemoRequest(output, head, seed, cast(Preset, preset))
     with progress_bar() as progress:
         if scene is Scene.PHOTOS:
-            summary = run_photo_demo(DemoRequest(output, seed), progress)
+            summary = run_photo_demo(request, progress)
         elif scene is Scene.ALL:
-            request = HeadDemoRequest(output, seed=seed, preset=cast(Preset, preset))
-            summary = run_three_heads(request, progress)
+            summary = run_all_heads(request, progress)
         else:
-            head = f"thesis-{scene.value}"
-            request = HeadDemoRequest(output, head, seed, cast(Preset, preset))
             summary = run_head_demo(request, progress)
     show(summary, as_json=as_json)

@@ -34,6 +34,7 @@ class Scene(StrEnum):
     MARKERS = "markers"
     MARKERS_MOVED = "markers-moved"
     PROBING = "probing"
+    STILL_PART = "still-part"
 
 
 class PresetName(StrEnum):

@@ -52,6 +52,7 @@ TwinScene = Literal[
     "markers",
     "markers-moved",
     "probing",
+    "still-part",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
 
@@ -130,6 +131,9 @@ class SimulatedScan(ScanSource, Protocol):
 
     def true_stripes(self, row: int) -> Sequence[TrueStripe]:
         """The stripes of all lasers of the head in the exposure of a row, on or off."""
+
+    def true_pose(self, row: int) -> Pose[Base, Sensor]:
+        """Where the head truly is in the middle of an exposure."""
 
     def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
         """The exposure of a row with other lasers on than its row says, as a live rig takes it."""

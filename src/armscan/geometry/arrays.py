@@ -234,6 +234,16 @@ class RowRecord(ArrayRecord):
         return dataclasses.replace(self, **chosen)
 
     @classmethod
+    def empty(cls, **others: Any) -> Self:
+        """No rows; ``others`` are the fields that do not count rows."""
+        rows: dict[str, Any] = {}
+        for name, column in cls._columns.items():
+            if column.shape[:1] == (ROWS,) and name not in others:
+                shape = (0, *(n if isinstance(n, int) else 0 for n in column.shape[1:]))
+                rows[name] = () if column.dtype is None else np.zeros(shape, column.dtype)
+        return cls(**rows, **others)
+
+    @classmethod
     def concat(cls, parts: Sequence[Self], **changes: Any) -> Self:
         """The rows of all ``parts``, in turn.
 

@@ -12,6 +12,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import ArrayRecord, FloatArray, floats
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 
 class Estimate(ArrayRecord, Generic[T]):
@@ -49,6 +50,17 @@ class Estimate(ArrayRecord, Generic[T]):
         residuals = np.array(self.residuals, dtype=np.float64)
         residuals.setflags(write=False)
         object.__setattr__(self, "residuals", residuals)
+
+    def of(self, value: U) -> Estimate[U]:
+        """The same evidence for a value in another form."""
+        return Estimate(
+            value=value,
+            parameter_names=self.parameter_names,
+            covariance=self.covariance,
+            residuals=self.residuals,
+            degrees_of_freedom=self.degrees_of_freedom,
+            chi2=self.chi2,
+        )
 
     @property
     def sigma(self) -> FloatArray:

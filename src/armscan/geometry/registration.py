@@ -13,7 +13,6 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, RowRecord, floats
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Frame, Pose
-from armscan.geometry.rotations import rotation_from_vector, skew
 
 A = TypeVar("A", bound=Frame)
 B = TypeVar("B", bound=Frame)
@@ -131,10 +130,7 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
         weighted = np.einsum("nji,njk->nik", jacobian, weights)
         normal = np.einsum("nij,njk->ik", weighted, jacobian)
         step = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residuals))
-        pose = Pose(
-            rotation_from_vector(step[:3]) @ pose.rotation,
-            pose.translation_mm + step[3:],
-        )
+        pose = pose.retract(step)
         if float(step @ normal @ step) < SETTLED:
             break
     residuals, jacobian, weights = _linearised(pairs, pose)
@@ -183,11 +179,8 @@ def carried_covariance_mm2(
 
     ``covariance`` is (6, 6) in the order of `REGISTRATION_PARAMETERS`.
     """
-    turned = points_b_mm @ a_from_b.rotation.T
-    jacobian = np.concatenate(
-        [-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2
-    )
-    own = a_from_b.rotation @ covariance_b_mm2 @ a_from_b.rotation.T
+    jacobian = a_from_b.jacobian(points_b_mm)
+    own = a_from_b.rotate_covariance(covariance_b_mm2)
     return np.asarray(own + jacobian @ covariance @ np.swapaxes(jacobian, 1, 2))
 
 
@@ -221,15 +214,11 @@ def _degenerate(pairs: PointPairs) -> FitFailure | None:
 
 def _linearised(pairs: PointPairs, pose: Pose[A, B]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Residuals (N, 3), derivative of the carried point (N, 3, 6), weights (N, 3, 3)."""
-    turned = pairs.points_b_mm @ pose.rotation.T
-    residuals = pairs.points_a_mm - turned - pose.translation_mm
-    jacobian = np.concatenate(
-        [-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2
-    )
-    total = pairs.covariance_a_mm2 + pose.rotation @ pairs.covariance_b_mm2 @ pose.rotation.T
+    residuals = pairs.points_a_mm - pose.apply(pairs.points_b_mm)
+    total = pairs.covariance_a_mm2 + pose.rotate_covariance(pairs.covariance_b_mm2)
     if float(np.linalg.eigvalsh(total).min()) <= 0.0:
         raise _no_covariance()
-    return residuals, jacobian, np.asarray(np.linalg.inv(total), dtype=np.float64)
+    return residuals, pose.jacobian(pairs.points_b_mm), np.asarray(np.linalg.inv(total))
 
 
 def _no_covariance() -> InputError:

@@ -1,330 +1,93 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demos: heads of the twin and rendered photographs through the whole chain, with one page
-each.
-"""
+"""The demos: the twin's scenes recorded, the commands run on them, and a page with the truth."""
 
 from __future__ import annotations
 
-import re
 import shutil
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
 from uuid import uuid4
 
-from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
-from armscan.errors import OptionError, OutputError
+import numpy as np
+
+from armscan.calibration.hand_eye.observations import PlateReference
+from armscan.devices.sources import Preset, Twin, TwinScene
+from armscan.errors import EstimationError, OptionError, OutputError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.plane import inspect_plane
+from armscan.inspection.results import StepInspection
+from armscan.inspection.sphere import inspect_sphere
+from armscan.inspection.step import inspect_step
 from armscan.jobs.camera import CameraRequest, run_camera_calibration
+from armscan.jobs.hand_eye import HandEyeRequest, run_hand_eye_calibration
+from armscan.jobs.inspect import read_plate
+from armscan.jobs.probe import ProbeRequest, run_probing
 from armscan.jobs.reconstruct import CloudRequest, run_reconstruction
 from armscan.jobs.sheets import LaserRequest, run_laser_calibration
-from armscan.models.calibration import CameraCalibration, Provenance, ScannerCalibration
-from armscan.models.two_views import StereoCalibration
-from armscan.pipeline.head_demo import (
-    ONE_SHEET_SCENES,
-    STILL_MARGIN,
-    HeadDemo,
-    HeadOptions,
-    RecordedScans,
-    run_head,
-)
-from armscan.pipeline.photo_demo import PhotoErrors, compare_with_truth, render_photos
+from armscan.jobs.stereo import StereoRequest, run_stereo_calibration
+from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.pipeline.adaptive_scan import record_adaptively
+from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.simulate import TwinName
-from armscan.records.exposure import Exposure
+from armscan.pipeline.reconstruct import reconstruct
+from armscan.pipeline.scan import ScanReconstruction, measure_scan
+from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
+from armscan.pipeline.truth import (
+    HeadDemo,
+    NamingErrors,
+    calibration_errors,
+    hand_eye_errors,
+    naming_errors,
+    part_errors,
+    true_names,
+)
+from armscan.reconstruction.label_single import DepthRange
+from armscan.reconstruction.sync import exposure_poses
+from armscan.records.cloud import PointCloud
 from armscan.report.demo import (
+    FRACTION_RULE,
+    KINDS,
     comparison_table,
-    demo_data,
+    head_data,
     head_demo_page,
+    heads_page,
     naming_table,
     truth_table,
-)
-from armscan.report.demo_comparison import (
-    HeadPicture,
-    head_picture,
-    kind,
-    three_heads_page,
-    three_heads_table,
 )
 from armscan.report.page import footer, render_page
 from armscan.report.quantity import Summary, Table, sentence, significant, summary_json, with_sigma
 from armscan.storage.clouds import ply_bytes, read_ply
 from armscan.storage.documents import (
-    camera_document,
     new_provenance,
+    read_scanner_calibration,
     read_sensor_calibration,
-    scanner_document,
-    sensor_document,
-    stereo_document,
 )
 from armscan.storage.files import write_files
-from armscan.storage.image_paths import are_simulated
-from armscan.storage.recording import FolderRecording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recording import FolderRecording, read_recording
 
-TEMPORARY = re.compile(r"(?<![^/])\.([^/]+)\.[0-9a-f]{32}\.part(?![^/])")
-"""Name of a file or folder that was not complete when its writer was killed."""
+Result = TypeVar("Result")
 
-
-def check_demo_folder(folder: Path, own_names: Collection[str], mark: Path) -> None:
-    """Refuse to write between files that are not an earlier demo's.
-
-    Parameters
-    ----------
-    folder
-        Where the demo goes; need not exist.
-    own_names
-        What the demo writes.
-    mark
-        A file of an earlier demo that lies beside the simulator's mark, or below it.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds something else.
-    """
-    found = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
-    is_demo = are_simulated((mark,))
-    _refuse(folder, [name for name in found if not is_demo or name not in own_names])
-
-
-@contextmanager
-def replaced_demo(folder: Path, own_files: re.Pattern[str]) -> Iterator[Path]:
-    """Give a folder of another name to write a demo into; it gets its name when all is written.
-
-    Until then an earlier demo stays as it is, also if the block raises or is interrupted. What a
-    killed run left beside the folder is removed first; so no two demos may be written to one
-    folder at a time.
-
-    Parameters
-    ----------
-    folder
-        Where the demo goes; made if need be.
-    own_files
-        Paths, with ``/``, of all files that a demo may hold; ``truth.json`` is its mark.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds anything else, now or at the end, or cannot be written.
-    """
-    target = folder.resolve()
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _clean_up(target, own_files)
-        _check_files(folder, own_files)
-        partial = _beside(target, "part")
-        partial.mkdir()
-        try:
-            yield partial
-            _check_files(folder, own_files)
-            _swap(partial, target)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(
-            f"the demo cannot be written ({error.strerror or error})",
-            where=str(folder),
-            remedy="free some space or choose another folder",
-        ) from error
-
-
-def _beside(target: Path, ending: str) -> Path:
-    return target.with_name(f".{target.name}.{uuid4().hex}.{ending}")
-
-
-def _swap(partial: Path, target: Path) -> None:
-    """Two renames; the earlier demo is removed after them."""
-    if not target.exists():
-        partial.rename(target)
-        return
-    old = _beside(target, "old")
-    target.rename(old)
-    try:
-        partial.rename(target)
-    except BaseException:
-        old.rename(target)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _clean_up(target: Path, own_files: re.Pattern[str]) -> None:
-    """Bring back the demo of a run that was killed between its renames; remove all that is left."""
-    pattern = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{32}}\.(part|old)")
-    left = [path for path in sorted(target.parent.iterdir()) if pattern.fullmatch(path.name)]
-    for path in left:
-        if path.suffix == ".old" and not target.exists():
-            path.rename(target)
-        elif not _foreign(path, own_files):
-            shutil.rmtree(path)
-
-
-def _check_files(folder: Path, own_files: re.Pattern[str]) -> None:
-    found = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    if found and not are_simulated((folder / "truth.json",)):
-        _refuse(folder, found)
-    _refuse(folder, _foreign(folder, own_files))
-
-
-def _foreign(folder: Path, own_files: re.Pattern[str]) -> list[str]:
-    """Files and links, as paths in the folder, that no demo writes."""
-    if not folder.is_dir():
-        return []
-    files = [p for p in sorted(folder.rglob("*")) if p.is_symlink() or not p.is_dir()]
-    names = [path.relative_to(folder).as_posix() for path in files]
-    return [name for name in names if not own_files.fullmatch(TEMPORARY.sub(r"\1", name))]
-
-
-def _refuse(folder: Path, foreign: list[str]) -> None:
-    if foreign:
-        raise OutputError(
-            f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
-            where=str(folder),
-            remedy="name a new or an empty folder",
-        )
-
-
-def head_demo_commands(recordings: Path, twin: Twin, demo: HeadDemo) -> Table:
-    """Each step on the demo's recordings; results go to the current folder."""
-    normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
-    truth, still = twin.truth, demo.still_step.nominal_height_mm
-    lines = [
-        *_calibrated(recordings, twin, demo),
-        f"armscan probe {recordings / 'probing'} -o plate.csv",
-        f"armscan calibrate hand-eye {recordings / 'hand-eye'} --sensor sensor.json "
-        "--plate plate.csv -o scanner.json",
-        *_measured(recordings, "plate", "plane plate.ply --plate plate.csv"),
-        *_measured(recordings, "ball", f"sphere ball.ply --diameter {truth.ball_diameter_mm:g}"),
-        f"armscan verify {recordings / 'ball'} --scanner scanner.json "
-        f"--ball {truth.ball_diameter_mm:g}",
-    ]
-    for k, height in enumerate(truth.step_heights_mm):
-        found = _measured(recordings, "steps", f"step steps.ply --height {height:g}")
-        lines += found if k == 0 else found[1:]
-    lines += [
-        f"armscan reconstruct {recordings / 'still-step'} --sensor sensor.json "
-        f"--depth-margin {STILL_MARGIN:g} -o still.ply",
-        f"armscan inspect step still.ply --height {still:g} --normal={normal}",
-        f"armscan reconstruct {recordings / 'part'} --scanner scanner.json -o part.ply",
-    ]
-    columns = ("The same, command by command",)
-    return Table(columns, tuple((line,) for line in lines), "", (0,))
-
-
-def _calibrated(recordings: Path, twin: Twin, demo: HeadDemo) -> list[str]:
-    """Cameras and sheets."""
-    target, laser = twin.target, recordings / "laser"
-    kind = "camera" if demo.instrument.sensor.second is None else "stereo"
-    return [
-        f"armscan calibrate {kind} --scan {recordings / 'camera'} --target {target} -o {kind}.json",
-        f"armscan calibrate laser --camera {kind}.json --scan {laser} --target {target} "
-        "-o sensor.json",
-    ]
-
-
-def _measured(recordings: Path, scene: str, inspection: str) -> list[str]:
-    return [
-        f"armscan reconstruct {recordings / scene} --scanner scanner.json -o {scene}.ply",
-        f"armscan inspect {inspection}",
-    ]
-
-
-@dataclass(frozen=True, slots=True)
-class DemoOrigin:
-    """Where a demo's files come from.
-
-    Parameters
-    ----------
-    command
-        The command line.
-    folder, place
-        Where they will lie, and where they lie yet.
-    """
-
-    command: tuple[str, ...]
-    folder: Path
-    place: Path
-
-    def provenance(self, files: Iterable[Path], *parents: Provenance) -> Provenance:
-        """Provenance that names files in ``place`` as they will be in ``folder``."""
-        found = new_provenance(files, command=self.command, parents=parents)
-        inputs = tuple(
-            replace(item, path=(self.folder / Path(item.path).relative_to(self.place)).as_posix())
-            for item in found.inputs
-        )
-        return replace(found, inputs=inputs)
-
-    def of_recording(self, recording: FolderRecording, *parents: Provenance) -> Provenance:
-        """Provenance of what rests on a recording."""
-        folder = recording.folder
-        return self.provenance((folder / EXPOSURES_FILE, folder / SESSION_FILE), *parents)
-
-
-def demo_documents(
-    demo: HeadDemo, scans: Mapping[TwinScene, FolderRecording], origin: DemoOrigin
-) -> dict[Path, bytes]:
-    """Files to write: camera or cameras, sensor, scanner, and the part's cloud."""
-    found, place = demo.instrument, origin.place
-    base = origin.of_recording(scans["camera"])
-    sensor = replace(
-        found.sensor,
-        camera=replace(found.sensor.camera, provenance=base),
-        provenance=origin.of_recording(scans["laser"], base),
-    )
-    if sensor.second is not None:
-        right = replace(sensor.second.camera, provenance=base)
-        sensor = replace(sensor, second=replace(sensor.second, camera=right))
-    scanner = ScannerCalibration(
-        sensor=sensor,
-        hand_eye=found.hand_eye.fit.calibration,
-        provenance=origin.of_recording(scans["hand-eye"], sensor.provenance),
-    )
-    return {
-        **_cameras(found.camera, place, base),
-        place / "sensor.json": sensor_document(sensor),
-        place / "scanner.json": scanner_document(scanner),
-        place / "cloud.ply": ply_bytes(demo.part.scan.cloud),
-    }
-
-
-def _cameras(
-    found: CameraCalibration | StereoCalibration, place: Path, provenance: Provenance
-) -> dict[Path, bytes]:
-    if isinstance(found, CameraCalibration):
-        return {place / "camera.json": camera_document(replace(found, provenance=provenance))}
-    return {place / "stereo.json": stereo_document(replace(found, provenance=provenance))}
-
-
-RECORDINGS = "recordings"
-TRUTH = "truth.json"
-DOCUMENTS = ("camera.json", "sensor.json", "scanner.json")
-STEREO_DOCUMENTS = ("stereo.json", "sensor.json", "scanner.json")
-RESULTS = ("cloud.ply", "report.html", "summary.json")
-OWN_NAMES = frozenset({RECORDINGS, TRUTH, *DOCUMENTS, *STEREO_DOCUMENTS, *RESULTS})
-"""What this demo may write into its folder."""
+RECORDINGS, TRUTH, FILES = "recordings", "truth.json", "files.txt"
 CALIBRATION_SCENES: tuple[TwinScene, ...] = ("camera", "laser", "hand-eye")
-SCENES = (*CALIBRATION_SCENES, *ONE_SHEET_SCENES, "waves", "still-step")
-OWN_FILES = re.compile(
-    "|".join(re.escape(name) for name in OWN_NAMES - {RECORDINGS})
-    + rf"|{RECORDINGS}/({'|'.join(('probing', *SCENES))})/"
-    r"(session\.toml|exposures\.csv|arm\.csv|probe\.toml|images/([a-zA-Z]+/){0,2}\d{2,4}\.png)"
-)
-"""Paths of all that: a folder that holds nothing else may be used again."""
-
-
-KINDS = {
-    "thesis-single": "single-line",
-    "thesis-cross": "cross-line",
-    "thesis-multi": "multi-line",
-}
-"""Words for the heads."""
+SCANS: tuple[TwinScene, ...] = ("plate", "ball", "steps", "part")
+"""Scanned by hand; where sheets must be told apart, a wavy plate too."""
+PHOTO_SCENES: tuple[TwinScene, ...] = ("camera", "laser", "still-part")
+STILL_HEIGHT_MM, STEREO_STILL_HEIGHT_MM = 20.0, 5.0
+"""Block of the scene ``still-step``: figures 5.19 and 5.33."""
+STILL_MARGIN = 0.3
+"""The block fills the view, and its lower face lies up to 13 mm beyond the 55 mm of depth in which
+the crossed lines are calibrated."""
 
 
 @dataclass(frozen=True, slots=True)
-class HeadDemoRequest:
-    """Where the demo goes, and what is simulated.
+class DemoRequest:
+    """Where a demo goes, and what is simulated.
 
     Parameters
     ----------
@@ -336,8 +99,9 @@ class HeadDemoRequest:
         Everything random follows from it.
     preset
         How good the instrument and how kind the surroundings are.
-    options
-        How much of the scans is used.
+    most_views
+        Views of a scene that are used, evenly chosen; where lasers are chosen meanwhile, exposures
+        of a pass. Scenes that are not named are used whole.
     processes
         Processes that render.
     """
@@ -346,361 +110,492 @@ class HeadDemoRequest:
     head: str = "thesis-single"
     seed: int = 1
     preset: Preset = "thesis"
-    options: HeadOptions = field(default_factory=HeadOptions)
+    most_views: Mapping[TwinScene, int] = field(default_factory=dict)
     processes: int = 2
 
     @property
-    def command(self) -> tuple[str, ...]:
+    def twin(self) -> TwinName:
+        """What is simulated."""
+        return TwinName(self.head, self.preset, self.seed)
+
+    def command(self, kind: str) -> tuple[str, ...]:
         """The command line that asks for the same."""
-        kind = self.head.removeprefix("thesis-")
         words = ("armscan", "demo", kind, "-o", self.folder.as_posix())
         return (*words, "--preset", self.preset, "--seed", str(self.seed))
 
 
-def run_head_demo(request: HeadDemoRequest, progress: Progress = silent) -> Summary:
-    """Render and record, calibrate, measure, inspect, compare with the truth, and write it all.
+@contextmanager
+def demo_folder(folder: Path) -> Iterator[None]:
+    """Make a folder anew, and list what was written into it; what it held comes back on an error.
 
     Raises
     ------
-    ArmscanError
-        If the folder holds something else than an earlier demo or cannot be written.
+    OutputError
+        If the folder holds a file that no earlier demo listed, or cannot be written.
     """
-    return make_head_demo(request, progress)[0]
+    target = folder.resolve()
+    listing = target / FILES
+    listed = listing.read_text("utf-8").splitlines() if listing.is_file() else []
+    foreign = [name for name in _files_in(target) if name not in listed]
+    if foreign or (target.exists() and not target.is_dir()):
+        raise OutputError(
+            f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
+            where=str(folder),
+            remedy="name a new or an empty folder",
+        )
+    earlier = target.with_name(f".{target.name}.{uuid4().hex}.old")
+    try:
+        if target.exists():
+            target.rename(earlier)
+        target.mkdir(parents=True)
+        try:
+            yield
+            names = [*_files_in(target), FILES]
+            listing.write_text("\n".join(names) + "\n", "utf-8")
+        except BaseException:
+            shutil.rmtree(target, ignore_errors=True)
+            if earlier.exists():
+                earlier.rename(target)
+            raise
+        shutil.rmtree(earlier, ignore_errors=True)
+    except OSError as error:
+        raise OutputError(
+            f"the demo cannot be written ({error.strerror or error})",
+            where=str(folder),
+            remedy="free some space or choose another folder",
+        ) from error
 
 
-def make_head_demo(
-    request: HeadDemoRequest, progress: Progress = silent
-) -> tuple[Summary, HeadDemo]:
-    """As `run_head_demo`, with all that the chain found.
+def _files_in(folder: Path) -> list[str]:
+    """Files and links, as paths in the folder."""
+    found = sorted(folder.rglob("*")) if folder.is_dir() else []
+    return [
+        path.relative_to(folder).as_posix()
+        for path in found
+        if path.is_symlink() or not path.is_dir()
+    ]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """One head's demo while it is made: where, of what, and the seconds of each stage so far."""
+
+    request: DemoRequest
+    folder: Path
+    twin: Twin
+    progress: Progress
+    command: tuple[str, ...]
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def timed(self, stage: str, work: Callable[[], Result]) -> Result:
+        """Do the work and note how long it took; parts of one stage are added up."""
+        start = perf_counter()
+        result = work()
+        self.seconds[stage] = round(self.seconds.get(stage, 0.0) + perf_counter() - start, 2)
+        return result
+
+    def place(self, scene: str) -> Path:
+        """Folder of a recording."""
+        return self.folder / RECORDINGS / scene
+
+    def record(self, scenes: Sequence[TwinScene]) -> None:
+        """Render scenes whose exposures are known before anything is calibrated."""
+        self.place("").mkdir()
+        record_scenes(
+            {scene: self.place(scene) for scene in scenes},
+            self.request.twin,
+            self.request.most_views,
+            processes=self.request.processes,
+            progress=self.progress,
+        )
+        record_touches(self.place("probing"), self.twin)
+
+    def scanned(self, scene: TwinScene, scanner: ScannerCalibration) -> FolderRecording:
+        """Read a recording, or make it now, with lasers chosen by the labelling."""
+        if not self.place(scene).exists():
+            record_adaptively(
+                self.place(scene),
+                self.request.twin,
+                scene,
+                scanner,
+                longest_stroke=self.request.most_views.get(scene),
+                processes=self.request.processes,
+                progress=self.progress,
+            )
+        return read_recording(self.place(scene))
+
+
+def run_head_demo(request: DemoRequest, progress: Progress = silent) -> Summary:
+    """Record, calibrate, measure, inspect, compare with the truth, and write it all.
 
     Raises
     ------
     ArmscanError
         If the head has no demo, the folder holds something else than an earlier demo or cannot be
-        written.
+        written, or a stage does not determine its result.
     """
+    _check_head(request)
+    with demo_folder(request.folder):
+        return make_head_demo(request, request.folder, progress)[0]
+
+
+def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
+    """Run the demo of each head, each in its own folder, and compare them; raises the same."""
+    folder = request.folder
+    with demo_folder(folder):
+        heads: dict[str, Any] = {}
+        demos: dict[str, HeadDemo] = {}
+        warnings: list[str] = []
+        data: dict[str, Any] = {}
+        for name, kind in KINDS.items():
+            own = folder / name.removeprefix("thesis-")
+            own.mkdir()
+            summary, demos[name] = make_head_demo(replace(request, head=name), own, progress)
+            data = dict(summary.data)
+            heads |= data["heads"]
+            warnings += [f"{kind}: {text}" for text in summary.warnings]
+        folders = tuple(folder / name.removeprefix("thesis-") for name in KINDS)
+        truths = [own / TRUTH for own in folders]
+        provenance = new_provenance(truths, command=request.command("all"))
+        page, result = folder / "report.html", folder / "summary.json"
+        summary = Summary(
+            title="Demo of three simulated heads on the same scenes",
+            facts=(),
+            tables=(comparison_table(heads),),
+            warnings=tuple(warnings),
+            written=(*folders, page, result),
+            next_step=f"open {page} in a browser; each head has its own page in its folder",
+            data={**data, "heads": heads},
+        )
+        document = render_page(heads_page(heads, demos, footer(provenance)))
+        write_files({page: document, result: summary_json(summary).encode()})
+        return summary
+
+
+def _check_head(request: DemoRequest) -> None:
     if request.head not in KINDS:
         raise OptionError(
             f"there is no demo of the head {request.head!r}",
             remedy=f"give one of {', '.join(KINDS)}",
         )
-    name = TwinName(request.head, request.preset, request.seed)
-    twin = name.build()
-    with replaced_demo(request.folder, OWN_FILES) as place:
-        start = perf_counter()
-        write_files({place / TRUTH: twin.truth.document()})
-        views = request.options.most_views
-        scans = RecordedScans(place / RECORDINGS, name, views, request.processes)
-        scans.record(scenes_of(twin), progress)
-        rendered = round(perf_counter() - start, 2)
-        demo = run_head(twin, request.options, progress, scans=scans)
-        seconds = {"render": rendered, **demo.seconds}
-        summary = _written(request, place, twin, demo, scans.recordings, seconds=seconds)
-    return summary, demo
+    request.twin.build()
 
 
-def _written(
-    request: HeadDemoRequest,
-    place: Path,
-    twin: Twin,
-    demo: HeadDemo,
-    scans: Mapping[TwinScene, FolderRecording],
-    *,
-    seconds: dict[str, float],
-) -> Summary:
-    start = perf_counter()
-    commands = head_demo_commands(request.folder / RECORDINGS, twin, demo)
-    photographs: dict[str, Exposure] = {s: _photograph(scan) for s, scan in scans.items()}
-    data = demo_data(
-        demo, head=request.head, seed=request.seed, preset=request.preset, seconds=seconds
-    )
-    head = data["heads"][request.head]
-    origin = DemoOrigin(request.command, request.folder, place)
-    documents = demo_documents(demo, scans, origin)
-    page = head_demo_page(
-        demo,
-        request.head,
-        head,
-        photographs,
-        commands=commands,
-        footer=footer(origin.provenance((place / TRUTH,))),
-    )
-    write_files({**documents, place / "report.html": render_page(page)})
-    seconds["write"] = round(perf_counter() - start, 2)
-    head["seconds"] = seconds
-    written = tuple(path.name for path in documents)
-    summary = _summary(request, demo, data, commands, written)
-    write_files({place / "summary.json": summary_json(summary).encode()})
-    return summary
+def calibrate_head(request: DemoRequest, folder: Path, progress: Progress = silent) -> Calibrated:
+    """Record what the calibrations of a head rest on, and run their commands."""
+    run = _Run(request, folder, request.twin.build(), progress, request.command("photos"))
+    run.record(CALIBRATION_SCENES)
+    return _calibrated(run)
 
 
-def _photograph(scan: ScanSource) -> Exposure:
-    """An exposure of the middle of a scan, with the laser on if it ever is."""
-    lit = [k for k, row in enumerate(scan.rows) if row.lasers] or list(range(len(scan.rows)))
-    return scan.exposure(lit[len(lit) // 2])
+def make_head_demo(
+    request: DemoRequest, folder: Path, progress: Progress = silent
+) -> tuple[Summary, HeadDemo]:
+    """As `run_head_demo`, in a folder that is there and empty, with all that was found."""
+    twin = request.twin.build()
+    command = request.command(request.head.removeprefix("thesis-"))
+    run = _Run(request, folder, twin, progress, command)
+    write_files({folder / TRUTH: twin.truth.document()})
+    is_many = len(twin.truth.sheet_points_mm) > 1
+    scans = (*SCANS, "waves") if is_many else SCANS
+    # a head of several sources chooses its lasers while it scans; a still has all of them on
+    known = () if len(twin.sources) > 1 else scans
+    run.timed("render", partial(run.record, (*CALIBRATION_SCENES, *known, "still-step")))
+    instrument = _calibrated(run)
+    demo = _measured(run, scans, instrument)
+    return _written(run, demo, instrument.warnings), demo
 
 
-def _summary(
-    request: HeadDemoRequest,
-    demo: HeadDemo,
-    data: Mapping[str, Any],
-    commands: Table,
-    written: tuple[str, ...],
-) -> Summary:
-    folder, head = request.folder, data["heads"][request.head]
-    fit = demo.instrument.hand_eye.fit
-    names = (*written, "report.html", "summary.json")
-    naming = (naming_table(demo.naming),) if demo.naming else ()
-    return Summary(
-        title=f"Demo on a simulated {KINDS[request.head]} arm scanner: calibrated, used, compared "
-        "with its truth",
-        facts=(("time", f"{sum(head['seconds'].values()):.0f} s"),),
-        tables=(
-            comparison_table(head, request.head),
-            truth_table(demo, head),
-            *naming,
-            commands,
-        ),
-        warnings=tuple(sentence(f"hand-eye: {text}") for text in fit.warnings),
-        written=(folder / RECORDINGS, *(folder / name for name in names)),
-        next_step=f"open {folder / 'report.html'} in a browser",
-        data=data,
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrated:
+    """What the commands of the calibrations wrote, and the warnings of the hand-eye."""
+
+    sensor: SensorCalibration
+    scanner: ScannerCalibration
+    plate: PlateReference
+    warnings: tuple[str, ...]
+
+
+def _calibrated(run: _Run) -> Calibrated:
+    target, command, folder, tell = run.twin.target, run.command, run.folder, run.progress
+    is_stereo = run.twin.truth.right_camera_parameters is not None
+    camera = folder / ("stereo.json" if is_stereo else "camera.json")
+    sensor, table, document = (folder / n for n in ("sensor.json", "plate.csv", "scanner.json"))
+    scan = run.place("camera")
+    if is_stereo:
+        stereo = StereoRequest("", "", target, camera, scan, command=command)
+        run.timed("calibrate_camera", partial(run_stereo_calibration, stereo, tell))
+    else:
+        one = CameraRequest((), target, camera, scan=scan, command=command)
+        run.timed("calibrate_camera", partial(run_camera_calibration, one, tell))
+    laser = LaserRequest(camera, (), (), target, sensor, scan=run.place("laser"), command=command)
+    run.timed("calibrate_laser", partial(run_laser_calibration, laser, tell))
+    run.timed("probe_plate", partial(run_probing, ProbeRequest(run.place("probing"), table)))
+    scans = (run.place("hand-eye"),)
+    hand_eye = HandEyeRequest(document, scans, sensor, plate=table, command=command)
+    found = run.timed("calibrate_hand_eye", partial(run_hand_eye_calibration, hand_eye, tell))
+    plate, _ = read_plate(table, np.zeros(3))
+    return Calibrated(
+        read_sensor_calibration(sensor), read_scanner_calibration(document), plate, found.warnings
     )
 
 
-def scenes_of(twin: Twin) -> tuple[TwinScene, ...]:
-    """Scenes whose exposures are known before anything is calibrated.
+def _measured(run: _Run, scenes: tuple[TwinScene, ...], instrument: Calibrated) -> HeadDemo:
+    """Measure and inspect every scene, then look at the truth."""
+    truth, sensor, scanner = run.twin.truth, instrument.sensor, instrument.scanner
+    found: dict[TwinScene, ScanReconstruction] = {}
+    for scene in scenes:
+        source = run.timed(f"take_{scene}", partial(run.scanned, scene, scanner))
+        measure = partial(measure_scan, source, scanner, progress=run.progress)
+        found[scene] = run.timed(scene, measure)
+    steps = tuple(
+        _succeeded(inspect_step(found["steps"].cloud, height), "steps")
+        for height in truth.step_heights_mm
+    )
+    still, normal = run.timed("still_step", partial(_still_step, run, instrument, steps[0].normal))
+    naming: dict[TwinScene, NamingErrors] = {}
+    if len(truth.sheet_points_mm) > 1:
+        names = true_names(sensor, truth.sheet_points_mm)
+        for scene, scan in found.items():
+            compare = partial(naming_errors, scan, run.twin.scan(scene), names)
+            naming[scene] = run.timed("compare_names", compare)
+    plane = inspect_plane(
+        found["plate"].cloud, instrument.plate.plane, reference_text="the probed plane"
+    )
+    ball = inspect_sphere(found["ball"].cloud, truth.ball_diameter_mm)
+    cameras, sheets = calibration_errors(sensor, truth)
+    return HeadDemo(
+        sensor=sensor,
+        scanner=scanner,
+        scans=found,
+        plate=_succeeded(plane, "plate"),
+        ball=_succeeded(ball, "ball"),
+        steps=steps,
+        still_step=still,
+        still_normal=normal,
+        part=part_errors(found["part"].cloud, truth),
+        naming=naming,
+        cameras=cameras,
+        sheets=sheets,
+        hand_eye=hand_eye_errors(scanner, truth.tool_from_sensor),
+    )
 
-    A head of several sources chooses its lasers while it scans; a still has all of them on.
+
+def _still_step(
+    run: _Run, instrument: Calibrated, normal_base: FloatArray
+) -> tuple[StepInspection, FloatArray]:
+    """Height of a block from one exposure, in Sensor, and the normal (3,) of its faces there.
+
+    Within the light sheet the faces stand further apart than the height if the sheet leans; how
+    far it leans follows from the arm's pose and the faces' direction in Base.
     """
-    if len(twin.sources) > 1:
-        return (*CALIBRATION_SCENES, "still-step")
-    waves: tuple[TwinScene, ...] = ("waves",) if len(twin.truth.sheet_points_mm) > 1 else ()
-    return (*CALIBRATION_SCENES, *ONE_SHEET_SCENES, *waves, "still-step")
+    sensor, scanner = instrument.sensor, instrument.scanner
+    source = run.scanned("still-step", scanner)
+    poses = exposure_poses(source.rows, source.arm, source.session.clock)
+    base_from_sensor = poses.pose(0) @ scanner.hand_eye.tool_from_sensor
+    normal = base_from_sensor.rotation.T @ normal_base
+    first, *others = (source.exposure(row) for row in range(len(source.rows)))
+    options = MeasureOptions(depths=DepthRange(margin=STILL_MARGIN))
+    cloud = reconstruct([first], sensor, rights=others, options=options).cloud
+    height = STILL_HEIGHT_MM if sensor.second is None else STEREO_STILL_HEIGHT_MM
+    return _succeeded(inspect_step(cloud, height, normal=normal), source.name), normal
 
 
-HEADS = ("thesis-single", "thesis-cross", "thesis-multi")
-FOLDERS = {name: name.removeprefix("thesis-") for name in HEADS}
-PAGE, DATA = "report.html", "summary.json"
-
-
-def run_three_heads(request: HeadDemoRequest, progress: Progress = silent) -> Summary:
-    """Run the demo of each head, and compare them.
-
-    An earlier comparison is removed first: if a head fails, none stands beside heads that it does
-    not compare.
-
-    Parameters
-    ----------
-    request
-        As for one head; each gets a folder of its name in the request's.
-    progress
-        Told of every exposure.
-
-    Raises
-    ------
-    ArmscanError
-        If the folder holds something else than an earlier demo or cannot be written.
-    """
-    folder = request.folder
-    mark = folder / FOLDERS[HEADS[0]] / TRUTH
-    check_demo_folder(folder, {*FOLDERS.values(), PAGE, DATA}, mark)
-    _remove_comparison(folder)
-    heads: dict[str, Any] = {}
-    pictures: dict[str, HeadPicture] = {}
-    warnings: list[str] = []
-    for name in HEADS:
-        own = replace(request, folder=folder / FOLDERS[name], head=name)
-        summary, demo = make_head_demo(own, progress)
-        heads.update(summary.data["heads"])
-        pictures[name] = head_picture(kind(name), demo)
-        warnings += [f"{kind(name)}: {text}" for text in summary.warnings]
-    command = ("armscan", "demo", "all", "-o", folder.as_posix())
-    options = ("--preset", request.preset, "--seed", str(request.seed))
-    truths = [folder / FOLDERS[name] / TRUTH for name in HEADS]
-    provenance = new_provenance(truths, command=(*command, *options))
-    page = three_heads_page(heads, pictures, footer(provenance))
-    first = summary.data
-    result = Summary(
-        title="Demo of three simulated heads on the same scenes",
-        facts=(),
-        tables=(three_heads_table(heads),),
-        warnings=tuple(warnings),
-        written=_three_heads_job_written(folder),
-        next_step=f"open {folder / PAGE} in a browser; each head has its own page in its folder",
-        data={**{key: first[key] for key in first if key != "heads"}, "heads": heads},
-    )
-    files = {folder / PAGE: render_page(page), folder / DATA: summary_json(result).encode()}
-    write_files(files, is_overwriting=True)
+def _succeeded(result: Result | FitFailure, what: str) -> Result:
+    if isinstance(result, FitFailure):
+        raise EstimationError(result.reason, where=what, remedy=result.remedy)
     return result
 
 
-def _remove_comparison(folder: Path) -> None:
-    for name in (PAGE, DATA):
-        try:
-            (folder / name).unlink(missing_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"the earlier comparison cannot be removed ({error.strerror or error})",
-                where=str(folder / name),
-                remedy="choose another folder",
-            ) from error
+def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
+    """Write the cloud of the part, the page and the figures."""
+    start = perf_counter()
+    request, folder, seconds = run.request, run.folder, run.seconds
+    name = request.head
+    head = {**head_data(demo), "seconds": seconds}
+    marked = tuple(sentence(f"hand-eye: {text}") for text in warnings)
+    commands = _commands(run, demo)
+    photographs = {}
+    for place in sorted(run.place("").iterdir()):
+        if place.name != "probing":
+            scan = read_recording(place)
+            lit = [k for k, row in enumerate(scan.rows) if row.lasers] or range(len(scan.rows))
+            photographs[place.name] = scan.exposure(lit[len(lit) // 2])
+    provenance = new_provenance((folder / TRUTH,), command=run.command)
+    page = head_demo_page(
+        demo,
+        name,
+        head,
+        photographs,
+        warnings=marked,
+        commands=commands,
+        footer=footer(provenance),
+    )
+    cloud, report, result = (folder / n for n in ("cloud.ply", "report.html", "summary.json"))
+    write_files({cloud: ply_bytes(demo.scans["part"].cloud), report: render_page(page)})
+    seconds["write"] = round(perf_counter() - start, 2)
+    naming = (naming_table(demo.naming),) if demo.naming else ()
+    summary = Summary(
+        title=f"Demo on a simulated {KINDS[name]} arm scanner: calibrated, used, compared with its "
+        "truth",
+        facts=(("time", f"{sum(seconds.values()):.0f} s"),),
+        tables=(comparison_table({name: head}), truth_table(demo, head), *naming, commands),
+        warnings=marked,
+        written=(folder / RECORDINGS, *sorted(folder.glob("*.*")), result),
+        next_step=f"open {report} in a browser",
+        data={
+            "kind": "demo",
+            "simulated": True,
+            "seed": request.seed,
+            "preset": request.preset,
+            "rule": FRACTION_RULE,
+            "heads": {name: head},
+        },
+    )
+    write_files({result: summary_json(summary).encode()})
+    return summary
 
 
-def _three_heads_job_written(folder: Path) -> tuple[Path, ...]:
-    return (*(folder / own for own in FOLDERS.values()), folder / PAGE, folder / DATA)
+def _commands(run: _Run, demo: HeadDemo) -> Table:
+    """Each step once more by hand; results go to the current folder."""
+    truth, target = run.twin.truth, run.twin.target
+    kind = "camera" if demo.sensor.second is None else "stereo"
+
+    def scan(scene: str) -> str:
+        return f"armscan reconstruct {run.place(scene)} --scanner scanner.json -o {scene}.ply"
+
+    normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
+    heights = (f"armscan inspect step steps.ply --height {h:g}" for h in truth.step_heights_mm)
+    lines = (
+        f"armscan calibrate {kind} --scan {run.place('camera')} --target {target} -o {kind}.json",
+        f"armscan calibrate laser --camera {kind}.json --scan {run.place('laser')} "
+        f"--target {target} -o sensor.json",
+        f"armscan probe {run.place('probing')} -o plate.csv",
+        f"armscan calibrate hand-eye {run.place('hand-eye')} --sensor sensor.json "
+        "--plate plate.csv -o scanner.json",
+        scan("plate"),
+        "armscan inspect plane plate.ply --plate plate.csv",
+        scan("ball"),
+        f"armscan inspect sphere ball.ply --diameter {truth.ball_diameter_mm:g}",
+        f"armscan verify {run.place('ball')} --scanner scanner.json "
+        f"--ball {truth.ball_diameter_mm:g}",
+        scan("steps"),
+        *heights,
+        f"armscan reconstruct {run.place('still-step')} --sensor sensor.json "
+        f"--depth-margin {STILL_MARGIN:g} -o still.ply",
+        f"armscan inspect step still.ply --height {demo.still_step.nominal_height_mm:g} "
+        f"--normal={normal}",
+        scan("part"),
+    )
+    return _typed(*lines)
 
 
-T = TypeVar("T")
-
-DEMO_JOB_OWN_NAMES = frozenset(
-    {
-        "photos",
-        "summary.json",
-        *("cloud.ply", "cloud.html"),
-        *(f"{name}{end}" for name in ("camera", "sensor") for end in (".json", ".npz", ".html")),
-    }
-)
-"""What a demo writes: a folder that holds nothing else may be used again."""
-
-
-@dataclass(frozen=True, slots=True)
-class DemoRequest:
-    """Where the demo goes.
-
-    Parameters
-    ----------
-    folder
-        Made if need be; an earlier demo in it is replaced.
-    seed
-        Placement and noise of the rendered photographs.
-    """
-
-    folder: Path
-    seed: int = 1
+def _typed(*lines: str) -> Table:
+    return Table(("The same, command by command",), tuple((line,) for line in lines), "", (0,))
 
 
 def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary:
-    """Render photographs, calibrate camera and laser, measure an object, state the errors.
+    """The commands on photographs, as a laboratory with a camera, a laser and no arm has them.
 
-    Writes ``photos/``, ``camera.json``, ``sensor.json``, ``cloud.ply``, a page beside each, and
-    ``summary.json``.
-
-    Raises
-    ------
-    ArmscanError
-        If the folder holds something else than an earlier demo or cannot be written.
+    Writes the recordings of the photographs, ``camera.json``, ``sensor.json``, ``cloud.ply``, a
+    page beside each, and ``summary.json``; raises as `run_head_demo`.
     """
     folder = request.folder
-    photos = folder / "photos"
-    check_demo_folder(folder, DEMO_JOB_OWN_NAMES, photos / "camera")
-    seconds: dict[str, float] = {}
-    truth = _timed(seconds, "render", lambda: render_photos(photos, request.seed, progress))
-    camera = CameraRequest(
-        images=(str(photos / "camera"),),
-        target=truth.target,
-        output=folder / "camera.json",
-        is_overwriting=True,
-        command=("armscan", "demo", "photos", "-o", folder.as_posix()),
-    )
-    laser = LaserRequest(
-        camera=camera.output,
-        on=(str(photos / "laser" / "on"),),
-        off=(str(photos / "laser" / "off"),),
-        target=truth.target,
-        output=folder / "sensor.json",
-        is_overwriting=True,
-        command=camera.command,
-    )
-    cloud = CloudRequest(
-        sensor=laser.output,
-        images=(str(photos / "object" / "laser.png"),),
-        background=(str(photos / "object" / "background.png"),),
-        output=folder / "cloud.ply",
-        is_overwriting=True,
-        command=camera.command,
-    )
-    stages = (
-        _timed(seconds, "calibrate_camera", lambda: run_camera_calibration(camera, progress)),
-        _timed(seconds, "calibrate_laser", lambda: run_laser_calibration(laser, progress)),
-        _timed(seconds, "reconstruct", lambda: run_reconstruction(cloud, progress)),
-    )
-    errors = compare_with_truth(
-        read_sensor_calibration(laser.output), read_ply(cloud.output), truth
-    )
-    names = ("camera", "laser", "points")
-    data = _data(request.seed, dict(zip(names, stages, strict=True)), errors, seconds)
-    result = folder / "summary.json"
-    summary = Summary(
-        title="Demo on simulated photographs: camera, light sheet and points against their truth",
-        facts=_facts(errors),
-        tables=(_commands(photos, folder, truth.target),),
-        warnings=tuple(warning for stage in stages for warning in stage.warnings),
-        written=(photos, *(path for stage in stages for path in stage.written), result),
-        next_step=f"open {folder / 'camera.html'}, {folder / 'sensor.html'} and "
-        f"{folder / 'cloud.html'} in a browser",
-        data=data,
-    )
-    write_files({result: summary_json(summary).encode()}, is_overwriting=True)
-    return summary
+    twin = request.twin.build()
+    with demo_folder(folder):
+        run = _Run(request, folder, twin, progress, request.command("photos"))
+        write_files({folder / TRUTH: twin.truth.document()})
+        run.timed("render", partial(run.record, PHOTO_SCENES))
+        boards, lines, still = (run.place(scene) / "images" for scene in PHOTO_SCENES)
+        on, off, lit, dark = (
+            str(path)
+            for path in (lines / "on", lines / "off", still / "0001.png", still / "0002.png")
+        )
+        target, command = twin.target, run.command
+        camera, sensor, cloud = (folder / n for n in ("camera.json", "sensor.json", "cloud.ply"))
+        of_camera = CameraRequest((str(boards),), target, camera, command=command)
+        of_laser = LaserRequest(camera, (on,), (off,), target, sensor, command=command)
+        of_cloud = CloudRequest(sensor, (lit,), (dark,), cloud, command=command)
+        works = (
+            ("camera", "calibrate_camera", partial(run_camera_calibration, of_camera, progress)),
+            ("laser", "calibrate_laser", partial(run_laser_calibration, of_laser, progress)),
+            ("points", "reconstruct", partial(run_reconstruction, of_cloud, progress)),
+        )
+        stages = {name: run.timed(stage, work) for name, stage, work in works}
+        errors = _photo_errors(run, read_sensor_calibration(sensor), read_ply(cloud))
+        commands = _typed(
+            f"armscan calibrate camera {boards} --target {target} -o camera.json",
+            f"armscan calibrate laser --camera camera.json --on {on} --off {off} "
+            f"--target {target} -o sensor.json",
+            f"armscan reconstruct {lit} --background {dark} --sensor sensor.json -o cloud.ply",
+        )
+        result = folder / "summary.json"
+        summary = Summary(
+            title="Demo on simulated photographs: camera, light sheet and points against their "
+            "truth",
+            facts=_photo_facts(errors),
+            tables=(commands,),
+            warnings=tuple(text for stage in stages.values() for text in stage.warnings),
+            written=(run.place(""), *sorted(folder.glob("*.*")), result),
+            next_step=f"open {folder / 'camera.html'}, {folder / 'sensor.html'} and "
+            f"{folder / 'cloud.html'} in a browser",
+            data={
+                "kind": "demo",
+                "simulated": True,
+                "seed": request.seed,
+                "preset": request.preset,
+                **{name: dict(stage.data) for name, stage in stages.items()},
+                "errors": errors,
+                "seconds": run.seconds,
+            },
+        )
+        write_files({result: summary_json(summary).encode()})
+        return summary
 
 
-def _timed(seconds: dict[str, float], stage: str, work: Callable[[], T]) -> T:
-    start = perf_counter()
-    result = work()
-    seconds[stage] = round(perf_counter() - start, 2)
-    return result
+def _photo_errors(run: _Run, sensor: SensorCalibration, cloud: PointCloud) -> dict[str, Any]:
+    """Errors of the whole chain against the truth."""
+    truth = run.twin.truth
+    part = part_errors(cloud, truth, run.twin.scan("still-part").true_pose(0))
+    (camera,), (sheet,) = calibration_errors(sensor, truth)
+    return {
+        "focal_px": camera.focal_px,
+        "focal_sigma_px": camera.focal_sigma_px,
+        "camera_normalised": camera.normalised,
+        "n_camera_parameters": camera.n_parameters,
+        "sheet": asdict(sheet),
+        "n_points": len(cloud),
+        "n_on_object": len(part.rows),
+        "points_rms_mm": part.rms_mm,
+        "points_median_mm": float(np.median(np.abs(part.distance_mm))),
+        "points_normalised_rms": part.normalised_rms,
+        "points_within_2_sigma": float(np.mean(np.abs(part.normalised) < 2.0)),
+    }
 
 
-def _facts(errors: PhotoErrors) -> tuple[tuple[str, str], ...]:
-    sheet = errors.sheet
+def _photo_facts(errors: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    sheet, n_camera = errors["sheet"], errors["n_camera_parameters"]
+    n_sheet = sheet["n_parameters"]
     return (
         (
             "camera",
-            f"error of the focal length {with_sigma(errors.focal_px, errors.focal_sigma_px, 'px')}",
+            "error of the focal length "
+            f"{with_sigma(errors['focal_px'], errors['focal_sigma_px'], 'px')}",
         ),
         (
             "light sheet",
-            f"{significant(sheet.angle_deg)} deg and {significant(abs(sheet.offset_mm))} mm off, "
-            f"{significant(sheet.rms_mm)} mm rms over the boards",
+            f"{significant(sheet['angle_deg'])} deg and {significant(abs(sheet['offset_mm']))} mm "
+            f"off, {significant(sheet['rms_mm'])} mm rms over the boards",
         ),
         (
             "object",
-            f"{errors.n_on_object} points, {significant(errors.points_median_mm)} mm median and "
-            f"{significant(errors.points_rms_mm)} mm rms from its true surface",
+            f"{errors['n_on_object']} points, {significant(errors['points_median_mm'])} mm median "
+            f"and {significant(errors['points_rms_mm'])} mm rms from its true surface",
         ),
         (
             "in sigmas",
-            f"camera {errors.camera_normalised:.1f} ({errors.n_camera_parameters**0.5:.1f} is "
-            f"usual for {errors.n_camera_parameters} numbers), sheet {sheet.normalised:.1f} "
-            f"({sheet.n_parameters**0.5:.1f} is usual for {sheet.n_parameters}), "
-            f"points {errors.points_normalised_rms:.2f} rms",
+            f"camera {errors['camera_normalised']:.1f} ({n_camera**0.5:.1f} is usual for "
+            f"{n_camera} numbers), sheet {sheet['normalised']:.1f} ({n_sheet**0.5:.1f} is usual "
+            f"for {n_sheet}), points {errors['points_normalised_rms']:.2f} rms",
         ),
     )
-
-
-def _commands(photos: Path, folder: Path, target: str) -> Table:
-    """The same by hand."""
-    camera, sensor, cloud = (folder / name for name in ("camera.json", "sensor.json", "cloud.ply"))
-    lines = (
-        f"armscan calibrate camera {photos / 'camera'} --target {target} -o {camera}",
-        f"armscan calibrate laser --camera {camera} --on {photos / 'laser' / 'on'} "
-        f"--off {photos / 'laser' / 'off'} --target {target} -o {sensor}",
-        f"armscan reconstruct {photos / 'object' / 'laser.png'} "
-        f"--background {photos / 'object' / 'background.png'} --sensor {sensor} -o {cloud}",
-    )
-    return Table(("The same, command by command",), tuple((line,) for line in lines))
-
-
-def _data(
-    seed: int, stages: Mapping[str, Summary], errors: PhotoErrors, seconds: Mapping[str, float]
-) -> dict[str, Any]:
-    return {
-        "kind": "demo",
-        "simulated": True,
-        "seed": seed,
-        "preset": "photos",
-        **{name: dict(stage.data) for name, stage in stages.items()},
-        "errors": asdict(errors),
-        "seconds": dict(seconds),
-    }

@@ -11,13 +11,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Any
 
-import numpy as np
-
 from armscan.calibration.sheets.result import (
     LaserFit,
     PointUse,
     SheetFit,
-    SheetImage,
     SkippedImage,
     reasons_to_refuse,
 )
@@ -27,7 +24,6 @@ from armscan.jobs.job import TriedImage, calibration_outputs, refuse, refused_fo
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.light_sheet import PLANE_PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
-from armscan.pipeline.documents import sensor_calibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
@@ -37,7 +33,6 @@ from armscan.pipeline.laser import (
 )
 from armscan.pipeline.progress import Progress, silent
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile, StripeFlag
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, Table, sentence, without_source
 from armscan.report.sheets import TITLE, laser_page, sheet_facts
@@ -54,7 +49,7 @@ from armscan.storage.documents import (
 from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.observations import pack_observations
+from armscan.storage.observations import pack_board_stripes
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.vision.targets.target import Target, parse_target
@@ -146,7 +141,7 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
         command=request.command,
-        options=(target, options.target, options.stripes, fit.options, request.image_options),
+        options=(target, options.stripes, fit.options, request.image_options),
         parents=(camera.provenance,),
         warnings=(*images.warnings, *all_warnings(fit)),
         forced=nonsense,
@@ -160,13 +155,9 @@ def run_laser_calibration(request: LaserRequest, progress: Progress = silent) ->
         exposure.source: item.sha256
         for exposure, item in zip(exposures, provenance.inputs[: len(exposures)], strict=True)
     }
-    observations = pack_observations(
-        [image.view for image in fit.images],
-        [_with_edge_flags(image) for image in fit.images],
-        hashes,
-    )
+    observations = pack_board_stripes(fit, hashes)
     document = sensor_document(
-        sensor_calibration(fit, provenance), (files.observations.name, observations)
+        fit.to_calibration(provenance), (files.observations.name, observations)
     )
     write_files(
         {files.document: document, files.observations: observations, files.page: render_page(page)},
@@ -190,7 +181,7 @@ def _refused(
     provenance = new_provenance(
         (*images.paths, *images.tables, request.camera),
         command=request.command,
-        options=(target, options.target, options.stripes, options.sheets, request.image_options),
+        options=(target, options.stripes, options.sheets, request.image_options),
         parents=(parent,),
         warnings=images.warnings,
     )
@@ -340,16 +331,6 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
     )
 
 
-def _with_edge_flags(image: SheetImage) -> Profile:
-    """The stripe points with those flagged that lay along an edge of the target.
-
-    The edges themselves are not kept, and without them the sheet could not be solved again.
-    """
-    is_on_edge = image.use == int(PointUse.ON_EDGE)
-    flags = image.profile.flags | np.where(is_on_edge, int(StripeFlag.TARGET_EDGE), 0)
-    return replace(image.profile, flags=flags)
-
-
 def all_warnings(fit: LaserFit) -> tuple[str, ...]:
     """Warnings of the whole and of each sheet."""
     own = [f"sheet {sheet.name}: {text}" for sheet in fit.sheets for text in sheet.warnings]
@@ -382,10 +363,10 @@ def laser_summary(fit: LaserFit, written: Sequence[Path], *, is_simulated: bool)
             "kind": "light sheet calibration",
             "simulated": is_simulated,
             "sheets": [_sheet_data(sheet) for sheet in fit.sheets],
-            "naming": fit.naming,
+            "naming": fit.diagnostics.naming,
             "cameras": 1 if fit.second is None else 2,
             "unnamed_points": sum(image.count(PointUse.UNNAMED) for image in fit.images),
-            "noise_factor": fit.noise_factor,
+            "noise_factor": fit.diagnostics.noise_factor,
             "laser_colour": fit.laser_colour,
             "channel_reason": fit.channel_reason,
             "skipped": [{"source": item.source, "reason": item.reason} for item in fit.skipped],
@@ -405,13 +386,13 @@ def _sheet_data(fit: SheetFit) -> dict[str, Any]:
         "tilt_sigma_deg": fit.tilt_sigma_deg,
         "offset_sigma_mm": fit.offset_sigma_mm,
         "rms_mm": fit.calibration.rms_mm,
-        "rms_px": fit.rms_px,
+        "rms_px": fit.diagnostics.rms_px,
         "n_boards": fit.calibration.n_boards,
         "n_points": fit.calibration.n_points,
         "depth_min_mm": low,
         "depth_max_mm": high,
         "is_redundant": fit.calibration.is_redundant,
-        "lack_of_fit_p": fit.final_test.p_value,
+        "lack_of_fit_p": fit.diagnostics.final_test.p_value,
         "points_off_boards": {
             **asdict(fit.points.fitted),
             "left_out_rms_mm": _known(fit.points.left_out_rms_mm),

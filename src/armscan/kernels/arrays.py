@@ -1,37 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Array types of the kernels, for Numba and for the type checker.
-
-Inputs are declared read-only, so that frozen records and writable arrays share one compiled
-version.
-"""
+"""How kernels are compiled, and the array types by which they say what they read and write."""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
-from numba import types
+from numba import njit, types
 from numpy.typing import NDArray
 
-Float32Array: TypeAlias = NDArray[np.float32]
-Float64Array: TypeAlias = NDArray[np.float64]
-Int64Array: TypeAlias = NDArray[np.int64]
-MaskArray: TypeAlias = NDArray[np.uint8]
-MapArray: TypeAlias = NDArray[np.int32]
+Image: TypeAlias = NDArray[np.float32]
+Mask: TypeAlias = NDArray[np.uint8]
+Bytes: TypeAlias = NDArray[np.uint8]
+Table: TypeAlias = NDArray[np.float64]
+Floats: TypeAlias = NDArray[np.float64]
+IntTable: TypeAlias = NDArray[np.int64]
+Ints: TypeAlias = NDArray[np.int64]
+ImageOut: TypeAlias = NDArray[np.float32]
+RowOut: TypeAlias = NDArray[np.float32]
+MapOut: TypeAlias = NDArray[np.int32]
+TableOut: TypeAlias = NDArray[np.float64]
+FloatsOut: TypeAlias = NDArray[np.float64]
+IntsOut: TypeAlias = NDArray[np.int64]
 
-IMAGE_IN = types.Array(types.float32, 2, "C", readonly=True)
-MASK_IN = types.Array(types.uint8, 2, "C", readonly=True)
-TAPS_IN = types.Array(types.float32, 2, "C", readonly=True)
-TAPS_OUT = types.Array(types.float32, 2, "C")
-TABLE_IN = types.Array(types.float64, 2, "C", readonly=True)
-FLOATS_IN = types.Array(types.float64, 1, "C", readonly=True)
-INTS_IN = types.Array(types.int64, 1, "C", readonly=True)
-TABLE_OUT = types.Array(types.float64, 2, "C")
-FLOATS_OUT = types.Array(types.float64, 1, "C")
-INTS_OUT = types.Array(types.int64, 1, "C")
-ROW_OUT = types.Array(types.float32, 1, "C")
+_TYPES: dict[str, Any] = {
+    "Image": types.Array(types.float32, 2, "C", readonly=True),
+    "Mask": types.Array(types.uint8, 2, "C", readonly=True),
+    "Bytes": types.Array(types.uint8, 1, "C", readonly=True),
+    "Table": types.Array(types.float64, 2, "C", readonly=True),
+    "Floats": types.Array(types.float64, 1, "C", readonly=True),
+    "IntTable": types.Array(types.int64, 2, "C", readonly=True),
+    "Ints": types.Array(types.int64, 1, "C", readonly=True),
+    "ImageOut": types.Array(types.float32, 2, "C"),
+    "RowOut": types.Array(types.float32, 1, "C"),
+    "MapOut": types.Array(types.int32, 2, "C"),
+    "TableOut": types.Array(types.float64, 2, "C"),
+    "FloatsOut": types.Array(types.float64, 1, "C"),
+    "IntsOut": types.Array(types.int64, 1, "C"),
+    "float": types.float64,
+    "int": types.int64,
+    "None": types.void,
+    "bool": types.boolean,
+    "tuple[int, int]": types.UniTuple(types.int64, 2),  # type: ignore[no-untyped-call]
+}
+"""Inputs are read-only, so that frozen records and writable arrays share one compiled version."""
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 COLUMN = 0
 """A point at an integer column: its centre was sought down that column."""
 ROW = 1
 """A point at an integer row: its centre was sought along that row."""
+
+
+def compiled(
+    *, fastmath: bool = False, error_model: Literal["python", "numpy"] = "python"
+) -> Callable[[F], F]:
+    """Compile a kernel for the types that its annotations name (the aliases of this module).
+
+    Parameters
+    ----------
+    fastmath
+        Sums may be taken in another order.
+    error_model
+        ``numpy``: a division by zero gives infinity or NaN instead of an exception.
+    """
+
+    def compile_kernel(kernel: F) -> F:
+        named = dict(kernel.__annotations__)
+        signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
+        found: F = njit(
+            signature, cache=True, nogil=True, fastmath=fastmath, error_model=error_model
+        )(kernel)
+        return found
+
+    return compile_kernel

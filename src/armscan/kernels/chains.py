@@ -6,19 +6,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_IN,
-    INTS_IN,
-    INTS_OUT,
     ROW,
-    TABLE_IN,
-    TABLE_OUT,
-    Float64Array,
-    Int64Array,
-    MapArray,
+    Floats,
+    Ints,
+    IntsOut,
+    MapOut,
+    Table,
+    TableOut,
+    compiled,
 )
 
 REACH_PX = 2.9
@@ -28,21 +26,13 @@ SAME_PX = 1.0
 LEAST_COSINE = 0.77
 NONE = -1
 
-MAP_OUT = types.Array(types.int32, 2, "C")
 
-
-@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT), cache=True, nogil=True)
-def place_points(points: Float64Array, owner: MapArray, is_kept: Int64Array) -> None:
+@compiled()
+def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
-    Parameters
-    ----------
-    points
-        (N, 6) from `refine_candidates`.
-    owner
-        (H, W) int32, filled with -1; receives the index of the point in each pixel.
-    is_kept
-        (N,) output, 1 or 0.
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32, filled with -1; receives
+    the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
     """
     height, width = owner.shape
     for side in range(2):
@@ -68,20 +58,13 @@ def place_points(points: Float64Array, owner: MapArray, is_kept: Int64Array) -> 
                 is_kept[i] = 0
 
 
-@njit(types.void(TABLE_IN, MAP_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
-def find_neighbours(
-    points: Float64Array, owner: MapArray, ahead: Int64Array, behind: Int64Array
-) -> None:
+@compiled()
+def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
     """Best continuation of each point to both sides along its tangent.
 
-    Parameters
-    ----------
-    points
-        (N, 6) from `refine_candidates`.
-    owner
-        (H, W) map from `place_points`.
-    ahead, behind
-        (N,) output: index of the neighbour, or -1. The tangent is the normal turned by a quarter.
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) map from `place_points`.
+    ``ahead``, ``behind``: (N,) output: index of the neighbour, or -1. The tangent is the normal
+    turned by a quarter.
     """
     height, width = owner.shape
     for i in range(points.shape[0]):
@@ -114,21 +97,14 @@ def find_neighbours(
                     behind[i] = j
 
 
-@njit(types.int64(INTS_OUT, INTS_OUT, INTS_OUT, INTS_OUT), cache=True, nogil=True)
-def walk_chains(ahead: Int64Array, behind: Int64Array, order: Int64Array, chain: Int64Array) -> int:
+@compiled()
+def walk_chains(ahead: IntsOut, behind: IntsOut, order: IntsOut, chain: IntsOut) -> int:
     """Order the points along their chains, ends first, then loops; lone points are left out.
 
-    Parameters
-    ----------
-    ahead, behind
-        (N,) from `find_neighbours`; links that are not mutual are cut here.
-    order, chain
-        (N,) output: index of the k-th point, and the number of its chain.
+    ``ahead``, ``behind``: (N,) from `find_neighbours`; links that are not mutual are cut here.
+    ``order``, ``chain``: (N,) output: index of the k-th point, and the number of its chain.
 
-    Returns
-    -------
-    int
-        Count of points in chains.
+    Returns count of points in chains.
     """
     n = ahead.shape[0]
     for i in range(n):
@@ -170,55 +146,30 @@ OWN_SPAN = 3.0
 """Along its own chain a point is another line's only after this many times the reach."""
 
 
-@njit(
-    types.void(
-        TABLE_IN,
-        INTS_IN,
-        INTS_IN,
-        INTS_IN,
-        INTS_IN,
-        types.int64,
-        types.int64,
-        types.float64,
-        TABLE_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def find_other_lines(
-    points: Float64Array,
-    chain: Int64Array,
-    start: Int64Array,
-    stop: Int64Array,
-    is_line: Int64Array,
+    points: Table,
+    chain: Ints,
+    start: Ints,
+    stop: Ints,
+    is_line: Ints,
     height: int,
     width: int,
     reach: float,
-    distance: Float64Array,
+    distance: TableOut,
 ) -> None:
     """Find the nearest point of another line, or of a far part of the same, on both sides.
 
     Points are sorted into square cells; a cell that holds only a point's own part of its chain is
     passed over, so that the cost is in crossings alone.
 
-    Parameters
-    ----------
-    points
-        (N, 6) ridge points, ordered along chains.
-    chain
-        (N,) chain numbers.
-    start, stop
-        (N,) first index, and index after the last, of each point's chain; the two ends of a chain
-        count as neighbours, because it may be a loop.
-    is_line
-        (N,) 0 for points that do not count as a line to others.
-    height, width
-        Size of the image.
-    reach
-        Largest distance that matters, and the side of a cell.
-    distance
-        (N, 2) output: distance to the nearest other line on the side of smaller and of larger
-        coordinate along the point's column or row; infinite where there is none within reach.
+    ``points``: (N, 6) ridge points, ordered along chains. ``chain``: (N,) chain numbers. ``start``,
+    ``stop``: (N,) first index, and index after the last, of each point's chain; the two ends of a
+    chain count as neighbours, because it may be a loop. ``is_line``: (N,) 0 for points that do not
+    count as a line to others. ``height``, ``width``: Size of the image. ``reach``: Largest distance
+    that matters, and the side of a cell. ``distance``: (N, 2) output: distance to the nearest other
+    line on the side of smaller and of larger coordinate along the point's column or row; infinite
+    where there is none within reach.
     """
     n = points.shape[0]
     rows = int(height / reach) + 1
@@ -267,18 +218,13 @@ def find_other_lines(
                     j = following[j]
 
 
-@njit(types.void(TABLE_IN, FLOATS_IN, INTS_OUT), cache=True, nogil=True)
-def best_states(scores: Float64Array, change_cost: Float64Array, state: Int64Array) -> None:
+@compiled()
+def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
     """Sequence of states with the greatest sum of scores less the costs of its changes.
 
-    Parameters
-    ----------
-    scores
-        (N, S) log-likelihood of each state at each place.
-    change_cost
-        (N,) cost of another state at a place than at the one before; 0 at the first of a stripe.
-    state
-        (N,) output.
+    ``scores``: (N, S) log-likelihood of each state at each place. ``change_cost``: (N,) cost of
+    another state at a place than at the one before; 0 at the first of a stripe. ``state``: (N,)
+    output.
     """
     n, s = scores.shape
     if n == 0:

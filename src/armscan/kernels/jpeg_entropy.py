@@ -1,58 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """Walk through the entropy-coded data of a sequential JPEG without making a picture of it.
 
-Decoders fill what is missing with grey and say so on stderr at most; here the codes
-themselves are
+Decoders fill what is missing with grey and say so on stderr at most; here the codes themselves are
 counted (ITU T.81, annex F.2.2).
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
 
-from armscan.kernels.arrays import Int64Array, MaskArray
+from armscan.kernels.arrays import Bytes, IntTable, compiled
 
 WHOLE, NO_CODE, TOO_SHORT, OUT_OF_BLOCK, NO_RESTART = range(5)
 BLOCK = 64
-BYTES_IN = types.Array(types.uint8, 1, "C", readonly=True)
-TABLES_IN = types.Array(types.int64, 2, "C", readonly=True)
 
 
-@njit(
-    types.Tuple((types.int64, types.int64))(  # type: ignore[no-untyped-call]
-        BYTES_IN, TABLES_IN, TABLES_IN, types.int64, types.int64
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def walk_scan(
-    data: MaskArray,
-    tables: Int64Array,
-    table_of_block: Int64Array,
+    data: Bytes,
+    tables: IntTable,
+    table_of_block: IntTable,
     n_units: int,
     restart: int,
 ) -> tuple[int, int]:
     """Decode all codes of one scan.
 
-    Parameters
-    ----------
-    data
-        (N,) from behind the scan's header to the marker that ends it.
-    tables
-        (T, 65536) of each Huffman table, by the next 16 bits: 256 times the length of the code
-        plus its value; 0 where there is no such code.
-    table_of_block
-        (B, 2) rows of ``tables`` of the DC and AC codes of each block of a unit (MCU).
-    n_units
-        Units of the picture.
-    restart
-        Units between restart markers; 0 for none.
+    ``data``: (N,) from behind the scan's header to the marker that ends it. ``tables``: (T, 65536)
+    of each Huffman table, by the next 16 bits: 256 times the length of the code plus its value; 0
+    where there is no such code. ``table_of_block``: (B, 2) rows of ``tables`` of the DC and AC
+    codes of each block of a unit (MCU). ``n_units``: Units of the picture. ``restart``: Units
+    between restart markers; 0 for none.
 
-    Returns
-    -------
-    defect, left
-        `WHOLE` and the bytes that were left over, or the defect and the units that are missing.
+    Returns ``defect``, ``left``: `WHOLE` and the bytes that were left over, or the defect and the
+    units that are missing.
     """
     n = len(data)
     position, bits, n_bits, borrowed = 0, np.int64(0), 0, 0

@@ -6,19 +6,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_IN,
-    FLOATS_OUT,
-    IMAGE_IN,
-    MASK_IN,
-    TABLE_IN,
-    TABLE_OUT,
-    Float32Array,
-    Float64Array,
-    MaskArray,
+    Floats,
+    FloatsOut,
+    Image,
+    Mask,
+    Table,
+    TableOut,
+    compiled,
 )
 
 REACH_SIGMAS = 2.7
@@ -33,23 +30,13 @@ CENTRE, AMPLITUDE, SIGMA, VARIANCE, SKEW, SKEW_NORM, CLIPPED, BEND_GAIN = range(
 """Columns of a fit result."""
 
 
-@njit(types.void(IMAGE_IN, TABLE_IN, FLOATS_IN, TABLE_OUT), cache=True, nogil=True)
-def read_sides(
-    image: Float32Array, points: Float64Array, sigma_px: Float64Array, sides: Float64Array
-) -> None:
+@compiled()
+def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -> None:
     """Mean grey level beside the line, on the side of smaller and of larger coordinate.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    points
-        (N, 6) from `refine_candidates`.
-    sigma_px
-        (N,) line sigma along the point's column or row.
-    sides
-        (N, 4) output: mean and pixel count of the lower side, then of the upper side; a side that
-        lies outside the image has count 0.
+    ``image``: (H, W) grey levels. ``points``: (N, 6) from `refine_candidates`. ``sigma_px``: (N,)
+    line sigma along the point's column or row. ``sides``: (N, 4) output: mean and pixel count of
+    the lower side, then of the upper side; a side that lies outside the image has count 0.
     """
     height, width = image.shape
     for i in range(points.shape[0]):
@@ -76,8 +63,8 @@ def read_sides(
             sides[i, 2 * side + 1] = n
 
 
-@njit(types.float64(TABLE_IN, types.int64, types.float64, types.float64), cache=True, nogil=True)
-def start_amplitude(profile: Float64Array, n: int, offset: float, sigma: float) -> float:
+@compiled()
+def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> float:
     """Unweighted height of a Gaussian ``offset`` pixels from the profile's first pixel."""
     top = norm = 0.0
     for k in range(n):
@@ -88,35 +75,22 @@ def start_amplitude(profile: Float64Array, n: int, offset: float, sigma: float) 
     return top / norm if norm > 0.0 else 0.0
 
 
-@njit(
-    types.void(TABLE_IN, types.int64, FLOATS_IN, FLOATS_IN, FLOATS_OUT),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@compiled(error_model="numpy")
 def accumulate(
-    profile: Float64Array,
+    profile: Table,
     n: int,
-    state: Float64Array,
-    noise: Float64Array,
-    sums: Float64Array,
+    state: Floats,
+    noise: Floats,
+    sums: FloatsOut,
 ) -> None:
     """Weighted sums of one Gauss-Newton step.
 
-    Parameters
-    ----------
-    profile
-        (3, >= n) grey level less background, background, and 1 where the pixel counts.
-    n
-        Pixels of the profile.
-    state
-        (3,) centre from the first pixel, amplitude, sigma.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
-    sums
-        (13,) output: normal matrix of (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its
-        right-hand side, then the residual against the skew term, the skew term's norm, its product
-        with the centre's derivative, and the same product for a term ``u^3``.
+    ``profile``: (3, >= n) grey level less background, background, and 1 where the pixel counts.
+    ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
+    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
+    (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side, then the residual
+    against the skew term, the skew term's norm, its product with the centre's derivative, and the
+    same product for a term ``u^3``.
     """
     sums[:] = 0.0
     # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
@@ -150,8 +124,8 @@ def accumulate(
         sums[12] += w * j0 * m * u * u * u
 
 
-@njit(types.float64(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
-def solve_step(sums: Float64Array, steps: Float64Array) -> float:
+@compiled()
+def solve_step(sums: Floats, steps: FloatsOut) -> float:
     """Solve the normal equations into ``steps`` (3,); return the centre's variance, or 0."""
     h00, h01, h02, h11, h12, h22 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     b0, b1, b2 = sums[6], sums[7], sums[8]
@@ -170,21 +144,16 @@ def solve_step(sums: Float64Array, steps: Float64Array) -> float:
     return float(c00 / determinant)
 
 
-@njit(
-    types.void(IMAGE_IN, MASK_IN, TABLE_IN, FLOATS_IN, TABLE_IN, FLOATS_IN, FLOATS_IN, TABLE_OUT),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@compiled(error_model="numpy")
 def fit_profiles(
-    image: Float32Array,
-    clipped: MaskArray,
-    points: Float64Array,
-    sigma_px: Float64Array,
-    sides: Float64Array,
-    noise: Float64Array,
-    reach: Float64Array,
-    result: Float64Array,
+    image: Image,
+    clipped: Mask,
+    points: Table,
+    sigma_px: Floats,
+    sides: Table,
+    noise: Floats,
+    reach: Floats,
+    result: TableOut,
 ) -> None:
     """Fit centre, amplitude and width by Gauss-Newton steps with weights from the noise model.
 
@@ -192,24 +161,14 @@ def fit_profiles(
     own grey level. Clipped pixels are left out and the window grows by their width, so that a
     saturated line is fitted on its flanks.
 
-    Parameters
-    ----------
-    image, points
-        As for `read_sides`.
-    clipped
-        (H, W) 1 where a pixel is saturated; (1, 1) if none is.
-    sigma_px
-        (N,) start value of the sigma along the column or row.
-    sides
-        (N, 2) background on the lower and upper side; interpolated linearly across the line.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
-    reach
-        (N,) half width of the fitted window in sigmas.
-    result
-        (N, 8) output: centre, amplitude, sigma, variance of the centre (0: the fit failed), skew
-        score, its norm, count of clipped pixels, and by how much a term ``u^3`` in the profile's
-        exponent moves the centre, in sigmas (for the correction on bent lines).
+    ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
+    (1, 1) if none is. ``sigma_px``: (N,) start value of the sigma along the column or row.
+    ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
+    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``reach``: (N,) half width of the fitted
+    window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma, variance of the centre
+    (0: the fit failed), skew score, its norm, count of clipped pixels, and by how much a term
+    ``u^3`` in the profile's exponent moves the centre, in sigmas (for the correction on bent
+    lines).
     """
     height, width = image.shape
     profile = np.zeros((3, max(height, width)))

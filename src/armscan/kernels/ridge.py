@@ -6,28 +6,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
 from armscan.kernels.arrays import (
     COLUMN,
-    FLOATS_OUT,
-    IMAGE_IN,
     ROW,
-    ROW_OUT,
-    TABLE_IN,
-    TABLE_OUT,
-    TAPS_IN,
-    TAPS_OUT,
-    Float32Array,
-    Float64Array,
+    FloatsOut,
+    Image,
+    ImageOut,
+    RowOut,
+    Table,
+    TableOut,
+    compiled,
 )
 
 VALLEY_RATIO = 0.5
 """A dip below this share of the peak splits a run into two lines."""
 
 
-@njit(types.void(IMAGE_IN, types.int64, types.int64, ROW_OUT), cache=True, nogil=True)
-def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Array) -> None:
+@compiled()
+def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
     """Write row ``i`` of the grid, interpolated linearly between cell centres, to ``row`` (W,)."""
     columns = grid.shape[1]
     for x in range(row.shape[0]):
@@ -37,21 +34,15 @@ def interpolate_columns(grid: Float32Array, cell_px: int, i: int, row: Float32Ar
         row[x] = grid[i, k] + (u - k) * (grid[i, m] - grid[i, k])
 
 
-@njit(types.float64(IMAGE_IN, types.int64, types.int64, types.int64), cache=True, nogil=True)
-def level_at(image: Float32Array, axis: int, line: int, k: int) -> float:
+@compiled()
+def level_at(image: Image, axis: int, line: int, k: int) -> float:
     """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
     return float(image[k, line] if axis == COLUMN else image[line, k])
 
 
-@njit(
-    types.float64(
-        IMAGE_IN, types.int64, types.int64, types.int64, types.int64, types.float64, types.float64
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def hump_centre(
-    image: Float32Array,
+    image: Image,
     axis: int,
     line: int,
     first: int,
@@ -69,30 +60,16 @@ def hump_centre(
     return moment / weight if weight > 0.0 else 0.5 * (first + last)
 
 
-@njit(
-    types.int64(
-        IMAGE_IN,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.float64,
-        types.float64,
-        TABLE_OUT,
-        types.int64,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def split_run(
-    image: Float32Array,
+    image: Image,
     axis: int,
     line: int,
     first: int,
     last: int,
     background: float,
     rise: float,
-    runs: Float64Array,
+    runs: TableOut,
     count: int,
 ) -> int:
     """Append the centre of each hump of one run; return the new count.
@@ -100,18 +77,10 @@ def split_run(
     A run is split where the three-pixel mean dips below half of the peaks on both sides, so that
     two lines that share a foot become two candidates.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    axis, line, first, last
-        The run: pixels ``first..last`` of column (axis 0) or row (axis 1) ``line``.
-    background, rise
-        Local background, and the height above it at which the run was cut.
-    runs
-        (capacity, 3) output rows ``x, y, axis``; rows beyond the capacity are counted only.
-    count
-        Rows used so far.
+    ``image``: (H, W) grey levels. ``axis``, ``line``, ``first``, ``last``: The run: pixels
+    ``first..last`` of column (axis 0) or row (axis 1) ``line``. ``background``, ``rise``: Local
+    background, and the height above it at which the run was cut. ``runs``: (capacity, 3) output
+    rows ``x, y, axis``; rows beyond the capacity are counted only. ``count``: Rows used so far.
     """
     peak = 0.0
     low = np.inf
@@ -143,41 +112,24 @@ def split_run(
     return count
 
 
-@njit(
-    types.int64(IMAGE_IN, IMAGE_IN, types.int64, types.float64, types.int64, TABLE_OUT),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def find_runs(
-    image: Float32Array,
-    background: Float32Array,
+    image: Image,
+    background: Image,
     cell_px: int,
     rise: float,
     longest_px: int,
-    runs: Float64Array,
+    runs: TableOut,
 ) -> int:
     """Find runs of pixels more than ``rise`` above the background in one pass over the image.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    background
-        (rows, columns) background per cell of ``cell_px`` pixels, interpolated in between.
-    cell_px
-        Side of a background cell.
-    rise
-        Height above the background.
-    longest_px
-        Longer runs are no cross-sections of a line and are left out.
-    runs
-        (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and the axis
-        (0: the run goes down a column, 1: along a row).
+    ``image``: (H, W) grey levels. ``background``: (rows, columns) background per cell of
+    ``cell_px`` pixels, interpolated in between. ``cell_px``: Side of a background cell. ``rise``:
+    Height above the background. ``longest_px``: Longer runs are no cross-sections of a line and are
+    left out. ``runs``: (capacity, 3) output rows: ``x, y`` of the centroid above the threshold, and
+    the axis (0: the run goes down a column, 1: along a row).
 
-    Returns
-    -------
-    int
-        Count of candidates; more than the capacity if the output was too short.
+    Returns count of candidates; more than the capacity if the output was too short.
     """
     height, width = image.shape
     floor = np.zeros(width, np.float32)
@@ -233,7 +185,7 @@ REPEAT_PX = 1.5
 ROUNDS = 3
 
 
-def gaussian_taps(sigma_px: float) -> Float32Array:
+def gaussian_taps(sigma_px: float) -> Image:
     """Sampled Gaussian and its first two derivatives, (3, 2 r + 1) with r = 3.5 sigma.
 
     Scaled so that a constant, a ramp and a parabola give their exact derivatives.
@@ -249,34 +201,19 @@ def gaussian_taps(sigma_px: float) -> Float32Array:
     return np.stack([smooth, slope, bend]).astype(np.float32)
 
 
-@njit(
-    types.void(IMAGE_IN, types.int64, types.int64, TAPS_IN, TAPS_OUT, FLOATS_OUT),
-    cache=True,
-    nogil=True,
-    fastmath=True,
-)
+@compiled(fastmath=True)
 def derivatives_at(
-    image: Float32Array,
+    image: Image,
     x: int,
     y: int,
-    taps: Float32Array,
-    columns: Float32Array,
-    result: Float64Array,
+    taps: Image,
+    columns: ImageOut,
+    result: FloatsOut,
 ) -> None:
     """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    x, y
-        Pixel.
-    taps
-        (3, m) from `gaussian_taps`.
-    columns
-        (3, m) scratch.
-    result
-        (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
+    ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`.
+    ``columns``: (3, m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
     """
     height, width = image.shape
     m = taps.shape[1]
@@ -321,21 +258,15 @@ def derivatives_at(
     result[4] = gyy
 
 
-@njit(
-    types.boolean(
-        IMAGE_IN, types.float64, types.float64, TAPS_IN, TAPS_OUT, FLOATS_OUT, FLOATS_OUT
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def step_to_ridge(
-    image: Float32Array,
+    image: Image,
     x_px: float,
     y_px: float,
-    taps: Float32Array,
-    scratch: Float32Array,
-    derivatives: Float64Array,
-    result: Float64Array,
+    taps: Image,
+    scratch: ImageOut,
+    derivatives: FloatsOut,
+    result: FloatsOut,
 ) -> bool:
     """Walk from a start to the nearest ridge; False if there is none.
 
@@ -343,16 +274,9 @@ def step_to_ridge(
     polynomial has its maximum at ``t = -(g . n) / (n' H n)``. The expansion point is moved while
     the step leaves its pixel.
 
-    Parameters
-    ----------
-    image, taps, scratch
-        As for `derivatives_at`.
-    x_px, y_px
-        Start.
-    derivatives
-        (5,) scratch.
-    result
-        (5,) output: x, y, normal x, normal y, negative second derivative along the normal.
+    ``image``, ``taps``, ``scratch``: As for `derivatives_at`. ``x_px``, ``y_px``: Start.
+    ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal y, negative
+    second derivative along the normal.
     """
     height, width = image.shape
     x = math.floor(x_px + 0.5)
@@ -389,44 +313,27 @@ def step_to_ridge(
     return False
 
 
-@njit(
-    types.int64(IMAGE_IN, TABLE_IN, types.int64, TAPS_IN, types.float64, TABLE_OUT),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def refine_candidates(
-    image: Float32Array,
-    runs: Float64Array,
+    image: Image,
+    runs: Table,
     n_runs: int,
-    taps: Float32Array,
+    taps: Image,
     least_bend: float,
-    points: Float64Array,
+    points: TableOut,
 ) -> int:
     """Ridge point in the column or row of each candidate.
 
     A column candidate is kept where the line is rather horizontal, a row candidate where it is
     rather vertical, with some overlap around the diagonal so that none is lost there.
 
-    Parameters
-    ----------
-    image
-        (H, W) grey levels.
-    runs
-        (>= n_runs, 3) from `find_runs`.
-    n_runs
-        Candidates to use.
-    taps
-        (3, m) from `gaussian_taps`.
-    least_bend
-        Smallest negative second derivative across the line.
-    points
-        (>= n_runs, 6) output rows: x, y, normal x, normal y, negative second derivative, axis.
-        The coordinate along the axis 0 (column) or 1 (row) that names the pixel line is whole.
+    ``image``: (H, W) grey levels. ``runs``: (>= n_runs, 3) from `find_runs`. ``n_runs``: Candidates
+    to use. ``taps``: (3, m) from `gaussian_taps`. ``least_bend``: Smallest negative second
+    derivative across the line. ``points``: (>= n_runs, 6) output rows: x, y, normal x, normal y,
+    negative second derivative, axis. The coordinate along the axis 0 (column) or 1 (row) that names
+    the pixel line is whole.
 
-    Returns
-    -------
-    int
-        Count of points.
+    Returns count of points.
     """
     height, width = image.shape
     scratch = np.zeros((3, taps.shape[1]), np.float32)

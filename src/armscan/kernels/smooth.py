@@ -6,17 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
 
-from armscan.kernels.arrays import (
-    FLOATS_IN,
-    FLOATS_OUT,
-    INTS_IN,
-    TABLE_IN,
-    TABLE_OUT,
-    Float64Array,
-    Int64Array,
-)
+from armscan.kernels.arrays import Floats, FloatsOut, Ints, Table, TableOut, compiled
 
 SHIFT, SLOPE, BEND, BEND_SIGMA, SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
 """Columns of a smoothing result."""
@@ -26,18 +17,13 @@ COUNT = 8
 """Place of the count of points among the moments."""
 
 
-@njit(types.boolean(FLOATS_IN, FLOATS_OUT), cache=True, nogil=True)
-def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
+@compiled()
+def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
     """Fit a weighted parabola; False if it is not determined.
 
-    Parameters
-    ----------
-    moments
-        (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of points.
-
-    solved
-        (5,) output: value, slope and second derivative at 0, then the variances of the value and of
-        the second derivative.
+    ``moments``: (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of
+    points. ``solved``: (5,) output: value, slope and second derivative at 0, then the variances of
+    the value and of the second derivative.
     """
     s0, s1, s2, s3, s4 = moments[0], moments[1], moments[2], moments[3], moments[4]
     c00 = s2 * s4 - s3 * s3
@@ -59,33 +45,18 @@ def solve_quadratic(moments: Float64Array, solved: Float64Array) -> bool:
     return True
 
 
-@njit(
-    types.int64(
-        TABLE_IN,
-        TABLE_IN,
-        FLOATS_IN,
-        INTS_IN,
-        INTS_IN,
-        types.int64,
-        types.int64,
-        types.int64,
-        types.float64,
-        FLOATS_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def gather(
-    points: Float64Array,
-    normals: Float64Array,
-    sigma_px: Float64Array,
-    is_used: Int64Array,
-    chain: Int64Array,
+    points: Table,
+    normals: Table,
+    sigma_px: Floats,
+    is_used: Ints,
+    chain: Ints,
     i: int,
     j: int,
     direction: int,
     reach: float,
-    moments: Float64Array,
+    moments: FloatsOut,
 ) -> int:
     """Add the neighbours of point ``i`` from place ``j`` on to the moments; return where it ended.
 
@@ -116,58 +87,32 @@ def gather(
     return j
 
 
-@njit(
-    types.void(
-        TABLE_IN,
-        TABLE_IN,
-        FLOATS_IN,
-        INTS_IN,
-        INTS_IN,
-        FLOATS_IN,
-        FLOATS_IN,
-        types.float64,
-        TABLE_OUT,
-    ),
-    cache=True,
-    nogil=True,
-)
+@compiled()
 def smooth_chains(
-    points: Float64Array,
-    normals: Float64Array,
-    sigma_px: Float64Array,
-    is_used: Int64Array,
-    chain: Int64Array,
-    windows_px: Float64Array,
-    inflation: Float64Array,
+    points: Table,
+    normals: Table,
+    sigma_px: Floats,
+    is_used: Ints,
+    chain: Ints,
+    windows_px: Floats,
+    inflation: Floats,
     confidence: float,
-    result: Float64Array,
+    result: TableOut,
 ) -> None:
     """Smooth every point along its chain by a local quadratic in its own tangent frame.
 
     Windows grow while their estimates agree within the noise (intersection of confidence
     intervals): a bend stops the growth before its bias exceeds the noise.
 
-    Parameters
-    ----------
-    points, normals
-        (N, 2) centres and unit normals, ordered along the chains.
-    sigma_px
-        (N,) standard deviation along the normal.
-    is_used
-        (N,) 0 for points that must not pull their neighbours.
-    chain
-        (N,) chain number of each point; a chain is consecutive.
-    windows_px
-        (K,) half widths along the tangent, increasing.
-    inflation
-        (K,) factor on the variance of each window because neighbours' noise is correlated.
-    confidence
-        Half width of the confidence intervals in sigmas.
-    result
-        (N, 8) output: shift along the normal, slope of the line against the tangent, its second
-        derivative (curvature) and that one's sigma, sigma of the shift, half window (0: not
-        smoothed), prediction of the point's shift by its neighbours alone, and that prediction's
-        sigma (0: there is none).
+    ``points``, ``normals``: (N, 2) centres and unit normals, ordered along the chains.
+    ``sigma_px``: (N,) standard deviation along the normal. ``is_used``: (N,) 0 for points that must
+    not pull their neighbours. ``chain``: (N,) chain number of each point; a chain is consecutive.
+    ``windows_px``: (K,) half widths along the tangent, increasing. ``inflation``: (K,) factor on
+    the variance of each window because neighbours' noise is correlated. ``confidence``: Half width
+    of the confidence intervals in sigmas. ``result``: (N, 8) output: shift along the normal, slope
+    of the line against the tangent, its second derivative (curvature) and that one's sigma, sigma
+    of the shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
+    alone, and that prediction's sigma (0: there is none).
     """
     n = points.shape[0]
     moments = np.zeros(9)

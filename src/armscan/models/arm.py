@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A measuring arm: Denavit-Hartenberg chain, joint angles to pose and back (eqs. 2.1 to 2.10)."""
+"""A measuring arm: Denavit-Hartenberg chain, from joint angles to pose (eqs. 2.1 to 2.10)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
-from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
-from armscan.geometry.estimate import FitFailure
-from armscan.geometry.poses import Base, Pose, Tool
-from armscan.geometry.rotations import vector_from_rotation
+from armscan.errors import InputError
+from armscan.geometry.arrays import ArrayRecord, FloatArray, floats, frozen_floats
+from armscan.geometry.poses import Pose, Tool
 
 AXIS_PARAMETERS = ("theta_offset_rad", "offset_mm", "length_mm", "twist_rad")
 """The four numbers of an axis, in this order: theta_i0, d_i, l_i, alpha_i of eq. 2.5."""
@@ -30,8 +28,7 @@ def quarter_turn_flange() -> Pose[Tool, Tool]:
     return Pose(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), np.zeros(3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmModel:
+class ArmModel(ArrayRecord):
     """Geometry of an arm of n revolute joints.
 
     ``base_from_tool`` is the product of ``Rz(theta_i + theta_i0) Tz(d_i) Tx(l_i) Rx(alpha_i)``
@@ -60,24 +57,19 @@ class ArmModel:
         If the lengths of the lists differ or a lower limit is not below its upper one.
     """
 
-    theta_offset_rad: FloatArray
-    offset_mm: FloatArray
-    length_mm: FloatArray
-    twist_rad: FloatArray
+    theta_offset_rad: FloatArray = floats("n")
+    offset_mm: FloatArray = floats("n")
+    length_mm: FloatArray = floats("n")
+    twist_rad: FloatArray = floats("n")
     flange: Pose[Tool, Tool] = field(default_factory=no_flange)
-    joint_min_rad: FloatArray | None = None
-    joint_max_rad: FloatArray | None = None
+    joint_min_rad: FloatArray | None = floats("n", infinite=True, default=None)
+    joint_max_rad: FloatArray | None = floats("n", infinite=True, default=None)
     name: str = "arm"
 
     def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.theta_offset_rad))
-        if n == 0:
+        super().__post_init__()
+        if self.n_axes == 0:
             raise InputError("an arm needs at least one axis", where=self.name)
-        for name in AXIS_PARAMETERS:
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (n,), name))
-        for name in ("joint_min_rad", "joint_max_rad"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, _limits(getattr(self, name), n, name))
         low, high = self.joint_limits_rad
         if not bool((low < high).all()):
             axis = int(np.flatnonzero(~(low < high))[0]) + 1
@@ -162,17 +154,7 @@ def thesis_arm(
     )
 
 
-def _limits(values: FloatArray, n: int, name: str) -> FloatArray:
-    """Limits may be infinite, unlike other numbers of a record."""
-    limits = np.array(values, dtype=np.float64)
-    if limits.shape != (n,) or bool(np.isnan(limits).any()):
-        raise InputError(f"{name} must hold {n} numbers")
-    limits.setflags(write=False)
-    return limits
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class AxisFrames:
+class AxisFrames(ArrayRecord):
     """Where the axes of an arm stand, for N joint vectors.
 
     Parameters
@@ -183,8 +165,8 @@ class AxisFrames:
         (N, n + 1, 3) their origins in Base.
     """
 
-    rotations: FloatArray
-    origins_mm: FloatArray
+    rotations: FloatArray = floats("N", "frames", 3, 3)
+    origins_mm: FloatArray = floats("N", "frames", 3)
 
 
 def link_matrices(
@@ -260,10 +242,13 @@ def _after_flange(arm: ArmModel, frames: AxisFrames) -> tuple[FloatArray, FloatA
     return last @ arm.flange.rotation, origin
 
 
-def joint_jacobian(
+def parameter_jacobian(
     arm: ArmModel, joints_rad: FloatArray, point_tool_mm: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative of the pose by the joint angles.
+    """Derivative of the pose by all the numbers of the chain.
+
+    An error of theta_i turns all that follows about z of frame i - 1, one of alpha_i about x of
+    frame i; d_i and l_i shift it along these axes.
 
     Parameters
     ----------
@@ -275,29 +260,9 @@ def joint_jacobian(
     Returns
     -------
     FloatArray
-        (N, 6, n): rows 0 to 2 rotation vector in Base, multiplied from the left
-        (``R <- exp(dr) R``), rows 3 to 5 motion of the point in Base, mm per rad.
-    """
-    return np.asarray(parameter_jacobian(arm, joints_rad, point_tool_mm)[:, :, 0::4])
-
-
-def parameter_jacobian(
-    arm: ArmModel, joints_rad: FloatArray, point_tool_mm: FloatArray | None = None
-) -> FloatArray:
-    """Derivative of the pose by all the numbers of the chain.
-
-    An error of theta_i turns all that follows about z of frame i - 1, one of alpha_i about x of
-    frame i; d_i and l_i shift it along these axes.
-
-    Parameters
-    ----------
-    arm, joints_rad, point_tool_mm
-        As for `joint_jacobian`.
-
-    Returns
-    -------
-    FloatArray
-        (N, 6, 4 n): rows as in `joint_jacobian`, columns in the order of ``arm.parameters``.
+        (N, 6, 4 n): rows 0 to 2 rotation vector in Base, multiplied from the left
+        (``R <- exp(dr) R``), rows 3 to 5 motion of the point in Base, mm; columns in the order of
+        ``arm.parameters``, so that every fourth is the derivative by a joint angle.
     """
     frames = axis_frames(arm, joints_rad)
     rotation, point = _after_flange(arm, frames)
@@ -317,141 +282,3 @@ def parameter_jacobian(
     by_axis = np.concatenate([np.stack(turns, axis=2), np.stack(shifts, axis=2)], axis=3)
     n_rows = len(by_axis)
     return np.asarray(by_axis.transpose(0, 3, 1, 2).reshape(n_rows, 6, 4 * arm.n_axes))
-
-
-@dataclass(frozen=True, slots=True)
-class InverseOptions:
-    """When joint angles are good enough.
-
-    Parameters
-    ----------
-    position_tolerance_mm, rotation_tolerance_rad
-        Largest remaining errors of the pose.
-    lever_mm
-        Length at which an error of the orientation counts as much as one of the position.
-    max_steps
-        Steps before giving up.
-    """
-
-    position_tolerance_mm: float = 1e-6
-    rotation_tolerance_rad: float = 1e-9
-    lever_mm: float = 300.0
-    max_steps: int = 200
-
-    def __post_init__(self) -> None:
-        positive = (self.position_tolerance_mm, self.rotation_tolerance_rad, self.lever_mm)
-        if not min(positive) > 0.0 or self.max_steps < 1:
-            raise OptionError("tolerances, lever and steps of the arm's inverse must be positive")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JointSolution:
-    """Joint angles that reach a pose, (n,), with what remains of the error."""
-
-    joints_rad: FloatArray
-    position_error_mm: float
-    rotation_error_rad: float
-    n_steps: int
-
-
-def inverse(
-    arm: ArmModel,
-    base_from_tool: Pose[Base, Tool],
-    start_rad: FloatArray,
-    options: InverseOptions | None = None,
-) -> JointSolution | FitFailure:
-    """Joint angles near a start that bring the tool to a pose.
-
-    An arm of more than six axes reaches a pose in many ways: the steps are the shortest ones, so
-    the answer is close to the start. A joint at a limit stays there as long as its step would
-    leave the range.
-
-    Parameters
-    ----------
-    arm
-        Geometry and limits.
-    base_from_tool
-        Wanted pose.
-    start_rad
-        (n,) angles to begin with.
-    options
-        Defaults if None.
-
-    Returns
-    -------
-    JointSolution or FitFailure
-        A failure says how far the nearest pose found is away.
-
-    Raises
-    ------
-    InputError
-        If the start does not fit the arm or lies outside its limits.
-    """
-    options = options or InverseOptions()
-    low, high = arm.joint_limits_rad
-    joints = frozen_floats(start_rad, (arm.n_axes,), "start_rad")
-    if not bool(((joints >= low) & (joints <= high)).all()):
-        raise InputError("the start lies outside the limits of the joints", where=arm.name)
-    error = _error(arm, base_from_tool, joints, options.lever_mm)
-    damping, step = 1e-3, 0
-    while step < options.max_steps and damping < 1e12 and not _is_reached(error, options):
-        step += 1
-        trial = _step(arm, joints, error, damping, options.lever_mm)
-        trial_error = _error(arm, base_from_tool, trial, options.lever_mm)
-        if trial_error @ trial_error < error @ error:
-            joints, error, damping = trial, trial_error, max(damping / 10.0, 1e-12)
-        else:
-            damping *= 10.0
-    position = float(np.linalg.norm(error[3:]))
-    rotation = float(np.linalg.norm(error[:3])) / options.lever_mm
-    if not _is_reached(error, options):
-        return FitFailure(
-            f"the pose is not reached: the nearest found is {position:.3g} mm and "
-            f"{np.degrees(rotation):.3g} degrees away",
-            "ask for a pose within reach and within the joints' limits, or start nearer to it",
-        )
-    return JointSolution(joints, position, rotation, step)
-
-
-def _error(
-    arm: ArmModel, wanted: Pose[Base, Tool], joints: FloatArray, lever_mm: float
-) -> FloatArray:
-    """(6,) what is missing: rotation in Base times the lever, then position, mm."""
-    rotations, translations = forward(arm, joints[None])
-    turn = vector_from_rotation(wanted.rotation @ rotations[0].T)
-    return np.concatenate([lever_mm * turn, wanted.translation_mm - translations[0]])
-
-
-def _is_reached(error: FloatArray, options: InverseOptions) -> bool:
-    is_near = float(np.linalg.norm(error[3:])) <= options.position_tolerance_mm
-    turn_rad = float(np.linalg.norm(error[:3])) / options.lever_mm
-    return is_near and turn_rad <= options.rotation_tolerance_rad
-
-
-def _step(
-    arm: ArmModel, joints: FloatArray, error: FloatArray, damping: float, lever_mm: float
-) -> FloatArray:
-    """Damped step; joints that it would push out of their range are held and the rest redone."""
-    low, high = arm.joint_limits_rad
-    jacobian = joint_jacobian(arm, joints[None])[0]
-    jacobian[:3] *= lever_mm
-    is_free = np.ones(arm.n_axes, dtype=np.bool_)
-    while True:
-        move = _damped(jacobian, error, is_free, damping)
-        blocked = is_free & (((joints <= low) & (move < 0.0)) | ((joints >= high) & (move > 0.0)))
-        if not blocked.any():
-            return np.clip(joints + move, low, high)
-        is_free &= ~blocked
-
-
-def _damped(
-    jacobian: FloatArray, error: FloatArray, is_free: BoolArray, damping: float
-) -> FloatArray:
-    """(n,) shortest step of the free joints in the damped least-squares sense."""
-    move = np.zeros(len(is_free))
-    free = jacobian[:, is_free]
-    if free.shape[1]:
-        normal = free @ free.T
-        normal += damping * max(float(np.trace(normal)) / 6.0, 1e-300) * np.eye(6)
-        move[is_free] = free.T @ np.linalg.solve(normal, error)
-    return move

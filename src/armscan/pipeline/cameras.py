@@ -25,7 +25,7 @@ from armscan.pipeline.targets import FoundTargets, find_targets
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ExposureRow
 from armscan.vision.targets.circle_grid import correct_centres
-from armscan.vision.targets.target import Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Target, TargetView
 
 CENTRE_ROUNDS = 5
 CENTRES_STABLE = 0.02
@@ -55,7 +55,6 @@ def calibrate_camera_from_exposures(
     exposures: Iterable[Exposure],
     target: Target,
     options: CameraOptions | None = None,
-    target_options: TargetOptions | None = None,
     *,
     progress: Progress = silent,
 ) -> CameraRun | FitFailure:
@@ -71,8 +70,8 @@ def calibrate_camera_from_exposures(
         Taken one after the other, so that a generator needs to hold only a few at a time.
     target
         What to look for.
-    options, target_options
-        Of the calibration and of the detection; None for the defaults.
+    options
+        Of the calibration; None for the defaults.
     progress
         Is told of each exposure and of each solution.
 
@@ -87,7 +86,7 @@ def calibrate_camera_from_exposures(
     InputError, OptionError
         As `calibrate_camera`.
     """
-    found = find_targets(exposures, target, target_options, progress=progress)
+    found = find_targets(exposures, target, progress=progress)
     return calibrate_camera_from_found(found, options, progress=progress)
 
 
@@ -255,7 +254,6 @@ def calibrate_stereo_from_exposures(
     options: StereoOptions | None = None,
     given: Given | None = None,
     *,
-    target_options: TargetOptions | None = None,
     progress: Progress = silent,
 ) -> StereoRun | FitFailure:
     """Find the target in each exposure and calibrate.
@@ -268,8 +266,6 @@ def calibrate_stereo_from_exposures(
         What to look for.
     options, given
         As `calibrate_stereo`.
-    target_options
-        Of the detection; None for the defaults.
     progress
         Is told of each exposure and of each solution.
 
@@ -284,7 +280,7 @@ def calibrate_stereo_from_exposures(
         As `calibrate_stereo`.
     """
     every = [exposure for pair in exposures for exposure in pair if exposure is not None]
-    found = find_targets(every, target, target_options, progress=progress)
+    found = find_targets(every, target, progress=progress)
     return calibrate_stereo_from_found(exposures, found, target, options, given, progress=progress)
 
 

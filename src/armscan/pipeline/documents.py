@@ -3,18 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from armscan.calibration.cameras.result import BoardWarp, CameraFit
-from armscan.calibration.sheets.result import LackOfFit, LaserFit, SheetFit
 from armscan.models.calibration import (
     CameraCalibration,
     CameraDiagnostics,
     FTest,
     Provenance,
-    SensorCalibration,
-    SensorDiagnostics,
-    SheetDiagnostics,
     WarpedBoard,
 )
 
@@ -50,41 +44,10 @@ def _camera_diagnostics(fit: CameraFit) -> CameraDiagnostics:
     )
 
 
-def sensor_calibration(fit: LaserFit, provenance: Provenance) -> SensorCalibration:
-    """The document's content of a fit of light sheets, diagnostics included."""
-    plain = fit.to_calibration(provenance)
-    return replace(
-        plain,
-        sheets=tuple(
-            replace(sheet.calibration, diagnostics=_sheet_diagnostics(sheet))
-            for sheet in fit.sheets
-        ),
-        diagnostics=SensorDiagnostics(
-            noise_factor=fit.noise_factor,
-            correlation_points=fit.correlation_points,
-            naming=fit.naming,
-        ),
-    )
-
-
 def _bowed_board(warp: BoardWarp) -> WarpedBoard:
     bow_x, bow_y = warp.bow_mm.tolist()
     sigma_x, sigma_y = warp.sigma_mm.tolist()
-    test = FTest(warp.f_statistic, len(warp.bow_mm), warp.p_value)
-    return WarpedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)
-
-
-def _sheet_diagnostics(fit: SheetFit) -> SheetDiagnostics:
-    return SheetDiagnostics(
-        rms_px=fit.rms_px,
-        plane_test=_test(fit.plane_test),
-        final_test=_test(fit.final_test),
-        bow_decision=fit.bow_decision,
-        coplanarity_mm=fit.coplanarity_mm,
-        coplanarity_sigma_mm=fit.coplanarity_sigma_mm,
-        board_angle_deg=fit.board_angle_deg,
+    test = FTest(
+        f_ratio=warp.f_statistic, degrees_of_freedom=len(warp.bow_mm), p_value=warp.p_value
     )
-
-
-def _test(found: LackOfFit) -> FTest:
-    return FTest(found.f_ratio, found.degrees_of_freedom, found.p_value)
+    return WarpedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)

@@ -10,6 +10,7 @@ import numpy as np
 
 from armscan.devices.sources import ScanSource, SimulatedScan, TrueStripe
 from armscan.errors import OptionError
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 
@@ -61,6 +62,10 @@ class ScanPart:
     def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
         """Take the exposure of ``rows[row]`` with other lasers on."""
         return self.whole.expose(self.kept[row], lasers)
+
+    def true_pose(self, row: int) -> Pose[Base, Sensor]:
+        """True pose of ``rows[row]``."""
+        return self.whole.true_pose(self.kept[row])
 
     def true_stripes(self, row: int) -> Sequence[TrueStripe]:
         """The true stripes of ``rows[row]``."""

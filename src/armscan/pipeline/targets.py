@@ -24,27 +24,22 @@ from armscan.vision.targets.target import (
     Charuco,
     OtherCountSeen,
     Target,
-    TargetOptions,
     TargetView,
     format_target,
 )
 
 
 def cached_target(
-    exposure: Exposure,
-    target: Target,
-    options: TargetOptions | None = None,
-    cache: DetectionCache | None = None,
+    exposure: Exposure, target: Target, cache: DetectionCache | None = None
 ) -> TargetView | FitFailure:
     """As `detect_target`; looks only if the cache does not know. None for no cache."""
-    chosen = TargetOptions() if options is None else options
     if cache is None:
-        return detect_target(exposure, target, chosen)
-    key = detection_key("target", exposure, (target, chosen))
+        return detect_target(exposure, target)
+    key = detection_key("target", exposure, (target,))
     found = cache.get(key)
     if isinstance(found, TargetView | FitFailure):
         return found
-    looked = detect_target(exposure, target, chosen)
+    looked = detect_target(exposure, target)
     cache.put(key, looked)
     return looked
 
@@ -167,7 +162,6 @@ def _listed(sources: Sequence[str]) -> str:
 def find_targets(
     exposures: Iterable[Exposure],
     target: Target,
-    options: TargetOptions | None = None,
     *,
     cache: DetectionCache | None = None,
     progress: Progress = silent,
@@ -178,8 +172,8 @@ def find_targets(
     ----------
     exposures
         Taken one after the other, so that a generator needs to hold only a few at a time.
-    target, options
-        What to look for, and how; None for the defaults.
+    target
+        What to look for.
     cache
         What was found before; None to look again and keep nothing.
     progress
@@ -190,7 +184,7 @@ def find_targets(
     not_found: list[tuple[str, str]] = []
     answers: list[TargetView | FitFailure] = []
     wrong: FitFailure | None = None
-    detections = _detect_in_order(exposures, target, options, cache)
+    detections = _detect_in_order(exposures, target, cache)
     for done, (source, found) in enumerate(detections, 1):
         if isinstance(found, FitFailure):
             not_found.append((source, found.reason))
@@ -209,14 +203,13 @@ def find_targets(
 def _detect_in_order(
     exposures: Iterable[Exposure],
     target: Target,
-    options: TargetOptions | None,
     cache: DetectionCache | None,
 ) -> Iterator[tuple[str, TargetView | FitFailure]]:
     """Detect in a few threads, in order, without holding more exposures than threads."""
     waiting: deque[tuple[str, Future[TargetView | FitFailure]]] = deque()
     with ThreadPoolExecutor(DETECTION_THREADS) as pool:
         for exposure in exposures:
-            looking = pool.submit(cached_target, exposure, target, options, cache)
+            looking = pool.submit(cached_target, exposure, target, cache)
             waiting.append((exposure.source, looking))
             if len(waiting) == DETECTION_THREADS:
                 source, future = waiting.popleft()

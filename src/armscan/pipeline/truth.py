@@ -8,16 +8,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.calibration.hand_eye.observations import PlateReference
-from armscan.devices.sources import SimulatedScan, TrueStripe
+from armscan.devices.sources import SimulatedScan, TrueStripe, TwinScene, TwinTruth
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.geometry.poses import Pose, Sensor, Tool
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
+from armscan.inspection.results import PlaneInspection, SphereInspection, StepInspection
 from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks
 from armscan.models.calibration import (
     ArmNoise,
@@ -33,6 +35,9 @@ from armscan.reconstruction.labels import MeasuredProfile, PointStatus
 from armscan.reconstruction.place import place_with_jacobian
 from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.cloud import PointCloud
+
+PART_REACH_MM = 1.0
+"""Points of the part's scan further than this from its surface lie on what stands around it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +100,131 @@ class HandEyeErrors:
     rotation_deg: float
     translation_mm: float
     normalised: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartErrors:
+    """Points of the free-form part against its true surface.
+
+    Parameters
+    ----------
+    rows
+        (N,) rows of the cloud within `PART_REACH_MM` of the true surface.
+    distance_mm, normalised
+        (N,) their signed distances from it, and these over the stated sigma along its normal.
+    n_elsewhere
+        Points further away.
+    """
+
+    rows: IntArray
+    distance_mm: FloatArray
+    normalised: FloatArray
+    n_elsewhere: int
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square distance."""
+        return float(np.sqrt(np.mean(self.distance_mm**2)))
+
+    @property
+    def normalised_rms(self) -> float:
+        """The same over the stated sigmas; 1 is usual."""
+        return float(np.sqrt(np.mean(self.normalised**2)))
+
+    def fraction_within(self, limit_mm: float) -> float:
+        """Share of the points within a distance of the true surface."""
+        return float(np.mean(np.abs(self.distance_mm) <= limit_mm))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeadDemo:
+    """What a demo found of one head, and how far that is from the truth.
+
+    Parameters
+    ----------
+    sensor, scanner
+        As the commands calibrated them.
+    scans
+        Points in Base of every scene that was scanned by hand.
+    plate, ball
+        Inspections of the plate and of the ball.
+    steps
+        One inspection a gauge block, through the arm.
+    still_step, still_normal
+        A block in one exposure, in Sensor; and the normal (3,) of its faces there, from the
+        arm's pose.
+    part
+        The free-form part.
+    naming
+        Names of stripes against the truth, by scene; empty for a head of one sheet.
+    cameras, sheets, hand_eye
+        Errors of the calibrations: a camera each, left first; a sheet each, in their order; where
+        the sensor sits on the arm.
+    """
+
+    sensor: SensorCalibration
+    scanner: ScannerCalibration
+    scans: Mapping[TwinScene, ScanReconstruction]
+    plate: PlaneInspection
+    ball: SphereInspection
+    steps: tuple[StepInspection, ...]
+    still_step: StepInspection
+    still_normal: FloatArray
+    part: PartErrors
+    naming: Mapping[TwinScene, NamingErrors]
+    cameras: tuple[CameraErrors, ...]
+    sheets: tuple[SheetErrors, ...]
+    hand_eye: HandEyeErrors
+
+
+def part_errors(
+    cloud: PointCloud, truth: TwinTruth, base_from_cloud: Pose[Base, Any] | None = None
+) -> PartErrors:
+    """Distances of a cloud from the part's true surface.
+
+    Parameters
+    ----------
+    cloud
+        In Base, or in the frame that ``base_from_cloud`` brings there.
+    truth
+        The twin's.
+    base_from_cloud
+        None for Base.
+
+    Raises
+    ------
+    EstimationError
+        If no point lies on the part.
+    """
+    points, covariance = cloud.points_mm, cloud.covariance_mm2
+    if base_from_cloud is not None:
+        points = base_from_cloud.apply(points)
+        covariance = base_from_cloud.rotate_covariance(covariance)
+    distance = truth.part_distance_mm(points)
+    rows = np.flatnonzero(np.abs(distance) <= PART_REACH_MM)
+    if len(rows) == 0:
+        raise EstimationError("no measured point lies on the part")
+    normals = truth.part_normals(points[rows])
+    variance = np.einsum("ni,nij,nj->n", normals, covariance[rows], normals)
+    normalised = np.asarray(distance[rows] / np.sqrt(variance))
+    return PartErrors(rows, distance[rows], normalised, len(cloud) - len(rows))
+
+
+def calibration_errors(
+    sensor: SensorCalibration, truth: TwinTruth
+) -> tuple[tuple[CameraErrors, ...], tuple[SheetErrors, ...]]:
+    """How far cameras and light sheets are from the twin's truth."""
+    cameras = [camera_errors(sensor.camera, truth.camera_parameters)]
+    if sensor.second is not None and truth.right_camera_parameters is not None:
+        cameras.append(camera_errors(sensor.second.camera, truth.right_camera_parameters))
+    sheets, names = [], true_names(sensor, truth.sheet_points_mm)
+    for k, sheet in enumerate(sensor.sheets):
+        of_sheet = sensor.sheet_parameter_slice(k)
+        points = truth.sheet_points_mm[names[sheet.name]]
+        low, high = sheet.depth_range_mm
+        inside = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+        sheets.append(sheet_errors(sheet, sensor.covariance[of_sheet, of_sheet], inside))
+    return tuple(cameras), tuple(sheets)
 
 
 def camera_errors(camera: CameraCalibration, true_parameters: FloatArray) -> CameraErrors:

@@ -10,16 +10,15 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.sheets.result import (
-    LackOfFit,
+    LACK_OF_FIT_P,
     LaserFit,
     PointUse,
     SheetFit,
     SheetImage,
-    SheetOptions,
     SheetPointCheck,
 )
 from armscan.geometry.arrays import FloatArray
-from armscan.models.calibration import Provenance
+from armscan.models.calibration import FTest, Provenance
 from armscan.models.light_sheet import BOW_TERMS
 from armscan.records.exposure import Exposure
 from armscan.report.drawing import (
@@ -100,6 +99,7 @@ def residual_histogram(fit: LaserFit) -> Picture:
     remaining = np.concatenate(
         [image.remaining_px[image.use == int(PointUse.USED)] for image in fit.images]
     )
+    found = fit.diagnostics
     reach = float(np.percentile(np.abs(values), 99.0)) * 1.3
     edges = np.linspace(-reach, reach, 61).tolist()
     with styled():
@@ -117,8 +117,8 @@ def residual_histogram(fit: LaserFit) -> Picture:
     return Picture(
         chart_markup(figure, "Histogram of the residuals"),
         title="Distribution of residuals",
-        caption=f"Stripe points scatter {fit.noise_factor:.2f} times as much as their sigmas "
-        f"say; about {fit.correlation_points:.0f} points along a stripe count as one.",
+        caption=f"Stripe points scatter {found.noise_factor:.2f} times as much as their sigmas "
+        f"say; about {found.correlation_points:.0f} points along a stripe count as one.",
     )
 
 
@@ -261,7 +261,7 @@ def laser_page(
 
 def named_and_found(fit: LaserFit) -> str:
     """How the stripes were given to sheets, and in which channel they were found."""
-    text = f"Named: {fit.naming}."
+    text = f"Named: {fit.diagnostics.naming}."
     return f"{text} Stripes in {fit.channel_reason}." if fit.channel_reason else text
 
 
@@ -281,12 +281,16 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             f"± {significant(fit.tilt_sigma_deg)}° in direction, "
             f"± {significant(fit.offset_sigma_mm)} mm in the middle",
         ),
-        ("Residual", f"{significant(calibration.rms_mm)} mm rms, {significant(fit.rms_px)} px rms"),
+        (
+            "Residual",
+            f"{significant(calibration.rms_mm)} mm rms, "
+            f"{significant(fit.diagnostics.rms_px)} px rms",
+        ),
         *point_facts(fit.points),
         ("Depth covered", f"Z {low:.1f} to {high:.1f} mm"),
         (
             "Rests on",
-            f"{calibration.n_boards} boards, at most {fit.board_angle_deg:.0f}° apart, "
+            f"{calibration.n_boards} boards, at most {fit.diagnostics.board_angle_deg:.0f}° apart, "
             f"{calibration.n_points} points",
         ),
         (
@@ -297,8 +301,8 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
         ),
         (
             "Stripes miss a common plane by",
-            f"{significant(fit.coplanarity_mm)} mm, expected "
-            f"{significant(fit.coplanarity_sigma_mm)} mm",
+            f"{significant(fit.diagnostics.coplanarity_mm)} mm, expected "
+            f"{significant(fit.diagnostics.coplanarity_sigma_mm)} mm",
         ),
         ("Bow (u along the stripe, v in depth)", bow if fit.sheet.is_bowed else "none: a plane"),
         *(
@@ -306,9 +310,9 @@ def sheet_facts(fit: SheetFit) -> tuple[tuple[str, str], ...]:
             if fit.sheet.fan.any()
             else ()
         ),
-        ("Plane or bow, and why", sentence(fit.bow_decision)),
-        ("Lack of fit of a plane", lack_of_fit_text(fit.plane_test)),
-        ("Lack of fit of the sheet", lack_of_fit_text(fit.final_test)),
+        ("Plane or bow, and why", sentence(fit.diagnostics.bow_decision)),
+        ("Lack of fit of a plane", lack_of_fit_text(fit.diagnostics.plane_test)),
+        ("Lack of fit of the sheet", lack_of_fit_text(fit.diagnostics.final_test)),
     )
 
 
@@ -382,11 +386,11 @@ def _term(i: int, j: int) -> str:
     return powers[i].format("u") + powers[j].format("v")
 
 
-def lack_of_fit_text(test: LackOfFit) -> str:
+def lack_of_fit_text(test: FTest) -> str:
     """A lack-of-fit test in words."""
     if test.degrees_of_freedom == 0 or not math.isfinite(test.p_value):
         return "nothing is redundant, so nothing can be tested"
-    if test.p_value < SheetOptions().lack_of_fit_p:
+    if test.p_value < LACK_OF_FIT_P:
         verdict = "the model does not explain the stripes"
     else:
         verdict = "weak objection" if test.p_value < WEAK_P else "no objection"

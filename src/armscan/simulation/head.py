@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -138,7 +138,6 @@ def _draw_laser(
         waist_distance_mm=float(np.linalg.norm(aim - source)),
         divergence_rad=_BLUE_DIVERGENCE_RAD * (printed.wavelength_mm / BLUE_MM),
         irradiance=printed.brightness * level,
-        colour=(1.0, 1.0, 1.0),
         source=printed.source,
         cubic_rad=cubic,
     )
@@ -236,6 +235,13 @@ class Head:
     def sources(self) -> tuple[str, ...]:
         """Names of the light sources, in the order of their first sheets."""
         return tuple(dict.fromkeys(laser.source for laser in self.lasers))
+
+    @property
+    def kind(self) -> Literal["one_line", "crossed", "many"]:
+        """What the plans of scenes go by."""
+        if len(self.cameras) > 1:
+            return "many"
+        return "one_line" if len(self.sources) == 1 else "crossed"
 
     def sheets_of(self, sources: tuple[str, ...]) -> tuple[LineLaser, ...]:
         """All sheets that light up when these sources are switched on.

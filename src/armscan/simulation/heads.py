@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,78 +12,17 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import CameraRight, Pose, Sensor, Tool
 from armscan.geometry.rotations import nearest_rotation, rotation_from_vector
 from armscan.simulation.optics.camera import RenderCamera
+from armscan.simulation.plans import PRINTED
 
 _BLUR_PX = 0.8
 _AIM_MM = 140.0
 
-_CAMERA = RenderCamera(
-    fx=5145.36,
-    fy=5153.66,
-    cx=1517.37,
-    cy=1023.36,
-    k1=-0.09035,
-    k2=0.1954,
-    p1=-0.000659,
-    p2=-0.000978,
-    k3=-0.4617,
-    width_px=3072,
-    height_px=2048,
-    blur_sigma_px=_BLUR_PX,
-)
-"""Section 5.1.2. Section 5.2.2 repeats it and garbles the distortion."""
-
-_LEFT = RenderCamera(
-    fx=5174.97,
-    fy=5175.62,
-    cx=1524.358,
-    cy=1032.405,
-    k1=-0.1035,
-    k2=0.3449,
-    p1=0.000706,
-    p2=-0.00032,
-    k3=-0.139,
-    blur_sigma_px=_BLUR_PX,
-)
-_RIGHT = RenderCamera(
-    fx=5163.38,
-    fy=5162.49,
-    cx=1563.458,
-    cy=1039.554,
-    k1=-0.0895,
-    k2=0.192148,
-    p1=0.000079,
-    p2=-0.00015,
-    k3=-0.5824,
-    blur_sigma_px=_BLUR_PX,
-)
-_R_LR = np.array(
-    [
-        [0.546702, 0.02539, 0.8369417],
-        [-0.03461, 0.99937, -0.007715],
-        [-0.83661, -0.0247, 0.547238],
-    ]
-)
-_T_LR_MM = np.array([-117.4319, 2.4648, 63.229])
-"""Section 5.3.2."""
-
-SINGLE_SHEET = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
-"""Section 5.1.2: the printed plane a x + b y + c z + D = 0 of the laser, Sensor frame, mm."""
-
-CROSS_SHEETS = np.array(
-    [[-0.659905, -0.551732, 0.51, -68.7215], [0.76417, -0.543156, 0.34787, -49.616]]
-)
-"""Section 5.2.2: lasers A and B."""
-
-MULTI_SHEETS = np.array(
-    [
-        [0.5465, 0.7106, 0.4431, -43.254],
-        [0.5772, 0.7132, 0.3976, -44.228],
-        [0.6050, 0.7144, 0.3513, -45.155],
-        [0.6316, 0.7138, 0.3025, -45.743],
-        [0.6565, 0.7107, 0.2527, -46.175],
-    ]
-)
-"""Section 5.3.3: the middle five of eleven, along the head in order."""
+SINGLE_SHEET = np.array(PRINTED["sheets"]["single"][0])
+"""(4,) the printed plane of the laser; section 5.1.2."""
+CROSS_SHEETS = np.array(PRINTED["sheets"]["cross"])
+"""(2, 4) lasers A and B; section 5.2.2."""
+MULTI_SHEETS = np.array(PRINTED["sheets"]["multi"])
+"""(5, 4) the middle five of eleven; section 5.3.3."""
 
 _MULTI_SOURCE_MM = np.array([63.03, -0.58, 20.89])
 """Midway between the cameras: near the axis that the five planes miss by 0.1 mm at most."""
@@ -99,34 +39,6 @@ _HALF_FIELD_MM = 36.0
 _CUBIC_BOW_MM = 0.015
 _OUTERMOST_ORDER = 5
 _LOST_AT_OUTERMOST = 0.3
-
-_TOOL_FROM_SINGLE = (
-    [
-        [-0.42453, 0.663009, -0.61659],
-        [-0.90541, -0.31178, 0.28813],
-        [-0.00121, 0.680594, 0.73266],
-    ],
-    [41.376, 21.496, 112.286],
-)
-"""Section 5.1.2."""
-_TOOL_FROM_CROSS = (
-    [
-        [-0.42684, 0.66270, -0.61532],
-        [-0.904314, -0.3163, 0.286604],
-        [-0.004728, 0.678785, 0.73432],
-    ],
-    [41.373, 21.393, 112.962],
-)
-"""Section 5.2.3, with 41.373 for the misprint 4.1373."""
-_TOOL_FROM_MULTI = (
-    [
-        [-0.77305, -0.44229, -0.454708],
-        [0.38834, -0.896779, 0.212077],
-        [-0.50157, -0.012635, 0.865022],
-    ],
-    [73.507, 4.651, 119.688],
-)
-"""Section 5.3.4."""
 
 BLUE_MM, RED_MM = 405e-6, 650e-6
 
@@ -189,26 +101,32 @@ class PrintedHead:
 
 def printed_heads() -> dict[str, PrintedHead]:
     """All kinds of heads by name."""
-    right: Pose[CameraRight, Sensor] = Pose(nearest_rotation(_R_LR), _T_LR_MM)
-    multi = _multi_sheets()
-    middle = tuple(
-        replace(sheet, name=f"A.{k + 1}")
-        for k, sheet in enumerate(multi[_OUTER_SHEETS:-_OUTER_SHEETS])
+    single, left, right = (
+        RenderCamera(**PRINTED["cameras"][name], blur_sigma_px=_BLUR_PX)
+        for name in ("single", "left", "right")
     )
-    on_multi = _hand_eye(_TOOL_FROM_MULTI)
+    right_from_left: Pose[CameraRight, Sensor] = _pose(PRINTED["right_from_left"])
+    on_tool: dict[str, Pose[Tool, Sensor]] = {
+        name: _pose(printed) for name, printed in PRINTED["tool_from_sensor"].items()
+    }
+    sheets = _multi_sheets()
+    middle = tuple(
+        replace(sheet, name=f"A.{k}")
+        for k, sheet in enumerate(sheets[_OUTER_SHEETS:-_OUTER_SHEETS], start=1)
+    )
+    two = (left, right)
     return {
-        "thesis-single": PrintedHead(
-            (_CAMERA,), None, (_single_sheet(),), _hand_eye(_TOOL_FROM_SINGLE)
-        ),
-        "thesis-cross": PrintedHead((_CAMERA,), None, _cross_sheets(), _hand_eye(_TOOL_FROM_CROSS)),
-        "thesis-multi": PrintedHead((_LEFT, _RIGHT), right, multi, on_multi),
-        "thesis-multi-5": PrintedHead((_LEFT, _RIGHT), right, middle, on_multi),
+        "thesis-single": PrintedHead((single,), None, (_single_sheet(),), on_tool["single"]),
+        "thesis-cross": PrintedHead((single,), None, _cross_sheets(), on_tool["cross"]),
+        "thesis-multi": PrintedHead(two, right_from_left, sheets, on_tool["multi"]),
+        "thesis-multi-5": PrintedHead(two, right_from_left, middle, on_tool["multi"]),
     }
 
 
-def _hand_eye(printed: tuple[list[list[float]], list[float]]) -> Pose[Tool, Sensor]:
-    rotation, translation_mm = printed
-    return Pose(nearest_rotation(np.array(rotation)), np.array(translation_mm))
+def _pose(printed: dict[str, Any]) -> Pose[Any, Sensor]:
+    return Pose(
+        nearest_rotation(np.array(printed["rotation"])), np.array(printed["translation_mm"])
+    )
 
 
 def _single_sheet() -> PrintedSheet:

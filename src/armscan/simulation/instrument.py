@@ -17,7 +17,7 @@ from armscan.simulation.arm.arm import COMFORTABLE_RAD, ArmErrors, MeasuringArm,
 from armscan.simulation.arm.hand import FACE_DOWN, HandTremor, Trajectory
 from armscan.simulation.head import Head, build_head
 from armscan.simulation.objects.boards import CirclePattern
-from armscan.simulation.objects.fixtures import Bench
+from armscan.simulation.objects.fixtures import Fixtures
 from armscan.simulation.targets import made_target
 
 SAMPLE_NS = 4_000_000
@@ -130,13 +130,13 @@ class PlateProbing:
 
 
 def probe_plate(
-    arm: MeasuringArm, bench: Bench, errors: ProbeErrors, rng: np.random.Generator
+    arm: MeasuringArm, fixtures: Fixtures, errors: ProbeErrors, rng: np.random.Generator
 ) -> PlateProbing:
     """Touch the plate all around with a tip that leans this way and that."""
     joints = []
     last = COMFORTABLE_RAD
     for x, y in _places_mm(rng):
-        centre = _tip_centre_mm(bench, x, y, errors.touch_mm * rng.standard_normal())
+        centre = _tip_centre_mm(fixtures, x, y, errors.touch_mm * rng.standard_normal())
         last = reach(arm.true, _tool_at(centre, rng), last)
         joints.append(last)
     n = len(joints)
@@ -159,12 +159,12 @@ def _places_mm(rng: np.random.Generator) -> FloatArray:
     return np.asarray(places + _STRAY_MM * rng.uniform(-1.0, 1.0, places.shape))
 
 
-def _tip_centre_mm(bench: Bench, x_mm: float, y_mm: float, touch_mm: float) -> FloatArray:
+def _tip_centre_mm(fixtures: Fixtures, x_mm: float, y_mm: float, touch_mm: float) -> FloatArray:
     """(3,) centre, in Base, of a tip that rests on the true face at x, y of the plate's frame."""
     x, y = np.array([x_mm]), np.array([y_mm])
-    foot = np.array([[x_mm, y_mm, bench.plate.height_mm(x, y)[0]]])
-    centre = foot[0] + (0.5 * TIP_DIAMETER_MM + touch_mm) * bench.plate.normals(foot)[0]
-    pose = bench.base_from_plate
+    foot = np.array([[x_mm, y_mm, fixtures.plate.height_mm(x, y)[0]]])
+    centre = foot[0] + (0.5 * TIP_DIAMETER_MM + touch_mm) * fixtures.plate.normals(foot)[0]
+    pose = fixtures.base_from_plate
     return np.asarray(pose.rotation @ centre + pose.translation_mm)
 
 
@@ -215,7 +215,7 @@ MECHANICS: dict[Preset, Mechanics] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instrument:
-    """Head, arm, bench and calibration target of one twin.
+    """Head, arm, fixtures and calibration target of one twin.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ class Instrument:
         Camera, laser and mounting.
     arm
         True and believed.
-    bench
+    fixtures
         What stands around.
     target
         The print of the calibration target, as it was made.
@@ -233,7 +233,7 @@ class Instrument:
 
     head: Head
     arm: MeasuringArm
-    bench: Bench
+    fixtures: Fixtures
     target: CirclePattern
     mechanics: Mechanics
 
@@ -244,7 +244,7 @@ class Instrument:
         return Instrument(
             head=build_head(head, preset, seed),
             arm=MeasuringArm.build(mechanics.arm, np.random.default_rng([seed, 2])),
-            bench=Bench.build(preset, np.random.default_rng([seed, 3])),
+            fixtures=Fixtures.build(preset, np.random.default_rng([seed, 3])),
             target=made_target(mechanics.target_mm, np.random.default_rng([seed, 4])),
             mechanics=mechanics,
         )

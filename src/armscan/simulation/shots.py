@@ -118,6 +118,10 @@ class TwinScan:
             view=shot.row.view,
         )
 
+    def true_pose(self, row: int) -> Pose[Base, Sensor]:
+        """Where the head truly is in the middle of an exposure."""
+        return self.shots[row].base_from_sensor
+
     def true_stripes(self, row: int) -> tuple[TrueStripe, ...]:
         """Where all sheets' centres truly lie in one exposure, at its middle, on or off.
 

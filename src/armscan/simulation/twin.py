@@ -33,6 +33,7 @@ from armscan.simulation.scenes import (
     laser_shots,
     marker_scene,
     scan_scene,
+    still_part_scene,
     still_step_scene,
 )
 from armscan.simulation.shots import TwinScan
@@ -85,7 +86,7 @@ class InstrumentTruth:
     @property
     def plate_plane(self) -> FloatArray:
         """(4,) unit normal and D of the best plane through the true plate, in Base (eq. 2.55)."""
-        return self.instrument.bench.plate_plane
+        return self.instrument.fixtures.plate_plane
 
     @property
     def ball_diameter_mm(self) -> float:
@@ -100,24 +101,24 @@ class InstrumentTruth:
     @property
     def marker_centres_base_mm(self) -> FloatArray:
         """(N, 3) middles of all ring markers of the scene ``markers``."""
-        return self.instrument.bench.marker_centres_mm()
+        return self.instrument.fixtures.marker_centres_mm()
 
     @property
     def moved_from_base(self) -> Pose[Base, Base]:
         """From Base to the Base of the scene ``markers-moved``."""
-        return self.instrument.bench.moved_from_base
+        return self.instrument.fixtures.moved_from_base
 
     def part_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
         """Signed distance (N,) of points (N, 3) in Base from the free-form part's surface."""
-        return self.instrument.bench.part_distance_mm(points_base_mm)
+        return self.instrument.fixtures.part_distance_mm(points_base_mm)
 
     def part_normals(self, points_base_mm: FloatArray) -> FloatArray:
         """(N, 3) unit normals of that surface next to points (N, 3)."""
-        return self.instrument.bench.part_normals(points_base_mm)
+        return self.instrument.fixtures.part_normals(points_base_mm)
 
     def document(self) -> bytes:
         """All of it as JSON, with the mark ``"simulated": true``."""
-        arm, bench, head = self.instrument.arm, self.instrument.bench, self.instrument.head
+        arm, fixtures, head = self.instrument.arm, self.instrument.fixtures, self.instrument.head
         content: dict[str, Any] = {
             "simulated": True,
             "head": head.name,
@@ -134,18 +135,18 @@ class InstrumentTruth:
             "target_marks_board_mm": self.instrument.target.marks_board_mm.tolist(),
             "tool_from_sensor": _pose(self.tool_from_sensor),
             "plate_plane_base": self.plate_plane.tolist(),
-            "base_from_plate": _pose(bench.base_from_plate),
+            "base_from_plate": _pose(fixtures.base_from_plate),
             "ball": {
                 "diameter_mm": self.ball_diameter_mm,
-                "centre_base_mm": bench.ball.centre_mm.tolist(),
+                "centre_base_mm": fixtures.ball.centre_mm.tolist(),
             },
             "steps": {
                 "heights_mm": list(self.step_heights_mm),
-                "base_from_ground": _pose(bench.base_from_ground),
+                "base_from_ground": _pose(fixtures.base_from_ground),
             },
-            "base_from_part": _pose(bench.base_from_part),
-            "base_from_waves": _pose(bench.base_from_waves),
-            "waves": [asdict(wave) for wave in bench.waves.waves],
+            "base_from_part": _pose(fixtures.base_from_part),
+            "base_from_waves": _pose(fixtures.base_from_waves),
+            "waves": [asdict(wave) for wave in fixtures.waves.waves],
             "markers": {
                 "centres_base_mm": self.marker_centres_base_mm.tolist(),
                 "disc_diameter_mm": DISC_DIAMETER_MM,
@@ -254,7 +255,7 @@ class SimulatedInstrument:
         """Touch the plate of the scene ``hand-eye``."""
         rng = np.random.default_rng([self.seed, _PROBING])
         tools = self.instrument
-        return probe_plate(tools.arm, tools.bench, tools.mechanics.probe, rng)
+        return probe_plate(tools.arm, tools.fixtures, tools.mechanics.probe, rng)
 
     def _with_arm(self, scene: TwinScene, rng: np.random.Generator) -> Recorded:
         tools = self.instrument
@@ -262,6 +263,8 @@ class SimulatedInstrument:
             return hand_eye_scene(tools, rng)
         if scene == "still-step":
             return still_step_scene(tools, rng)
+        if scene == "still-part":
+            return still_part_scene(tools, rng)
         if scene in ("markers", "markers-moved"):
             return marker_scene(tools, scene == "markers-moved", rng)
         return scan_scene(tools, cast(SweptScene, scene), rng)

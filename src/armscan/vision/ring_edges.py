@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rims of rings on raw pixels, and the image of a ring's centre from its two rims.
 
-The centre of an ellipse is not the image of the circle's centre. With the homography H of
-the
-ring's plane, the rims are ``Q_k ~ H^-T diag(1, 1, -r_k^2) H^-1``, so that ``Q_2^-1 Q_1`` is
-similar
+The centre of an ellipse is not the image of the circle's centre. With the homography H of the
+ring's plane, the rims are ``Q_k ~ H^-T diag(1, 1, -r_k^2) H^-1``, so that ``Q_2^-1 Q_1`` is similar
 to ``diag(1, 1, r_1^2 / r_2^2)``: a double eigenvalue, whose eigenvectors lie on the plane's
 vanishing line, and a single one, whose eigenvector is the image of the common centre.
 
-To first order this is ``(c_2 - q c_1) / (1 - q)`` with the ellipses' centres c and ``q =
-(r_2 /
-r_1)^2``: the shift between the centres, continued to radius 0. It uses all that two circles
-say
+To first order this is ``(c_2 - q c_1) / (1 - q)`` with the ellipses' centres c and ``q = (r_2 /
+r_1)^2``: the shift between the centres, continued to radius 0. It uses all that two circles say
 about the centre: what else the rims determine (size, axes) is common to both to that order.
 """
 
@@ -37,20 +33,10 @@ _MAX_MISFIT_SHARE, _MAX_MISFIT_PX = 0.02, 0.2
 class Rims:
     """N measured rims.
 
-    Parameters
-    ----------
-    ellipses
-        The fits.
-    centres_px
-        (N, 2) centres of the ellipses.
-    half_px
-        (N, 2) half axes, the shorter one first.
-    directions
-        (N, 2, 2) unit vectors of the two axes, as columns.
-    contrast_levels
-        (N,) level outside minus level inside.
-    is_edge
-        (N,) True where an edge goes round on an ellipse.
+    ``ellipses``: The fits. ``centres_px``: (N, 2) centres of the ellipses. ``half_px``: (N, 2) half
+    axes, the shorter one first. ``directions``: (N, 2, 2) unit vectors of the two axes, as columns.
+    ``contrast_levels``: (N,) level outside minus level inside. ``is_edge``: (N,) True where an edge
+    goes round on an ellipse.
     """
 
     ellipses: Ellipses
@@ -70,16 +56,9 @@ def measure_rims(
 ) -> Rims:
     """Measure the outlines of blobs.
 
-    Parameters
-    ----------
-    grey
-        (H, W) raw levels.
-    blobs
-        N blobs.
-    gaps_px
-        (N,) distance to the nearest other rim: the band of pixels reaches half of it.
-    min_contrast_levels
-        Rims with less contrast are no edges.
+    ``grey``: (H, W) raw levels. ``blobs``: N blobs. ``gaps_px``: (N,) distance to the nearest other
+    rim: the band of pixels reaches half of it. ``min_contrast_levels``: Rims with less contrast are
+    no edges.
     """
     n = len(blobs)
     sizes = np.log2(np.sqrt(np.maximum(np.linalg.det(blobs.shapes_px2), 1.0)))
@@ -121,12 +100,8 @@ def _is_near(ellipses: Ellipses, half: FloatArray, blobs: Blobs) -> BoolArray:
 def nearest_gaps_px(blobs: Blobs, partners: tuple[IntArray, IntArray]) -> FloatArray:
     """Distance (N,) from each blob's outline to that of its nearest concentric neighbour.
 
-    Parameters
-    ----------
-    blobs
-        N blobs.
-    partners
-        Rows of the two blobs of each concentric pair, either way round.
+    ``blobs``: N blobs. ``partners``: Rows of the two blobs of each concentric pair, either way
+    round.
     """
     half = np.sqrt(np.linalg.eigvalsh(blobs.shapes_px2)[:, 0])
     gaps = np.full(len(blobs), np.inf)
@@ -140,20 +115,11 @@ def nearest_gaps_px(blobs: Blobs, partners: tuple[IntArray, IntArray]) -> FloatA
 def common_centres(outer: Ellipses, inner: Ellipses) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Images of the centres of N rings.
 
-    Parameters
-    ----------
-    outer, inner
-        N conics each; row by row two concentric circles seen in perspective.
+    ``outer``, ``inner``: N conics each; row by row two concentric circles seen in perspective.
 
-    Returns
-    -------
-    centres_px
-        (N, 2).
-    covariance_px2
-        (N, 2, 2), the two rims' noise taken as independent.
-    mismatch
-        (N,) half the difference of the two eigenvalues that should be equal, over their mean:
-        how far the rims' shapes are from those of concentric circles.
+    Returns ``centres_px``: (N, 2). ``covariance_px2``: (N, 2, 2), the two rims' noise taken as
+    independent. ``mismatch``: (N,) half the difference of the two eigenvalues that should be equal,
+    over their mean: how far the rims' shapes are from those of concentric circles.
     """
     origin, unit = outer.origin_px, outer.scale_px
     first, dfirst = outer.conics_in(origin, unit)

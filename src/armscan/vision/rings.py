@@ -2,14 +2,11 @@
 """Ring markers in an exposure: nested blobs of the right size and shape (eqs. 4.19 to 4.21).
 
 The thesis calls P "the contour circumference ... when the angle between the camera and the
-non-coding point is 0", and it sets the limit of C to 1.7 for a tilt of about 50 degrees.
-Both fit
-together only if P stays that of the untilted ring while A is the area as seen: the longer
-half
-axis ``a`` of the image does not shrink with tilt, so that ``P = 2 pi a``, ``A = pi a b`` and
-``C = P^2 / (4 pi A) = a / b``, which is 1.56 at 50 degrees and 1.7 at 54. With the ellipse's
-own
-circumference C would be 1.10 at 50 degrees and reach 1.7 at 73.
+non-coding point is 0", and it sets the limit of C to 1.7 for a tilt of about 50 degrees. Both fit
+together only if P stays that of the untilted ring while A is the area as seen: the longer half axis
+``a`` of the image does not shrink with tilt, so that ``P = 2 pi a``, ``A = pi a b`` and ``C = P^2 /
+(4 pi A) = a / b``, which is 1.56 at 50 degrees and 1.7 at 54. With the ellipse's own circumference
+C would be 1.10 at 50 degrees and reach 1.7 at 73.
 """
 
 from __future__ import annotations
@@ -29,7 +26,6 @@ from armscan.records.points import RingImages
 from armscan.vision.ring_edges import Rims, common_centres, measure_rims, nearest_gaps_px
 from armscan.vision.targets.circle_lattice import Blobs, find_blobs
 from armscan.vision.targets.grey import grey_channels, to_grey8
-from armscan.vision.targets.target import TargetOptions
 
 THESIS_PERIMETER_PX = (200.0, 350.0)
 """Limits of eq. 4.19 as the thesis sets them."""
@@ -133,10 +129,7 @@ _MIN_RADIUS_RATIO = 1.1
 def concentric_pairs(blobs: Blobs) -> tuple[IntArray, IntArray]:
     """Rows of the blobs of each pair that nests, the outer one first, of any polarity.
 
-    Parameters
-    ----------
-    blobs
-        N blobs.
+    ``blobs``: N blobs.
     """
     if len(blobs) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -207,12 +200,13 @@ def detect_rings(exposure: Exposure, options: RingOptions | None = None) -> Ring
     """
     options = RingOptions() if options is None else options
     grey = grey_channels(exposure)[0]
-    search = TargetOptions(
-        min_circle_px=_MIN_DIAMETER_PX,
-        max_circle_px=1.1 * options.max_perimeter_px / np.pi,
+    blobs = find_blobs(
+        to_grey8(grey, exposure.full_scale),
+        smallest_px=_MIN_DIAMETER_PX,
+        largest_px=1.1 * options.max_perimeter_px / np.pi,
         min_contrast=options.min_contrast,
+        same_log_area=SAME_LOG_AREA,
     )
-    blobs = find_blobs(to_grey8(grey, exposure.full_scale), search, SAME_LOG_AREA)
     pairs = concentric_pairs(blobs)
     nested = np.zeros(len(blobs), np.bool_)
     nested[pairs[0]] = nested[pairs[1]] = True

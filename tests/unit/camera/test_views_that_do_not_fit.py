@@ -127,13 +127,13 @@ def test_repeated_views_do_not_count() -> None:
 def test_views_without_enough_points_are_named() -> None:
     views, _ = make_views(Scene(), seed=7)
     views[3] = TargetView(
-        "few.png",
-        views[3].width_px,
-        views[3].height_px,
-        views[3].point_index[:5],
-        views[3].points_px[:5],
-        views[3].covariance_px2[:5],
-        views[3].points_board_mm[:5],
+        source="few.png",
+        width_px=views[3].width_px,
+        height_px=views[3].height_px,
+        point_index=views[3].point_index[:5],
+        points_px=views[3].points_px[:5],
+        covariance_px2=views[3].covariance_px2[:5],
+        points_board_mm=views[3].points_board_mm[:5],
     )
     fit = calibrate_camera(views, ALL_FIVE)
     assert isinstance(fit, CameraFit)

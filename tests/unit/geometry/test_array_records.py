@@ -136,6 +136,12 @@ def test_records_are_joined_row_by_row() -> None:
     assert len(joined.is_good) == 5
 
 
+def test_no_rows_at_all() -> None:
+    none = Cloud.empty(table=np.eye(2), source="a")
+    assert (len(none), none.points_mm.shape, none.names) == (0, (0, 3), ())
+    assert Cloud.concat([none, cloud(2)]).ids.tolist() == [0, 1]
+
+
 def test_what_differs_between_the_parts_must_be_given() -> None:
     parts = [cloud(2), cloud(2, first=2, source="b")]
     with pytest.raises(InputError, match="source differs"):

@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from armscan.calibration.sheets.board_points import HeadCameras
-from armscan.calibration.sheets.calibrate import calibrate_sheets, observe_boards
-from armscan.calibration.sheets.labels import SheetAssignment, name_stripes
+from armscan.calibration.sheets.calibrate import calibrate_sheets
+from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets
 from armscan.calibration.sheets.lack_of_fit import board_scatter, stripe_noise
 from armscan.calibration.sheets.model import start_sheet
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetOptions
 from armscan.calibration.sheets.solve import (
     CommonErrors,
     SheetSolution,
-    collect_observations,
-    placement_covariances,
     solve_sheets,
+    stack_observations,
 )
+from armscan.calibration.sheets.voting import observe_boards
 from armscan.models.light_sheet import LightSheet
 from rigs.sheet_rig import SheetRig, placed, thesis_rig
 
@@ -97,13 +97,13 @@ def test_a_stripe_of_which_nothing_is_left_has_no_say() -> None:
     cameras = HeadCameras.of(rig.calibration(rig.camera))
     boards = rig.boards(rig.camera, np.random.default_rng(1))
     images = observe_boards(boards, cameras, SheetOptions()).images
-    named = name_stripes(images, cameras.covariance, SheetOptions())
+    named = assign_sheets(images, SheetOptions())
     assert isinstance(named, SheetAssignment)
-    every = collect_observations(images, named)
+    every = stack_observations(images, named)
     few = every.select((every.stripe != 0) | (np.arange(len(every)) < 2))
     start = start_sheet("A", few, images)
     assert isinstance(start, LightSheet)
-    errors = CommonErrors(placement_covariances(images), cameras.covariance)
+    errors = CommonErrors.of(images)
     flat = solve_sheets(few, [start], errors, [False])
     assert isinstance(flat, SheetSolution)
     noise = stripe_noise(few, flat.remaining_px)

@@ -16,7 +16,8 @@ def cross_ratio(a: float, b: float, c: float, d: float) -> float:
 def test_three_points_give_the_point_with_their_cross_ratio() -> None:
     image, board = np.array([0.0, 1.0, 4.0]), np.array([0.0, 10.0, 20.0])
     found = projective_coordinate(image, board, 2.0)
-    np.testing.assert_allclose(cross_ratio(*board, found), cross_ratio(*image, 2.0), rtol=1e-12)
+    on_board, in_image = [*board, found], [*image, 2.0]
+    np.testing.assert_allclose(cross_ratio(*on_board), cross_ratio(*in_image), rtol=1e-12)
 
 
 def test_more_points_agree_with_three_of_them() -> None:

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from armscan.calibration.sheets.board_points import HeadCameras
-from armscan.calibration.sheets.coplanarity import PosedObservation
 from armscan.calibration.sheets.fan import FanAssignment, number_fan
-from armscan.calibration.sheets.labels import board_numbers, name_stripes
+from armscan.calibration.sheets.labels import assign_sheets, board_numbers
 from armscan.calibration.sheets.result import BoardStripes, SheetOptions
 from armscan.calibration.sheets.stripes_on_board import BoardImage, observe_board_stripes
 from armscan.geometry.estimate import FitFailure
@@ -29,26 +28,21 @@ def images_of(rig: FanRig, seed: int, *, dropped: float = 0.0, n_strays: int = 0
     calibration = stereo if has_right else stereo.left
     boards, truth = rig.boards(calibration, rng, dropped=dropped, n_strays=n_strays)
     cameras = HeadCameras.of(calibration)
-    images = [observe_board_stripes(board, cameras, SheetOptions()) for board in boards]
+    images = [observe_board_stripes(board, cameras) for board in boards]
     return images, [true_sheets(image, names) for image, names in zip(images, truth, strict=True)]
 
 
 def true_sheets(image: BoardImage, of_segment: list[int]) -> list[int]:
     segment = image.data.profile.segment
-    return [of_segment[int(np.bincount(segment[s.rows]).argmax())] for s in image.sightings]
+    return [of_segment[int(np.bincount(segment[s.rows]).argmax())] for s in image.stripes]
 
 
 def named(images: list[BoardImage], n_sheets: int = 0) -> Named:
-    cameras = HeadCameras.of(fan_rig(0, 1).stereo().left)
-    n = images[0].by_camera.shape[2]
-    camera = np.zeros((n, n)) if n != len(cameras.covariance) else cameras.covariance
-    posed = [[PosedObservation(s, image.placed.covariance, camera) for s in image.sightings]
-             for image in images]  # fmt: skip
-    return number_fan(posed, board_numbers(images), n_sheets)
+    return number_fan([image.stripes for image in images], board_numbers(images), n_sheets)
 
 
 def offsets(names: FanAssignment, truth: list[list[int]]) -> set[int]:
-    """True number less given number of every named stripe: one value if all are right."""
+    """True number less given number of every numbered stripe: one value if all are right."""
     return {
         true - names.numbers[k] if true >= 0 else -100
         for row, sheets in zip(truth, names.sheets, strict=True)
@@ -116,8 +110,8 @@ def test_a_line_seen_on_one_board_counts_in_the_numbering() -> None:
 
 
 def without(image: BoardImage, truth: list[int], sheets: set[int]) -> tuple[BoardImage, list[int]]:
-    kept = [s for s, true in zip(image.sightings, truth, strict=True) if true not in sheets]
-    return replace(image, sightings=tuple(kept)), [true for true in truth if true not in sheets]
+    kept = [s for s, true in zip(image.stripes, truth, strict=True) if true not in sheets]
+    return replace(image, stripes=tuple(kept)), [true for true in truth if true not in sheets]
 
 
 def test_parallel_boards_are_refused_with_the_reason() -> None:
@@ -150,7 +144,7 @@ def test_boards_that_share_no_line_are_placed_by_the_fan_or_refused() -> None:
 
 def test_a_source_named_by_the_caller_gives_numbered_sheets() -> None:
     images, _ = images_of(fan_rig(5, 6, 5), 5)
-    found = name_stripes(images, np.zeros((9, 9)), SheetOptions(n_sheets=5))
+    found = assign_sheets(images, SheetOptions(n_sheets=5))
     assert not isinstance(found, FitFailure), found
     assert found.names == ("A.1", "A.2", "A.3", "A.4", "A.5")
     assert found.is_fan
@@ -158,7 +152,7 @@ def test_a_source_named_by_the_caller_gives_numbered_sheets() -> None:
 
 def test_more_lines_than_announced_are_refused() -> None:
     images, _ = images_of(fan_rig(5, 6, 5), 5)
-    found = name_stripes(images, np.zeros((9, 9)), SheetOptions(n_sheets=4))
+    found = assign_sheets(images, SheetOptions(n_sheets=4))
     assert isinstance(found, FitFailure)
     assert "5 lines, and 4 were announced" in found.reason
 
@@ -167,7 +161,7 @@ def test_one_line_and_a_reflection_are_one_sheet() -> None:
     """Two stripes in each image of a source: the longer one is its line, as before."""
     rig = fan_rig(6, 4)
     images, _ = images_of(replace(rig, sheets=rig.sheets[5:6]), 6, n_strays=1)
-    found = name_stripes(images, np.zeros((9, 9)), SheetOptions())
+    found = assign_sheets(images, SheetOptions())
     assert not isinstance(found, FitFailure), found
     assert found.names == ("A",)
 
@@ -177,7 +171,7 @@ def test_numbers_run_from_left_to_right() -> None:
     names = named(images)
     assert isinstance(names, FanAssignment), names
     for image, sheets in zip(images, names.sheets, strict=True):
-        where = [float(sighting.middle_px.sum()) for sighting in image.sightings]
+        where = [float(sighting.middle_px.sum()) for sighting in image.stripes]
         ordered = [at for k, at in sorted(zip(sheets, where, strict=True)) if k >= 0]
         assert ordered == sorted(ordered)
 
@@ -187,7 +181,5 @@ def test_two_images_of_one_placement_are_one_board() -> None:
                            placement=i.data.placement)
               for i in images_of(fan_rig(8, 2), 8)[0]]  # fmt: skip
     cameras = HeadCameras.of(fan_rig(8, 1).stereo().left)
-    twice = [
-        observe_board_stripes(board, cameras, SheetOptions()) for board in (boards[0], *boards)
-    ]
+    twice = [observe_board_stripes(board, cameras) for board in (boards[0], *boards)]
     assert board_numbers(twice) == [0, 0, 1]

@@ -62,7 +62,7 @@ def test_stripes_that_swap_their_order_are_named_by_coplanarity() -> None:
     rig = crossing_rig()
     order = [[0, 1], [1, 0], [0, 1], [1, 0]]
     fit = fitted(rig, order)
-    assert "coplanarity" in fit.naming, fit.naming
+    assert "coplanarity" in fit.diagnostics.naming, fit.diagnostics.naming
     assert fit.sheet_names == ("A", "B")
     assert_names_follow_truth(rig, fit, order)
     middles = [
@@ -97,7 +97,7 @@ def test_parallel_stripes_on_two_boards_go_by_order_with_a_warning() -> None:
     poses = (placed(0.0, 12.0, 134.0, CENTRE), placed(0.0, -12.0, 139.0, CENTRE))
     rig = replace(thesis_rig(), sheets=sheets, poses=poses)
     fit = fitted(rig, [[0, 1], [1, 0]])
-    assert "order" in fit.naming
+    assert "order" in fit.diagnostics.naming
     assert any("one laser at a time" in warning for warning in fit.warnings)
     assert_names_follow_truth(rig, fit, [[0, 1], [1, 0]])
 
@@ -111,7 +111,7 @@ def test_one_laser_an_image_is_the_callers_word() -> None:
     fit = calibrate_sheets(boards, rig.calibration(rig.camera))
     assert isinstance(fit, LaserFit)
     assert fit.sheet_names == ("left", "right")
-    assert "caller" in fit.naming
+    assert "caller" in fit.diagnostics.naming
     assert_names_follow_truth(rig, fit, order)
 
 

@@ -6,18 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from armscan.calibration.sheets.calibrate import calibrate_sheets
-from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
+from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse
 from armscan.calibration.sheets.stripes_on_board import PULL_WIDTHS
-from armscan.calibration.sheets.target_edges import TargetEdges
+from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
 from rigs.sheet_rig import SheetRig, thesis_rig
 
 PULL_PX = 0.25
 
 
-def fitted(
-    rig: SheetRig, boards: list[BoardStripes], options: SheetOptions | None = None
-) -> LaserFit:
-    fit = calibrate_sheets(boards, rig.calibration(rig.camera), options)
+def fitted(rig: SheetRig, boards: list[BoardStripes]) -> LaserFit:
+    fit = calibrate_sheets(boards, rig.calibration(rig.camera))
     assert isinstance(fit, LaserFit), fit
     return fit
 
@@ -39,9 +37,8 @@ def pulled(board: BoardStripes) -> BoardStripes:
     edge = points[:n] + 2.0 * profile.width_px[:n, None] * normals
     along = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     points[:n] += PULL_PX * normals
-    return replace(
-        board, profile=replace(profile, points_px=points), edges=TargetEdges(edge, along)
-    )
+    moved = replace(profile, points_px=points)
+    return replace(board, profile=moved, on_edge=runs_along_edge(moved, TargetEdges(edge, along)))
 
 
 def test_points_along_an_edge_are_left_out_and_the_sheet_is_right() -> None:
@@ -54,16 +51,22 @@ def test_points_along_an_edge_are_left_out_and_the_sheet_is_right() -> None:
         assert image.count(PointUse.ON_EDGE) < n + 12, "the edge's ends reach 9 px further"
         assert image.count(PointUse.USED) > 0.5 * len(image.profile)
     assert height_mm(rig, fit) < 3.0 * fit.sheets[0].offset_sigma_mm
-    every = fitted(rig, boards, SheetOptions(edge_widths=0.0))
+    every = fitted(rig, [replace(b, on_edge=np.zeros_like(b.on_edge)) for b in boards])
     assert all(image.count(PointUse.ON_EDGE) == 0 for image in every.images)
-    assert every.sheets[0].rms_px > 1.3 * fit.sheets[0].rms_px
+    assert every.sheets[0].diagnostics.rms_px > 1.3 * fit.sheets[0].diagnostics.rms_px
 
 
 def test_an_edge_that_crosses_the_stripe_costs_no_point() -> None:
     rig = thesis_rig()
     boards = rig.boards(rig.camera, np.random.default_rng(3))
     crossed = [
-        replace(b, edges=TargetEdges(b.profile.points_px, b.profile.normals_px)) for b in boards
+        replace(
+            b,
+            on_edge=runs_along_edge(
+                b.profile, TargetEdges(b.profile.points_px, b.profile.normals_px)
+            ),
+        )
+        for b in boards
     ]
     fit = fitted(rig, crossed)
     assert all(image.count(PointUse.ON_EDGE) == 0 for image in fit.images)
@@ -107,7 +110,7 @@ def test_coplanarity_of_two_boards_against_correlated_noise() -> None:
             for b in rig.boards(rig.camera, np.random.default_rng(seed))
         ]
         sheet = fitted(rig, boards).sheets[0]
-        sigmas.append(sheet.coplanarity_mm / sheet.coplanarity_sigma_mm)
+        sigmas.append(sheet.diagnostics.coplanarity_mm / sheet.diagnostics.coplanarity_sigma_mm)
     assert 0.82 < np.sqrt(np.mean(np.square(sigmas))) < 1.18
 
 
@@ -119,7 +122,8 @@ def test_a_stripe_that_runs_along_the_pattern_is_used_as_less_certain() -> None:
     along = np.stack([-profile.normals_px[:, 1], profile.normals_px[:, 0]], axis=1)
     beside = TargetEdges(profile.points_px + 2.0 * profile.normals_px, along)
     pulled_px = profile.points_px + PULL_PX * profile.normals_px
-    boards[2] = replace(boards[2], edges=beside, profile=replace(profile, points_px=pulled_px))
+    pulled = replace(profile, points_px=pulled_px)
+    boards[2] = replace(boards[2], on_edge=runs_along_edge(pulled, beside), profile=pulled)
     fit = fitted(rig, boards)
     used = fit.images[2].use == PointUse.USED
     assert used.sum() > 0.8 * len(profile)

@@ -4,7 +4,7 @@
 import numpy as np
 
 from armscan.calibration.cameras.board_pose import estimate_board_pose
-from armscan.calibration.sheets.board_points import intersect_board, pose_by_camera
+from armscan.calibration.sheets.board_points import dpose_dcamera, intersect_board
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
@@ -58,7 +58,7 @@ def test_the_pose_follows_the_camera_as_the_estimator_does() -> None:
     view = RIG.view(3, np.random.default_rng(0))
     pose = estimate_board_pose(view, RIG.camera)
     assert pose
-    predicted = pose_by_camera(view, pose.value, RIG.camera)
+    predicted = dpose_dcamera(view, pose.value, RIG.camera)
     scale = np.array([1e-4] * 3 + [1e-2] * 3)
     for k, step in enumerate([0.5, 0.5, 0.5, 0.5, 1e-4, 1e-3, 1e-5, 1e-5, 1e-2]):
         ends = []

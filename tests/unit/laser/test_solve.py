@@ -12,7 +12,7 @@ from armscan.calibration.sheets.solve import (
     SheetObservations,
     SheetSolution,
     solve_sheets,
-    square_root,
+    square_matrix_root,
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
@@ -41,16 +41,16 @@ def observations(rng: np.random.Generator) -> SheetObservations:
     image = np.repeat(np.arange(N_IMAGES), N_STRIPE)
     local = np.column_stack([rng.uniform(-20, 20, (n, 2)), rng.normal(0.0, 1e-5, n)])
     return SheetObservations(
-        image,
-        np.arange(n),
-        image,
-        np.zeros(n, dtype=np.int64),
-        image,
-        FLAT.origin_mm + local @ FLAT.axes,
-        np.tile(0.03 * FLAT.axes[2] + 0.01 * FLAT.axes[0], (n, 1)),
-        np.full(n, 1e-4 * SIGMA_PX),
-        1e-4 * rng.normal(size=(n, 3, 6)),
-        1e-4 * smooth(local, rng),
+        image=image,
+        row=np.arange(n),
+        board=image,
+        sheet=np.zeros(n, dtype=np.int64),
+        stripe=image,
+        points_mm=FLAT.origin_mm + local @ FLAT.axes,
+        across_mm_px=np.tile(0.03 * FLAT.axes[2] + 0.01 * FLAT.axes[0], (n, 1)),
+        sigma_px=np.full(n, 1e-4 * SIGMA_PX),
+        dpoint_dpose=1e-4 * rng.normal(size=(n, 3, 6)),
+        dpoint_dcamera=1e-4 * smooth(local, rng),
     )
 
 
@@ -75,8 +75,8 @@ def test_fit_and_joint_covariance_are_those_of_the_full_matrix() -> None:
     assert solution.has_converged
 
     _, residual, by_sheet, by_point = points.residuals_px([FLAT])
-    by_camera = np.einsum("ni,nij->nj", by_point, points.by_camera)
-    by_pose = np.einsum("ni,nij->nj", by_point, points.by_pose)
+    by_camera = np.einsum("ni,nij->nj", by_point, points.dpoint_dcamera)
+    by_pose = np.einsum("ni,nij->nj", by_point, points.dpoint_dpose)
     full = np.diag(points.sigma_px**2) + by_camera @ camera @ by_camera.T
     for i in range(N_IMAGES):
         own = np.ix_(points.image == i, points.image == i)
@@ -118,8 +118,8 @@ def test_sheets_of_cameras_that_are_held_are_those_of_the_conditional_estimate()
     np.testing.assert_array_equal(held.common[-9:], 0.0)
 
     _, residual, by_sheet, by_point = points.residuals_px([FLAT])
-    by_camera = np.einsum("ni,nij->nj", by_point, points.by_camera)
-    by_pose = np.einsum("ni,nij->nj", by_point, points.by_pose)
+    by_camera = np.einsum("ni,nij->nj", by_point, points.dpoint_dcamera)
+    by_pose = np.einsum("ni,nij->nj", by_point, points.dpoint_dpose)
     known = np.diag(points.sigma_px**2)
     for i in range(N_IMAGES):
         own = points.image == i
@@ -149,7 +149,7 @@ def test_sheets_of_cameras_that_are_held_are_those_of_the_conditional_estimate()
 def test_square_root_of_a_covariance_without_full_rank() -> None:
     sigma = np.array([600.0, 0.0, 1e-5])
     covariance = np.outer(sigma, sigma)
-    root = square_root(covariance)
+    root = square_matrix_root(covariance)
     np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-9)
 
 

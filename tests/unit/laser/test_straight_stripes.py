@@ -3,8 +3,7 @@
 
 import numpy as np
 
-from armscan.calibration.sheets.result import SheetOptions
-from armscan.calibration.sheets.stripes_on_board import find_straight_stripes
+from armscan.calibration.sheets.stripes_on_board import MIN_SPAN, find_straight_stripes
 from armscan.geometry.arrays import FloatArray
 
 SIGMA_MM = 0.02
@@ -22,11 +21,10 @@ def find(points: FloatArray, segment: FloatArray, n_lines: int = 0) -> list[set[
         points,
         np.full(len(points), SIGMA_MM),
         segment.astype(np.int64),
-        BOARD_MM,
-        SheetOptions(),
+        shortest_mm=MIN_SPAN * min(BOARD_MM),
         n_lines=n_lines,
     )
-    return [set(stripe.rows.tolist()) for stripe in stripes]
+    return [set(rows.tolist()) for rows in stripes]
 
 
 def test_two_broken_crossing_lines_and_scattered_points() -> None:

@@ -20,16 +20,16 @@ def straight_observations() -> SheetObservations:
     points[:, 0] = np.tile(np.linspace(-20.0, 20.0, N_POINTS), N_STRIPES)
     points[:, 2] = 130.0 + stripe
     return SheetObservations(
-        stripe,
-        np.tile(np.arange(N_POINTS), N_STRIPES),
-        stripe,
-        np.zeros(n, dtype=np.int64),
-        stripe,
-        points,
-        np.tile([0.0, 0.03, 0.0], (n, 1)),
-        np.full(n, SIGMA_PX),
-        np.zeros((n, 3, 6)),
-        np.zeros((n, 3, 9)),
+        image=stripe,
+        row=np.tile(np.arange(N_POINTS), N_STRIPES),
+        board=stripe,
+        sheet=np.zeros(n, dtype=np.int64),
+        stripe=stripe,
+        points_mm=points,
+        across_mm_px=np.tile([0.0, 0.03, 0.0], (n, 1)),
+        sigma_px=np.full(n, SIGMA_PX),
+        dpoint_dpose=np.zeros((n, 3, 6)),
+        dpoint_dcamera=np.zeros((n, 3, 9)),
     )
 
 

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from armscan.calibration.sheets import target_edges
 from armscan.calibration.sheets.target_edges import TargetEdges, find_target_edges, runs_along_edge
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
@@ -30,7 +31,6 @@ CAMERA = CameraModel(
 HERE: Pose[Sensor, Board] = Pose(np.eye(3), np.array([-50.0, -40.0, 500.0]))
 """A board square to the camera at 2 px/mm, its origin at pixel (400, 320)."""
 WIDTH_PX = 1.5
-REACH, ANGLE_DEG = 3.0, 75.0
 
 
 def upright(x_px: float, low_px: float, high_px: float) -> Profile:
@@ -55,16 +55,18 @@ def view_of(target: Target, rim_px: FloatArray | None = None) -> TargetView:
     edges = None
     if rim_px is not None:
         n = len(rim_px)
-        edges = CircleEdges(rim_px, np.zeros(n, dtype=np.int64), np.full(n, 0.02))
+        edges = CircleEdges(
+            points_px=rim_px, circle=np.zeros(n, dtype=np.int64), sigma_px=np.full(n, 0.02)
+        )
     return TargetView(
-        "board.png",
-        1001,
-        801,
-        np.arange(len(board)),
-        CAMERA.project(board + HERE.translation_mm),
-        np.tile(0.01 * np.eye(2), (len(board), 1, 1)),
-        board,
-        edges,
+        source="board.png",
+        width_px=1001,
+        height_px=801,
+        point_index=np.arange(len(board)),
+        points_px=CAMERA.project(board + HERE.translation_mm),
+        covariance_px2=np.tile(0.01 * np.eye(2), (len(board), 1, 1)),
+        points_board_mm=board,
+        edges=edges,
     )
 
 
@@ -76,9 +78,7 @@ def edges_of(target: Target, rim_px: FloatArray | None = None) -> TargetEdges:
 
 def near_px(stripe: Profile, edges: TargetEdges) -> FloatArray:
     """The y of the points next to an edge along the stripe."""
-    return np.asarray(
-        stripe.points_px[runs_along_edge(stripe, edges, REACH, ANGLE_DEG), 1], dtype=np.float64
-    )
+    return np.asarray(stripe.points_px[runs_along_edge(stripe, edges), 1], dtype=np.float64)
 
 
 def ellipse(half_x: float, half_y: float) -> tuple[FloatArray, FloatArray]:
@@ -99,11 +99,13 @@ def test_a_stripe_that_grazes_a_circle() -> None:
     assert len(near_px(upright(134.6, 50.0, 150.0), edges)) == 0
 
 
-def test_a_stripe_through_the_middle_of_a_circle_crosses_its_rim() -> None:
+def test_a_stripe_through_the_middle_of_a_circle_crosses_its_rim(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     edges = edges_of(CircleGrid(3, 2, 10.0), ellipse(30.0, 30.0)[0])
     assert len(near_px(upright(100.0, 50.0, 150.0), edges)) == 0
-    everything = runs_along_edge(upright(100.0, 50.0, 150.0), edges, REACH, 90.0)
-    assert everything.any()
+    monkeypatch.setattr(target_edges, "LARGEST_ANGLE_DEG", 90.0)
+    assert runs_along_edge(upright(100.0, 50.0, 150.0), edges).any()
 
 
 def test_tangents_of_a_slanted_circle() -> None:

@@ -8,8 +8,9 @@ import pytest
 
 from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.calibration.sheets.board_points import HeadCameras
-from armscan.calibration.sheets.calibrate import calibrate_sheets, observe_boards
+from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions
+from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
 from rigs.sheet_rig import SheetRig, SheetTruth, make_profile, project, stripe_on_board, thesis_rig
@@ -119,7 +120,7 @@ def test_honest_boards_are_not_outvoted(bow_mm: float) -> None:
         boards = rig.boards(camera, rng)
         vote = observe_boards(boards, HeadCameras.of(rig.calibration(camera)), SheetOptions())
         assert vote.outlying == (), seed
-        assert all(len(image.sightings) == 1 for image in vote.images)
+        assert all(len(image.stripes) == 1 for image in vote.images)
 
 
 def test_two_sheets_are_both_kept() -> None:

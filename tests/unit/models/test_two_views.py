@@ -194,7 +194,7 @@ def test_points_without_noise_are_found_again_as_opencv_finds_them() -> None:
     left, right = LEFT.project(truth), VIEWS.project_right(truth)
     ideal = [camera.undistort(q)[0] for camera, q in ((LEFT, left), (RIGHT, right))]
     matrices = [np.eye(3, 4), CONVERGING.matrix[:3]]
-    found = cv2.triangulatePoints(*matrices, ideal[0].T, ideal[1].T)
+    found = cv2.triangulatePoints(matrices[0], matrices[1], ideal[0].T, ideal[1].T)
     opencv = (found[:3] / found[3]).T
     ours = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE)
     assert np.abs(triangulate_directly(VIEWS, left, right) - opencv).max() < 1e-7

@@ -11,7 +11,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.pipeline import targets
 from armscan.pipeline.laser import find_placements
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.target import Chessboard, TargetOptions
+from armscan.vision.targets.target import Chessboard
 from rigs.sheet_rig import thesis_rig
 
 
@@ -26,6 +26,6 @@ def test_the_first_images_reason_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     image = np.zeros((64, 64), np.uint8)
     pair = Exposure(image, "on.png"), Exposure(image, "off.png")
     cameras = HeadCameras.of(rig.calibration(rig.camera))
-    (placement,) = find_placements([pair], Chessboard(8, 6, 5.0), cameras, TargetOptions())
+    (placement,) = find_placements([pair], Chessboard(8, 6, 5.0), cameras)
     assert placement.seen == {0: FitFailure("nothing in off.png")}
     assert placement.placed is None

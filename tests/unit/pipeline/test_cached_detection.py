@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
+import armscan
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline import targets
 from armscan.pipeline.targets import cached_profile, cached_target
@@ -18,7 +20,7 @@ from armscan.records.exposure import Exposure, SensorWindow
 from armscan.storage import detection_cache
 from armscan.storage.detection_cache import SUFFIX, DetectionCache, detection_key
 from armscan.vision.stripe.image import StripeOptions
-from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetOptions, TargetView
+from armscan.vision.targets.target import Chessboard, CircleGrid, Target, TargetView
 
 GRID = CircleGrid(5, 4, 10.0)
 BOARD = Chessboard(5, 4, 10.0)
@@ -83,9 +85,9 @@ def test_the_second_look_gives_the_same_without_looking(
     exposure: Exposure, target: Target, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path / "cache")
-    first = cached_target(exposure, target, None, cache)
+    first = cached_target(exposure, target, cache)
     assert isinstance(first, FitFailure) == (target is GRID and exposure.source == "board.png")
-    assert_same(cached_target(exposure, target, None, cache), first)
+    assert_same(cached_target(exposure, target, cache), first)
     assert looked == [exposure.source]
 
 
@@ -121,22 +123,21 @@ def other_pixel(exposure: Exposure) -> Exposure:
 )
 def test_another_image_is_another_entry(change: Any) -> None:
     same = replace(circles(), t_ns=7, view="v", trigger_id=1)
-    key = detection_key("target", circles(), (GRID, TargetOptions()))
-    assert detection_key("target", same, (GRID, TargetOptions())) == key
-    assert detection_key("target", change(circles()), (GRID, TargetOptions())) != key
+    key = detection_key("target", circles(), (GRID,))
+    assert detection_key("target", same, (GRID,)) == key
+    assert detection_key("target", change(circles()), (GRID,)) != key
 
 
 def test_other_options_and_other_code_are_other_entries(monkeypatch: pytest.MonkeyPatch) -> None:
     exposure = circles()
     keys = {
-        detection_key("target", exposure, (GRID, TargetOptions())),
-        detection_key("stripes", exposure, (GRID, TargetOptions())),
-        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5), TargetOptions())),
-        detection_key("target", exposure, (GRID, TargetOptions(min_contrast=0.03))),
-        detection_key("target", exposure, (GRID, TargetOptions()), exposure),
+        detection_key("target", exposure, (GRID,)),
+        detection_key("stripes", exposure, (GRID,)),
+        detection_key("target", exposure, (replace(GRID, pitch_mm=10.5),)),
+        detection_key("target", exposure, (GRID,), exposure),
     }
     monkeypatch.setattr(detection_cache, "code_version", lambda: "newer")
-    keys.add(detection_key("target", exposure, (GRID, TargetOptions())))
+    keys.add(detection_key("target", exposure, (GRID,)))
     assert len(keys) == 6
 
 
@@ -146,14 +147,14 @@ def test_the_code_version_follows_the_detectors_sources(
     """A copy of the package with one line more in a detector has another version."""
     root = tmp_path / "armscan"
     for package in detection_cache.CODE:
-        source = Path(detection_cache.armscan.__file__).parent / package
+        source = Path(armscan.__file__).parent / package
         for path in source.rglob("*.py"):
             copy = root / package / path.relative_to(source)
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(path.read_bytes())
     version = detection_cache.code_version.__wrapped__
     here = version()
-    monkeypatch.setattr(detection_cache.armscan, "__file__", str(root / "__init__.py"))
+    monkeypatch.setattr(armscan, "__file__", str(root / "__init__.py"))
     assert version() == here
     saddle = root / "vision" / "targets" / "saddle.py"
     saddle.write_text(saddle.read_text("utf-8") + "\n", "utf-8")
@@ -165,14 +166,14 @@ def test_a_damaged_entry_is_looked_for_again(
     damage: str, tmp_path: Path, looked: list[str]
 ) -> None:
     cache = DetectionCache(tmp_path)
-    first = cached_target(circles(), GRID, None, cache)
+    first = cached_target(circles(), GRID, cache)
     (entry,) = tmp_path.glob(f"*{SUFFIX}")
     content = bytearray(entry.read_bytes())
     if damage == "flipped":
         content[len(content) // 2] ^= 4
     elif damage == "renamed":
         # whole, but of another image
-        cached_target(chessboard(), BOARD, None, cache)
+        cached_target(chessboard(), BOARD, cache)
         (other,) = set(tmp_path.glob(f"*{SUFFIX}")) - {entry}
         content = bytearray(other.read_bytes())
         looked.clear()
@@ -180,10 +181,10 @@ def test_a_damaged_entry_is_looked_for_again(
     entry.write_bytes(
         {"cut": content[:-9], "empty": b"", "foreign": b"x" * 99}.get(damage, content)
     )
-    again = cached_target(circles(), GRID, None, cache)
+    again = cached_target(circles(), GRID, cache)
     assert_same(again, first)
     assert looked == ["grid.png", "grid.png"]
-    assert_same(cached_target(circles(), GRID, None, cache), first)
+    assert_same(cached_target(circles(), GRID, cache), first)
     assert len(looked) == 2
 
 
@@ -192,8 +193,8 @@ def test_a_folder_that_may_not_be_written_costs_time_only(
 ) -> None:
     (tmp_path / "cache").write_text("a file")
     cache = DetectionCache(tmp_path / "cache")
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
-    assert isinstance(cached_target(circles(), GRID, None, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
+    assert isinstance(cached_target(circles(), GRID, cache), TargetView)
     assert len(looked) == 2
     cache.trim()
     assert (tmp_path / "cache").read_text() == "a file"
@@ -205,7 +206,7 @@ def test_the_folder_stays_below_its_limit(tmp_path: Path) -> None:
     found = FitFailure("x" * 1000)
     for k, name in enumerate("abcd"):
         cache.put(name, found)
-        detection_cache.os.utime(tmp_path / f"{name}{SUFFIX}", (k, k))
+        os.utime(tmp_path / f"{name}{SUFFIX}", (k, k))
     size = (tmp_path / f"a{SUFFIX}").stat().st_size
     assert cache.get("a") == found
     (tmp_path / "mine.txt").write_text("y" * 5000)

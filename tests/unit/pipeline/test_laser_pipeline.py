@@ -11,7 +11,7 @@ from armscan.errors import EstimationError, InputError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_exposures
+from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.reconstruct import reconstruct
@@ -78,8 +78,8 @@ def sensor() -> SensorCalibration:
 
 def test_images_without_a_board_are_named_with_the_reason() -> None:
     events: list[ProgressEvent] = []
-    fit = calibrate_sheets_from_exposures(
-        [picture("one.png", 100.0), picture("two.png", 120.0)],
+    fit = calibrate_sheets_from_pairs(
+        [(picture("one.png", 100.0), None), (picture("two.png", 120.0), None)],
         Chessboard(7, 5, 10.0),
         CALIBRATION,
         progress=events.append,
@@ -97,7 +97,7 @@ def test_images_without_a_board_are_named_with_the_reason() -> None:
 def test_images_of_another_size_are_refused_before_any_work() -> None:
     small = picture("small.png", width=300)
     for call in (
-        lambda: calibrate_sheets_from_exposures([small], Chessboard(7, 5, 10.0), CALIBRATION),
+        lambda: calibrate_sheets_from_pairs([(small, None)], Chessboard(7, 5, 10.0), CALIBRATION),
         lambda: reconstruct([small], sensor()),
     ):
         with pytest.raises(InputError, match=r"small\.png.*320 x 240"):

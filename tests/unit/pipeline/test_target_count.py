@@ -7,8 +7,9 @@ import pytest
 from armscan.geometry.estimate import FitFailure
 from armscan.pipeline.cameras import calibrate_camera_from_exposures
 from armscan.pipeline.targets import ENOUGH_IMAGES, wrong_count
-from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.vision.targets.target import Chessboard, CircleGrid, OtherCountSeen, TargetView
+from rigs.flat_prints import ChessboardPattern
 from rigs.target_scenes import exposure, render
 
 ASKED = Chessboard(9, 7, 3.0)
@@ -22,7 +23,13 @@ def view_of(target: Chessboard, chosen: slice) -> TargetView:
     points = target.points_board_mm[chosen]
     n = len(points)
     return TargetView(
-        "seen", 640, 480, np.arange(n), points[:, :2], np.tile(np.eye(2), (n, 1, 1)), points
+        source="seen",
+        width_px=640,
+        height_px=480,
+        point_index=np.arange(n),
+        points_px=points[:, :2],
+        covariance_px2=np.tile(np.eye(2), (n, 1, 1)),
+        points_board_mm=points,
     )
 
 

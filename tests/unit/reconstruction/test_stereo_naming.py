@@ -14,7 +14,7 @@ from armscan.reconstruction.label_stereo import StereoLabelOptions, log_ratio
 from armscan.reconstruction.labels import LabelStatus
 from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
 from armscan.reconstruction.triangulate import sensor_covariance
-from armscan.vision.stripe.extract import empty_profile
+from armscan.records.profile import Profile
 from rigs.placing_rig import scanner
 from rigs.stereo_head import StereoHead
 from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
@@ -117,7 +117,7 @@ def test_each_point_is_counted_once() -> None:
 
 
 def test_no_stripes_give_no_points() -> None:
-    none = empty_profile("none")
+    none = Profile.empty(source="none")
     _, left, _ = measured("plate", 0)
     for pair in ((none, none), (left.profile, none), (none, left.profile)):
         found = measure_stereo(*pair, head().calibration())
@@ -129,7 +129,7 @@ def test_one_camera_is_refused() -> None:
     sensor = scanner().sensor
     assert sensor is not None
     with pytest.raises(InputError, match="one camera"):
-        measure_stereo(empty_profile("a"), empty_profile("b"), sensor)
+        measure_stereo(Profile.empty(source="a"), Profile.empty(source="b"), sensor)
 
 
 def test_options_out_of_range_are_refused() -> None:

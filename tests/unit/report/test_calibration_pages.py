@@ -14,10 +14,11 @@ import pytest
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.sheets.calibrate import calibrate_sheets
-from armscan.calibration.sheets.result import LackOfFit, LaserFit, PointUse
-from armscan.calibration.sheets.target_edges import TargetEdges
+from armscan.calibration.sheets.result import LaserFit, PointUse
+from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
 from armscan.jobs.sheets import laser_summary
-from armscan.pipeline.documents import camera_calibration, sensor_calibration
+from armscan.models.calibration import FTest
+from armscan.pipeline.documents import camera_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
 from armscan.report.camera import ARROW_SHARE, camera_page, residual_magnification
@@ -103,18 +104,21 @@ def test_document_of_a_camera_is_the_fit() -> None:
 
 def test_document_of_sheets_keeps_the_evidence() -> None:
     fit = laser_fit()
-    document = sensor_calibration(fit, PROVENANCE)
+    document = fit.to_calibration(PROVENANCE)
     (sheet,), (kept,) = fit.sheets, [sheet.diagnostics for sheet in document.sheets]
     assert kept is not None
-    assert kept.plane_test.f_ratio == sheet.plane_test.f_ratio > kept.final_test.f_ratio
-    assert kept.final_test.p_value == sheet.final_test.p_value
-    assert (kept.rms_px, kept.board_angle_deg) == (sheet.rms_px, sheet.board_angle_deg)
+    assert kept.plane_test.f_ratio == sheet.diagnostics.plane_test.f_ratio > kept.final_test.f_ratio
+    assert kept.final_test.p_value == sheet.diagnostics.final_test.p_value
+    assert (kept.rms_px, kept.board_angle_deg) == (
+        sheet.diagnostics.rms_px,
+        sheet.diagnostics.board_angle_deg,
+    )
     assert (kept.coplanarity_mm, kept.coplanarity_sigma_mm) == (
-        sheet.coplanarity_mm,
-        sheet.coplanarity_sigma_mm,
+        sheet.diagnostics.coplanarity_mm,
+        sheet.diagnostics.coplanarity_sigma_mm,
     )
     assert document.diagnostics is not None
-    assert document.diagnostics.naming == fit.naming
+    assert document.diagnostics.naming == fit.diagnostics.naming
 
 
 def test_laser_page_shows_every_point_and_the_bow() -> None:
@@ -140,7 +144,8 @@ def test_laser_page_names_the_points_along_an_edge_and_gives_every_fate_a_colour
     profile = boards[0].profile
     half = profile.select(np.arange(len(profile)) < len(profile) // 2)
     along = np.stack([-half.normals_px[:, 1], half.normals_px[:, 0]], axis=1)
-    boards[0] = replace(boards[0], edges=TargetEdges(half.points_px, along))
+    on_edge = runs_along_edge(profile, TargetEdges(half.points_px, along))
+    boards[0] = replace(boards[0], on_edge=on_edge)
     fit = calibrate_sheets(boards, rig.calibration(rig.camera))
     assert isinstance(fit, LaserFit)
     page = render_page(laser_page(fit, {}, PROVENANCE))
@@ -179,4 +184,4 @@ def test_every_flag_that_rejects_has_a_colour_of_its_own() -> None:
 )
 def test_lack_of_fit_is_worded_by_the_decisions_own_limit(p_value: float, words: str) -> None:
     """The sheet is bowed below 0.001; 0.0027 is not nothing."""
-    assert words in lack_of_fit_text(LackOfFit(2.03, 20, p_value))
+    assert words in lack_of_fit_text(FTest(2.03, 20, p_value))

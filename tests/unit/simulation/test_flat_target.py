@@ -12,8 +12,9 @@ from armscan.simulation.objects.board_image import (
     reflectance_image,
     render_flat_target,
 )
-from armscan.simulation.objects.boards import ChessboardPattern, CirclePattern
+from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.optics.camera import RenderCamera
+from rigs.flat_prints import ChessboardPattern
 
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
 TILTED = cv2.Rodrigues(np.array([0.5, -0.4, 0.2]))[0]

@@ -15,16 +15,18 @@ from armscan.geometry.poses import Points, Sensor
 from armscan.pipeline.scan_part import FewerViews
 from armscan.simulation.arm.arm import reach
 from armscan.simulation.arm.hand import CAMERA_CLOCK_NS, HeadOrientation, aim_point_mm, sensor_over
-from armscan.simulation.arm.passes import SweptScene, strokes_of
+from armscan.simulation.arm.passes import SweptScene, scan_passes
 from armscan.simulation.head import MountedCamera
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.scenes import PLACES, hand_eye_poses, marker_poses
+from armscan.simulation.plans import PLANS
+from armscan.simulation.scenes import hand_eye_poses, marker_poses
 from armscan.simulation.shots import RenderRequest, TwinScan
-from armscan.simulation.targets import MULTI_FAR_PLACES, MULTI_LEFT_PLACES
 from armscan.simulation.twin import build_twin
 from armscan.storage.recording import read_recording, write_recording
 
 SEEDS = range(1, 11)
+N_PLACES = len(PLANS["markers"]["places"])
+N_OUTER = sum(len(PLANS["laser_targets"][name]) for name in ("left_first", "left_last"))
 IMAGE_SCENES = [scene for scene in get_args(TwinScene) if scene != "probing"]
 
 
@@ -104,7 +106,7 @@ def test_both_cameras_see_all_marks_half_way_between_them(seed: int):
             assert into[2, 2] > np.cos(np.radians(55.0))
     laser_views = twin.scan("laser").shots[::4]
     seen_by_both = [all(_marks_in_view(shot, eye) for eye in cameras) for shot in laser_views]
-    assert sum(seen_by_both) >= len(laser_views) - len(MULTI_LEFT_PLACES + MULTI_FAR_PLACES) == 24
+    assert sum(seen_by_both) >= len(laser_views) - N_OUTER == 24
     assert all(_marks_in_view(shot, cameras[0]) for shot in laser_views)
 
 
@@ -162,12 +164,12 @@ def test_the_arm_reaches_every_posture_and_stroke(head: str):
     """Ends and middle of every stroke, as far aside as the hand strays; ten instruments."""
     for seed in SEEDS:
         tools = build_twin(head, seed=seed).instrument
-        poses = hand_eye_poses(tools.head, tools.bench, np.random.default_rng(seed))
+        poses = hand_eye_poses(tools.head, tools.fixtures, np.random.default_rng(seed))
         for is_moved in (False, True):
             rng = np.random.default_rng(seed)
-            poses += [p for _, p in marker_poses(tools.head, tools.bench, is_moved, rng)]
+            poses += [p for _, p in marker_poses(tools.head, tools.fixtures, is_moved, rng)]
         for scene in get_args(SweptScene):
-            for stroke in strokes_of(scene, tools.head, tools.bench):
+            for stroke in scan_passes(scene, tools.head, tools.fixtures):
                 for share, stray in ((0.0, 3.0), (1.0, -3.0)):
                     spot = stroke.start_mm + share * (stroke.end_mm - stroke.start_mm)
                     aim = stroke.aim
@@ -240,7 +242,7 @@ def test_the_plans_fix_the_hand_eye_as_well_as_the_single_lines_does(head: str):
     twin = build_twin(head, seed=5)
     tools = twin.instrument
     information = np.zeros((6, 6))
-    for pose in hand_eye_poses(tools.head, tools.bench, np.random.default_rng(5)):
+    for pose in hand_eye_poses(tools.head, tools.fixtures, np.random.default_rng(5)):
         normal = twin.truth.plate_plane[:3] @ pose.rotation
         height = twin.truth.plate_plane[:3] @ pose.translation_mm + twin.truth.plate_plane[3]
         seen = []
@@ -267,7 +269,7 @@ def test_the_plans_fix_the_hand_eye_as_well_as_the_single_lines_does(head: str):
 @pytest.mark.parametrize(("head", "height_mm"), [("thesis-cross", 20.0), ("thesis-multi", 5.0)])
 def test_the_still_step_shows_block_and_ground(head: str, height_mm: float):
     scan = scan_of(head, "still-step")
-    ground = build_twin(head, seed=2).instrument.bench.base_from_ground
+    ground = build_twin(head, seed=2).instrument.fixtures.base_from_ground
     seen = _seen_on(scan, len(scan.rows) - 1)
     for sheet in ("A.5", "A.6", "A.7") if head == "thesis-multi" else ("A", "B"):
         height = ((seen[sheet] - ground.translation_mm) @ ground.rotation)[:, 2]
@@ -315,8 +317,8 @@ def test_places_of_markers_overlap_and_are_named():
             inside = ((pixels > 100.0) & (pixels < size - 100.0)).all(axis=1)
             seen &= set(np.flatnonzero(inside).tolist())
         lit = [row.lasers for row in scan.rows]
-        assert lit == [(), (), ("A",), ("A",)] * len(PLACES)
-    assert list(views) == [f"place-{k:02d}" for k in range(1, 2 * len(PLACES) + 1)]
+        assert lit == [(), (), ("A",), ("A",)] * N_PLACES
+    assert list(views) == [f"place-{k:02d}" for k in range(1, 2 * N_PLACES + 1)]
     names = list(views)
     for name, following in pairwise(names):
         assert len(views[name]) >= 8

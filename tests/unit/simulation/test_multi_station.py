@@ -13,7 +13,7 @@ from armscan.geometry.poses import Base, Part, Plate, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import LEFT, RIGHT, Head, Window, build_head
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed
-from armscan.simulation.optics.render import Speckle, render_laser
+from armscan.simulation.optics.render import Speckle
 from armscan.simulation.optics.scene import GROUND_STEEL, Material, SceneObject, Sphere
 from armscan.simulation.station import (
     ExposureSettings,
@@ -24,6 +24,7 @@ from armscan.simulation.station import (
     seen_from,
     true_stripes,
 )
+from rigs.slow_renderer import render_laser
 
 MATT = Material()
 WINDOW = Window(1150, 750, 700, 500)

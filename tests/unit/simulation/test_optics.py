@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.optics.camera import RenderCamera, add_noise, blur_image
+from armscan.simulation.optics.camera import RenderCamera, blur_image
+from rigs.slow_renderer import add_noise
 
 CAMERA = RenderCamera(
     1500.0, 1490.0, 610.0, 440.0, -0.2, 0.08, 1e-3, -7e-4, 0.01, width_px=1200, height_px=900

@@ -114,7 +114,7 @@ def test_the_laser_meets_disc_ring_and_face():
 
 def test_markers_lie_on_faces_and_clear_of_each_other():
     for seed in range(5):
-        bench = build_twin("thesis-multi", seed=seed).instrument.bench
+        bench = build_twin("thesis-multi", seed=seed).instrument.fixtures
         centres = bench.marker_centres_mm()
         assert len(centres) == N_MARKERS == 30
         up = bench.base_from_marked.rotation[:, 2]

@@ -45,7 +45,7 @@ def test_a_ghost_lies_mirrored_at_the_centre() -> None:
 
 def test_mono_levels_clip_at_full_scale_and_refuse_odd_bits() -> None:
     light = np.array([[-0.2, 0.0, 0.502, 1.0, 7.0]], np.float32)
-    quiet = Detector(is_colour=False, read_noise=0.0, electrons_per_level=1e9)
+    quiet = Detector(read_noise=0.0, electrons_per_level=1e9)
     levels = expose_mono(light, quiet, np.random.default_rng(0))
     assert levels.tolist() == [[0, 0, 128, 255, 255]]
     with pytest.raises(InputError, match="17 bits"):

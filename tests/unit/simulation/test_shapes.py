@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blocks, bars, plates and their places in a scene, against geometry done by hand."""
+"""Blocks, plates and their places in a scene, against geometry done by hand."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError
 from armscan.geometry.poses import Base, Part, Pose
-from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Rod, Solid
+from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Solid
 from armscan.simulation.optics.scene import Material, SceneObject, Sphere
 
 SOLIDS: dict[str, Solid] = {
     "box": Box(np.array([30.0, 9.0, 20.0])),
-    "rod": Rod(6.0, 25.0),
     "ball": Sphere(np.array([1.0, 2.0, 10.0]), 17.48),
     "plate": FlatPlate.draw((200.0, 150.0), 0.015, np.random.default_rng(3)),
 }
@@ -45,7 +44,7 @@ def test_rays_stop_on_the_surface_and_nowhere_before(name: str) -> None:
         assert solid.distance_mm(before).min() > 0.0
 
 
-@pytest.mark.parametrize("name", ["box", "rod", "ball"])
+@pytest.mark.parametrize("name", ["box", "ball"])
 def test_rays_that_miss_never_come_inside(name: str) -> None:
     solid = SOLIDS[name]
     origins, directions = rays_at(10.0)
@@ -147,7 +146,6 @@ def test_texture_has_its_contrast_and_grain_and_stays_on_the_thing() -> None:
 def test_shapes_without_size_are_refused() -> None:
     for make in (
         lambda: Box(np.array([1.0, 0.0, 1.0])),
-        lambda: Rod(1.0, 0.0),
         lambda: FlatPlate(np.array([-1.0, 1.0])),
         lambda: Material(gloss=-1.0),
         lambda: Material(texture_mm=0.0),

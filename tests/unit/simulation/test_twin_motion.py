@@ -16,7 +16,7 @@ from armscan.simulation.arm.hand import (
     ScanPass,
     sweep,
 )
-from armscan.simulation.arm.single_passes import plate_strokes
+from armscan.simulation.arm.passes import scan_passes
 from armscan.simulation.head import sheet_middle_mm
 from armscan.simulation.instrument import SAMPLE_NS
 from armscan.simulation.twin import build_twin
@@ -34,7 +34,7 @@ def _middle_of_stripe(joints: np.ndarray) -> np.ndarray:
 
 
 def test_a_stroke_has_a_persons_speed_and_ends_where_it_should():
-    stroke = plate_strokes(TOOLS.bench)[0]
+    stroke = scan_passes("plate", TOOLS.head, TOOLS.fixtures)[0]
     hand = TOOLS.mechanics.hand
     done = sweep(stroke, TOOLS.head, TOOLS.arm.true, hand, np.random.default_rng(3))
     assert len(done.exposure_t_ns) == stroke.n_exposures
@@ -52,7 +52,7 @@ def test_a_stroke_has_a_persons_speed_and_ends_where_it_should():
 
 
 def test_a_steady_hand_follows_the_line_at_even_speed():
-    here = TOOLS.bench.base_from_plate
+    here = TOOLS.fixtures.base_from_plate
     start = here.translation_mm
     end = start + 60.0 * here.rotation[:, 0]
     stroke = ScanPass(here.rotation, start, end, HeadOrientation(-20.0, 0.0, 0.0, 137.0), 40.0, 4)
@@ -65,7 +65,7 @@ def test_a_steady_hand_follows_the_line_at_even_speed():
 
 
 def test_a_stroke_too_short_for_its_images_is_refused():
-    here = TOOLS.bench.base_from_plate
+    here = TOOLS.fixtures.base_from_plate
     end = here.translation_mm + 5.0 * here.rotation[:, 0]
     aim = HeadOrientation(0.0, 0.0, 0.0, 137.0)
     stroke = ScanPass(here.rotation, here.translation_mm, end, aim, 40.0, 50)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.scenes import PLAN
+from armscan.simulation.plans import PLANS
 from armscan.simulation.shots import TwinScan
 from armscan.simulation.twin import build_twin
 
@@ -15,7 +15,7 @@ from armscan.simulation.twin import build_twin
 def _stripe_on_plate(tools: Instrument, scan: TwinScan, row: int) -> np.ndarray:
     """(N, 3) points, in Sensor, of the stripe on the plate's plane that the camera sees."""
     head, pose = tools.head, scan.shots[row].base_from_sensor
-    laser, plane = head.lasers[0], tools.bench.plate_plane
+    laser, plane = head.lasers[0], tools.fixtures.plate_plane
     rays = laser.rays(np.linspace(-laser.half_angle_rad, laser.half_angle_rad, 401))
     normal = plane[:3] @ pose.rotation
     height = plane[:3] @ pose.translation_mm + plane[3]
@@ -33,8 +33,8 @@ def _stripe_on_plate(tools: Instrument, scan: TwinScan, row: int) -> np.ndarray:
 def test_every_hand_eye_exposure_shows_a_long_stripe_on_the_plate(seed: int):
     twin = build_twin(seed=seed)
     scan = twin.scan("hand-eye")
-    assert len(scan.rows) == 2 * len(PLAN) == 24
-    plate = twin.instrument.bench
+    assert len(scan.rows) == 2 * len(PLANS["hand_eye"]["one_line"]) == 24
+    plate = twin.instrument.fixtures
     for row in range(len(scan.rows)):
         points = _stripe_on_plate(twin.instrument, scan, row)
         assert np.linalg.norm(points[-1] - points[0]) > 55.0

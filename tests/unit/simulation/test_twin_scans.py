@@ -98,7 +98,7 @@ def test_the_still_step_shows_the_block_and_the_ground():
     twin = build_twin(seed=3)
     scan = twin.scan("still-step")
     stripe = scan.true_stripes(0)[0]
-    ground = twin.instrument.bench.base_from_ground
+    ground = twin.instrument.fixtures.base_from_ground
     placed = (stripe.points_base_mm - ground.translation_mm) @ ground.rotation
     on_top = stripe.thing == 1.0
     np.testing.assert_allclose(placed[on_top, 2], 20.0, atol=1e-6)
@@ -132,7 +132,7 @@ def test_truth_is_of_the_same_instrument_and_says_that_it_is_simulated():
     assert np.ptp(truth.sheet_points_mm["A"][:, 2]) == pytest.approx(60.0)
     assert truth.camera_parameters[0] == camera.fx
     assert np.linalg.norm(truth.plate_plane[:3]) == pytest.approx(1.0)
-    plate = twin.instrument.bench.base_from_plate.translation_mm
+    plate = twin.instrument.fixtures.base_from_plate.translation_mm
     assert truth.plate_plane[:3] @ plate + truth.plate_plane[3] == pytest.approx(0.0, abs=1e-10)
     document = json.loads(truth.document())
     assert document["simulated"] is True
@@ -145,7 +145,7 @@ def test_presets_differ_in_arm_plate_and_probing():
     assert 20.0 * noise[0] < noise[1] < 0.5 * noise[2]
     x, y = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-99, 99, 41)]))
     uneven = [
-        float(np.ptp(t.instrument.bench.plate.height_mm(x, y))) for t in (clean, thesis, harsh)
+        float(np.ptp(t.instrument.fixtures.plate.height_mm(x, y))) for t in (clean, thesis, harsh)
     ]
     np.testing.assert_allclose(uneven, [0.001, 0.015, 0.04], rtol=0.1)
 

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_image import (
+from armscan.vision.stripe.image import StripeOptions
+from rigs.stripe_image import (
     NO_NOISE,
     CircleCurve,
     SimulatedStripe,
@@ -13,7 +14,6 @@ from armscan.simulation.stripe_image import (
     StripeScene,
     WaveCurve,
 )
-from armscan.vision.stripe.image import StripeOptions
 from rigs.stripe_scenes import line, score
 
 NOISE_LIMIT_PX = 0.045

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from armscan.records.exposure import Exposure
-from armscan.simulation.stripe_image import StripeNoise, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions, find_laser_colour, split_channels, subtract
+from rigs.stripe_image import StripeNoise, StripeScene
 from rigs.stripe_scenes import line
 
 SCENE = StripeScene((line(75.0),), 320, 240)

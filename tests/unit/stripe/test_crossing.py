@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.simulation.stripe_image import (
+from armscan.vision.stripe.extract import extract_stripes
+from rigs.stripe_image import (
     NO_NOISE,
     SimulatedStripe,
     StraightCurve,
     StripeNoise,
     StripeScene,
 )
-from armscan.vision.stripe.extract import extract_stripes
 
 ANGLES_DEG = (-50.0, 55.0)
 SIGMA_PX = 3.0
@@ -26,7 +26,7 @@ def pulled(noise: StripeNoise, seed: int) -> tuple[FloatArray, FloatArray]:
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 2)
     middle = np.array([200.0, 150.0]) + shift
     stripes = tuple(
-        SimulatedStripe(StraightCurve(*middle, angle), sigma_px=SIGMA_PX) for angle in ANGLES_DEG
+        SimulatedStripe(StraightCurve(*[*middle, angle]), sigma_px=SIGMA_PX) for angle in ANGLES_DEG
     )
     profile = extract_stripes(StripeScene(stripes, noise=noise).expose(seed))
     points = profile.points_px[profile.is_accepted]
@@ -59,7 +59,7 @@ def test_nor_with_speckle() -> None:
 def test_without_the_flag_there_would_be_a_pull() -> None:
     """The same profile's rejected points show what is dropped."""
     middle = (200.3, 150.2)
-    stripes = tuple(SimulatedStripe(StraightCurve(*middle, angle)) for angle in ANGLES_DEG)
+    stripes = tuple(SimulatedStripe(StraightCurve(*[*middle, angle])) for angle in ANGLES_DEG)
     profile = extract_stripes(StripeScene(stripes, noise=NO_NOISE).expose(1))
     dropped = profile.points_px[~profile.is_accepted]
     nearest = np.min([np.abs(stripe.curve.locate(dropped)[0]) for stripe in stripes], axis=0)

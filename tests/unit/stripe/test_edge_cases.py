@@ -6,9 +6,9 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.records.exposure import Exposure
-from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
+from rigs.stripe_image import StripeScene
 from rigs.stripe_scenes import line
 
 METHODS = ("fit", "threshold", "centroid", "template", "hessian")

@@ -6,8 +6,8 @@ import pytest
 
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
-from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
+from rigs.stripe_image import StripeScene
 from rigs.stripe_scenes import line
 
 NEAR_SIGMAS = 14.0

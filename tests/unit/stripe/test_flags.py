@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from armscan.records.profile import StripeFlag
-from armscan.simulation.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.flags import close_gaps
 from armscan.vision.stripe.image import StripeOptions
 from armscan.vision.stripe.ridge import strong_median
+from rigs.stripe_image import SimulatedStripe, StraightCurve, StripeScene
 from rigs.stripe_scenes import line, score
 
 

@@ -4,9 +4,9 @@
 import numpy as np
 
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.simulation.stripe_image import StripeScene
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.ridge import find_candidates, find_line_sigma, measure_level
+from rigs.stripe_image import StripeScene
 from rigs.stripe_scenes import line
 
 

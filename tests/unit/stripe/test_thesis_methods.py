@@ -4,18 +4,19 @@
 import numpy as np
 import pytest
 
-from armscan.simulation.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
+from armscan.geometry.arrays import FloatArray
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeMethod, StripeOptions, mono_plane
 from armscan.vision.stripe.ridge import measure_level
-from armscan.vision.stripe.thesis import THESIS_METHODS, StripeCentres
+from armscan.vision.stripe.thesis import THESIS_METHODS
+from rigs.stripe_image import NO_NOISE, CircleCurve, SimulatedStripe, StripeScene
 from rigs.stripe_scenes import line, score
 
 METHODS: tuple[StripeMethod, ...] = ("threshold", "centroid", "template", "hessian")
 NOISE_PX = {"threshold": 0.4, "centroid": 0.2, "template": 0.45, "hessian": 0.1}
 
 
-def centres(method: str, scene: StripeScene, threshold: float = 20.0) -> StripeCentres:
+def centres(method: str, scene: StripeScene, threshold: float = 20.0) -> FloatArray:
     image = mono_plane(scene.expose(1), None).image
     return THESIS_METHODS[method](image, measure_level(image, threshold), 3.0)
 
@@ -35,20 +36,20 @@ def test_noise_is_the_methods_own_and_the_mean_is_right(
 def test_threshold_gives_the_middle_of_the_run() -> None:
     scene = StripeScene((line(0.0),), 40, 240, noise=NO_NOISE)
     found = centres("threshold", scene)
-    assert len(found.points_px) == 40
-    assert np.unique(found.points_px[:, 1] * 2 % 1).tolist() == [0.0]
-    assert np.abs(found.points_px[:, 1] - 120.2).max() <= 0.5
+    assert len(found) == 40
+    assert np.unique(found[:, 1] * 2 % 1).tolist() == [0.0]
+    assert np.abs(found[:, 1] - 120.2).max() <= 0.5
 
 
 def test_centroid_is_exact_for_a_symmetric_noise_free_line() -> None:
     scene = StripeScene((line(0.0),), 40, 240, background=0.0, noise=NO_NOISE, bits=16)
-    assert np.abs(centres("centroid", scene, 0.5).points_px[:, 1] - 120.2).max() < 0.02
+    assert np.abs(centres("centroid", scene, 0.5)[:, 1] - 120.2).max() < 0.02
 
 
 def test_template_gives_whole_pixels_and_the_nearest_direction() -> None:
     found = centres("template", StripeScene((line(45.0),), 320, 240, noise=NO_NOISE))
-    assert (found.points_px == np.rint(found.points_px)).all()
-    direction = np.median(np.abs(found.normals), axis=0)
+    assert (found[:, :2] == np.rint(found[:, :2])).all()
+    direction = np.median(np.abs(found[:, 2:]), axis=0)
     assert direction == pytest.approx([np.sqrt(0.5), np.sqrt(0.5)])
 
 
@@ -56,7 +57,7 @@ def test_hessian_has_the_known_bias_on_a_circle() -> None:
     radius, sigma = 80.0, 3.0
     stripe = SimulatedStripe(CircleCurve(120.0, 120.0, radius), sigma_px=sigma)
     scene = StripeScene((stripe,), 240, 240, noise=NO_NOISE)
-    error, _, _ = scene.errors(centres("hessian", scene).points_px)
+    error, _, _ = scene.errors(centres("hessian", scene)[:, :2])
     assert error.mean() == pytest.approx(-(sigma**2) / (2.0 * radius), rel=0.15)
 
 

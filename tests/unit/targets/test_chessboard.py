@@ -8,10 +8,10 @@ import pytest
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 from armscan.simulation.objects.board_image import Lighting, RenderedTarget
-from armscan.simulation.objects.boards import CharucoPattern, ChessboardPattern
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView
+from rigs.flat_prints import CharucoPattern, ChessboardPattern
 from rigs.target_scenes import exposure, nees, render
 
 BOARD = Chessboard(7, 4, 3.0)
@@ -26,7 +26,7 @@ def tilted() -> RenderedTarget:
 def test_corners_and_covariance_against_the_truth(tilted: RenderedTarget) -> None:
     errors, covariances = [], []
     rough = tilted.marks_px.reshape(4, 7, 2)
-    step_x, step_y = (np.gradient(rough, axis=k).reshape(-1, 2) for k in (1, 0))
+    step_x, step_y = (np.asarray(np.gradient(rough, axis=k)).reshape(-1, 2) for k in (1, 0))
     for seed in range(20):
         image = exposure(tilted.image, seed).image
         start = tilted.marks_px + 0.7 * np.random.default_rng(seed).uniform(-1, 1, (28, 2))

@@ -176,13 +176,13 @@ def test_noise_and_saturation_fail() -> None:
 def test_centres_cannot_be_corrected_without_edges() -> None:
     view = detected(render(PATTERN, DISTANCE_MM))
     bare = TargetView(
-        "x",
-        view.width_px,
-        view.height_px,
-        view.point_index,
-        view.points_px,
-        view.covariance_px2,
-        view.points_board_mm,
+        source="x",
+        width_px=view.width_px,
+        height_px=view.height_px,
+        point_index=view.point_index,
+        points_px=view.points_px,
+        covariance_px2=view.covariance_px2,
+        points_board_mm=view.points_board_mm,
     )
     with pytest.raises(InputError, match="no circle edges"):
         correct_centres(bare)

@@ -380,13 +380,13 @@ def stack_pair_observations(boards: Sequence[StereoPair]) -> JointObservations:
 
 def _without_points(view: TargetView) -> TargetView:
     return TargetView(
-        "",
-        view.width_px,
-        view.height_px,
-        np.zeros(0, dtype=np.int64),
-        np.zeros((0, 2)),
-        np.zeros((0, 2, 2)),
-        np.zeros((0, 3)),
+        source="",
+        width_px=view.width_px,
+        height_px=view.height_px,
+        point_index=np.zeros(0, dtype=np.int64),
+        points_px=np.zeros((0, 2)),
+        covariance_px2=np.zeros((0, 2, 2)),
+        points_board_mm=np.zeros((0, 3)),
     )
 
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points where rays of the head's cameras meet a board, with their covariance by pixels, board
-pose and cameras, in one view or two.
+"""Points where rays of the head's cameras meet a board or a sheet, and the board's pose in Sensor.
+
+All derivatives by the cameras' parameters are in one order: the 9 of camera 0, or of two cameras
+`armscan.models.two_views.STEREO_PARAMETER_NAMES` (left 9, right 9, pose 6).
 """
 
 from __future__ import annotations
@@ -14,15 +16,22 @@ from armscan.calibration.sheets.result import PlacedBoard
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import Estimate
-from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector, skew, vector_from_rotation
-from armscan.models.calibration import CameraCalibration, SecondCamera
+from armscan.models.calibration import CameraCalibration, SecondCamera, SensorCalibration
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.models.two_views import StereoCalibration
 from armscan.vision.targets.target import TargetView
 
 N_CAMERA = len(PARAMETER_NAMES)
+RIGHT_CAMERA = slice(9, 18)
+RIGHT_POSE = slice(18, 24)
+GRAZING = 1e-6
+"""Rays within this sine of the board's plane do not meet it."""
+
+SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
+"""Camera, target, and the board's pose in that camera's own frame."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,13 +40,10 @@ class HeadCameras:
 
     Parameters
     ----------
-    left
-        Camera 0.
-    second
-        Camera 1, if there is one.
+    left, second
+        Camera 0, and camera 1 if there is one.
     covariance
-        (P, P) of the P parameters that all images have in common: 9, or 24 in the order of
-        `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
+        (P, P) of the P parameters that all images have in common: 9, or 24.
     """
 
     left: CameraCalibration
@@ -45,11 +51,18 @@ class HeadCameras:
     covariance: FloatArray
 
     @staticmethod
-    def of(calibration: CameraCalibration | StereoCalibration) -> HeadCameras:
-        """The cameras of a calibration of one or of two."""
+    def of(calibration: CameraCalibration | StereoCalibration | SensorCalibration) -> HeadCameras:
+        """The cameras of a calibration of one or of two, or of a calibrated sensor."""
         if isinstance(calibration, CameraCalibration):
             return HeadCameras(calibration, None, calibration.covariance)
-        second = SecondCamera(calibration.right, calibration.right_from_left)
+        if isinstance(calibration, SensorCalibration):
+            places = np.arange(len(calibration.covariance))
+            places = np.append(places[:N_CAMERA], places[calibration.second_parameter_slice])
+            covariance = calibration.covariance[np.ix_(places, places)]
+            return HeadCameras(calibration.camera, calibration.second, covariance)
+        second = SecondCamera(
+            camera=calibration.right, right_from_sensor=calibration.right_from_left
+        )
         return HeadCameras(calibration.left, second, calibration.covariance)
 
     @property
@@ -65,35 +78,18 @@ class HeadCameras:
         )
 
     def model(self, camera: int) -> CameraModel:
-        """The model of camera 0 or 1.
-
-        Raises
-        ------
-        InputError
-            If there is no such camera.
-        """
-        if camera == 0:
-            return self.left.camera
-        return self._right(camera).camera.camera
+        """The model of camera 0 or 1; `InputError` if there is no such camera."""
+        return self.left.camera if camera == 0 else self.right(camera).camera.camera
 
     def centre_mm(self, camera: int) -> FloatArray:
         """(3,) where the rays of camera 0 or 1 start, in Sensor."""
         if camera == 0:
             return np.zeros(3)
-        place = self._right(camera).right_from_sensor
+        place = self.right(camera).right_from_sensor
         return np.asarray(-place.translation_mm @ place.rotation)
 
-    def right(self) -> SecondCamera:
-        """Camera 1.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
-        return self._right(1)
-
-    def _right(self, camera: int) -> SecondCamera:
+    def right(self, camera: int = 1) -> SecondCamera:
+        """Camera 1; `InputError` if there is none."""
         if self.second is None or camera != 1:
             raise InputError(
                 f"an image of camera {camera} is given, and that camera is not calibrated",
@@ -106,10 +102,6 @@ class HeadCameras:
         wide = np.zeros((*by_left.shape[:-1], self.n_parameters))
         wide[..., :N_CAMERA] = by_left
         return wide
-
-
-GRAZING = 1e-6
-"""Rays within this sine of the board's plane do not meet it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,37 +161,10 @@ def intersect_board(
     )
 
 
-def pose_by_camera(
-    view: TargetView, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
-) -> FloatArray:
-    """(6, 9) derivative of the board's pose, as estimated from ``view``, by the camera.
-
-    The pose minimises the weighted reprojection error, so at the optimum a change of the camera
-    moves it by ``-(Jp' W Jp)^-1 Jp' W Jc`` (Gauss-Newton form of the implicit function theorem).
-    """
-    rotated = view.points_board_mm @ sensor_from_board.rotation.T
-    _, dq_dpoint, dq_dcamera = camera.project_with_jacobian(
-        rotated + sensor_from_board.translation_mm
-    )
-    dq_dpose = np.concatenate([-dq_dpoint @ skew(rotated), dq_dpoint], axis=2)
-    weight = np.linalg.inv(view.covariance_px2)
-    weighted = np.einsum("nki,nkl->nil", dq_dpose, weight)
-    normal = np.einsum("nik,nkj->ij", weighted, dq_dpose)
-    return np.asarray(-np.linalg.solve(normal, np.einsum("nik,nkj->ij", weighted, dq_dcamera)))
-
-
-RIGHT_CAMERA = slice(9, 18)
-RIGHT_POSE = slice(18, 24)
-
-
 def intersect_board_of(
     q_px: FloatArray, camera: int, sensor_from_board: Pose[Sensor, Board], cameras: HeadCameras
 ) -> BoardPoints:
-    """Intersect the rays of (N, 2) pixels of one of the cameras with a board.
-
-    As `intersect_board`, with the points in the Sensor frame and derivatives by the parameters of
-    all cameras.
-    """
+    """As `intersect_board` for camera 0 or 1: points in Sensor, derivatives by all cameras."""
     if camera == 0:
         points = intersect_board(q_px, sensor_from_board, cameras.left.camera)
         return BoardPoints(
@@ -210,32 +175,26 @@ def intersect_board_of(
             cameras.by_parameters(points.dpoint_dcamera),
         )
     second = cameras.right()
-    place = second.right_from_sensor
-    turn, shift = place.rotation, place.translation_mm
-    right_from_board: Pose[CameraRight, Board] = place @ sensor_from_board
+    turn, shift = second.right_from_sensor.rotation, second.right_from_sensor.translation_mm
+    right_from_board = second.right_from_sensor @ sensor_from_board
     # The function knows one frame: to it, the right camera's is the sensor's.
     as_sensor: Pose[Sensor, Board] = Pose(
         right_from_board.rotation, right_from_board.translation_mm
     )
-    seen = intersect_board(q_px, as_sensor, second.camera.camera)
-    back = turn.T
-    follow = np.zeros((6, 6))
-    follow[:3, :3] = np.eye(3)
+    found = intersect_board(q_px, as_sensor, second.camera.camera)
+    follow = np.eye(6)
     follow[3:, :3] = -skew(turn @ sensor_from_board.translation_mm)
-    follow[3:, 3:] = np.eye(3)
     carried = np.concatenate(
-        [skew(seen.points_mm - shift), np.tile(-np.eye(3), (len(q_px), 1, 1))], axis=2
+        [skew(found.points_mm - shift), np.tile(-np.eye(3), (len(q_px), 1, 1))], axis=2
     )
     by_cameras = np.zeros((len(q_px), 3, cameras.n_parameters))
-    by_cameras[:, :, RIGHT_CAMERA] = back @ seen.dpoint_dcamera
-    by_cameras[:, :, RIGHT_POSE] = back @ (seen.dpoint_dpose @ follow + carried)
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = turned[3:, 3:] = turn
+    by_cameras[:, :, RIGHT_CAMERA] = turn.T @ found.dpoint_dcamera
+    by_cameras[:, :, RIGHT_POSE] = turn.T @ (found.dpoint_dpose @ follow + carried)
     return BoardPoints(
-        (seen.points_mm - shift) @ turn,
-        seen.is_valid,
-        back @ seen.dpoint_dq,
-        back @ seen.dpoint_dpose @ turned,
+        (found.points_mm - shift) @ turn,
+        found.is_valid,
+        turn.T @ found.dpoint_dq,
+        turn.T @ found.dpoint_dpose @ _twice(turn),
         by_cameras,
     )
 
@@ -256,26 +215,32 @@ def intersect_sheet_of(
     return (points - place.translation_mm) @ place.rotation, is_met & has_ray
 
 
-def place_board(
-    seen: Sequence[tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]], cameras: HeadCameras
-) -> PlacedBoard:
-    """Pose of a board in Sensor from what one or both cameras saw of it.
+def dpose_dcamera(
+    view: TargetView, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
+) -> FloatArray:
+    """(6, 9) derivative of the board's pose, as estimated from ``view``, by the camera.
 
-    Parameters
-    ----------
-    seen
-        Camera, target, and the board's pose in that camera's own frame as
-        `armscan.calibration.cameras.board_pose.estimate_board_pose` gives it, one entry a camera.
-    cameras
-        The cameras.
-
-    Returns
-    -------
-    PlacedBoard
-        Mean of the poses weighted by their covariances, the cameras being held; the derivative
-        tells how it follows the cameras' errors, which the two views do not share.
+    The pose minimises the weighted reprojection error, so at the optimum a change of the camera
+    moves it by ``-(Jp' W Jp)^-1 Jp' W Jc`` (Gauss-Newton form of the implicit function theorem).
     """
-    poses = [_in_sensor(camera, view, found, cameras) for camera, view, found in seen]
+    rotated = view.points_board_mm @ sensor_from_board.rotation.T
+    _, dq_dpoint, dq_dcamera = camera.project_with_jacobian(
+        rotated + sensor_from_board.translation_mm
+    )
+    dq_dpose = np.concatenate([-dq_dpoint @ skew(rotated), dq_dpoint], axis=2)
+    weight = np.linalg.inv(view.covariance_px2)
+    weighted = np.einsum("nki,nkl->nil", dq_dpose, weight)
+    normal = np.einsum("nik,nkj->ij", weighted, dq_dpose)
+    return np.asarray(-np.linalg.solve(normal, np.einsum("nik,nkj->ij", weighted, dq_dcamera)))
+
+
+def place_board(seen: Sequence[SeenBoard], cameras: HeadCameras) -> PlacedBoard:
+    """Pose of a board in Sensor from what one or both cameras saw of it, one entry a camera.
+
+    The mean of the poses weighted by their covariances, the cameras being held; the derivative
+    tells how it follows the cameras' errors, which the two views do not share.
+    """
+    poses = [_in_sensor(one, cameras) for one in seen]
     first = poses[0]
     if len(poses) == 1:
         return first
@@ -283,8 +248,8 @@ def place_board(
     information = [np.linalg.inv(pose.covariance) for pose in poses]
     covariance = np.linalg.inv(information[0] + information[1])
     gain = covariance @ information[1]
-    a, b = first.sensor_from_board, second.sensor_from_board
-    step = gain @ _apart(a, b)
+    a = first.sensor_from_board
+    step = gain @ _step(a, second.sensor_from_board)
     pose: Pose[Sensor, Board] = Pose(
         rotation_from_vector(step[:3]) @ a.rotation, a.translation_mm + step[3:]
     )
@@ -292,21 +257,25 @@ def place_board(
     return PlacedBoard(pose, 0.5 * (covariance + covariance.T), follow)
 
 
-def _in_sensor(
-    camera: int,
-    view: TargetView,
-    found: Estimate[Pose[Sensor, Board]],
-    cameras: HeadCameras,
-) -> PlacedBoard:
-    own = pose_by_camera(view, found.value, cameras.model(camera))
+def poses_chi2(left: SeenBoard, right: SeenBoard, cameras: HeadCameras) -> float:
+    """How far two cameras disagree about a board: 6 on average, the cameras' errors included."""
+    a, b = _in_sensor(left, cameras), _in_sensor(right, cameras)
+    follow = b.by_cameras - a.by_cameras
+    covariance = a.covariance + b.covariance + follow @ cameras.covariance @ follow.T
+    step = _step(a.sensor_from_board, b.sensor_from_board)
+    return float(step @ np.linalg.solve(covariance, step))
+
+
+def _in_sensor(seen: SeenBoard, cameras: HeadCameras) -> PlacedBoard:
+    camera, view, found = seen
+    by_own = dpose_dcamera(view, found.value, cameras.model(camera))
     if camera == 0:
-        return PlacedBoard(found.value, found.covariance, cameras.by_parameters(own))
+        return PlacedBoard(found.value, found.covariance, cameras.by_parameters(by_own))
     place = cameras.right().right_from_sensor
     back, offset = place.rotation.T, found.value.translation_mm - place.translation_mm
-    turned = np.zeros((6, 6))
-    turned[:3, :3] = turned[3:, 3:] = back
+    turned = _twice(back)
     follow = np.zeros((6, cameras.n_parameters))
-    follow[:, RIGHT_CAMERA] = turned @ own
+    follow[:, RIGHT_CAMERA] = turned @ by_own
     follow[:3, 18:21] = -back
     follow[3:, 18:21] = back @ skew(offset)
     follow[3:, 21:24] = -back
@@ -314,20 +283,12 @@ def _in_sensor(
     return PlacedBoard(pose, turned @ found.covariance @ turned.T, follow)
 
 
-def poses_chi2(
-    left: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
-    right: tuple[int, TargetView, Estimate[Pose[Sensor, Board]]],
-    cameras: HeadCameras,
-) -> float:
-    """How far two cameras disagree about a board: 6 on average, the cameras' errors included."""
-    a, b = (_in_sensor(*item, cameras) for item in (left, right))
-    follow = b.by_cameras - a.by_cameras
-    covariance = a.covariance + b.covariance + follow @ cameras.covariance @ follow.T
-    apart = _apart(a.sensor_from_board, b.sensor_from_board)
-    return float(apart @ np.linalg.solve(covariance, apart))
+def _twice(turn: FloatArray) -> FloatArray:
+    """(6, 6) a rotation (3, 3) acting on both halves of a pose's increment."""
+    return np.asarray(np.kron(np.eye(2), turn), dtype=np.float64)
 
 
-def _apart(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
+def _step(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
     """(6,) step from pose a to pose b: rotation vector from the left, then translation."""
     return np.concatenate(
         [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do lines on several boards lie in one plane, and do they determine it? The test of a common
-plane and the geometry of boards that fixes it.
+plane and the geometry of boards that fixes it, with refusals and warnings.
 """
 
 from __future__ import annotations
@@ -17,32 +17,20 @@ from armscan.geometry.shapes import Plane, fit_plane
 from armscan.models.light_sheet import LightSheet
 
 ROUNDS = 3
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedObservation:
-    """A stripe with the covariance of its board's pose (6, 6) and of the camera (9, 9)."""
-
-    sighting: StripeObservation
-    pose_covariance: FloatArray
-    camera_covariance: FloatArray
-
-    def own_covariance_mm2(self, normal: FloatArray) -> FloatArray:
-        """(2, 2) covariance of the ends along ``normal`` by the board's pose and stripe noise."""
-        by_pose = np.einsum("i,eij->ej", normal, self.sighting.ends_by_pose)
-        noise = self.sighting.noise_ends_mm2 * float(self.sighting.across @ normal) ** 2
-        return np.asarray(by_pose @ self.pose_covariance @ by_pose.T + noise)
-
-    def by_camera(self, normal: FloatArray) -> FloatArray:
-        """(2, 9) derivative of the ends along ``normal`` by the camera."""
-        return np.asarray(np.einsum("i,eij->ej", normal, self.sighting.ends_by_camera))
-
-    def height_covariance_mm2(self, normal: FloatArray) -> FloatArray:
-        """(2, 2) covariance of the ends along ``normal``, the camera's error included."""
-        by_camera = self.by_camera(normal)
-        return np.asarray(
-            self.own_covariance_mm2(normal) + by_camera @ self.camera_covariance @ by_camera.T
-        )
+"""Gauss-Newton steps of a common plane: the second one is at rounding already."""
+MIN_SPREAD_RATIO = 0.01
+"""Spread across the stripes over that along them, below which there is only one line."""
+MIN_SPREAD_SIGMAS = 5.0
+"""Spread across the stripes over its own uncertainty, below which it is not known to be there: a
+spread that is partly error makes the sheet look better known than it is."""
+MAX_TILT_SIGMA_DEG = 2.0
+"""A sheet known to less than that is nothing to measure with."""
+MAX_PARALLEL_TILT_SIGMA_DEG = 0.4
+"""For parallel boards. Beyond it they lie so close that small differences of their poses decide:
+with simulated boards the errors were then several times the sigmas."""
+WEAK_TILT_SIGMA_DEG = 0.2
+PARALLEL_DEG = 2.0
+"""Boards within this angle count as parallel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,18 +56,19 @@ class CommonPlane:
     sigma_largest_mm: float
 
 
-def fit_common_plane(stripes: Sequence[PosedObservation]) -> CommonPlane | FitFailure:
+def fit_common_plane(stripes: Sequence[StripeObservation]) -> CommonPlane | FitFailure:
     """Fit one plane to two or more stripes by generalised least squares on their ends."""
-    ends = np.concatenate([s.sighting.ends_mm for s in stripes])
+    ends = np.concatenate([stripe.ends_mm for stripe in stripes])
     start = fit_plane(ends)
     if isinstance(start, FitFailure):
         return start
     plane = start.value
+    dends_dcamera = np.concatenate([stripe.dends_dcamera for stripe in stripes])
     for _ in range(ROUNDS):
         local = (ends - plane.point_mm) @ plane.axes.T
         design = np.stack([local[:, 0], local[:, 1], np.ones(len(ends))], axis=1)
         # All boards share the camera's error, hence one full matrix.
-        by_camera = np.concatenate([s.by_camera(plane.normal) for s in stripes])
+        by_camera = np.einsum("i,eij->ej", plane.normal, dends_dcamera)
         covariance = by_camera @ stripes[0].camera_covariance @ by_camera.T
         for k, stripe in enumerate(stripes):
             block = slice(2 * k, 2 * k + 2)
@@ -110,19 +99,6 @@ def _tilted(plane: Plane, step: FloatArray) -> Plane:
     return Plane(point, np.stack([first, np.cross(normal, first), normal]))
 
 
-MIN_SPREAD_RATIO = 0.01
-"""Spread across the stripes over that along them, below which there is only one line."""
-MIN_SPREAD_SIGMAS = 5.0
-"""Spread across the stripes over its own uncertainty, below which it is not known to be there: a
-spread that is partly error makes the sheet look better known than it is."""
-MAX_TILT_SIGMA_DEG = 2.0
-MAX_PARALLEL_TILT_SIGMA_DEG = 0.4
-"""For parallel boards. Beyond it they lie so close that small differences of their poses decide:
-with simulated boards the errors were then several times the sigmas."""
-WEAK_TILT_SIGMA_DEG = 0.2
-PARALLEL_DEG = 2.0
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SheetGeometry:
     """How the boards of one sheet lie.
@@ -136,13 +112,25 @@ class SheetGeometry:
     depth_range_mm
         Smallest and largest Z of the points.
     spread_mm
-        (2,) root mean square spread of the points along the stripes and across them, in the sheet.
+        (2,) root mean square extent of the points along the stripes and across them, in the sheet.
     """
 
     n_boards: int
     board_angle_deg: float
     depth_range_mm: tuple[float, float]
     spread_mm: FloatArray
+
+    @staticmethod
+    def of(sheet: LightSheet, points_mm: FloatArray, board_normals: FloatArray) -> SheetGeometry:
+        """How the (N, 3) points and the (M, 3) boards' normals spread over a sheet."""
+        local = (points_mm - points_mm.mean(axis=0)) @ sheet.axes[:2].T
+        cosine = np.clip(np.abs(board_normals @ board_normals.T), 0.0, 1.0)
+        return SheetGeometry(
+            len(board_normals),
+            float(np.degrees(np.arccos(cosine.min()))),
+            (float(points_mm[:, 2].min()), float(points_mm[:, 2].max())),
+            np.sqrt((local**2).mean(axis=0)),
+        )
 
     @property
     def facts(self) -> str:
@@ -153,20 +141,6 @@ class SheetGeometry:
             f"depth {low:.1f} to {high:.1f} mm, points spread {self.spread_mm[0]:.2f} mm along "
             f"the stripes and {self.spread_mm[1]:.3f} mm across them"
         )
-
-
-def describe_geometry(
-    sheet: LightSheet, points_mm: FloatArray, board_normals: FloatArray
-) -> SheetGeometry:
-    """Measure how the (N, 3) points and the (M, 3) boards' normals spread over a sheet."""
-    local = (points_mm - points_mm.mean(axis=0)) @ sheet.axes[:2].T
-    cosine = np.clip(np.abs(board_normals @ board_normals.T), 0.0, 1.0)
-    return SheetGeometry(
-        len(board_normals),
-        float(np.degrees(np.arccos(cosine.min()))),
-        (float(points_mm[:, 2].min()), float(points_mm[:, 2].max())),
-        np.sqrt((local**2).mean(axis=0)),
-    )
 
 
 def refuse_few_boards(name: str, n_boards: int) -> FitFailure | None:
@@ -181,27 +155,21 @@ def refuse_few_boards(name: str, n_boards: int) -> FitFailure | None:
     )
 
 
-def refuse_one_line(name: str, geometry: SheetGeometry) -> FitFailure | None:
-    """Refuse boards whose stripes are all (nearly) the same line in space."""
-    along, across = (float(value) for value in geometry.spread_mm)
-    if across > MIN_SPREAD_RATIO * along:
-        return None
-    return FitFailure(
-        f"sheet {name}: all stripes lie on nearly one line in space, so that the sheet may turn "
-        f"about it ({geometry.facts}; ratio {across / max(along, 1e-12):.2g}, need "
-        f"{MIN_SPREAD_RATIO})",
-        "move the board in depth or tilt it between the images",
-    )
-
-
 def refuse_lost_spread(
     name: str, geometry: SheetGeometry, across_sigma_mm: float
 ) -> FitFailure | None:
-    """Refuse stripes whose spread is hardly larger than the errors of their boards' poses.
+    """Refuse stripes that are nearly one line in space, or spread little more than their errors.
 
     ``across_sigma_mm`` is the sigma of a point's place across the stripes by its board's pose.
     """
-    across = float(geometry.spread_mm[1])
+    along, across = (float(value) for value in geometry.spread_mm)
+    if across <= MIN_SPREAD_RATIO * along:
+        return FitFailure(
+            f"sheet {name}: all stripes lie on nearly one line in space, so that the sheet may "
+            f"turn about it ({geometry.facts}; ratio {across / max(along, 1e-12):.2g}, need "
+            f"{MIN_SPREAD_RATIO})",
+            "move the board in depth or tilt it between the images",
+        )
     if across >= MIN_SPREAD_SIGMAS * across_sigma_mm:
         return None
     return FitFailure(

@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does the sheet's model explain the stripes? F test against the noise along each stripe, the
-scatter between boards, and the outliers of a fit.
+scatter between boards, and the view without which a plane would do.
+
+A board that is bent, or a lens that the camera's model does not follow, moves a board's stripe as a
+whole: more than the covariance of its pose allows, and differently on every board. A bow of the
+sheet moves them all by one law, and curves them. The likelihood of both readings tells them apart;
+against the noise along the stripes alone, either would look certain.
 """
 
 from __future__ import annotations
@@ -10,16 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from armscan.calibration.sheets.result import LackOfFit, SheetOptions
+from armscan.calibration.sheets.result import LACK_OF_FIT_P
 from armscan.calibration.sheets.solve import (
     CommonErrors,
     SheetObservations,
     SheetSolution,
     solve_sheets,
-    square_root,
+    square_matrix_root,
 )
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma
+from armscan.models.calibration import FTest
 from armscan.models.light_sheet import LightSheet
 
 SHAPE_DEGREE = 3
@@ -28,6 +35,14 @@ MAX_LAG = 100
 CORRELATION_ROUNDS = 20
 MAX_TAKEN = 0.5
 """Largest share of the noise that the cubic is believed to take."""
+BOARD_SHAPES = 3
+"""Offset, slope and curvature of a stripe; a board's pose makes the first two."""
+LEAST_POINTS = 8
+"""With fewer points left of it a stripe has no shape."""
+FACTORS = np.geomspace(1.0, 100.0, 81)
+"""Scatter of the boards that is tried, in steps of 6 %."""
+FEWEST_BOARDS = 4
+"""For an outlier among them: with fewer, two are left of which each explains the other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,16 +78,10 @@ class StripeNoise:
 def stripe_noise(observations: SheetObservations, residual_px: FloatArray) -> StripeNoise:
     """Estimate the noise of the stripes from their scatter around a cubic course.
 
-    Parameters
-    ----------
-    observations
-        The points, ordered along each stripe.
-    residual_px
-        (N,) residuals from the sheets; a smooth misfit does not matter.
+    ``residual_px`` (N,) are residuals from the sheets; a smooth misfit does not matter.
     """
     rest = [
-        _off_course(observations.select(own), residual_px[own])
-        for own in (observations.stripe == stripe for stripe in np.unique(observations.stripe))
+        _off_course(observations.select(of), residual_px[of]) for of in observations.each_stripe()
     ]
     squares = sum(float(left @ left) for left in rest)
     correlation = _correlation(rest)
@@ -89,21 +98,23 @@ def scatter_by_stripe(observations: SheetObservations, residual_px: FloatArray) 
     others.
     """
     factor = np.ones(len(observations))
-    for stripe in np.unique(observations.stripe):
-        own = observations.stripe == stripe
-        left = _off_course(observations.select(own), residual_px[own])
-        factor[own] = 1.4826 * float(np.median(np.abs(left)))
+    for of in observations.each_stripe():
+        factor[of] = robust_sigma(_off_course(observations.select(of), residual_px[of]))
     return np.where(factor > 0.0, factor, 1.0)
+
+
+def _course(stripe: SheetObservations, degree: int) -> FloatArray:
+    """(N, degree + 1) Legendre polynomials along one stripe."""
+    along = (stripe.points_mm - stripe.points_mm[0]) @ (stripe.points_mm[-1] - stripe.points_mm[0])
+    t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
+    return np.asarray(np.polynomial.legendre.legvander(t, degree))
 
 
 def _off_course(stripe: SheetObservations, residual_px: FloatArray) -> FloatArray:
     """What one stripe's residuals leave of a cubic course, in the points' own sigmas."""
-    along = (stripe.points_mm - stripe.points_mm[0]) @ (stripe.points_mm[-1] - stripe.points_mm[0])
-    t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
-    design = np.polynomial.legendre.legvander(t, SHAPE_DEGREE) / stripe.sigma_px[:, None]
+    design = _course(stripe, SHAPE_DEGREE) / stripe.sigma_px[:, None]
     normalised = residual_px / stripe.sigma_px
-    left = normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0]
-    return np.asarray(left)
+    return np.asarray(normalised - design @ np.linalg.lstsq(design, normalised, rcond=None)[0])
 
 
 def _correlation(rest: list[FloatArray]) -> float:
@@ -113,57 +124,44 @@ def _correlation(rest: list[FloatArray]) -> float:
     share; it depends on the sum itself, hence the rounds.
     """
     count = sum(len(left) for left in rest)
-    lags = _lag_correlations(rest)
+    power = sum(float(left @ left) for left in rest) / count
+    lags: list[float] = []
+    for lag in range(1, MAX_LAG + 1):
+        pairs = [(left[:-lag], left[lag:]) for left in rest if len(left) > 4 * lag]
+        n_pairs = sum(len(a) for a, _ in pairs)
+        if n_pairs == 0 or power == 0.0:
+            break
+        rho = sum(float(a @ b) for a, b in pairs) / n_pairs / power
+        if rho < 2.5 / np.sqrt(n_pairs):
+            break
+        lags.append(rho)
     correlation = 1.0
-    for _ in range(CORRELATION_ROUNDS if len(lags) else 0):
+    for _ in range(CORRELATION_ROUNDS if lags else 0):
         taken = min(N_SHAPE * len(rest) * correlation / count, MAX_TAKEN)
-        correlation = 1.0 + 2.0 * float((lags * (1.0 - taken) + taken).sum())
+        correlation = 1.0 + 2.0 * float((np.array(lags) * (1.0 - taken) + taken).sum())
     return min(correlation, MAX_TAKEN * count / (N_SHAPE * len(rest)))
 
 
-def _lag_correlations(rest: list[FloatArray]) -> FloatArray:
-    power = sum(float(left @ left) for left in rest) / sum(len(left) for left in rest)
-    found: list[float] = []
-    for lag in range(1, MAX_LAG + 1):
-        pairs = [(left[:-lag], left[lag:]) for left in rest if len(left) > 4 * lag]
-        count = sum(len(a) for a, _ in pairs)
-        if count == 0 or power == 0.0:
-            break
-        rho = sum(float(a @ b) for a, b in pairs) / count / power
-        if rho < 2.5 / np.sqrt(count):
-            break
-        found.append(rho)
-    return np.array(found)
-
-
 def lack_of_fit(
-    observations: SheetObservations,
-    solution: SheetSolution,
+    chi2: float,
+    n_stripes: int,
+    n_parameters: int,
     noise: StripeNoise,
     sigma_factor: float | None = None,
-) -> LackOfFit:
+) -> FTest:
     """Test a solution that was weighted with ``noise.sigma_factor``, or with a larger one.
 
     Of each stripe the first four shape terms (offset, slope, curvature, twist) are compared with
     the model; what scatters around them is the noise. Board and camera errors are free within
     their covariance, and cost what that covariance says.
     """
-    n_stripes = len(np.unique(observations.stripe))
-    freedom = N_SHAPE * n_stripes - solution.n_parameters
+    freedom = N_SHAPE * n_stripes - n_parameters
     if freedom <= 0:
-        return LackOfFit(0.0, 0, 1.0)
+        return FTest(f_ratio=0.0, degrees_of_freedom=0, p_value=1.0)
     share = (noise.sigma_factor / (sigma_factor or noise.sigma_factor)) ** 2
-    squares = max(solution.chi2 - noise.effective_freedom * share, 0.0)
-    ratio = squares / freedom
+    ratio = max(chi2 - noise.effective_freedom * share, 0.0) / freedom
     p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
-    return LackOfFit(ratio, freedom, p_value)
-
-
-SHAPES = 3
-"""Offset, slope and curvature of a stripe; a board's pose makes the first two."""
-LEAST_POINTS = 8
-"""With fewer points left of it a stripe has no shape."""
-FACTORS = np.geomspace(1.0, 100.0, 81)
+    return FTest(f_ratio=ratio, degrees_of_freedom=freedom, p_value=p_value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,43 +200,26 @@ def board_scatter(
         Of the points along the stripes.
     """
     _, residual, _, by_point = observations.residuals_px(solution.sheets)
-    by_pose = np.einsum("ni,nij->nj", by_point, observations.by_pose)
-    by_camera = np.einsum("ni,nij->nj", by_point, observations.by_camera)
+    by_pose = np.einsum("ni,nij->nj", by_point, observations.dpoint_dpose)
+    by_camera = np.einsum("ni,nij->nj", by_point, observations.dpoint_dcamera)
     moved = solution.common[len(solution.common) - errors.n_camera :]
-    residual = residual + by_camera @ (square_root(errors.camera_covariance) @ moved)
-    numbers, counts = np.unique(observations.stripe, return_counts=True)
-    stripes = numbers[counts >= LEAST_POINTS]
-    n = SHAPES * len(stripes)
+    residual = residual + by_camera @ (square_matrix_root(errors.camera_covariance) @ moved)
+    stripes = [of for of in observations.each_stripe() if of.sum() >= LEAST_POINTS]
+    n = BOARD_SHAPES * len(stripes)
     lost = np.sqrt(n / max(n - solution.n_parameters, 1.0))
     log_likelihood = np.zeros(len(FACTORS))
-    for stripe in stripes:
-        own = observations.stripe == stripe
-        shape, covariance = _shape(observations.select(own), lost * residual[own], noise)
-        root = square_root(errors.pose_covariances[int(observations.board[own][0])])
-        follow = shape.gain @ by_pose[own] @ root
-        log_likelihood += _log_likelihood(shape.terms, covariance, follow)
+    for of in stripes:
+        stripe = observations.select(of)
+        design = _course(stripe, BOARD_SHAPES - 1)
+        weighted = design / (stripe.sigma_px * noise.sigma_factor)[:, None] ** 2
+        covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
+        gain = covariance @ weighted.T
+        root = square_matrix_root(errors.pose_covariances[int(stripe.board[0])])
+        log_likelihood += _log_likelihood(
+            gain @ (lost * residual[of]), covariance, gain @ by_pose[of] @ root
+        )
     best = int(np.argmax(log_likelihood))
     return BoardScatter(float(FACTORS[best]), float(log_likelihood[best]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Shape:
-    """(3,) shape terms of a stripe's residuals, and (3, N) how they follow these."""
-
-    terms: FloatArray
-    gain: FloatArray
-
-
-def _shape(
-    stripe: SheetObservations, residual_px: FloatArray, noise: StripeNoise
-) -> tuple[_Shape, FloatArray]:
-    along = (stripe.points_mm - stripe.points_mm[0]) @ (stripe.points_mm[-1] - stripe.points_mm[0])
-    t = 2.0 * (along - along.min()) / max(float(np.ptp(along)), 1e-12) - 1.0
-    design = np.polynomial.legendre.legvander(t, SHAPES - 1)
-    weighted = design / (stripe.sigma_px * noise.sigma_factor)[:, None] ** 2
-    covariance = np.asarray(np.linalg.inv(weighted.T @ design), dtype=np.float64)
-    gain = covariance @ weighted.T
-    return _Shape(gain @ residual_px, gain), covariance
 
 
 def _log_likelihood(terms: FloatArray, noise: FloatArray, follow: FloatArray) -> FloatArray:
@@ -249,32 +230,16 @@ def _log_likelihood(terms: FloatArray, noise: FloatArray, follow: FloatArray) ->
     return np.asarray(-0.5 * (log_determinant + solved[:, :, 0] @ terms))
 
 
-MIN_BOARDS = 4
-"""With fewer, two boards are left of which each explains the other."""
-
-
 def find_outlier_view(
-    observations: SheetObservations,
-    sheet: LightSheet,
-    errors: CommonErrors,
-    options: SheetOptions,
+    observations: SheetObservations, sheet: LightSheet, errors: CommonErrors
 ) -> int | None:
     """Number of an image without whose board a plane explains all others, or None.
 
-    Parameters
-    ----------
-    observations
-        Points of one sheet that a plane does not explain.
-    sheet
-        Where the fits start.
-    errors
-        Covariance of boards and camera.
-    options
-        For the limit of the lack-of-fit test.
+    ``observations`` are points of one sheet that a plane does not explain; fits start at ``sheet``.
     """
     alone = observations.as_one_sheet()
     boards = np.unique(alone.board)
-    if len(boards) < MIN_BOARDS:
+    if len(boards) < FEWEST_BOARDS:
         return None
     noise = stripe_noise(alone, alone.residuals_px([sheet])[1])
     whole = solve_sheets(alone, [sheet], errors, [False], sigma_factor=noise.sigma_factor)
@@ -282,7 +247,7 @@ def find_outlier_view(
         return None
     p_values = [_probability_without(int(board), alone, whole, noise) for board in boards]
     best = int(np.argmax(p_values))
-    if p_values[best] < options.lack_of_fit_p:
+    if p_values[best] < LACK_OF_FIT_P:
         return None
     return int(alone.image[alone.board == boards[best]][0])
 
@@ -291,13 +256,13 @@ def _probability_without(
     board: int, observations: SheetObservations, whole: SheetSolution, noise: StripeNoise
 ) -> float:
     """Of the lack of fit of all other boards, by one step from the plane of all."""
-    linear = whole.linear
-    normal = linear.system.solve(linear.weight, 0, without_board=board)
+    normal = whole.system.solve(whole.weight, 0, without_board=board)
     if normal is None:
         return 0.0
     rest = observations.board != board
-    remaining = (linear.system.residual_px + linear.system.times(normal.step))[rest]
+    remaining = (whole.system.residual_px + whole.system.times(normal.step))[rest]
     common = normal.step[normal.n_sheet :]
-    chi2 = float((linear.weight[rest] * remaining**2).sum() + common @ common)
+    chi2 = float((whole.weight[rest] * remaining**2).sum() + common @ common)
     share = replace(noise, degrees_of_freedom=noise.degrees_of_freedom * float(rest.mean()))
-    return lack_of_fit(observations.select(rest), replace(whole, chi2=chi2), share).p_value
+    n_stripes = len(np.unique(observations.stripe[rest]))
+    return lack_of_fit(chi2, n_stripes, whole.n_parameters, share).p_value

@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the calibration of light sheets is given and asked for, and what it gives: stripes on
-boards, options, the fate of every point, fits with their checks, and the reasons for
-refusal.
+"""What the calibration of light sheets is given and asked for, and what it gives.
+
+Stripes on boards and options go in; sheets come out with the use of every point, the checks of
+each sheet, and the reasons for which a result must be refused.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal, TypeAlias
 
-from armscan.calibration.sheets.target_edges import TargetEdges
 from armscan.errors import OptionError
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats, ints
 from armscan.geometry.estimate import Estimate
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.calibration import (
@@ -21,12 +21,24 @@ from armscan.models.calibration import (
     Provenance,
     SecondCamera,
     SensorCalibration,
+    SensorDiagnostics,
     SheetCalibration,
+    SheetDiagnostics,
 )
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile
 from armscan.vision.stripe.image import LaserColour
 from armscan.vision.targets.target import TargetView
+
+LACK_OF_FIT_P = 0.001
+"""A model is rejected when the probability of its lack of fit is below this: of a thousand good
+sheets one is given a bow that it does not need, which costs a little precision and no bias."""
+LARGEST_RMS = 0.003
+"""Of the image's diagonal, residual across the stripe: 2.4 px of 640 x 480. The plainest real sets
+at hand have 0.0005."""
+LARGEST_MISS = 0.03
+"""Of the depth: how far points of a board lie off it if the sheet rests on the other boards. Real
+sets at hand have 0.0001 to 0.007, the largest at a triangulation angle of 4 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,24 +56,6 @@ class SheetOptions:
     sheet_names
         Names to give, in the order of the stripes across the first image (left to right, or top
         to bottom where stripes lie flatter than 45 degrees); empty gives A, B, C, ...
-    edge_widths
-        A stripe point is left out if an edge of the target's marks that runs along the stripe is
-        nearer than this many of the stripe's widths (sigma of its cross-section); 0 leaves none
-        out.
-    edge_angle_deg
-        Largest angle between stripe and edge for this; edges that are turned further cross the
-        stripe and pull it to neither side.
-    line_tolerance_mm
-        Half width of the band on the board in which points belong to one straight stripe, before
-        robust statistics tighten it.
-    outlier_sigma
-        Points further than this many robust sigmas from their stripe or sheet are rejected.
-    min_points
-        Fewest points that make a stripe.
-    lack_of_fit_p
-        A bow is fitted when the plane's lack-of-fit probability is below this.
-    min_boards_for_bow
-        Fewest boards from which a bow is told from the boards' own errors.
     is_bow_allowed
         False holds every sheet to a plane.
     """
@@ -69,68 +63,30 @@ class SheetOptions:
     margin_mm: float | None = None
     n_sheets: int = 0
     sheet_names: tuple[str, ...] = ()
-    edge_widths: float = 3.0
-    edge_angle_deg: float = 75.0
-    line_tolerance_mm: float = 1.0
-    outlier_sigma: float = 4.0
-    min_points: int = 20
-    lack_of_fit_p: float = 0.001
-    min_boards_for_bow: int = 4
     is_bow_allowed: bool = True
 
     def __post_init__(self) -> None:
-        _require(
-            self.margin_mm is None or math.isfinite(self.margin_mm),
-            f"margin of {self.margin_mm} mm",
-            "give a finite length",
-        )
-        _require(0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32")
-        _require(
-            self.edge_widths >= 0.0,
-            f"edges within {self.edge_widths} widths",
-            "give 0 (use every point) or more",
-        )
-        _require(
-            0.0 < self.edge_angle_deg <= 90.0,
-            f"edges within {self.edge_angle_deg} deg of the stripe",
-            "give an angle between 0 and 90",
-        )
-        _require(
-            self.line_tolerance_mm > 0.0,
-            f"line tolerance of {self.line_tolerance_mm} mm",
-            "give a positive length",
-        )
-        _require(
-            self.outlier_sigma >= 2.0,
-            f"outlier limit of {self.outlier_sigma} sigma",
-            "give at least 2, or good points are lost",
-        )
-        _require(self.min_points >= 5, f"{self.min_points} points a stripe", "give at least 5")
-        _require(
-            0.0 < self.lack_of_fit_p < 0.5,
-            f"lack-of-fit probability {self.lack_of_fit_p}",
-            "give a value between 0 and 0.5",
-        )
-        _require(
-            self.min_boards_for_bow >= 3,
-            f"bow from {self.min_boards_for_bow} boards",
-            "give at least 3",
-        )
-        _require(
-            len(set(self.sheet_names)) == len(self.sheet_names),
-            "sheet names repeat",
-            "give each sheet its own name",
-        )
-        _require(
-            not self.sheet_names or self.n_sheets in (0, len(self.sheet_names)),
-            f"{len(self.sheet_names)} names for {self.n_sheets} sheets",
-            "give one name a sheet",
-        )
-
-
-def _require(holds: bool, what: str, remedy: str) -> None:
-    if not holds:
-        raise OptionError(what, where="light sheet options", remedy=remedy)
+        n = len(self.sheet_names)
+        for holds, what, remedy in (
+            (
+                self.margin_mm is None or math.isfinite(self.margin_mm),
+                f"margin of {self.margin_mm} mm",
+                "give a finite length",
+            ),
+            (0 <= self.n_sheets <= 32, f"{self.n_sheets} sheets", "give 0 (find out) to 32"),
+            (
+                len(set(self.sheet_names)) == n,
+                "sheet names repeat",
+                "give each sheet its own name",
+            ),
+            (
+                not n or self.n_sheets in (0, n),
+                f"{n} names for {self.n_sheets} sheets",
+                "give one name a sheet",
+            ),
+        ):
+            if not holds:
+                raise OptionError(what, where="light sheet options", remedy=remedy)
 
 
 class PointUse(IntEnum):
@@ -185,8 +141,7 @@ class PlacedBoard:
         (6, 6) by the noise of the target's points: rotation-vector increment (rad, Sensor frame,
         from the left), then translation (mm).
     by_cameras
-        (6, P) how it follows the parameters of the cameras, P as in
-        `armscan.calibration.sheets.board_points.HeadCameras`.
+        (6, P) derivative by the P parameters of `HeadCameras`.
     """
 
     sensor_from_board: Pose[Sensor, Board]
@@ -201,22 +156,21 @@ class BoardStripes:
     Parameters
     ----------
     profile
-        Stripe points of the exposure with the laser on.
+        N stripe points of the exposure with the laser on.
     view
         The target as found in the same exposure, or in one without laser of the same placement.
     sensor_from_board
-        The board's pose with its (6, 6) covariance: rotation-vector increment (rad, Sensor frame,
-        multiplied from the left), then translation (mm), the camera being held fixed.
+        The board's pose in its camera's own frame with its (6, 6) covariance: rotation-vector
+        increment (rad, from the left), then translation (mm), the camera being held fixed.
     lasers
         Names of the sources that were on; empty when not known.
-    edges
-        Edges of the target's marks; None if they are not known, and then no point is left out for
-        them.
+    on_edge
+        (N,) True for points next to an edge of the target's marks that runs along the stripe;
+        None if the edges are not known.
     camera
         The camera of profile and view: 0, or 1 for the right one of a stereo head.
     placed
-        The pose in Sensor where it rests on more than this view; else ``sensor_from_board`` holds,
-        which is always the pose in the camera's own frame.
+        The pose in Sensor where it rests on more than this view.
     placement
         Images of equal placement saw the board in one place, so that they share its pose and the
         error of that; empty stands for the view's source.
@@ -226,7 +180,7 @@ class BoardStripes:
     view: TargetView
     sensor_from_board: Estimate[Pose[Sensor, Board]]
     lasers: tuple[str, ...] = ()
-    edges: TargetEdges | None = None
+    on_edge: BoolArray | None = None
     camera: int = 0
     placed: PlacedBoard | None = None
     placement: str = ""
@@ -245,8 +199,7 @@ class SkippedImage:
     reason: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SheetImage:
+class SheetImage(ArrayRecord):
     """What one image gave.
 
     Parameters
@@ -277,23 +230,13 @@ class SheetImage:
     profile: Profile
     view: TargetView
     sensor_from_board: Pose[Sensor, Board]
-    use: IntArray
-    sheet: IntArray
-    points_mm: FloatArray
-    residual_mm: FloatArray
-    residual_px: FloatArray
-    remaining_px: FloatArray
+    use: IntArray = ints("N")
+    sheet: IntArray = ints("N")
+    points_mm: FloatArray = floats("N", 3, nan=True)
+    residual_mm: FloatArray = floats("N", nan=True)
+    residual_px: FloatArray = floats("N", nan=True)
+    remaining_px: FloatArray = floats("N", nan=True)
     pose_shift_sigma: float
-
-    def __post_init__(self) -> None:
-        n = len(self.profile)
-        for name in ("use", "sheet"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name), (n,), name))
-        for name in ("residual_mm", "residual_px", "remaining_px"):
-            values = frozen_floats(getattr(self, name), (n,), name, allow_nan=True)
-            object.__setattr__(self, name, values)
-        points = frozen_floats(self.points_mm, (n, 3), "points_mm", allow_nan=True)
-        object.__setattr__(self, "points_mm", points)
 
     @property
     def source(self) -> str:
@@ -301,28 +244,8 @@ class SheetImage:
         return self.profile.source
 
     def count(self, use: PointUse) -> int:
-        """Count of points with this fate."""
+        """Count of points with this use."""
         return int((self.use == int(use)).sum())
-
-
-@dataclass(frozen=True, slots=True)
-class LackOfFit:
-    """Does the model explain the stripes' shape? An F test against the noise along each stripe.
-
-    Parameters
-    ----------
-    f_ratio
-        Mean square of what the model leaves of each stripe's low-order shape (weights as in the
-        fit, boards free within their covariance), over the mean square of the noise around it.
-    degrees_of_freedom
-        Of the numerator; 0 when nothing is redundant.
-    p_value
-        Probability of a ratio at least this large if the model is right.
-    """
-
-    f_ratio: float
-    degrees_of_freedom: int
-    p_value: float
 
 
 PlaneMethod: TypeAlias = Literal["algebraic", "total least squares", "cross ratio"]
@@ -352,16 +275,9 @@ class PlaneComparison:
 
 @dataclass(frozen=True, slots=True)
 class BoardDistances:
-    """Distances of points from the plane of their board; positive beyond it.
+    """Distances of ``n_points`` points from the plane of their board, positive beyond it.
 
-    Parameters
-    ----------
-    n_points
-        Count; 0 if there are none, and then all figures are NaN.
-    mean_mm, sigma_mean_mm
-        Mean, and the standard deviation that the calibration claims for it.
-    rms_mm, claimed_rms_mm
-        Root mean square, and what the calibration claims for it.
+    Mean and root mean square, and what the calibration claims for them; NaN if there is no point.
     """
 
     n_points: int
@@ -414,60 +330,35 @@ class SheetPointCheck:
     boards: tuple[BoardPointCheck, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SheetFit:
+class SheetFit(ArrayRecord):
     """One calibrated sheet with what a reader needs to trust it or not.
 
     Parameters
     ----------
     calibration
-        The sheet and its key figures.
+        The sheet, its key figures and its diagnostics.
     covariance
         (8, 8) in the order of `armscan.models.calibration.SHEET_PARAMETER_NAMES`, camera included.
-    rms_px
-        Of the residuals across the stripe, boards as measured.
-    plane_test
-        Lack of fit of the plane.
-    final_test
-        Lack of fit of the model in use (equal to ``plane_test`` where there is no bow).
-    bow_decision
-        Why there is a bow, or none, in words.
     tilt_sigma_deg
         Standard deviation of the normal's direction, the worse axis.
     offset_sigma_mm
         Standard deviation of the sheet's position in the middle of the calibrated region.
-    coplanarity_mm
-        The one residual of two straight stripes: the distance that the lines, taken as they were
-        measured, miss a common plane by; for more boards the largest over pairs.
-    coplanarity_sigma_mm
-        Its standard deviation by the boards' covariance and the stripe noise.
-    board_angle_deg
-        Largest angle between two of its boards.
     comparisons
         Simpler methods on the same points.
-    warnings
-        What is weak, in words.
     points
         Points that the stored calibration makes of its own stripes, against their boards.
+    warnings
+        What is weak, in words.
     """
 
     calibration: SheetCalibration
-    covariance: FloatArray
-    rms_px: float
-    plane_test: LackOfFit
-    final_test: LackOfFit
-    bow_decision: str
+    diagnostics: SheetDiagnostics
+    covariance: FloatArray = floats(8, 8)
     tilt_sigma_deg: float
     offset_sigma_mm: float
-    coplanarity_mm: float
-    coplanarity_sigma_mm: float
-    board_angle_deg: float
     comparisons: tuple[PlaneComparison, ...]
-    warnings: tuple[str, ...]
     points: SheetPointCheck
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (8, 8), "covariance"))
+    warnings: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -480,8 +371,7 @@ class SheetFit:
         return self.calibration.sheet
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LaserFit:
+class LaserFit(ArrayRecord):
     """Calibrated light sheets and all evidence.
 
     Parameters
@@ -490,28 +380,23 @@ class LaserFit:
         One entry a sheet.
     images
         One entry an image, in the order given.
-    camera
-        The camera that was used, the left one of two.
+    camera, second
+        The camera that was used, the left one of two, and the right one if there is one.
     covariance
         Joint covariance as `SensorCalibration` wants it: (9 + 8 S, 9 + 8 S), with 15 more for a
         second camera.
-    noise_factor
-        Scatter of the stripe points around smooth stripes over what their sigmas claim.
-    correlation_points
-        Points along a stripe that count as one independent point (1: white noise).
-    naming
-        How the stripes were given to sheets, in words.
+    diagnostics
+        Of all sheets together.
+    boards
+        What was given: enough to solve again.
     options
         In force.
     warnings
         On the whole calibration; those of one sheet are with the sheet.
     skipped
         Images that gave nothing.
-    second
-        The right camera of a stereo head.
     laser_colour
-        The channel of colour images in which the stripes were found, as
-        `armscan.vision.stripe.image.StripeOptions.laser_colour`.
+        The channel of colour images in which the stripes were found.
     channel_reason
         Why that channel, in words; empty where nothing was to be chosen.
     """
@@ -519,20 +404,15 @@ class LaserFit:
     sheets: tuple[SheetFit, ...]
     images: tuple[SheetImage, ...]
     camera: CameraCalibration
-    covariance: FloatArray
-    noise_factor: float
-    correlation_points: float
-    naming: str
+    second: SecondCamera | None
+    covariance: FloatArray = floats("P", "P")
+    diagnostics: SensorDiagnostics
+    boards: tuple[BoardStripes, ...]
     options: SheetOptions
     warnings: tuple[str, ...]
     skipped: tuple[SkippedImage, ...] = ()
-    second: SecondCamera | None = None
     laser_colour: LaserColour = "auto"
     channel_reason: str = ""
-
-    def __post_init__(self) -> None:
-        n = 9 + 8 * len(self.sheets) + (15 if self.second is not None else 0)
-        object.__setattr__(self, "covariance", frozen_floats(self.covariance, (n, n), "covariance"))
 
     @property
     def sheet_names(self) -> tuple[str, ...]:
@@ -540,59 +420,44 @@ class LaserFit:
         return tuple(sheet.name for sheet in self.sheets)
 
     def to_calibration(self, provenance: Provenance) -> SensorCalibration:
-        """Return the document that reconstruction needs."""
-        sheets = tuple(sheet.calibration for sheet in self.sheets)
+        """The document's content, diagnostics included."""
         return SensorCalibration(
             camera=self.camera,
-            sheets=sheets,
+            sheets=tuple(
+                replace(sheet.calibration, diagnostics=sheet.diagnostics) for sheet in self.sheets
+            ),
             covariance=self.covariance,
             provenance=provenance,
-            diagnostics=None,
+            diagnostics=self.diagnostics,
             second=self.second,
             laser_colour=self.laser_colour,
         )
 
 
-LARGEST_RMS = 0.003
-"""Of the image's diagonal, residual across the stripe: 2.4 px of 640 x 480. The plainest real sets
-at hand have 0.0005."""
-LARGEST_MISS = 0.03
-"""Of the depth: how far points of a board lie off it if the sheet rests on the other boards. Real
-sets at hand have 0.0001 to 0.007, the largest at a triangulation angle of 4 degrees."""
-
-
 def reasons_to_refuse(fit: LaserFit) -> tuple[str, ...]:
     """Why solved sheets must not be written as if they were some; empty if nothing speaks against.
 
-    Parameters
-    ----------
-    fit
-        The sheets with their evidence.
+    The limits lie far outside what photographs of a laser on a board give, however plain: a
+    refusal means a mistake (stripes of another light, boards of another size, images that do not
+    belong together), not a poor set.
     """
     camera = fit.camera.camera
-    diagonal_px = math.hypot(camera.width_px, camera.height_px)
-    return tuple(
-        f"sheet {sheet.name}: {reason}"
-        for sheet in fit.sheets
-        for reason in _reasons(sheet, LARGEST_RMS * diagonal_px)
-    )
-
-
-def _reasons(sheet: SheetFit, largest_rms_px: float) -> tuple[str, ...]:
+    largest_px = LARGEST_RMS * math.hypot(camera.width_px, camera.height_px)
     found = []
-    if sheet.rms_px > largest_rms_px:
-        found.append(
-            f"its stripes lie {sheet.rms_px:.1f} px (rms) from it, {largest_rms_px:.1f} px is the "
-            "limit"
-        )
-    low, high = sheet.calibration.depth_range_mm
-    alone = sheet.points.left_out_rms_mm
-    rms_mm = alone if math.isfinite(alone) else sheet.points.fitted.rms_mm
-    miss = rms_mm / (0.5 * (low + high))
-    if miss > LARGEST_MISS:
-        others = " if the sheet rests on the other boards" if math.isfinite(alone) else ""
-        found.append(
-            f"points on a board lie {rms_mm:.3g} mm (rms) off it{others}, {100.0 * miss:.1f} % of "
-            f"the depth: {100.0 * LARGEST_MISS:.0f} % is the limit"
-        )
+    for sheet in fit.sheets:
+        rms_px = sheet.diagnostics.rms_px
+        if rms_px > largest_px:
+            found.append(
+                f"sheet {sheet.name}: its stripes lie {rms_px:.1f} px (rms) from it, "
+                f"{largest_px:.1f} px is the limit"
+            )
+        alone = sheet.points.left_out_rms_mm
+        rms_mm = alone if math.isfinite(alone) else sheet.points.fitted.rms_mm
+        miss = rms_mm / (0.5 * sum(sheet.calibration.depth_range_mm))
+        if miss > LARGEST_MISS:
+            others = " if the sheet rests on the other boards" if math.isfinite(alone) else ""
+            found.append(
+                f"sheet {sheet.name}: points on a board lie {rms_mm:.3g} mm (rms) off it{others}, "
+                f"{100.0 * miss:.1f} % of the depth: {100.0 * LARGEST_MISS:.0f} % is the limit"
+            )
     return tuple(found)

@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Edges of a target's printed marks, next to which a stripe's centre is pulled aside."""
+"""Where a target's print changes between dark and light, and which stripe points lie along it.
+
+A stripe that runs along such an edge is brighter on the one side, and every method of finding its
+centre is pulled there. The edges are known, so such points can be told without looking at their
+residuals.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.records.profile import Profile
@@ -21,6 +26,11 @@ from armscan.vision.targets.target import (
     TargetView,
 )
 
+REACH_WIDTHS = 3.0
+"""An edge pulls a point that is nearer to it than this many of the stripe's widths (sigma of its
+cross-section): beyond three sigma there is no light."""
+LARGEST_ANGLE_DEG = 75.0
+"""Edges that are turned further from the stripe cross it, and pull it to neither side."""
 SAMPLE_PX = 1.0
 """Spacing in the image of the points that stand for a straight edge."""
 COARSE = 64
@@ -28,6 +38,7 @@ COARSE = 64
 MARGIN_PX = 20.0
 """Edges are followed this far outside the image."""
 SAME_RAY = 1e-6
+"""A point is the camera's own if its ray leads back to it this well, in the plane at distance 1."""
 MIN_RIM_POINTS = 8
 """With fewer, the shape of a circle's rim is not known."""
 
@@ -36,21 +47,12 @@ MIN_RIM_POINTS = 8
 class TargetEdges:
     """Points of the target's reflectance edges in the image.
 
-    Parameters
-    ----------
-    points_px
-        (K, 2) full-sensor pixels, about a pixel apart along an edge.
-    directions_px
-        (K, 2) unit vectors along the edge; the sign does not matter.
+    ``points_px`` (K, 2) full-sensor pixels, about a pixel apart along an edge; ``directions_px``
+    (K, 2) unit vectors along the edge, whose sign does not matter.
     """
 
     points_px: FloatArray
     directions_px: FloatArray
-
-    def __post_init__(self) -> None:
-        k = len(self.points_px)
-        for name in ("points_px", "directions_px"):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (k, 2), name))
 
 
 def find_target_edges(
@@ -67,38 +69,23 @@ def find_target_edges(
     return _borders(target, sensor_from_board, camera)
 
 
-def runs_along_edge(
-    profile: Profile, edges: TargetEdges, reach_widths: float, max_angle_deg: float
-) -> BoolArray:
-    """(N,) True for stripe points near an edge that runs along the stripe.
-
-    Parameters
-    ----------
-    profile
-        N stripe points.
-    edges
-        Of the target.
-    reach_widths
-        An edge is near within this many times the point's own `Profile.width_px`.
-    max_angle_deg
-        An edge that is turned further than this from the stripe crosses it, which pulls the
-        stripe to neither side.
-    """
+def runs_along_edge(profile: Profile, edges: TargetEdges) -> BoolArray:
+    """(N,) True for stripe points near an edge that runs along the stripe."""
     near = np.zeros(len(profile), dtype=np.bool_)
     if len(edges.points_px) == 0 or len(profile) == 0:
         return near
     tree = cKDTree(edges.points_px)
-    found = tree.query_ball_point(profile.points_px, reach_widths * profile.width_px)
+    found = tree.query_ball_point(profile.points_px, REACH_WIDTHS * profile.width_px)
     row = np.repeat(np.arange(len(profile)), [len(neighbours) for neighbours in found])
     edge = np.concatenate([np.asarray(neighbours, dtype=np.int64) for neighbours in found])
     across = np.einsum("ni,ni->n", profile.normals_px[row], edges.directions_px[edge])
-    near[row[np.abs(across) < np.sin(np.radians(max_angle_deg))]] = True
+    near[row[np.abs(across) < np.sin(np.radians(LARGEST_ANGLE_DEG))]] = True
     return near
 
 
 def _rims(edges: CircleEdges) -> TargetEdges:
     """Tangents of the rims, by the ellipse that has the rim points' second moments."""
-    points, directions = [], []
+    points, directions = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for circle in np.unique(edges.circle):
         rim = edges.points_px[edges.circle == circle]
         if len(rim) < MIN_RIM_POINTS:
@@ -108,8 +95,6 @@ def _rims(edges: CircleEdges) -> TargetEdges:
         tangent = np.stack([-normal[:, 1], normal[:, 0]], axis=1)
         points.append(rim)
         directions.append(tangent / np.linalg.norm(tangent, axis=1)[:, None])
-    if not points:
-        return TargetEdges(np.zeros((0, 2)), np.zeros((0, 2)))
     return TargetEdges(np.concatenate(points), np.concatenate(directions))
 
 

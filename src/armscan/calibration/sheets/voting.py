@@ -1,18 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of several candidate lines on each board belong to the sheet on which the boards agree."""
+"""Which straight stripes the boards agree on: one light sheet draws coplanar lines on all of them.
+
+A photograph shows more straight lines than the laser's: a border of the board, the line where it
+went past the board to the wall behind, a reflection, a second laser. Carried to their boards'
+planes, the lines of one sheet are coplanar in the Sensor frame and the others are not, so that
+three boards and more tell them apart without any limit on brightness or length.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.labels import LEAST_FAN, board_numbers
-from armscan.calibration.sheets.result import PointUse, SheetOptions, SkippedImage
-from armscan.calibration.sheets.solve import square_root
-from armscan.calibration.sheets.stripes_on_board import BoardImage, StripeObservation
+from armscan.calibration.sheets.result import BoardStripes, PointUse, SheetOptions, SkippedImage
+from armscan.calibration.sheets.solve import square_matrix_root
+from armscan.calibration.sheets.stripes_on_board import (
+    BoardImage,
+    StripeObservation,
+    observe_board_stripes,
+)
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 
 LEAST_BOARDS = 3
@@ -26,9 +36,11 @@ lasers bow by up to 0.7 % over the field that they light, boards of card by abou
 the print, whose pose is that of its own middle plane, a bent carrier leaves it with the square of
 the distance."""
 AGREEING_SHARE = 0.6
+"""Of the boards: with so many in agreement no wider tolerance is tried."""
 SECOND_SHARE = 0.5
 """A further sheet is seen on at least this part of the boards that show the first."""
 MAX_TRIALS = 3000
+"""Pairs of lines whose planes are tried: all pairs of 78 lines."""
 CHUNK = 250
 POSE_SIGMAS = 3.0
 OUTLYING = 4.0
@@ -40,12 +52,13 @@ plane of its own rays. A light sheet at so small an angle measures no depth."""
 GRAZING = 0.1
 """Sine of the angle between sheet and board below which a pixel's height is not trusted."""
 MIN_SPREAD_RATIO = 0.01
+"""Of two lines: how wide they must lie apart over their length to span a plane."""
 REFITS = 3
 SEED = 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Vote:
+class SheetVote:
     """What the boards agreed on.
 
     Parameters
@@ -63,41 +76,29 @@ class Vote:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Lines:
-    """S stripes as the pieces in space between their ends.
+def observe_boards(
+    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
+) -> SheetVote:
+    """Straight stripes on the boards, less the lines on which the boards do not agree.
 
-    ``ends_mm`` (S, 2, 3); ``pose_root`` (S, 2, 3, 6) movement of the ends for a sigma of the
-    board's pose; ``across_mm_px`` (S, 3) movement for a pixel across; ``length`` (S,) points;
-    ``image`` and ``board`` (S,), ``place`` (S,) number of the sighting in its image; ``centre_mm``
-    (S, 3) of the camera that saw it, and ``bow_mm`` (S,) what a bow may do on its board.
+    Stripes are looked for on the print and, where three boards can vote, on the carrier around it
+    as far as the print is long: a board may go on beyond its print by the print's own length.
     """
-
-    ends_mm: FloatArray
-    pose_root: FloatArray
-    across_mm_px: FloatArray
-    length: FloatArray
-    image: IntArray
-    board: IntArray
-    place: IntArray
-    centre_mm: FloatArray
-    bow_mm: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Agreement:
-    """A plane ``normal @ x = offset``, how far (px) from it a line may lie to agree, and of all
-    lines the (S,) residuals and whether they agree, at most one an image.
-    """
-
-    normal: FloatArray
-    offset: float
-    limit_px: float
-    residual_px: FloatArray
-    agrees: BoolArray
-
-    def boards(self, lines: _Lines) -> int:
-        return len(np.unique(lines.board[self.agrees]))
+    can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
+    n_lines = 0 if can_vote else options.n_sheets
+    on_print = [
+        observe_board_stripes(board, cameras, options.margin_mm, n_lines) for board in boards
+    ]
+    if not can_vote:
+        return SheetVote(tuple(on_print))
+    around = on_print
+    if options.margin_mm is None:
+        lengths = [float(np.ptp(board.view.points_board_mm, axis=0).max()) for board in boards]
+        around = [
+            observe_board_stripes(board, cameras, length)
+            for board, length in zip(boards, lengths, strict=True)
+        ]
+    return vote_on_sheets(on_print, around, cameras, options)
 
 
 def vote_on_sheets(
@@ -105,7 +106,7 @@ def vote_on_sheets(
     around: Sequence[BoardImage],
     cameras: HeadCameras,
     options: SheetOptions,
-) -> Vote:
+) -> SheetVote:
     """Keep of each image the stripes that lie on a sheet on which at least three boards agree.
 
     The stripes on the print vote. Of images that show none there, a stripe beside the print is kept
@@ -127,200 +128,209 @@ def vote_on_sheets(
     images: list[BoardImage] = list(on_print)
     outlying: list[SkippedImage] = []
     warnings: list[str] = []
-    for group in _groups(on_print):
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, image in enumerate(on_print):
+        lasers = image.data.lasers
+        groups.setdefault(lasers if len(lasers) == 1 else (), []).append(i)
+    for group in groups.values():
         inner, wide = [on_print[i] for i in group], [around[i] for i in group]
         if _most_lines(inner) >= LEAST_FAN:
             continue
-        if _most_lines(inner) < 1 and _most_lines(wide) >= LEAST_FAN:
-            found = [_Chosen(image) for image in wide]
-        else:
-            found = _voted(inner, wide, cameras, options)
-        for i, item in zip(group, found, strict=True):
-            images[i] = item.image
-            if item.off is not None:
-                outlying.append(item.off)
-        n_shown = sum(bool(image.sightings) for image in wide)
-        n_agree = sum(bool(item.image.sightings) for item in found)
+        chosen, off = wide, list[SkippedImage | None]()
+        if _most_lines(inner) >= 1 or _most_lines(wide) < LEAST_FAN:
+            chosen, off = _voted(inner, wide, cameras, options)
+        for i, image in zip(group, chosen, strict=True):
+            images[i] = image
+        outlying += [item for item in off if item is not None]
+        n_shown = sum(bool(image.stripes) for image in wide)
+        n_agree = sum(bool(image.stripes) for image in chosen)
         if n_agree < 0.5 * n_shown:
             warnings.append(
                 f"only {n_agree} of {n_shown} images with a straight line agree on a sheet: look "
                 "at those that were left out"
             )
-    return Vote(tuple(images), tuple(outlying), tuple(warnings))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Chosen:
-    """An image with the stripes that stay, and why it was left out if none did."""
-
-    image: BoardImage
-    off: SkippedImage | None = None
+    return SheetVote(tuple(images), tuple(outlying), tuple(warnings))
 
 
 def _most_lines(images: Sequence[BoardImage]) -> float:
-    return float(np.median([len(image.sightings) for image in images]))
+    return float(np.median([len(image.stripes) for image in images]))
 
 
 def _voted(
-    inner: Sequence[BoardImage],
-    wide: Sequence[BoardImage],
-    cameras: HeadCameras,
-    options: SheetOptions,
-) -> list[_Chosen]:
-    """Vote on the stripes of the print, or if they show no sheet, on those around it."""
-    lines = _lines_of(inner, cameras)
-    sheets = _agreements(lines, options.n_sheets or LEAST_FAN)
+    inner: list[BoardImage], wide: list[BoardImage], cameras: HeadCameras, options: SheetOptions
+) -> tuple[list[BoardImage], list[SkippedImage | None]]:
+    """Vote on the stripes of the print, or if they show no sheet, on those around it.
+
+    The images with the stripes that stay, and of each why it was left out if none did.
+    """
+    off: list[SkippedImage | None] = [None for _ in inner]
+    voters = _Lines.of(inner, cameras)
+    sheets = _agreements(voters, options.n_sheets or LEAST_FAN)
     if not options.n_sheets and len(sheets) >= LEAST_FAN:
-        return [_Chosen(image) for image in inner]
-    if sheets:
-        kept = [set(lines.place[_any(sheets) & (lines.image == i)]) for i in range(len(inner))]
-    else:
-        lines = _lines_of(wide, cameras)
-        sheets = _agreements(lines, options.n_sheets or 1)
-        kept = [set[int]() for _ in inner]
+        return inner, off
+    kept = [set(voters.stripes_of(i, sheets)) for i in range(len(inner))]
+    beside = _Lines.of(wide, cameras)
     if not sheets:
-        return [_Chosen(image) for image in inner]
-    beside = _lines_of(wide, cameras)
-    sheets_beside = [_held_against(beside, sheet) for sheet in sheets]
+        voters = beside
+        sheets = _agreements(voters, options.n_sheets or 1)
+    if not sheets:
+        return inner, off
+    everyone = np.ones(len(beside.length), dtype=np.bool_)
+    on_these = [
+        _held_against(beside, everyone, sheet.normal, sheet.offset, sheet.limit_px)
+        for sheet in sheets
+    ]
     found = []
     for i, image in enumerate(inner):
         if kept[i]:
-            found.append(_Chosen(_with(image, kept[i])))
+            found.append(_with_only(image, kept[i]))
             continue
-        mine = beside.image == i
-        there = set(beside.place[_any(sheets_beside) & mine].tolist())
-        chosen = _Chosen(_with(wide[i], there))
-        if mine.any() and not there:
-            off = min(float(sheet.residual_px[mine].min()) for sheet in sheets_beside)
-            chosen = _Chosen(chosen.image, _outlying(image, off, sheets[0].boards(lines)))
-        found.append(chosen)
-    return found
+        there = set(beside.stripes_of(i, on_these))
+        found.append(_with_only(wide[i], there))
+        shown = beside.image == i
+        if shown.any() and not there:
+            off_px = min(float(sheet.residual_px[shown].min()) for sheet in on_these)
+            off[i] = SkippedImage(
+                image.data.profile.source,
+                f"outlying board: its straight stripe lies {off_px:.1f} px from the sheet that "
+                f"{sheets[0].n_boards(voters)} boards agree on",
+            )
+    return found, off
 
 
-def _any(sheets: Sequence[_Agreement]) -> BoolArray:
-    return np.asarray(np.any([sheet.agrees for sheet in sheets], axis=0))
-
-
-def _groups(images: Sequence[BoardImage]) -> list[list[int]]:
-    """Numbers of the images that share one named laser; all others are one group."""
-    groups: dict[tuple[str, ...], list[int]] = {}
-    for i, image in enumerate(images):
-        lasers = image.data.lasers
-        groups.setdefault(lasers if len(lasers) == 1 else (), []).append(i)
-    return list(groups.values())
-
-
-def _outlying(image: BoardImage, off_px: float, n_boards: int) -> SkippedImage:
-    return SkippedImage(
-        image.data.profile.source,
-        f"outlying board: its straight stripe lies {off_px:.1f} px from the sheet that {n_boards} "
-        "boards agree on",
-    )
-
-
-def _with(image: BoardImage, kept: set[int]) -> BoardImage:
-    if len(kept) == len(image.sightings):
-        return image
+def _with_only(image: BoardImage, kept: set[int]) -> BoardImage:
+    """The image with the stripes of these numbers."""
     use = image.use.copy()
-    for place, sighting in enumerate(image.sightings):
-        if place not in kept:
-            use[sighting.rows] = int(PointUse.OUTVOTED)
-    sightings = tuple(s for place, s in enumerate(image.sightings) if place in kept)
-    return replace(image, use=use, sightings=sightings)
+    for number, stripe in enumerate(image.stripes):
+        if number not in kept:
+            use[stripe.rows] = int(PointUse.OUTVOTED)
+    stripes = tuple(s for number, s in enumerate(image.stripes) if number in kept)
+    return replace(image, use=use, stripes=stripes)
 
 
-def _lines_of(images: Sequence[BoardImage], cameras: HeadCameras) -> _Lines:
-    boards = board_numbers(images)
-    found = [(i, k, s) for i, image in enumerate(images) for k, s in enumerate(image.sightings)]
-    roots = [square_root(image.placed.covariance) for image in images]
-    n = len(found)
-    return _Lines(
-        np.array([s.ends_mm for _, _, s in found]).reshape(n, 2, 3),
-        np.array([s.ends_by_pose @ roots[i] for i, _, s in found]).reshape(n, 2, 3, 6),
-        np.array([s.across * _mm_per_px(images[i], s) for i, _, s in found]).reshape(n, 3),
-        np.array([float(len(s.rows)) for _, _, s in found]),
-        np.array([i for i, _, _ in found], dtype=np.int64),
-        np.array([boards[i] for i, _, _ in found], dtype=np.int64),
-        np.array([k for _, k, _ in found], dtype=np.int64),
-        np.array([cameras.centre_mm(images[i].data.camera) for i, _, _ in found]).reshape(n, 3),
-        np.array([_bow_mm(images[i], s) for i, _, s in found]),
-    )
+@dataclass(frozen=True, slots=True, eq=False)
+class _Agreement:
+    """A plane ``normal @ x = offset``, how far (px) from it a line may lie to agree, and of all
+    lines the (S,) residuals and whether they agree, at most one an image.
+    """
+
+    normal: FloatArray
+    offset: float
+    limit_px: float
+    residual_px: FloatArray
+    agrees: BoolArray
+
+    def n_boards(self, lines: _Lines) -> int:
+        return len(np.unique(lines.board[self.agrees]))
 
 
-def _bow_mm(image: BoardImage, sighting: StripeObservation) -> float:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """S stripes as the pieces in space between their ends.
+
+    ``ends_mm`` (S, 2, 3); ``pose_root`` (S, 2, 3, 6) movement of the ends for a sigma of the
+    board's pose; ``across_mm_px`` (S, 3) movement for a pixel across; ``length`` (S,) points;
+    ``image`` and ``board`` (S,), ``number`` (S,) of the stripe in its image; ``centre_mm``
+    (S, 3) of the camera that saw it, and ``bow_mm`` (S,) what a bow may do on its board.
+    """
+
+    ends_mm: FloatArray
+    pose_root: FloatArray
+    across_mm_px: FloatArray
+    length: FloatArray
+    image: IntArray
+    board: IntArray
+    number: IntArray
+    centre_mm: FloatArray
+    bow_mm: FloatArray
+
+    @staticmethod
+    def of(images: Sequence[BoardImage], cameras: HeadCameras) -> _Lines:
+        boards = board_numbers(images)
+        found = [(i, k, s) for i, image in enumerate(images) for k, s in enumerate(image.stripes)]
+        roots = [square_matrix_root(image.placed.covariance) for image in images]
+        centres = [cameras.centre_mm(image.data.camera) for image in images]
+        n = len(found)
+        return _Lines(
+            np.array([s.ends_mm for _, _, s in found]).reshape(n, 2, 3),
+            np.array([s.dends_dpose @ roots[i] for i, _, s in found]).reshape(n, 2, 3, 6),
+            np.array([s.across * images[i].mm_per_px(s.rows) for i, _, s in found]).reshape(n, 3),
+            np.array([float(len(s.rows)) for _, _, s in found]),
+            np.array([i for i, _, _ in found], dtype=np.int64),
+            np.array([boards[i] for i, _, _ in found], dtype=np.int64),
+            np.array([k for _, k, _ in found], dtype=np.int64),
+            np.array([centres[i] for i, _, _ in found]).reshape(n, 3),
+            np.array([_bow_mm(images[i], s) for i, _, s in found]),
+        )
+
+    def stripes_of(self, image: int, sheets: Sequence[_Agreement]) -> list[int]:
+        """Numbers of an image's stripes that agree with one of the sheets."""
+        agrees = np.any([sheet.agrees for sheet in sheets], axis=0) if sheets else False
+        return [int(k) for k in self.number[agrees & (self.image == image)]]
+
+    def misses(
+        self, chosen: BoolArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
+    ) -> FloatArray:
+        """(T, S) largest distance of a line's ends from each plane, over what is tolerated."""
+        height = np.einsum("ti,sei->tse", normals, self.ends_mm[chosen]) - offsets[:, None, None]
+        by_pose = np.einsum("ti,seip->tsep", normals, self.pose_root[chosen])
+        pose = POSE_SIGMAS * np.sqrt((by_pose**2).sum(axis=3))
+        allowed = tolerance_px * self.mm_per_px(chosen, normals) + self.bow_mm[chosen]
+        allowed = allowed[:, :, None] + pose
+        return np.asarray((np.abs(height) / allowed).max(axis=2))
+
+    def mm_per_px(self, chosen: BoolArray, normals: FloatArray) -> FloatArray:
+        """(T, S) height over each plane for a pixel across the stripe."""
+        across = self.across_mm_px[chosen]
+        height = np.abs(normals @ across.T)
+        return np.asarray(np.maximum(height, GRAZING * np.linalg.norm(across, axis=1)))
+
+
+def _bow_mm(image: BoardImage, stripe: StripeObservation) -> float:
     print_mm = image.data.view.points_board_mm
     side_mm = float(np.ptp(print_mm, axis=0).max())
     pose = image.placed.sensor_from_board
-    ends = (sighting.ends_mm - pose.translation_mm) @ pose.rotation
+    ends = (stripe.ends_mm - pose.translation_mm) @ pose.rotation
     middle = 0.5 * (print_mm.min(axis=0) + print_mm.max(axis=0))
     far_mm = float(np.linalg.norm(ends[:, :2] - middle[:2], axis=1).max())
     return BOW_SHARE * side_mm * max(1.0, (far_mm / (0.5 * side_mm)) ** 2)
 
 
-def _mm_per_px(image: BoardImage, sighting: StripeObservation) -> float:
-    rows = sighting.rows
-    return float(np.median(image.sigma_mm[rows] / image.data.profile.sigma_px[rows]))
-
-
 def _agreements(lines: _Lines, most: int) -> list[_Agreement]:
     """Planes from the one with the most support on; lines of one do not count for the next."""
-    n_boards = len(np.unique(lines.board))
     found: list[_Agreement] = []
-    open_lines = np.ones(len(lines.length), dtype=np.bool_)
+    is_open = np.ones(len(lines.length), dtype=np.bool_)
     while len(found) < most:
-        best = _best_agreement(lines, open_lines, n_boards)
+        best = _best_agreement(lines, is_open)
         if best is None:
             break
-        least = SECOND_SHARE * found[0].boards(lines) if found else 0.0
-        if best.boards(lines) < max(LEAST_BOARDS, least):
+        least = SECOND_SHARE * found[0].n_boards(lines) if found else 0.0
+        if best.n_boards(lines) < max(LEAST_BOARDS, least):
             break
         found.append(best)
-        open_lines &= ~(best.residual_px < 2.0 * TOLERANCES_PX[0]) & ~best.agrees
+        is_open &= ~(best.residual_px < 2.0 * TOLERANCES_PX[0]) & ~best.agrees
     return found
 
 
-def _held_against(lines: _Lines, sheet: _Agreement) -> _Agreement:
-    """The same plane with other lines: which of them agree with it."""
-    return _judged(
-        lines,
-        np.ones(len(lines.length), dtype=np.bool_),
-        sheet.normal,
-        sheet.offset,
-        sheet.limit_px,
-    )
-
-
-def _judged(
-    lines: _Lines, own: BoolArray, normal: FloatArray, offset: float, limit_px: float
-) -> _Agreement:
-    everyone = np.ones(len(lines.length), dtype=np.bool_)
-    ratio = _misses(lines, everyone, normal[None], np.array([offset]), limit_px)[0]
-    height = np.abs(lines.ends_mm @ normal - offset).max(axis=1)
-    residual = height / _mm_of_px(lines, everyone, normal[None])[0]
-    agrees = _one_an_image(lines, own & (ratio < 1.0), ratio)
-    return _Agreement(normal, offset, limit_px, residual, agrees)
-
-
-def _best_agreement(lines: _Lines, own: BoolArray, n_boards: int) -> _Agreement | None:
-    trials = list(_trial_planes(lines, own))
-    if not trials:
-        return None
-    normals, offsets = (np.concatenate(parts) for parts in zip(*trials, strict=True))
+def _best_agreement(lines: _Lines, is_open: BoolArray) -> _Agreement | None:
+    normals, offsets = _trial_planes(lines, is_open)
     if not len(normals):
         return None
+    enough = max(LEAST_BOARDS, AGREEING_SHARE * len(np.unique(lines.board)))
     best: _Agreement | None = None
-    for tolerance in TOLERANCES_PX:
-        found = _refined(lines, own, *_most_supported(lines, own, normals, offsets, tolerance))
-        if best is None or found.boards(lines) > best.boards(lines):
+    for tolerance_px in TOLERANCES_PX:
+        trial = _most_supported(lines, is_open, normals, offsets, tolerance_px)
+        found = _refined(lines, is_open, normals[trial], float(offsets[trial]), tolerance_px)
+        if best is None or found.n_boards(lines) > best.n_boards(lines):
             best = found
-        if best.boards(lines) >= max(LEAST_BOARDS, AGREEING_SHARE * n_boards):
+        if best.n_boards(lines) >= enough:
             break
     return best
 
 
-def _trial_planes(lines: _Lines, own: BoolArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+def _trial_planes(lines: _Lines, is_open: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Planes (T, 3), (T,) through two lines of different boards, a random choice of all pairs."""
-    chosen = np.flatnonzero(own)
+    chosen = np.flatnonzero(is_open)
     a, b = np.triu_indices(len(chosen), 1)
     apart = lines.board[chosen[a]] != lines.board[chosen[b]]
     a, b = chosen[a[apart]], chosen[b[apart]]
@@ -330,86 +340,73 @@ def _trial_planes(lines: _Lines, own: BoolArray) -> Iterator[tuple[FloatArray, F
         generator = np.random.default_rng(SEED)
         pick = generator.choice(len(a), MAX_TRIALS, replace=False, p=weight / weight.sum())
         a, b = a[pick], b[pick]
-    for start in range(0, len(a), CHUNK):
-        pair = np.concatenate(
-            [lines.ends_mm[a[start : start + CHUNK]], lines.ends_mm[b[start : start + CHUNK]]],
-            axis=1,
-        )
-        middle = pair.mean(axis=1)
-        values, vectors = np.linalg.eigh(
-            np.einsum("tki,tkj->tij", pair - middle[:, None], pair - middle[:, None])
-        )
-        ray = middle - lines.centre_mm[a[start : start + CHUNK]]
-        sine = np.abs(np.einsum("ti,ti->t", vectors[:, :, 0], ray)) / np.linalg.norm(ray, axis=1)
-        sound = (values[:, 1] > MIN_SPREAD_RATIO**2 * values[:, 2]) & (sine > LEAST_TRIANGULATION)
-        normals = vectors[sound, :, 0]
-        yield normals, np.einsum("ti,ti->t", normals, middle[sound])
+    pair = np.concatenate([lines.ends_mm[a], lines.ends_mm[b]], axis=1)
+    middle = pair.mean(axis=1)
+    local = pair - middle[:, None]
+    values, vectors = np.linalg.eigh(np.einsum("tki,tkj->tij", local, local))
+    ray = middle - lines.centre_mm[a]
+    sine = np.abs(np.einsum("ti,ti->t", vectors[:, :, 0], ray)) / np.linalg.norm(ray, axis=1)
+    sound = (values[:, 1] > MIN_SPREAD_RATIO**2 * values[:, 2]) & (sine > LEAST_TRIANGULATION)
+    normals = vectors[sound, :, 0]
+    return normals, np.einsum("ti,ti->t", normals, middle[sound])
 
 
 def _most_supported(
-    lines: _Lines, own: BoolArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
-) -> tuple[FloatArray, float, float]:
-    """The plane with the longest support, one line an image, and the tolerance."""
+    lines: _Lines,
+    is_open: BoolArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+    tolerance_px: float,
+) -> int:
+    """Number of the plane with the longest support, one line an image."""
     best, best_score = 0, -1.0
-    images = lines.image[own]
+    images = lines.image[is_open]
     order = np.argsort(images, kind="stable")
     starts = np.flatnonzero(np.diff(images[order], prepend=-1))
     for start in range(0, len(normals), CHUNK):
         block = slice(start, start + CHUNK)
-        ratio = _misses(lines, own, normals[block], offsets[block], tolerance_px)
-        gain = lines.length[own] * np.maximum(1.0 - ratio**2, 0.0)
+        ratio = lines.misses(is_open, normals[block], offsets[block], tolerance_px)
+        gain = lines.length[is_open] * np.maximum(1.0 - ratio**2, 0.0)
         score = np.maximum.reduceat(gain[:, order], starts, axis=1).sum(axis=1)
         if float(score.max()) > best_score:
             best, best_score = start + int(np.argmax(score)), float(score.max())
-    return normals[best], float(offsets[best]), tolerance_px
-
-
-def _misses(
-    lines: _Lines, own: BoolArray, normals: FloatArray, offsets: FloatArray, tolerance_px: float
-) -> FloatArray:
-    """(T, S) largest distance of a line's ends from each plane, over what is tolerated."""
-    height = np.einsum("ti,sei->tse", normals, lines.ends_mm[own]) - offsets[:, None, None]
-    by_pose = np.einsum("ti,seip->tsep", normals, lines.pose_root[own])
-    pose = POSE_SIGMAS * np.sqrt((by_pose**2).sum(axis=3))
-    allowed = tolerance_px * _mm_of_px(lines, own, normals) + lines.bow_mm[own]
-    allowed = allowed[:, :, None] + pose
-    return np.asarray((np.abs(height) / allowed).max(axis=2))
-
-
-def _mm_of_px(lines: _Lines, own: BoolArray, normals: FloatArray) -> FloatArray:
-    """(T, S) height over each plane for a pixel across the stripe."""
-    across = lines.across_mm_px[own]
-    height = np.abs(normals @ across.T)
-    return np.asarray(np.maximum(height, GRAZING * np.linalg.norm(across, axis=1)))
+    return best
 
 
 def _refined(
-    lines: _Lines, own: BoolArray, normal: FloatArray, offset: float, tolerance_px: float
+    lines: _Lines, is_open: BoolArray, normal: FloatArray, offset: float, tolerance_px: float
 ) -> _Agreement:
     """Refit the plane to who agrees, and leave out who is far off by the others' own scatter."""
-    found = _judged(lines, own, normal, offset, tolerance_px)
+    found = _held_against(lines, is_open, normal, offset, tolerance_px)
     for _ in range(REFITS):
-        if found.boards(lines) < LEAST_BOARDS:
+        if found.n_boards(lines) < LEAST_BOARDS:
             break
         agrees = found.agrees
         ends = lines.ends_mm[agrees].reshape(-1, 3)
-        mm_px = _mm_of_px(lines, agrees, found.normal[None])[0]
+        mm_px = lines.mm_per_px(agrees, found.normal[None])[0]
         weight = np.repeat(lines.length[agrees] / mm_px**2, 2)
         middle = weight @ ends / weight.sum()
-        spread = (ends - middle).T @ ((ends - middle) * weight[:, None])
-        normal = np.linalg.eigh(spread)[1][:, 0]
-        refit = _judged(lines, own, normal, float(normal @ middle), found.limit_px)
+        scatter_mm2 = (ends - middle).T @ ((ends - middle) * weight[:, None])
+        normal = np.linalg.eigh(scatter_mm2)[1][:, 0]
+        refit = _held_against(lines, is_open, normal, float(normal @ middle), found.limit_px)
         scatter = 1.4826 * float(np.median(refit.residual_px[agrees]))
         limit = float(np.clip(OUTLYING * scatter, TOLERANCES_PX[0], tolerance_px))
-        found = _judged(lines, own, refit.normal, refit.offset, limit)
+        found = _held_against(lines, is_open, refit.normal, refit.offset, limit)
     return found
 
 
-def _one_an_image(lines: _Lines, agrees: BoolArray, ratio: FloatArray) -> BoolArray:
-    """Of the lines of one image that agree, the one with the most support."""
-    gain = np.where(agrees, lines.length * (1.0 - ratio**2), -1.0)
-    keep = np.zeros(len(gain), dtype=np.bool_)
-    for i in np.unique(lines.image[agrees]):
-        own = np.flatnonzero(lines.image == i)
-        keep[own[np.argmax(gain[own])]] = True
-    return keep
+def _held_against(
+    lines: _Lines, is_open: BoolArray, normal: FloatArray, offset: float, limit_px: float
+) -> _Agreement:
+    """Which of the open lines agree with a plane: of each image the one with the most support."""
+    everyone = np.ones(len(lines.length), dtype=np.bool_)
+    ratio = lines.misses(everyone, normal[None], np.array([offset]), limit_px)[0]
+    height = np.abs(lines.ends_mm @ normal - offset).max(axis=1)
+    residual = height / lines.mm_per_px(everyone, normal[None])[0]
+    near = is_open & (ratio < 1.0)
+    support = np.where(near, lines.length * (1.0 - ratio**2), -1.0)
+    agrees = np.zeros(len(support), dtype=np.bool_)
+    for i in np.unique(lines.image[near]):
+        of_image = np.flatnonzero(lines.image == i)
+        agrees[of_image[np.argmax(support[of_image])]] = True
+    return _Agreement(normal, offset, limit_px, residual, agrees)

@@ -6,7 +6,7 @@ tremor, and scan passes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -20,6 +20,8 @@ from armscan.simulation.head import Head, sheet_middle_mm
 
 FACE_DOWN = np.diag([1.0, -1.0, -1.0])
 """Sensor axes over a face with x to the right and z up: it looks down on it, upright."""
+_JITTER = np.array([2.0, 2.0, 6.0, 2.0])
+"""By how much a person misses tilts and roll, degrees, and depth, mm, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,21 @@ class HeadOrientation:
             for angle, axis in ((self.roll_deg, 2), (-self.tilt_y_deg, 1), (-self.tilt_x_deg, 0))
         )
         return np.asarray(roll @ FACE_DOWN @ about_x @ about_y)
+
+    def turned(
+        self, tilt_x_deg: float, tilt_y_deg: float, roll_deg: float, deeper_mm: float = 0.0
+    ) -> HeadOrientation:
+        """The same with more tilt, roll and depth."""
+        return HeadOrientation(
+            self.tilt_x_deg + tilt_x_deg,
+            self.tilt_y_deg + tilt_y_deg,
+            self.roll_deg + roll_deg,
+            self.depth_mm + deeper_mm,
+        )
+
+    def by_hand(self, jitter: FloatArray) -> HeadOrientation:
+        """The same as a person hits it; ``jitter`` (4,) is between -1 and 1."""
+        return self.turned(*(_JITTER * jitter))
 
 
 def sensor_over(
@@ -99,7 +116,7 @@ _STEREO_ROLL_DEG = 92.0
 
 
 def light_upright(head: Head) -> HeadOrientation:
-    """HeadOrientation at which the light falls along the face's normal.
+    """Orientation at which the light falls along the face's normal.
 
     One sheet: its middle ray stands upright. Two: both sheets do, that is the line in which they
     meet. More: the middle ray of the middle one.
@@ -110,21 +127,8 @@ def light_upright(head: Head) -> HeadOrientation:
     return _looking_along(head, head.lasers[len(head.lasers) // 2].rays(np.zeros(1))[0])
 
 
-def half_way(head: Head) -> HeadOrientation:
-    """HeadOrientation at which light and camera lie equally far from the face's normal.
-
-    For two cameras it is that at which both of them do.
-    """
-    if len(head.cameras) > 1:
-        return facing_both(head)
-    upright = light_upright(head)
-    return replace(
-        upright, tilt_x_deg=0.5 * upright.tilt_x_deg, tilt_y_deg=0.5 * upright.tilt_y_deg
-    )
-
-
 def facing_both(head: Head) -> HeadOrientation:
-    """HeadOrientation at which a face is seen equally obliquely by all cameras."""
+    """Orientation at which a face is seen equally obliquely by all cameras."""
     return _looking_along(head, _mean_view(head))
 
 
@@ -165,7 +169,7 @@ def _mean_view(head: Head) -> FloatArray:
 
 
 def _looking_along(head: Head, direction: FloatArray) -> HeadOrientation:
-    """HeadOrientation that turns a direction (3,) of Sensor against the face's normal."""
+    """Orientation that turns a direction (3,) of Sensor against the face's normal."""
     x, y, z = direction / np.linalg.norm(direction)
     is_stereo = len(head.cameras) > 1
     return HeadOrientation(
@@ -412,12 +416,7 @@ def _poses(
     aim = stroke.aim
     poses = []
     for way, (tilt_x, tilt_y, roll, depth, aside) in zip(way_mm, stray, strict=True):
-        held = HeadOrientation(
-            aim.tilt_x_deg + tilt_x,
-            aim.tilt_y_deg + tilt_y,
-            aim.roll_deg + roll,
-            aim.depth_mm + depth,
-        )
+        held = aim.turned(tilt_x, tilt_y, roll, depth)
         spot = stroke.start_mm + way * along + aside * across
         middle = aim_point_mm(head, held.depth_mm)
         poses.append(sensor_over(stroke.base_from_face, spot, held, middle))

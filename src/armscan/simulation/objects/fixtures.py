@@ -135,7 +135,7 @@ _LEVEL_RAD = 0.004
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Bench:
+class Fixtures:
     """The things of one twin, each where it stands for its scene.
 
     Parameters
@@ -172,7 +172,7 @@ class Bench:
     moved_from_base: Pose[Base, Base]
 
     @staticmethod
-    def build(preset: Preset, rng: np.random.Generator) -> Bench:
+    def build(preset: Preset, rng: np.random.Generator) -> Fixtures:
         """Draw the things and put them down by hand: a little aside, not quite level."""
         plate = FlatPlate.draw(PLATE_SIZE_MM, _FLATNESS_MM[preset], rng, _WHITE)
         ground = FlatPlate.draw(_GROUND_SIZE_MM, _GROUND_FLATNESS_MM, rng, _STEEL)
@@ -185,7 +185,7 @@ class Bench:
         waves = [replace(w, phase_rad=float(p)) for w, p in zip(_WAVES, phases, strict=True)]
         base_from_marked = _put_down(_MARKED_MM, rng)
         moved_from_marked = _put_down(_MARKED_AFTER_MOVE_MM, rng, _TURN_OF_MOVE_RAD)
-        return Bench(
+        return Fixtures(
             plate=plate,
             base_from_plate=base_from_plate,
             ball=Sphere(ball, 0.5 * BALL_DIAMETER_MM, _WHITE),

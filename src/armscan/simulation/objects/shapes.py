@@ -117,63 +117,6 @@ class Box:
         return np.asarray(points_mm - np.array([0.0, 0.0, 0.5 * self.size_mm[2]]))
 
 
-@dataclass(frozen=True, slots=True)
-class Rod:
-    """A round bar with flat ends, from z = 0 to z = length of its frame, about the z axis."""
-
-    radius_mm: float
-    length_mm: float
-    colour: tuple[float, float, float] = GREY
-
-    def __post_init__(self) -> None:
-        if min(self.radius_mm, self.length_mm) <= 0.0:
-            raise InputError(f"bar of radius {self.radius_mm} mm, length {self.length_mm} mm")
-
-    def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
-        """As for `Surface`; rays start outside."""
-        flat, along = directions[:, :2], directions[:, 2]
-        a = np.sum(flat * flat, axis=1)
-        b = np.sum(origins_mm[:, :2] * flat, axis=1)
-        c = np.sum(origins_mm[:, :2] ** 2, axis=1) - self.radius_mm**2
-        root = b * b - a * c
-        half = np.sqrt(np.maximum(root, 0.0))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            side_in, side_out = (-b - half) / a, (-b + half) / a
-            ends = np.stack(
-                [-origins_mm[:, 2] / along, (self.length_mm - origins_mm[:, 2]) / along]
-            )
-        enter = np.fmax(side_in, ends.min(axis=0))
-        leave = np.fmin(side_out, ends.max(axis=0))
-        return np.where((root > 0.0) & (enter < leave) & (enter > 0.0), enter, MISS)
-
-    def normals(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`: of the nearest of mantle and ends."""
-        beyond_side, beyond_end = self._beyond(points_mm)
-        centred = points_mm - np.array([0.0, 0.0, 0.5 * self.length_mm])
-        is_end = beyond_end > beyond_side
-        radius = np.maximum(np.hypot(centred[:, 0], centred[:, 1]), 1e-12)
-        normals = np.zeros(centred.shape)
-        normals[:, :2] = np.where(is_end[:, None], 0.0, centred[:, :2] / radius[:, None])
-        normals[:, 2] = np.where(is_end, np.where(centred[:, 2] < 0.0, -1.0, 1.0), 0.0)
-        return normals
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
-
-    def distance_mm(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Solid`."""
-        side, end = self._beyond(points_mm)
-        outside = np.hypot(np.maximum(side, 0.0), np.maximum(end, 0.0))
-        return np.asarray(outside + np.minimum(np.maximum(side, end), 0.0))
-
-    def _beyond(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(N,) how far points lie beyond the mantle and beyond the nearer end."""
-        side = np.hypot(points_mm[:, 0], points_mm[:, 1]) - self.radius_mm
-        end = np.abs(points_mm[:, 2] - 0.5 * self.length_mm) - 0.5 * self.length_mm
-        return np.asarray(side), np.asarray(end)
-
-
 N_WAVES = 7
 """Half waves over each side of a plate: on 200 mm the shortest is 29 mm long."""
 _GRID = 61

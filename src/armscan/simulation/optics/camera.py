@@ -128,44 +128,6 @@ def blur_image(image: NDArray[Float], sigma_px: float) -> NDArray[Float]:
     return np.asarray(blurred, dtype=image.dtype)
 
 
-def add_noise(
-    image: FloatArray,
-    rng: np.random.Generator,
-    *,
-    sigma: float = 2.0,
-    electrons_per_level: float | None = None,
-    bits: int = 8,
-) -> ImageArray:
-    """Turn a rendered image into what a camera delivers.
-
-    Parameters
-    ----------
-    image
-        Grey levels of an 8-bit image, whatever ``bits`` is: 255 is full scale.
-    rng
-        Source of the noise.
-    sigma
-        Read noise, in 8-bit grey levels.
-    electrons_per_level
-        Electrons per 8-bit grey level, for shot noise; None for none.
-    bits
-        Significant bits of the result, low aligned: uint8 up to 8 bits, else uint16.
-
-    Returns
-    -------
-    Rounded and clipped image.
-    """
-    if not 1 <= bits <= 16:
-        raise InputError(f"{bits} bits do not fit into 16")
-    variance = np.full(image.shape, sigma**2)
-    if electrons_per_level is not None:
-        variance += np.maximum(image, 0.0) / electrons_per_level
-    noisy = image + np.sqrt(variance) * rng.standard_normal(image.shape)
-    full_scale = (1 << bits) - 1
-    levels: FloatArray = np.clip(np.rint(noisy * (full_scale / 255.0)), 0, full_scale)
-    return levels.astype(np.uint8) if bits <= 8 else levels.astype(np.uint16)
-
-
 def _largest(values: FloatArray) -> float:
     return float(np.abs(values).max(initial=0.0))
 
@@ -175,12 +137,10 @@ LEVELS = 255.0
 
 @dataclass(frozen=True, slots=True)
 class Detector:
-    """Sensor and amplifier of a camera.
+    """Sensor and amplifier of a mono camera.
 
     Parameters
     ----------
-    is_colour
-        Deliver red, green, blue; else one channel, the first.
     bits
         Significant bits; more than 8 are stored in 16.
     electrons_per_level
@@ -191,7 +151,6 @@ class Detector:
         Part of strong light that the lens and the cover glass scatter, and how far.
     """
 
-    is_colour: bool = True
     bits: int = 8
     electrons_per_level: float = 60.0
     read_noise: float = 0.8
@@ -201,24 +160,6 @@ class Detector:
     def __post_init__(self) -> None:
         if not 0.0 <= self.halo_share < 1.0 or not self.electrons_per_level > 0.0:
             raise InputError("a detector scatters a part of the light and counts electrons")
-
-    def scatter(self, light: FloatArray) -> FloatArray:
-        """Move the halo's share of light (H, W) away from where it belongs; the sum is kept."""
-        if self.halo_share == 0.0:
-            return light
-        halo = blur_image(light, self.halo_sigma_px)
-        return np.asarray((1.0 - self.halo_share) * light + self.halo_share * halo)
-
-    def expose(self, light: FloatArray, rng: np.random.Generator) -> ImageArray:
-        """Grey levels of light (H, W) or (H, W, 3), given as parts of full scale."""
-        seen = light[..., 0] if light.ndim == 3 and not self.is_colour else light
-        return add_noise(
-            np.asarray(LEVELS * seen),
-            rng,
-            sigma=self.read_noise,
-            electrons_per_level=self.electrons_per_level,
-            bits=self.bits,
-        )
 
 
 Image32 = NDArray[np.float32]

@@ -15,9 +15,6 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
 from armscan.geometry.poses import Pose
 
-RED = (1.0, 0.09, 0.05)
-"""What the three channels of a colour camera answer to a red laser."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineLaser:
@@ -48,8 +45,6 @@ class LineLaser:
         part of the camera's full scale that a white surface then shows.
     falloff
         Part of the brightness that is lost from the fan's middle to its ends.
-    colour
-        (3,) response of red, green and blue to this light; mono cameras see the first.
     source
         Name of the light source that it is switched with; by default that of the sheet.
     cubic_rad
@@ -67,7 +62,6 @@ class LineLaser:
     divergence_rad: float = 6e-4
     irradiance: float = 1.0
     falloff: float = 0.4
-    colour: tuple[float, float, float] = RED
     source: str = ""
     cubic_rad: float = 0.0
 

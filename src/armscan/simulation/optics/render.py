@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from armscan.devices.sources import Preset
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
-from armscan.simulation.optics.camera import STEP_TOLERANCE, Detector, RenderCamera, blur_image
+from armscan.simulation.optics.camera import STEP_TOLERANCE, Detector, RenderCamera
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.scene import Hits, Scene
 
@@ -145,88 +145,6 @@ class Speckle:
             raise InputError("speckle contrast and grain cannot be negative")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LaserImage:
-    """One laser's light in an image.
-
-    Parameters
-    ----------
-    light
-        (H, W) parts of full scale, blurred, neither clipped nor noisy.
-    truth
-        Where the centre of the sheet truly lies.
-    """
-
-    light: FloatArray
-    truth: StripeTruth
-
-
-def render_room(scene: Scene, camera: RenderCamera) -> FloatArray:
-    """(H, W, 3) image under the lamp alone, parts of full scale, blurred; one ray a pixel."""
-    rows, columns = np.indices((camera.height_px, camera.width_px))
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    hits = scene.trace(np.zeros(3), camera_rays(camera, pixels))
-    light = scene.room_light(hits).reshape(camera.height_px, camera.width_px, 3)
-    return blur_image(light, camera.blur_sigma_px)
-
-
-def render_laser(
-    scene: Scene,
-    camera: RenderCamera,
-    laser: LineLaser,
-    speckle: Speckle,
-    rng: np.random.Generator,
-) -> LaserImage:
-    """Render the light of one laser and find the truth of its stripe."""
-    band = laser_band(scene, camera, laser)
-    light = np.zeros(band.shape)
-    if not band.any():
-        return LaserImage(light, find_stripe(scene, camera, laser, band))
-    margin = int(np.ceil(BLUR_REACH * camera.blur_sigma_px)) + 1
-    is_used = np.asarray(band.any(axis=1)), np.asarray(band.any(axis=0))
-    window = _span(is_used[0], margin), _span(is_used[1], margin)
-    fine = _trace_finely(scene, camera, laser, band[window], (window[1].start, window[0].start))
-    fine *= _speckle_field(fine.shape, speckle, rng)
-    blurred = blur_image(fine, SUBPIXELS * camera.blur_sigma_px)
-    height, width = light[window].shape
-    light[window] = cv2.resize(blurred, (width, height), interpolation=cv2.INTER_AREA)
-    return LaserImage(light, find_stripe(scene, camera, laser, band))
-
-
-def _span(is_used: BoolArray, margin: int) -> slice:
-    """Slice around the True entries (N,), widened by a margin."""
-    used = np.flatnonzero(is_used)
-    return slice(max(int(used[0]) - margin, 0), min(int(used[-1]) + 1 + margin, len(is_used)))
-
-
-def _trace_finely(
-    scene: Scene,
-    camera: RenderCamera,
-    laser: LineLaser,
-    band: BoolArray,
-    corner_px: tuple[int, int],
-) -> FloatArray:
-    """Laser light on the fine grid of a window of the image whose top-left pixel is given."""
-    rows, columns = np.nonzero(band)
-    fine = np.zeros((SUBPIXELS * band.shape[0], SUBPIXELS * band.shape[1]))
-    for b in range(SUBPIXELS):
-        for a in range(SUBPIXELS):
-            shift = (np.array([a, b]) + 0.5) / SUBPIXELS - 0.5 + corner_px
-            rays = camera_rays(camera, np.stack([columns, rows], axis=1) + shift)
-            hits = scene.trace(np.zeros(3), rays)
-            fine[SUBPIXELS * rows + b, SUBPIXELS * columns + a] = scene.laser_light(laser, hits)
-    return fine
-
-
-def laser_band(scene: Scene, camera: RenderCamera, laser: LineLaser) -> BoolArray:
-    """(H, W) True for pixels that the laser's light may reach.
-
-    A coarse grid of rays is traced; a cell belongs to the band if the sheet lies, within its
-    thickness, between the nearest and the farthest of the cell's corners; so do its neighbours.
-    """
-    return next(laser_bands(scene, camera, (laser,)))
-
-
 def laser_bands(
     scene: Scene, camera: RenderCamera, lasers: Sequence[LineLaser]
 ) -> Iterator[BoolArray]:
@@ -275,20 +193,6 @@ def cells_near_sheet(reach: FloatArray, rank: FloatArray) -> BoolArray:
 def _corners(grid: FloatArray) -> FloatArray:
     """(4, H - 1, W - 1) values at the corners of each cell."""
     return np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, :-1], grid[1:, 1:]])
-
-
-def _speckle_field(
-    shape: tuple[int, ...], speckle: Speckle, rng: np.random.Generator
-) -> FloatArray | float:
-    """Positive random factor with mean 1: the logarithm is normal, smoothed to the grain."""
-    if speckle.contrast == 0.0:
-        return 1.0
-    normal = rng.standard_normal(shape, dtype=np.float32)
-    if speckle.grain_px > 0.0:
-        normal = blur_image(normal, SUBPIXELS * speckle.grain_px)
-        normal = normal / normal.std()
-    variance = np.log1p(speckle.contrast**2)
-    return np.asarray(np.exp(np.sqrt(variance) * normal - 0.5 * variance))
 
 
 Image32 = NDArray[np.float32]
@@ -351,7 +255,7 @@ def enlarged(cells: NDArray[np.uint8], step_px: int) -> NDArray[np.uint8]:
 
 
 _FINE_GRAIN = Speckle(contrast=0.22, grain_px=0.6)
-_MONO = Detector(is_colour=False, halo_share=0.02)
+_MONO = Detector(halo_share=0.02)
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,9 +314,7 @@ IMAGING: dict[Preset, Imaging] = {
     "clean": Imaging(
         ambient=0.004,
         speckle=Speckle(contrast=0.01, grain_px=0.6),
-        detector=Detector(
-            is_colour=False, electrons_per_level=2000.0, read_noise=0.2, halo_share=0.0
-        ),
+        detector=Detector(electrons_per_level=2000.0, read_noise=0.2, halo_share=0.0),
         gloss=0.0,
         texture=0.0,
         spot_level=0.0,
@@ -423,9 +325,7 @@ IMAGING: dict[Preset, Imaging] = {
         laser_level=1.3,
         ambient=0.08,
         speckle=Speckle(contrast=0.45, grain_px=0.9),
-        detector=Detector(
-            is_colour=False, electrons_per_level=20.0, read_noise=2.0, halo_share=0.06
-        ),
+        detector=Detector(electrons_per_level=20.0, read_noise=2.0, halo_share=0.06),
         gloss=2.5,
         texture=2.5,
         ghost_share=0.01,

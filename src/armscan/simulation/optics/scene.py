@@ -319,8 +319,7 @@ class Scene:
     def laser_light(self, laser: LineLaser, hits: Hits) -> FloatArray:
         """(N,) radiance of hits under one laser alone, as parts of full scale, without speckle.
 
-        A laser is nearly of one wavelength: the surface answers with its red albedo, and the
-        camera's channels with `LineLaser.colour`, which is not applied here.
+        A laser is nearly of one wavelength: the surface answers with its red albedo.
         """
         radiance = np.zeros(len(hits.surface))
         met = np.flatnonzero(hits.surface >= 0)

@@ -92,20 +92,17 @@ def extract_stripes(
     else:
         centres = THESIS_METHODS[options.method](plane.image, level, sigma)
         ridge = link_centres(centres, plane.image)
-    ridge = _of_laser(plane, ridge, sigma, options)
+    ridge = _of_laser(plane, ridge, sigma)
     if not len(ridge):
-        return empty_profile(exposure.source)
-    if options.method == "fit":
-        fits = fit_ridge(plane, ridge, sigma, level.noise, options.shortest_px)
-        return to_profile(exposure, plane, fits, options)
-    return thesis_profile(exposure, plane, ridge, sigma, options)
+        return Profile.empty(source=exposure.source)
+    if options.method != "fit":
+        return thesis_profile(exposure, plane, ridge, sigma)
+    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, level.noise), options)
 
 
-def _of_laser(
-    plane: StripePlane, ridge: RidgePoints, sigma_px: float, options: StripeOptions
-) -> RidgePoints:
+def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgePoints:
     """Leave out faint chains, what lacks the laser's colour, and what was white without it."""
-    ridge = ridge.select(is_bright(ridge, options.faintest_share))
+    ridge = ridge.select(is_bright(ridge))
     if plane.gate is not None and len(ridge):
         ridge = ridge.select(has_laser_colour(plane.gate, ridge.table, ridge.chain, sigma_px))
     if plane.unknown is not None and len(ridge):
@@ -114,45 +111,23 @@ def _of_laser(
 
 
 def thesis_profile(
-    exposure: Exposure,
-    plane: StripePlane,
-    ridge: RidgePoints,
-    sigma_px: float,
-    options: StripeOptions,
+    exposure: Exposure, plane: StripePlane, ridge: RidgePoints, sigma_px: float
 ) -> Profile:
     """Profile of a thesis method: not smoothed, one sigma and one width for all points."""
-    points = ridge.table[:, :2]
+    points, normals, chain = ridge.table[:, :2], ridge.table[:, 2:4], ridge.chain
     flags = np.zeros(len(points), np.int64)
     flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
-    flags[is_short(points, ridge.chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
-    binning = exposure.window.binning
-    sigma = max(scatter(points, ridge.table[:, 2:4], ridge.chain), LEAST_SIGMA_PX)
+    flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
+    sigma = np.full(len(points), max(scatter(points, normals, chain), LEAST_SIGMA_PX))
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(points),
-        normals_px=ridge.table[:, 2:4],
-        sigma_px=np.full(len(points), sigma * binning),
-        width_px=np.full(len(points), sigma_px * binning),
+        normals_px=normals,
+        sigma_px=sigma * exposure.window.binning,
+        width_px=np.full(len(points), sigma_px * exposure.window.binning),
         intensity=np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
         flags=flags,
-        segment=ridge.chain,
-    )
-
-
-def empty_profile(source: str) -> Profile:
-    """A profile without points."""
-    none = np.zeros(0)
-    pairs = np.zeros((0, 2))
-    index = np.zeros(0, np.int64)
-    return Profile(
-        source=source,
-        points_px=pairs,
-        normals_px=pairs,
-        sigma_px=none,
-        width_px=none,
-        intensity=none,
-        flags=index,
-        segment=index,
+        segment=chain,
     )
 
 
@@ -161,22 +136,25 @@ def to_profile(
 ) -> Profile:
     """Flag the fitted centres, smooth them along their chains and map them to the full sensor."""
     if not len(fits.ridge):
-        return empty_profile(exposure.source)
+        return Profile.empty(source=exposure.source)
     points, normals, sigma = fitted_centres(fits)
     chain = fits.ridge.chain
-    across = axis_component(fits.ridge.table)
-    width = fits.values[:, SIGMA] * across
+    width = fits.values[:, SIGMA] * axis_component(fits.ridge.table)
+    near = is_near_other_line(fits.neighbour, chain, width)
     flags = np.zeros(len(points), np.int64)
-    flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
-    flags[is_background_step(fits, options.background_step)] |= int(StripeFlag.BACKGROUND_STEP)
-    flags[is_asymmetric(fits, width)] |= int(StripeFlag.ASYMMETRIC)
-    near = is_near_other_line(fits.neighbour, chain, width, options.neighbour_sigmas)
-    flags[near] |= int(StripeFlag.NEIGHBOUR)
-    flags[is_cut_off(fits, points, width, plane.image.shape)] |= int(StripeFlag.END)
-    flags[is_short(points, chain, options.shortest_px)] |= int(StripeFlag.SHORT_SEGMENT)
+    for flag, holds in (
+        (StripeFlag.SATURATED, is_saturated(points, plane.saturated)),
+        (StripeFlag.BACKGROUND_STEP, is_background_step(fits)),
+        (StripeFlag.ASYMMETRIC, is_asymmetric(fits, width)),
+        (StripeFlag.NEIGHBOUR, near),
+        (StripeFlag.END, is_cut_off(fits, points, width, plane.image.shape)),
+        (StripeFlag.SHORT_SEGMENT, is_short(points, chain)),
+    ):
+        flags[holds] |= int(flag)
     usable = (flags & ~int(StripeFlag.SATURATED)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
-    stretch = np.concatenate([[0], np.cumsum((np.diff(chain) != 0) | (np.diff(near) != 0))])
+    is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
+    stretch = np.concatenate([[0], np.cumsum(is_new)])
     course = straighten(Course(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)

@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
@@ -22,14 +22,20 @@ from armscan.kernels.profile_fit import (
     read_sides,
 )
 from armscan.vision.stripe.image import StripePlane
-from armscan.vision.stripe.ridge import RidgePoints, chain_bounds, chain_lengths_px, mean_along
+from armscan.vision.stripe.ridge import (
+    SHORTEST_PX,
+    FloatImage,
+    RidgePoints,
+    chain_bounds,
+    chain_lengths_px,
+    mean_along,
+)
 
 START_CONTRAST2 = 0.03
 START_PER_GAIN = 0.1
 BIN_EDGES = np.array([0.0, 0.01, 0.03, 0.07, 0.13, 0.22, 0.33, 0.46, 0.6, 0.75, 0.9, 1.2])
 LEAST_PER_BIN = 30
 LEAST_VARIANCE = 0.02
-MAD_TO_SIGMA = 1.4826
 FIT_PARAMETERS = 3.0
 
 
@@ -39,7 +45,7 @@ def start_noise(background_noise: float) -> FloatArray:
 
 
 def estimate_noise(
-    image: NDArray[np.float32],
+    image: FloatImage,
     points: FloatArray,
     sides: FloatArray,
     fits: FloatArray,
@@ -50,18 +56,9 @@ def estimate_noise(
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    points
-        (N, 6) ridge points.
-    sides
-        (N, 2) background on both sides.
-    fits
-        (N, 8) from the profile fit with any sensible weights.
-    fallback
-        (3,) what to return if there are too few residuals.
+    ``image``: (H, W) float32. ``points``: (N, 6) ridge points. ``sides``: (N, 2) background on both
+    sides. ``fits``: (N, 8) from the profile fit with any sensible weights. ``fallback``: (3,) what
+    to return if there are too few residuals.
     """
     good = fits[:, VARIANCE] > 0.0
     if good.sum() < LEAST_PER_BIN:
@@ -76,7 +73,7 @@ def estimate_noise(
             continue
         m = level[inside]
         rows.append([np.mean(m * m), np.mean(np.maximum(total[inside], 0.0)), 1.0])
-        typical = float(np.median(np.abs(residual[inside]))) * MAD_TO_SIGMA
+        typical = robust_sigma(residual[inside])
         clipped = np.minimum(residual[inside] ** 2, (3.5 * typical) ** 2)
         variances.append(max(float(clipped.mean()), LEAST_VARIANCE))
         counts.append(inside.sum())
@@ -90,7 +87,7 @@ def estimate_noise(
 
 
 def _residuals(
-    image: NDArray[np.float32], points: FloatArray, sides: FloatArray, fits: FloatArray
+    image: FloatImage, points: FloatArray, sides: FloatArray, fits: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Model level, model plus background, and residual of every pixel of the fitted profiles."""
     height, width = image.shape
@@ -135,20 +132,11 @@ LEAST_REACH_SIGMAS = 1.4
 class ProfileFits:
     """Result of fitting the cross-section at each ridge point.
 
-    Parameters
-    ----------
-    ridge
-        The ridge points, only those whose fit succeeded.
-    values
-        (N, 8) columns as named in `armscan.kernels.profile_fit`.
-    sides
-        (N, 2) background on the lower and upper side, averaged along the line.
-    side_sigma
-        (N,) standard deviation of the difference of the two sides.
-    neighbour
-        (N, 2) distance to the nearest other line on the lower and upper side, in px.
-    noise
-        (3,) ``C^2``, ``1 / gain``, ``read^2``.
+    ``ridge``: The ridge points, only those whose fit succeeded. ``values``: (N, 8) columns as named
+    in `armscan.kernels.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
+    averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
+    sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
+    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``.
     """
 
     ridge: RidgePoints
@@ -170,16 +158,15 @@ def fit_ridge(
     ridge: RidgePoints,
     line_sigma_px: float,
     background_noise: float,
-    shortest_px: float,
 ) -> ProfileFits:
     """Fit a Gaussian with weights from the noise model at every ridge point.
 
     The noise model is estimated from a sample of the points first. Chains shorter than
-    ``shortest_px`` are fitted, but do not count as lines beside others.
+    `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
     sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
-    neighbour = _neighbours(plane, ridge, line_sigma_px, shortest_px)
+    neighbour = _neighbours(plane, ridge, line_sigma_px)
     room = neighbour.min(axis=1) / line_sigma_px - FOOT_SIGMAS
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
@@ -207,14 +194,12 @@ def fit_ridge(
     )
 
 
-def _neighbours(
-    plane: StripePlane, ridge: RidgePoints, line_sigma_px: float, shortest_px: float
-) -> FloatArray:
+def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:
     height, width = plane.image.shape
     length = chain_lengths_px(ridge.table[:, :2], ridge.chain)
     distance = np.zeros((len(ridge), 2))
     reach = max(CLEAR_SIGMAS * line_sigma_px, LEAST_REACH_PX)
-    is_line = (length >= shortest_px).astype(np.int64)
+    is_line = (length >= SHORTEST_PX).astype(np.int64)
     bounds = chain_bounds(ridge.chain)
     find_other_lines(ridge.table, ridge.chain, *bounds, is_line, height, width, reach, distance)
     return distance

@@ -9,12 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX
 from armscan.kernels.profile_fit import AMPLITUDE, REACH_SIGMAS, SKEW, SKEW_NORM
 from armscan.vision.stripe.fit import ProfileFits, axis_component
-from armscan.vision.stripe.ridge import chain_bounds, chain_lengths_px, mean_along, sum_along
+from armscan.vision.stripe.ridge import (
+    SHORTEST_PX,
+    chain_bounds,
+    chain_lengths_px,
+    mean_along,
+    sum_along,
+)
 
 SIGNIFICANT = 5.0
+BACKGROUND_STEP = 0.2
+"""Smallest step that matters, as a share of the line's amplitude."""
+NEIGHBOUR_SIGMAS = 4.5
+"""Another line within this many sigmas pulls the centre."""
 MERGED_SIGMAS = 20.0
 """Where two lines cross at a small angle they run as one over about this many sigmas."""
 SKEW_HALF = 4
@@ -24,21 +35,14 @@ SKEW_PX = 0.3
 """The part in px that counts on narrow lines, which few pixels describe."""
 
 
-def is_background_step(fits: ProfileFits, least_share: float) -> BoolArray:
+def is_background_step(fits: ProfileFits) -> BoolArray:
     """(N,) True where the two sides differ enough to move the centre.
 
     A step of height d beside a line of amplitude A and sigma s moves every method by about s d / A.
-
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    least_share
-        Smallest step that matters, as a share of the line's amplitude.
     """
     step = np.abs(fits.sides[:, 1] - fits.sides[:, 0])
     is_certain = step > SIGNIFICANT * fits.side_sigma
-    return np.asarray(is_certain & (step > least_share * fits.values[:, AMPLITUDE]))
+    return np.asarray(is_certain & (step > BACKGROUND_STEP * fits.values[:, AMPLITUDE]))
 
 
 def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
@@ -47,12 +51,7 @@ def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
     The part is ``c m (u^3 - 3 u)`` beside the Gaussian ``m``; it moves the centre by about 0.6 c
     sigmas.
 
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    width_px
-        (N,) sigma of the line.
+    ``fits``: Fitted profiles. ``width_px``: (N,) sigma of the line.
     """
     both = np.stack([fits.values[:, SKEW], fits.values[:, SKEW_NORM]], axis=1)
     total = sum_along(both, fits.ridge.chain, SKEW_HALF)
@@ -75,23 +74,13 @@ def is_saturated(points: FloatArray, saturated: NDArray[np.uint8]) -> BoolArray:
     return found
 
 
-def is_near_other_line(
-    distance: FloatArray, chain: IntArray, width_px: FloatArray, sigmas: float
-) -> BoolArray:
-    """(N,) True where another line is within ``sigmas`` widths, and where two lines have merged.
+def is_near_other_line(distance: FloatArray, chain: IntArray, width_px: FloatArray) -> BoolArray:
+    """(N,) True where another line is within `NEIGHBOUR_SIGMAS`, and where two lines have merged.
 
-    Parameters
-    ----------
-    distance
-        (N, 2) to the nearest other line on both sides.
-    chain
-        (N,) chain numbers.
-    width_px
-        (N,) sigma of the line.
-    sigmas
-        Distance that matters.
+    ``distance``: (N, 2) to the nearest other line on both sides. ``chain``: (N,) chain numbers.
+    ``width_px``: (N,) sigma of the line.
     """
-    near = np.asarray(distance.min(axis=1) < sigmas * width_px)
+    near = np.asarray(distance.min(axis=1) < NEIGHBOUR_SIGMAS * width_px)
     if not near.any():
         return near
     return close_gaps(near, chain, MERGED_SIGMAS * width_px)
@@ -107,9 +96,9 @@ def close_gaps(flags: BoolArray, chain: IntArray, span: FloatArray) -> BoolArray
     return np.asarray(flags | (is_between & (after - before <= span)))
 
 
-def is_short(points: FloatArray, chain: IntArray, shortest_px: float) -> BoolArray:
-    """(N,) True where the point's chain is shorter than ``shortest_px``."""
-    return np.asarray(chain_lengths_px(points, chain) < shortest_px)
+def is_short(points: FloatArray, chain: IntArray) -> BoolArray:
+    """(N,) True where the point's chain is shorter than `SHORTEST_PX`."""
+    return np.asarray(chain_lengths_px(points, chain) < SHORTEST_PX)
 
 
 HALF = 4
@@ -152,21 +141,13 @@ def is_cut_off(
     """(N,) True where a line's end inside the image truncates the fitted column or row.
 
     Where an edge cuts a slanted line, part of the profile lies beyond the cut: it is narrower than
-    the line farther in or leans, and its centre follows the edge. From each end these
-    signs are followed inwards, at least as far as a cut at right angles to the line takes effect
-    (2.7 sigma times the slant's tangent) and at most as far as one along the rows or columns.
-    Ends at the image's border and closed loops have none.
+    the line farther in or leans, and its centre follows the edge. From each end these signs are
+    followed inwards, at least as far as a cut at right angles to the line takes effect (2.7 sigma
+    times the slant's tangent) and at most as far as one along the rows or columns. Ends at the
+    image's border and closed loops have none.
 
-    Parameters
-    ----------
-    fits
-        Fitted profiles.
-    points
-        (N, 2) fitted centres, image pixels.
-    width_px
-        (N,) sigma of the line.
-    shape
-        Rows and columns of the image.
+    ``fits``: Fitted profiles. ``points``: (N, 2) fitted centres, image pixels. ``width_px``: (N,)
+    sigma of the line. ``shape``: Rows and columns of the image.
     """
     chain = fits.ridge.chain
     found = np.zeros(len(chain), dtype=np.bool_)
@@ -233,4 +214,4 @@ def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
 
 def _spread(values: FloatArray) -> float:
     """Standard deviation of most of the values."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return robust_sigma(values - np.median(values))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.ridge import mean_along, strong_median
+from armscan.vision.stripe.ridge import FloatImage, mean_along, strong_median
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
 LaserColour = Literal[
@@ -32,6 +32,8 @@ LaserColour = Literal[
     "blue-red",
     "blue-green",
 ]
+MaskImage: TypeAlias = NDArray[np.uint8]
+
 SIGMA_RANGE_PX = (0.6, 10.0)
 
 
@@ -52,27 +54,15 @@ class StripeOptions:
     threshold
         Least height of a line above its background in grey levels, or None to set it from the
         image's noise.
-    shortest_px
-        Segments shorter than this are flagged as no stripe.
     smoothing_px
         Largest half window of the smoothing along the line; 0 switches it off.
-    neighbour_sigmas
-        A line within this many sigmas of another is flagged.
-    background_step
-        A background step of more than this share of the line's amplitude is flagged.
-    faintest_share
-        Segments fainter than this share of the bright ones are taken for reflections and left out.
     """
 
     method: StripeMethod = "fit"
     laser_colour: LaserColour = "auto"
     line_sigma_px: float | None = None
     threshold: float | None = None
-    shortest_px: float = 15.0
     smoothing_px: float = 12.0
-    neighbour_sigmas: float = 4.5
-    background_step: float = 0.2
-    faintest_share: float = 0.1
 
     def __post_init__(self) -> None:
         for name, choices in (("method", StripeMethod), ("laser_colour", LaserColour)):
@@ -92,17 +82,8 @@ class StripeOptions:
             raise OptionError(
                 f"threshold is {self.threshold}", remedy="give a positive count of grey levels"
             )
-        for name in (
-            "shortest_px",
-            "smoothing_px",
-            "neighbour_sigmas",
-            "background_step",
-            "faintest_share",
-        ):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise OptionError(
-                    f"{name} is {getattr(self, name)}", remedy="give a number that is not negative"
-                )
+        if not 0.0 <= self.smoothing_px < math.inf:
+            raise OptionError(f"smoothing_px is {self.smoothing_px}", remedy="give 0 or up")
 
 
 SAMPLE_STEP_PX = 4
@@ -122,21 +103,13 @@ def check_background(exposure: Exposure, background: Exposure) -> None:
         )
 
 
-def subtract(
-    lit: NDArray[np.float32], dark: NDArray[np.float32], full_scale: float
-) -> NDArray[np.float32]:
+def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage:
     """Subtract the dark view after matching its brightness.
 
-    Gain and offset come from a trimmed line fit over a sample of unsaturated pixels, so that a
-    lamp that flickers between the two images leaves no ghost, and the laser's own pixels do not
-    count.
+    Gain and offset come from a trimmed line fit over a sample of unsaturated pixels, so that a lamp
+    that flickers between the two images leaves no ghost, and the laser's own pixels do not count.
 
-    Parameters
-    ----------
-    lit, dark
-        (H, W) float32, laser on and off.
-    full_scale
-        Grey level of saturation.
+    ``lit``, ``dark``: (H, W) float32, laser on and off. ``full_scale``: Grey level of saturation.
     """
     x = dark[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
     y = lit[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX].ravel().astype(np.float64)
@@ -160,58 +133,62 @@ NORMAL_SCALE = 255.0
 """Grey levels are scaled to 8 bits, so that no constant depends on the camera's depth."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class StripePlane:
-    """One channel of an exposure, ready for extraction.
+    """One channel of an exposure, ready for extraction; a mask is (1, 1) if it holds nowhere.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32, full scale 255 before background subtraction.
-    clipped
-        (H, W) uint8, 1 where ``image`` says nothing because the camera saturated; (1, 1) if
-        nowhere.
-    saturated
-        (H, W) uint8, 1 where the laser's own channel saturated; (1, 1) if nowhere.
-    grey_levels_per_unit
-        Factor from ``image`` to the exposure's own grey levels.
-    gate
-        (H, W) float32 how much the pixel has the laser's colour, or None for grey images.
-    unknown
-        (H, W) uint8, 1 where the view without laser saturated already; (1, 1) if nowhere; None
-        without such a view.
+    ``image``: (H, W), full scale 255 before background subtraction. ``clipped``: (H, W) 1 where
+    ``image`` says nothing because the camera saturated. ``saturated``: (H, W) 1 where the laser's
+    own channel saturated. ``grey_levels_per_unit``: Factor from ``image`` to the exposure's own
+    grey levels. ``gate``: (H, W) how much the pixel has the laser's colour, or None for grey
+    images. ``unknown``: (H, W) 1 where the view without laser saturated already; None without such
+    a view.
     """
 
-    image: NDArray[np.float32]
-    clipped: NDArray[np.uint8]
-    saturated: NDArray[np.uint8]
+    image: FloatImage
+    clipped: MaskImage
+    saturated: MaskImage
     grey_levels_per_unit: float
-    gate: NDArray[np.float32] | None = None
-    unknown: NDArray[np.uint8] | None = None
+    gate: FloatImage | None = None
+    unknown: MaskImage | None = None
 
 
-def saturated_mask(channel: ImageArray, full_scale: int) -> NDArray[np.uint8]:
+def _saturated(channel: ImageArray, full_scale: int) -> MaskImage:
     """Mask (H, W) of clipped pixels, or (1, 1) zeros if there are none."""
     if int(channel.max()) < full_scale:
         return np.zeros((1, 1), np.uint8)
     return np.ascontiguousarray(channel >= full_scale).view(np.uint8)
 
 
-def to_units(channel: ImageArray, full_scale: int) -> NDArray[np.float32]:
-    """Scale grey levels so that full scale is 255."""
-    return channel.astype(np.float32) * np.float32(NORMAL_SCALE / full_scale)
+def _level(exposure: Exposure, background: Exposure | None, k: int | None) -> FloatImage:
+    """A channel scaled to 255, less the background's; ``k`` None for a grey image."""
+    scale = np.float32(NORMAL_SCALE / exposure.full_scale)
+    image = _channel(exposure, k).astype(np.float32) * scale
+    if background is None:
+        return image
+    return subtract(image, _level(background, None, k), NORMAL_SCALE)
+
+
+def _channel(exposure: Exposure, k: int | None) -> ImageArray:
+    return exposure.image if k is None else exposure.image[:, :, k].copy()
+
+
+def _unknown(background: Exposure | None, k: int | None) -> MaskImage | None:
+    if background is None:
+        return None
+    return _saturated(_channel(background, k), background.full_scale)
 
 
 def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     """Plane of a grey exposure, less the background."""
-    scale = exposure.full_scale
-    image = to_units(exposure.image, scale)
-    unknown = None
-    if background is not None:
-        unknown = saturated_mask(background.image, background.full_scale)
-        image = subtract(image, to_units(background.image, background.full_scale), NORMAL_SCALE)
-    clipped = saturated_mask(exposure.image, scale)
-    return StripePlane(image, clipped, clipped, scale / NORMAL_SCALE, unknown=unknown)
+    clipped = _saturated(exposure.image, exposure.full_scale)
+    return StripePlane(
+        image=_level(exposure, background, None),
+        clipped=clipped,
+        saturated=clipped,
+        grey_levels_per_unit=exposure.full_scale / NORMAL_SCALE,
+        unknown=_unknown(background, None),
+    )
 
 
 CHANNELS = ("red", "green", "blue")
@@ -230,50 +207,28 @@ NOWHERE = np.zeros((1, 1), np.uint8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColourImages:
-    """Channels of a colour exposure after background subtraction.
+    """Red, green and blue (H, W) after background subtraction, and their saturated pixels."""
 
-    Parameters
-    ----------
-    channels
-        Red, green, blue: (H, W) float32.
-    clipped
-        The mask of saturated pixels of each.
-    """
-
-    channels: tuple[NDArray[np.float32], ...]
-    clipped: tuple[NDArray[np.uint8], ...]
+    channels: tuple[FloatImage, ...]
+    clipped: tuple[MaskImage, ...]
 
 
 def split_channels(exposure: Exposure, background: Exposure | None) -> ColourImages:
     """Red, green and blue of an exposure, less the background."""
-    scale = exposure.full_scale
-    channels, clipped = [], []
-    for k in range(3):
-        raw = _channel(exposure, k)
-        channel = to_units(raw, scale)
-        if background is not None:
-            dark = to_units(_channel(background, k), background.full_scale)
-            channel = subtract(channel, dark, NORMAL_SCALE)
-        channels.append(channel)
-        clipped.append(saturated_mask(raw, scale))
-    return ColourImages(tuple(channels), tuple(clipped))
+    return ColourImages(
+        tuple(_level(exposure, background, k) for k in range(3)),
+        tuple(_saturated(_channel(exposure, k), exposure.full_scale) for k in range(3)),
+    )
 
 
-def _channel(exposure: Exposure, k: int) -> ImageArray:
-    image = exposure.image
-    if image.dtype == np.uint8:
-        return np.ascontiguousarray(image[:, :, k], dtype=np.uint8)
-    return np.ascontiguousarray(image[:, :, k], dtype=np.uint16)
-
-
-def colour_excess(images: ColourImages, colour: str) -> NDArray[np.float32]:
+def colour_excess(images: ColourImages, colour: str) -> FloatImage:
     """How much stronger the laser's colour is than the mean of the two others, (H, W)."""
     k = CHANNELS.index(colour)
     others = [images.channels[m] for m in range(3) if m != k]
     return np.asarray(images.channels[k] - np.float32(0.5) * (others[0] + others[1]))
 
 
-def ridge_height(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def ridge_height(image: FloatImage) -> FloatImage:
     """Height (H - 2 s, W - 2 s) above both neighbours at distance s, along rows or columns."""
     s = RIDGE_STEP_PX
     if min(image.shape) <= 2 * s:
@@ -284,7 +239,7 @@ def ridge_height(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.maximum(along_row, down_column))
 
 
-def _strength(image: NDArray[np.float32]) -> float:
+def _strength(image: FloatImage) -> float:
     ridge = ridge_height(image)
     return float(np.quantile(ridge, RIDGE_QUANTILE)) if ridge.size else 0.0
 
@@ -314,24 +269,31 @@ def colour_plane(
         colour = find_laser_colour(images)
     if colour == "grey":
         mean = np.asarray(sum(images.channels) / np.float32(3.0), dtype=np.float32)
-        clipped = _any_clipped(images.clipped)
-        return StripePlane(mean, clipped, clipped, factor)
+        found = [mask for mask in images.clipped if mask.size > 1]
+        anywhere = np.maximum.reduce(found) if found else NOWHERE
+        return StripePlane(
+            image=mean, clipped=anywhere, saturated=anywhere, grey_levels_per_unit=factor
+        )
     own = CHANNELS.index(colour.partition("-")[0])
-    unknown = None
-    if background is not None:
-        unknown = saturated_mask(_channel(background, own), background.full_scale)
+    gate, clipped = None, images.clipped[own]
     if colour not in CHANNELS:
-        clipped = images.clipped[own]
-        return StripePlane(_difference(images, colour), clipped, clipped, factor, unknown=unknown)
-    excess = colour_excess(images, colour)
-    core = _core_channel(images, excess, own)
-    image, clipped = images.channels[own], images.clipped[own]
-    if core is not None:
-        image, clipped = image + images.channels[core], images.clipped[core]
-    return StripePlane(image, clipped, images.clipped[own], factor, excess, unknown)
+        image = _difference(images, colour)
+    else:
+        image, gate = images.channels[own], colour_excess(images, colour)
+        core = _core_channel(images, gate, own)
+        if core is not None:
+            image, clipped = image + images.channels[core], images.clipped[core]
+    return StripePlane(
+        image=image,
+        clipped=clipped,
+        saturated=images.clipped[own],
+        grey_levels_per_unit=factor,
+        gate=gate,
+        unknown=_unknown(background, own),
+    )
 
 
-def _difference(images: ColourImages, colour: LaserColour) -> NDArray[np.float32]:
+def _difference(images: ColourImages, colour: LaserColour) -> FloatImage:
     """One channel less another one, or less the mean of both others."""
     first, _, second = colour.partition("-")
     if second == "excess":
@@ -339,12 +301,7 @@ def _difference(images: ColourImages, colour: LaserColour) -> NDArray[np.float32
     return images.channels[CHANNELS.index(first)] - images.channels[CHANNELS.index(second)]
 
 
-def _any_clipped(masks: tuple[NDArray[np.uint8], ...]) -> NDArray[np.uint8]:
-    found = [mask for mask in masks if mask.size > 1]
-    return np.maximum.reduce(found) if found else NOWHERE
-
-
-def _core_channel(images: ColourImages, excess: NDArray[np.float32], own: int) -> int | None:
+def _core_channel(images: ColourImages, excess: FloatImage, own: int) -> int | None:
     """The channel that shows a core in which the laser's own is saturated; None if none is."""
     s = RIDGE_STEP_PX
     ridge = ridge_height(excess)
@@ -369,21 +326,15 @@ LEAST_SHARE = 0.25
 
 
 def has_laser_colour(
-    gate: NDArray[np.float32], table: FloatArray, chain: IntArray, line_sigma_px: float
+    gate: FloatImage, table: FloatArray, chain: IntArray, line_sigma_px: float
 ) -> BoolArray:
     """(N,) True where the colour excess near the ridge stands out from both sides.
 
     The core of a saturated line is white; its halo keeps the colour. So the strongest excess within
     three sigmas is compared with the excess farther out, averaged along the line.
 
-    Parameters
-    ----------
-    gate
-        (H, W) colour excess.
-    table, chain
-        Ridge points and their chains.
-    line_sigma_px
-        Typical sigma of the lines.
+    ``gate``: (H, W) colour excess. ``table``, ``chain``: Ridge points and their chains.
+    ``line_sigma_px``: Typical sigma of the lines.
     """
     core = max(CORE_SIGMAS * line_sigma_px, LEAST_CORE_PX)
     inside = _across(gate, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1)
@@ -399,9 +350,7 @@ def has_laser_colour(
     return np.asarray(contrast > max(NOISE_FACTOR * noise, LEAST_SHARE * typical))
 
 
-def is_on_known_ground(
-    unknown: NDArray[np.uint8], table: FloatArray, line_sigma_px: float
-) -> BoolArray:
+def is_on_known_ground(unknown: MaskImage, table: FloatArray, line_sigma_px: float) -> BoolArray:
     """(N,) False where the view without laser was saturated within three sigmas of the ridge."""
     if unknown.size == 1:
         return np.ones(len(table), dtype=np.bool_)
@@ -409,9 +358,7 @@ def is_on_known_ground(
     return np.asarray(_across(unknown, table, np.arange(-core, core + 0.5, 1.0)).max(axis=1) == 0)
 
 
-def _across(
-    gate: NDArray[np.float32] | NDArray[np.uint8], table: FloatArray, offsets: FloatArray
-) -> FloatArray:
+def _across(gate: FloatImage | MaskImage, table: FloatArray, offsets: FloatArray) -> FloatArray:
     height, width = gate.shape
     x = np.rint(table[:, :1] + table[:, 2:3] * offsets).astype(np.int64)
     y = np.rint(table[:, 1:2] + table[:, 3:4] * offsets).astype(np.int64)

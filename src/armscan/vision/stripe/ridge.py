@@ -5,22 +5,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, walk_chains
 from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates
+
+FloatImage: TypeAlias = NDArray[np.float32]
 
 CELL_PX = 64
 SQRT2 = math.sqrt(2.0)
 SAMPLE_STEP_PX = 4
 CLUTTER_LAG_PX = 12
 BACKGROUND_QUANTILE = 0.4
-MAD_TO_SIGMA = 1.4826
 LEAST_NOISE = 0.35
 """Rounding to whole grey levels hides smaller noise."""
 THRESHOLD_SIGMAS = 6.0
@@ -33,34 +36,24 @@ PEAK_QUANTILE = 0.999
 class ImageLevel:
     """What the pixels beside the lines look like.
 
-    Parameters
-    ----------
-    background
-        (rows, columns) float32 background level per cell of `CELL_PX` pixels.
-    noise
-        Standard deviation of a background pixel against its neighbour.
-    clutter
-        The same at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and
-        surface texture show; never less than ``noise``.
-    rise
-        Height above the background at which a line begins.
+    ``background``: (rows, columns) float32 background level per cell of `CELL_PX` pixels.
+    ``noise``: Standard deviation of a background pixel against its neighbour. ``clutter``: The same
+    at a distance of `CLUTTER_LAG_PX`, where compression blocks, chroma subsampling and surface
+    texture show; never less than ``noise``. ``rise``: Height above the background at which a line
+    begins.
     """
 
-    background: NDArray[np.float32]
+    background: FloatImage
     noise: float
     clutter: float
     rise: float
 
 
-def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageLevel:
+def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
     """Estimate background and noise from a sample of the pixels.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    threshold
-        Least height of a line above the background, or None to set it from the noise.
+    ``image``: (H, W) float32. ``threshold``: Least height of a line above the background, or None
+    to set it from the noise.
     """
     background = _cell_quantiles(image)
     noise = _noise(image, 1)
@@ -72,7 +65,7 @@ def measure_level(image: NDArray[np.float32], threshold: float | None) -> ImageL
     return ImageLevel(background, noise, clutter, threshold)
 
 
-def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def _cell_quantiles(image: FloatImage) -> FloatImage:
     height, width = image.shape
     rows, columns = -(-height // CELL_PX), -(-width // CELL_PX)
     steps = CELL_PX // SAMPLE_STEP_PX
@@ -84,12 +77,12 @@ def _cell_quantiles(image: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.ascontiguousarray(ordered[:, :, int(BACKGROUND_QUANTILE * steps * steps)])
 
 
-def _noise(image: NDArray[np.float32], lag: int) -> float:
+def _noise(image: FloatImage, lag: int) -> float:
     rows = image[:: 2 * SAMPLE_STEP_PX]
     if rows.shape[1] <= lag:
         return LEAST_NOISE
     step = np.abs(rows[:, lag::3] - rows[:, : rows.shape[1] - lag : 3])
-    typical = float(np.median(step)) * MAD_TO_SIGMA
+    typical = robust_sigma(step)
     trimmed = float(np.minimum(step, max(2.5 * typical, 2.0)).mean()) * math.sqrt(math.pi / 2.0)
     return max(typical, trimmed, LEAST_NOISE * SQRT2) / SQRT2
 
@@ -151,17 +144,11 @@ ALONG_PX = (-2.0, 0.0, 2.0)
 LOPSIDED = 1.8
 
 
-def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLevel) -> float:
+def find_line_sigma(image: FloatImage, runs: FloatArray, level: ImageLevel) -> float:
     """Median sigma of the brighter lines from their full width at half height, in px.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    runs
-        (N, 3) candidates; a sample of them is measured across the local ridge direction.
-    level
-        Background and threshold.
+    ``image``: (H, W) float32. ``runs``: (N, 3) candidates; a sample of them is measured across the
+    local ridge direction. ``level``: Background and threshold.
     """
     points = _strongest(image, runs)
     if not len(points):
@@ -179,7 +166,7 @@ def find_line_sigma(image: NDArray[np.float32], runs: FloatArray, level: ImageLe
     return float(np.clip(sigma, *SIGMA_LIMITS_PX))
 
 
-def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
+def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     """(N, 6) ridge points of the stronger lines, at the scale that suits them better.
 
     A wide line that saturates is flat where a narrow filter looks, and what little is narrow beside
@@ -196,7 +183,7 @@ def _strongest(image: NDArray[np.float32], runs: FloatArray) -> FloatArray:
     return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
 
 
-def _across(image: NDArray[np.float32], points: FloatArray) -> FloatArray:
+def _across(image: FloatImage, points: FloatArray) -> FloatArray:
     """Profiles (N, K) across the ridges, averaged over a few places along them."""
     t = np.arange(-REACH_PX, REACH_PX + STEP_PX, STEP_PX)
     total = np.zeros((len(points), len(t)))
@@ -236,6 +223,10 @@ def _first_below(side: FloatArray, level: FloatArray) -> FloatArray:
 
 
 LONGEST_RUN_PX = 90
+SHORTEST_PX = 15.0
+"""A shorter chain is no stripe."""
+FAINTEST_SHARE = 0.1
+"""Chains with less of the strong ones' curvature are reflections."""
 HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
 
 
@@ -243,13 +234,9 @@ HESSIAN_SIGMA_LIMITS_PX = (1.0, 8.0)
 class RidgePoints:
     """Points on ridges, ordered along chains.
 
-    Parameters
-    ----------
-    table
-        (N, 6) x, y, normal x, normal y (image pixels), negative second derivative across the line,
-        axis (0: at an integer column, 1: at an integer row).
-    chain
-        (N,) number of the chain; a chain's points are consecutive.
+    ``table``: (N, 6) x, y, normal x, normal y (image pixels), negative second derivative across the
+    line, axis (0: at an integer column, 1: at an integer row). ``chain``: (N,) number of the chain;
+    a chain's points are consecutive.
     """
 
     table: FloatArray
@@ -269,7 +256,7 @@ class RidgePoints:
         return RidgePoints(table, np.concatenate([[0], np.cumsum(is_new)]).astype(np.int64))
 
 
-def find_candidates(image: NDArray[np.float32], level: ImageLevel) -> FloatArray:
+def find_candidates(image: FloatImage, level: ImageLevel) -> FloatArray:
     """Centroids (N, 3) of the runs above the background: x, y, axis."""
     height, width = image.shape
     capacity = max(1000, height * width // 32)
@@ -292,20 +279,12 @@ def hessian_sigma(line_sigma_px: float) -> float:
 
 
 def trace_ridges(
-    image: NDArray[np.float32], runs: FloatArray, line_sigma_px: float, rise: float
+    image: FloatImage, runs: FloatArray, line_sigma_px: float, rise: float
 ) -> RidgePoints:
     """Ridge points at the candidates, linked into chains.
 
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    runs
-        (N, 3) from `find_candidates`.
-    line_sigma_px
-        Typical sigma of the lines.
-    rise
-        Least height of a line above its background.
+    ``image``: (H, W) float32. ``runs``: (N, 3) from `find_candidates`. ``line_sigma_px``: Typical
+    sigma of the lines. ``rise``: Least height of a line above its background.
     """
     scale = hessian_sigma(line_sigma_px)
     found = np.zeros((max(len(runs), 1), 6))
@@ -317,12 +296,7 @@ def trace_ridges(
 def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     """Order points (N, 6) along chains; points without a neighbour are dropped.
 
-    Parameters
-    ----------
-    points
-        Rows as in `RidgePoints.table`.
-    shape
-        Rows and columns of the image.
+    ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
     """
     n = len(points)
     owner = np.full(shape, -1, np.int32)
@@ -337,12 +311,12 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     return RidgePoints(points[order[:count]], chain[:count])
 
 
-def is_bright(ridge: RidgePoints, least_share: float) -> NDArray[np.bool_]:
-    """(N,) False for the chains whose median curvature is below a share of the strong ones'."""
+def is_bright(ridge: RidgePoints) -> NDArray[np.bool_]:
+    """(N,) False for the chains whose median curvature is below `FAINTEST_SHARE`."""
     if not len(ridge):
         return np.zeros(0, dtype=np.bool_)
     bend = ridge.table[:, 4]
     starts = np.flatnonzero(np.concatenate([[True], np.diff(ridge.chain) != 0]))
     sizes = np.diff(np.concatenate([starts, [len(ridge)]]))
     medians = np.array([np.median(bend[a : a + n]) for a, n in zip(starts, sizes, strict=True)])
-    return np.asarray(np.repeat(medians, sizes) >= least_share * strong_median(bend))
+    return np.asarray(np.repeat(medians, sizes) >= FAINTEST_SHARE * strong_median(bend))

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.kernels.smooth import (
     BEND,
     BEND_SIGMA,
@@ -42,16 +43,9 @@ RESIDUAL_WIDENING = 1.5
 class Course:
     """Centres in the order of their chains.
 
-    Parameters
-    ----------
-    points, normals
-        (N, 2) image pixels and unit normals.
-    sigma
-        (N,) standard deviation along the normal as the fit predicts it.
-    chain
-        (N,) chain numbers.
-    is_used
-        (N,) False for points that must not pull their neighbours.
+    ``points``, ``normals``: (N, 2) image pixels and unit normals. ``sigma``: (N,) standard
+    deviation along the normal as the fit predicts it. ``chain``: (N,) chain numbers. ``is_used``:
+    (N,) False for points that must not pull their neighbours.
     """
 
     points: FloatArray
@@ -85,16 +79,9 @@ class Course:
 class SmoothedCentres:
     """Centres after smoothing.
 
-    Parameters
-    ----------
-    points
-        (N, 2) image pixels.
-    normals
-        (N, 2) unit normals.
-    sigma
-        (N,) standard deviation along the normal.
-    is_outlier
-        (N,) True where the raw centre disagrees with its neighbours' course.
+    ``points``: (N, 2) image pixels. ``normals``: (N, 2) unit normals. ``sigma``: (N,) standard
+    deviation along the normal. ``is_outlier``: (N,) True where the raw centre disagrees with its
+    neighbours' course.
     """
 
     points: FloatArray
@@ -115,12 +102,7 @@ def smooth(course: Course, largest_px: float) -> SmoothedCentres:
     The noise of neighbours is measured from the residuals, not assumed: its size corrects the
     sigmas, and its correlation widens those of the smoothed centres.
 
-    Parameters
-    ----------
-    course
-        The centres.
-    largest_px
-        Largest half window; 0 only measures the noise.
+    ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
     rough = course.run(half, np.ones(len(half)))
@@ -259,5 +241,5 @@ def _filter_residuals(course: Course, half: int) -> FloatArray:
     residual = np.full(n, np.nan)
     residual[middle] = np.where(inside, offset / course.sigma[middle], np.nan)
     limit = 5.0 * max(float(np.nanmedian(np.abs(residual))), 0.3) if inside.any() else 0.0
-    residual[np.abs(residual) > limit * 1.4826] = np.nan
+    residual[np.abs(residual) > limit * MAD_TO_SIGMA] = np.nan
     return residual

@@ -9,13 +9,14 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.kernels.ridge import gaussian_taps
 from armscan.vision.stripe.ridge import (
     CELL_PX,
+    LONGEST_RUN_PX,
+    FloatImage,
     ImageLevel,
     RidgePoints,
     hessian_sigma,
@@ -23,52 +24,23 @@ from armscan.vision.stripe.ridge import (
     link,
 )
 
-LONGEST_RUN_PX = 90
 SHORTEST_RUN_PX = 2
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StripeCentres:
-    """Centre points without order.
-
-    Parameters
-    ----------
-    points_px
-        (N, 2) image pixels.
-    normals
-        (N, 2) unit vectors across the line, of either sign.
-    """
-
-    points_px: FloatArray
-    normals: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.points_px)
-        for name in ("points_px", "normals"):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (n, 2), name))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Runs:
     """Stretches of pixels above the threshold, all down the columns or all along the rows.
 
-    Parameters
-    ----------
-    is_down
-        True if the runs go down the columns.
-    lines
-        (N,) column or row of each run.
-    first, stop
-        (N,) first pixel of each run and the one after its last.
-    heights
-        (lines, pixels) image less background, rows are the columns or rows of the image.
+    ``is_down``: True if the runs go down the columns. ``lines``: (N,) column or row of each run.
+    ``first``, ``stop``: (N,) first pixel of each run and the one after its last. ``heights``:
+    (lines, pixels) image less background, rows are the columns or rows of the image.
     """
 
     is_down: bool
     lines: IntArray
     first: IntArray
     stop: IntArray
-    heights: NDArray[np.float32]
+    heights: FloatImage
 
     def points(self, centres: FloatArray) -> FloatArray:
         """Image points (N, 2) from positions (N,) along the runs."""
@@ -81,7 +53,7 @@ class Runs:
         return np.asarray(running[self.lines, self.stop] - running[self.lines, self.first])
 
 
-def above_background(image: NDArray[np.float32], level: ImageLevel) -> NDArray[np.float32]:
+def above_background(image: FloatImage, level: ImageLevel) -> FloatImage:
     """Image (H, W) less its interpolated background."""
     rows, columns = (
         np.clip((np.arange(n) + 0.5) / CELL_PX - 0.5, 0.0, cells - 1.0)
@@ -92,7 +64,7 @@ def above_background(image: NDArray[np.float32], level: ImageLevel) -> NDArray[n
     return np.asarray(image - surface, dtype=np.float32)
 
 
-def find_thesis_runs(image: NDArray[np.float32], level: ImageLevel) -> Runs:
+def find_thesis_runs(image: FloatImage, level: ImageLevel) -> Runs:
     """Runs above the threshold across the lines: down the columns unless rows give more."""
     heights = above_background(image, level)
     down = _runs(heights.T, True, level.rise)
@@ -100,7 +72,7 @@ def find_thesis_runs(image: NDArray[np.float32], level: ImageLevel) -> Runs:
     return down if len(down.lines) >= len(along.lines) else along
 
 
-def _runs(heights: NDArray[np.float32], is_down: bool, rise: float) -> Runs:
+def _runs(heights: FloatImage, is_down: bool, rise: float) -> Runs:
     lit: BoolArray = heights > rise
     edges = np.diff(np.pad(lit, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     lines, first = np.nonzero(edges == 1)
@@ -112,22 +84,11 @@ def _runs(heights: NDArray[np.float32], is_down: bool, rise: float) -> Runs:
 HALF_PIXEL = 0.5
 
 
-def hessian_centres(
-    image: NDArray[np.float32], level: ImageLevel, line_sigma_px: float
-) -> StripeCentres:
+def hessian_centres(image: FloatImage, level: ImageLevel, line_sigma_px: float) -> FloatArray:
     """Points where the Taylor polynomial across the line peaks inside its own pixel.
 
     The image is convolved with the derivatives of a Gaussian (eq. 2.41; Steger 1998); the
     eigenvector of the eigenvalue of largest curvature is the normal.
-
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold; pixels below it are not looked at.
-    line_sigma_px
-        Typical sigma of the lines, also that of the Gaussian.
     """
     scale = hessian_sigma(line_sigma_px)
     gx, gy, gxx, gxy, gyy = derivative_images(image, scale)
@@ -140,12 +101,10 @@ def hessian_centres(
     offset = step[:, None] * n
     inside = (np.abs(offset) <= HALF_PIXEL).all(axis=1)
     points = np.stack([x, y], axis=1)[inside] + offset[inside]
-    return StripeCentres(points, n[inside])
+    return np.column_stack([points, n[inside]])
 
 
-def derivative_images(
-    image: NDArray[np.float32], scale_px: float
-) -> tuple[NDArray[np.float32], ...]:
+def derivative_images(image: FloatImage, scale_px: float) -> tuple[FloatImage, ...]:
     """Images d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2 of the image smoothed at ``scale_px``."""
     g0, g1, g2 = gaussian_taps(scale_px)
     pairs = ((g1, g0), (g0, g1), (g2, g0), (g1, g1), (g0, g2))
@@ -156,9 +115,7 @@ def derivative_images(
     )
 
 
-def ridge_normals(
-    image: NDArray[np.float32], points: FloatArray, line_sigma_px: float
-) -> FloatArray:
+def ridge_normals(image: FloatImage, points: FloatArray, line_sigma_px: float) -> FloatArray:
     """Unit normals (N, 2) of the ridge at the pixels nearest to points (N, 2)."""
     _, _, gxx, gxy, gyy = derivative_images(image, hessian_sigma(line_sigma_px))
     x, y = np.rint(points).astype(np.int64).T
@@ -166,9 +123,7 @@ def ridge_normals(
     return normals
 
 
-def _principal(
-    gxx: NDArray[np.float32], gxy: NDArray[np.float32], gyy: NDArray[np.float32]
-) -> tuple[FloatArray, FloatArray]:
+def _principal(gxx: FloatImage, gxy: FloatImage, gyy: FloatImage) -> tuple[FloatArray, FloatArray]:
     """Normals (..., 2) and negative second derivative (...) along them."""
     half = 0.5 * (gxx - gyy).astype(np.float64)
     root = np.hypot(half, gxy)
@@ -182,54 +137,31 @@ def _principal(
     return normals, root - 0.5 * (gxx + gyy)
 
 
-def threshold_centres(
-    image: NDArray[np.float32], level: ImageLevel, line_sigma_px: float
-) -> StripeCentres:
+def threshold_centres(image: FloatImage, level: ImageLevel, line_sigma_px: float) -> FloatArray:
     """Middle of each run of pixels above the threshold (section 2.3.2.1, first method).
 
     Simple, whole half pixels only, and as good as the line's edges are.
-
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Typical sigma of the lines, for the normals.
     """
     runs = find_thesis_runs(image, level)
     points = runs.points(np.asarray(0.5 * (runs.first + runs.stop - 1), dtype=np.float64))
-    return StripeCentres(points, ridge_normals(image, points, line_sigma_px))
+    return np.column_stack([points, ridge_normals(image, points, line_sigma_px)])
 
 
-def centroid_centres(
-    image: NDArray[np.float32], level: ImageLevel, line_sigma_px: float
-) -> StripeCentres:
-    """Centre of gravity of the grey levels above the background in each run (eq. 3.1).
-
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Typical sigma of the lines, for the normals.
-    """
+def centroid_centres(image: FloatImage, level: ImageLevel, line_sigma_px: float) -> FloatArray:
+    """Centre of gravity of the grey levels above the background in each run (eq. 3.1)."""
     runs = find_thesis_runs(image, level)
     heights = runs.heights.astype(np.float64)
     weight = runs.sums(heights)
     moment = runs.sums(heights * np.arange(heights.shape[1]))
     points = runs.points(moment / weight)
-    return StripeCentres(points, ridge_normals(image, points, line_sigma_px))
+    return np.column_stack([points, ridge_normals(image, points, line_sigma_px)])
 
 
 ANGLES_DEG = (0.0, 45.0, 90.0, 135.0)
 HALF_LENGTH_SIGMAS = 2.0
 
 
-def direction_template(angle_deg: float, line_sigma_px: float) -> NDArray[np.float32]:
+def direction_template(angle_deg: float, line_sigma_px: float) -> FloatImage:
     """A short piece of line at ``angle_deg`` from the x axis: Gaussian across, even along."""
     half = max(int(np.ceil(HALF_LENGTH_SIGMAS * line_sigma_px)), 2)
     y, x = np.mgrid[-half : half + 1, -half : half + 1]
@@ -239,21 +171,10 @@ def direction_template(angle_deg: float, line_sigma_px: float) -> NDArray[np.flo
     return np.asarray(template / template.sum(), dtype=np.float32)
 
 
-def template_centres(
-    image: NDArray[np.float32], level: ImageLevel, line_sigma_px: float
-) -> StripeCentres:
+def template_centres(image: FloatImage, level: ImageLevel, line_sigma_px: float) -> FloatArray:
     """Pixel of each run where the best of four direction templates answers most strongly.
 
     Withstands noise and bridges small breaks, to whole pixels (section 2.3.2.1, third method).
-
-    Parameters
-    ----------
-    image
-        (H, W) float32.
-    level
-        Background and threshold.
-    line_sigma_px
-        Sigma across the templates.
     """
     answers = np.stack(
         [cv2.filter2D(image, -1, direction_template(a, line_sigma_px)) for a in ANGLES_DEG]
@@ -266,11 +187,12 @@ def template_centres(
     points = runs.points(np.array(peaks, dtype=np.float64))
     x, y = points.astype(np.int64).T
     angle = np.radians(np.array(ANGLES_DEG)[answers[:, y, x].argmax(axis=0)])
-    normals: FloatArray = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    return StripeCentres(points, normals)
+    return np.column_stack([points, -np.sin(angle), np.cos(angle)])
 
 
-CentreFinder = Callable[[NDArray[np.float32], ImageLevel, float], StripeCentres]
+CentreFinder = Callable[[FloatImage, ImageLevel, float], FloatArray]
+"""From an image (H, W), its background and threshold, and the typical sigma of its lines to centre
+points without order: rows (N, 4) of x, y in image pixels and the unit normal, of either sign."""
 
 THESIS_METHODS: Mapping[str, CentreFinder] = MappingProxyType(
     {
@@ -282,12 +204,11 @@ THESIS_METHODS: Mapping[str, CentreFinder] = MappingProxyType(
 )
 
 
-def link_centres(centres: StripeCentres, image: NDArray[np.float32]) -> RidgePoints:
+def link_centres(centres: FloatArray, image: FloatImage) -> RidgePoints:
     """Order a method's points along chains; the curvature column holds the grey level."""
-    n = len(centres.points_px)
-    table = np.zeros((n, 6))
-    table[:, :2] = np.clip(centres.points_px, 0.0, np.array(image.shape[::-1]) - 1.0)
-    table[:, 2:4] = centres.normals
+    table = np.zeros((len(centres), 6))
+    table[:, :2] = np.clip(centres[:, :2], 0.0, np.array(image.shape[::-1]) - 1.0)
+    table[:, 2:4] = centres[:, 2:]
     x, y = np.rint(table[:, :2]).astype(np.int64).T
     table[:, 4] = image[y, x]
     return link(table, image.shape)

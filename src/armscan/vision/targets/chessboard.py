@@ -1,24 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chessboards: a lattice of crossings, numbered by count, ends and tone, on raw pixels.
 
-The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a
-table:
-one tone. Where that is seen along a side, the outermost corners are the board's own, and the
-count is known although another side is hidden or out of view. A hand or a sheet of paper
-that covers corners does not end along a line of the squares and gives no such evidence.
+The border squares of a chessboard alternate, and beyond them lies a rim, a carrier or a table: one
+tone. Where that is seen along a side, the outermost corners are the board's own, and the count is
+known although another side is hidden or out of view. A hand or a sheet of paper that covers corners
+does not end along a line of the squares and gives no such evidence.
 
-The camera looks at the front of a print, so that in the image the board's y lies clockwise
-of
-its x. Where several numberings remain, the one whose x points most to the right is taken.
+The camera looks at the front of a print, so that in the image the board's y lies clockwise of its
+x. Where several numberings remain, the one whose x points most to the right is taken.
 
-A flat board seen through any lens is a homography followed by a smooth field: a polynomial
-of
-third degree over the image holds distortion and a bow. A corner that a light stripe or a
-shadow
-pulled lies off it by many times the scatter of the rest.
+A flat board seen through any lens is a homography followed by a smooth field: a polynomial of third
+degree over the image holds distortion and a bow. A corner that a light stripe or a shadow pulled
+lies off it by many times the scatter of the rest.
 
-The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board
-is
+The origin is the inner corner whose outer square (towards -x, -y) is dark. Part of a board is
 enough where its ends tell which part it is.
 """
 
@@ -42,9 +37,9 @@ from armscan.vision.targets.crossings import (
     find_lattices,
     predict_cells,
 )
-from armscan.vision.targets.grey import Grey32, RawGrey, grey_channels, sample
+from armscan.vision.targets.grey import MIN_CONTRAST, Grey32, RawGrey, grey_channels, sample
 from armscan.vision.targets.saddle import fit_saddles
-from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetOptions, TargetView
+from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView, rightness
 
 Side = Literal["ends", "may end", "continues", "unknown"]
 """What is seen beyond the outermost corners; "may end" where too few of them tell."""
@@ -73,17 +68,9 @@ _SUSPECT = 0.4
 class Extent:
     """A rectangle of corners, as they lie in the image.
 
-    Parameters
-    ----------
-    cells
-        (N, 2) cells (a, b) of the corners found, from (0, 0); b lies clockwise of a.
-    points_px
-        (N, 2) their image points.
-    size
-        Counts along a and b.
-    sides
-        What is beyond: before the first and after the last a, before the first and after
-        the last b.
+    ``cells``: (N, 2) cells (a, b) of the corners found, from (0, 0); b lies clockwise of a.
+    ``points_px``: (N, 2) their image points. ``size``: Counts along a and b. ``sides``: What is
+    beyond: before the first and after the last a, before the first and after the last b.
     """
 
     cells: IntArray
@@ -107,14 +94,8 @@ class Extent:
 def extents(grey: Grey32, crossings: Crossings, lattice: Lattice) -> Iterator[Extent]:
     """Yield the rectangle of a lattice, then those without its sparse outermost rows.
 
-    Parameters
-    ----------
-    grey
-        (H, W) levels of the image in which the crossings were found.
-    crossings
-        All of the image.
-    lattice
-        Those that make a lattice.
+    ``grey``: (H, W) levels of the image in which the crossings were found. ``crossings``: All of
+    the image. ``lattice``: Those that make a lattice.
     """
     cells, index = cell_arrays(lattice)
     while len(cells) and (np.ptp(cells, axis=0) + 1).min() >= SMALLEST:
@@ -203,14 +184,8 @@ def _difference(
 class NumberedCorners:
     """Corners with their places on the board.
 
-    Parameters
-    ----------
-    cells
-        (N, 2) column and row of each.
-    points_px
-        (N, 2) image points.
-    quarter_turns
-        How far the board's x is turned against the lattice's a.
+    ``cells``: (N, 2) column and row of each. ``points_px``: (N, 2) image points. ``quarter_turns``:
+    How far the board's x is turned against the lattice's a.
     """
 
     cells: IntArray
@@ -239,7 +214,7 @@ def numberings(extent: Extent, columns: int, rows: int) -> list[NumberedCorners]
         cells = np.stack([size[1] - 1 - cells[:, 1], cells[:, 0]], axis=-1)
         size = size[::-1]
         sides = (sides[3], sides[2], sides[0], sides[1])
-    return sorted(found, key=lambda numbered: -_rightness(numbered))
+    return sorted(found, key=lambda n: -rightness(n.cells.astype(np.float64), n.points_px))
 
 
 def is_sure(choices: list[NumberedCorners], *, is_square: bool) -> bool:
@@ -261,12 +236,6 @@ def _first_number(count: int, wanted: int, before: Side, after: Side) -> int | N
     return None
 
 
-def _rightness(numbered: NumberedCorners) -> float:
-    design = np.column_stack([numbered.cells, np.ones(len(numbered.cells))])
-    affine = np.linalg.lstsq(design, numbered.points_px, rcond=None)[0]
-    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
-
-
 _OUTLIER_SIGMAS = 6.0
 _TUKEY = 4.7
 _HOMOGRAPHIES, _ROUNDS = 3, 6
@@ -281,23 +250,12 @@ def off_lattice(
 ) -> tuple[BoolArray, float]:
     """Tell which of N corners are off the lattice that the others make.
 
-    Parameters
-    ----------
-    board
-        (N, 2) places on the board, any unit.
-    points_px
-        (N, 2) image points.
-    least_sigma_px
-        (N,) their standard deviations; the scatter found is not taken to be smaller.
-    tolerance_px
-        What a print's own errors may be; corners that are off by less stay.
+    ``board``: (N, 2) places on the board, any unit. ``points_px``: (N, 2) image points.
+    ``least_sigma_px``: (N,) their standard deviations; the scatter found is not taken to be
+    smaller. ``tolerance_px``: What a print's own errors may be; corners that are off by less stay.
 
-    Returns
-    -------
-    is_off
-        (N,) True for corners to leave out.
-    scatter_px
-        Robust standard deviation, per axis, of the rest; infinite if there is no homography.
+    Returns ``is_off``: (N,) True for corners to leave out. ``scatter_px``: Robust standard
+    deviation, per axis, of the rest; infinite if there is no homography.
     """
     weights = np.ones(len(board))
     size = scatter = np.full(len(board), np.inf)
@@ -340,6 +298,8 @@ def _terms(image: FloatArray) -> FloatArray:
     return np.stack(terms[:1], axis=-1)
 
 
+SEARCH_SIZE_PX = 1400
+"""Larger images are reduced to this size for the search; corners are measured in the full one."""
 MIN_SEEN_FRACTION = 0.4
 """Least fraction of a board's corners that makes a view."""
 MIN_GOOD_FRACTION = 0.7
@@ -372,44 +332,37 @@ class _Corners:
     step_px: float
 
 
-def detect_chessboard(
-    exposure: Exposure, target: Chessboard, options: TargetOptions
-) -> TargetView | FitFailure:
+def detect_chessboard(exposure: Exposure, target: Chessboard) -> TargetView | FitFailure:
     """Find a chessboard and measure its corners.
 
-    Returns
-    -------
-    The view, with the corners that the fit on raw pixels accepted; or why there is none.
+    Returns the view, with the corners that the fit on raw pixels accepted; or why there is none.
     """
     channels = grey_channels(exposure)
-    min_contrast = options.min_contrast * exposure.full_scale
+    min_contrast = MIN_CONTRAST * exposure.full_scale
     why: FitFailure | None = None
     seen: list[Extent] = []
-    for number, grey in enumerate(channels):
-        others = channels[:number] + channels[number + 1 :]
-        for numbered in _numbered(grey, target, options.search_size_px, min_contrast, seen):
+    for k, grey in enumerate(channels):
+        others = channels[:k] + channels[k + 1 :]
+        for numbered in _numbered(grey, target, min_contrast, seen):
             corners = _best_measured(grey, others, target, numbered)
             refusal = _refusal(exposure, target, corners)
             if refusal is None:
-                return _view(exposure, target, corners)
+                good = corners.is_good
+                number = corners.cells[good, 1] * target.columns + corners.cells[good, 0]
+                found, covariance = corners.points_px[good], corners.covariance_px2[good]
+                return TargetView.of_image(exposure, target, number, found, covariance)
             why = refusal if why is None else why
     return _not_found(exposure, target, seen) if why is None else why
-
-
-def is_symmetric(target: Chessboard) -> bool:
-    """Tell whether the board looks the same after half a turn (columns + rows even)."""
-    return (target.columns + target.rows) % 2 == 0
 
 
 def _numbered(
     grey: RawGrey,
     target: Chessboard,
-    size_px: int,
     min_contrast: float,
     seen: list[Extent],
 ) -> Iterator[NumberedCorners]:
     """Yield boards of the right count in one channel; other lattices are noted in ``seen``."""
-    small, factor = _search_image(grey, size_px)
+    small, factor = _search_image(grey)
     crossings = find_crossings(small, min_contrast)
     fewest = MIN_SEEN_FRACTION * target.columns * target.rows
     for lattice in find_lattices(crossings):
@@ -427,10 +380,10 @@ def _numbered(
                 yield NumberedCorners(choices[0].cells, points, choices[0].quarter_turns)
 
 
-def _search_image(grey: RawGrey, size_px: int) -> tuple[Grey32, float]:
-    """The image, reduced to at most ``size_px``, and the factor back to full size."""
+def _search_image(grey: RawGrey) -> tuple[Grey32, float]:
+    """The image, reduced to at most `SEARCH_SIZE_PX`, and the factor back to full size."""
     image = np.ascontiguousarray(grey, dtype=np.float32)
-    factor = max(image.shape) / size_px
+    factor = max(image.shape) / SEARCH_SIZE_PX
     if factor <= 1.0:
         return image, 1.0
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
@@ -543,22 +496,6 @@ def _refusal(exposure: Exposure, target: Chessboard, corners: _Corners) -> FitFa
             "use a flat board",
         )
     return None
-
-
-def _view(exposure: Exposure, target: Chessboard, corners: _Corners) -> TargetView:
-    good = corners.is_good
-    binning = exposure.window.binning
-    number = corners.cells[good, 1] * target.columns + corners.cells[good, 0]
-    return TargetView(
-        source=exposure.source,
-        width_px=exposure.window.x_px + exposure.width_px * binning,
-        height_px=exposure.window.y_px + exposure.height_px * binning,
-        point_index=number,
-        points_px=exposure.window.to_full_sensor(corners.points_px[good]),
-        covariance_px2=corners.covariance_px2[good] * binning**2,
-        points_board_mm=target.points_board_mm[number],
-        is_ambiguous=is_symmetric(target),
-    )
 
 
 def _not_found(exposure: Exposure, target: Chessboard, extents_seen: list[Extent]) -> FitFailure:

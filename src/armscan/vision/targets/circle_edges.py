@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Edge points of circles by least squares on raw pixels, starting from rough ellipses.
 
-Each rim is cut into sectors. In a sector the level depends on the distance d to the rim as
-``I = inner + (outer - inner) Phi((d - shift) / blur)`` with Phi the normal distribution (an
-erf
-edge). Inner level, outer level and shift belong to the sector, the blur to the circle; no
-pixel
-is shared, so that the shifts of sectors are independent and their sigma follows from the
-fit.
+Each rim is cut into sectors. In a sector the level depends on the distance d to the rim as ``I =
+inner + (outer - inner) Phi((d - shift) / blur)`` with Phi the normal distribution (an erf edge).
+Inner level, outer level and shift belong to the sector, the blur to the circle; no pixel is shared,
+so that the shifts of sectors are independent and their sigma follows from the fit.
 """
 
 from __future__ import annotations
@@ -33,20 +30,11 @@ _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 class EdgeProfiles:
     """Fitted profiles of N circles in K sectors.
 
-    Parameters
-    ----------
-    shift_px
-        (N, K) outward shift of the edge from the rim.
-    sigma_px
-        (N, K) its standard deviation; infinite where a sector has too few pixels.
-    inner, outer
-        (N, K) levels of the two sides.
-    misfit
-        (N, K) mean squared residual of the sector over that of its circle.
-    blur_px
-        (N,) standard deviation of the edge.
-    noise
-        (N,) standard deviation of the residuals, grey levels.
+    ``shift_px``: (N, K) outward shift of the edge from the rim. ``sigma_px``: (N, K) its standard
+    deviation; infinite where a sector has too few pixels. ``inner``, ``outer``: (N, K) levels of
+    the two sides. ``misfit``: (N, K) mean squared residual of the sector over that of its circle.
+    ``blur_px``: (N,) standard deviation of the edge. ``noise``: (N,) standard deviation of the
+    residuals, grey levels.
     """
 
     shift_px: FloatArray
@@ -71,18 +59,10 @@ def fit_profiles(
 ) -> EdgeProfiles:
     """Fit all sectors of all circles by Gauss-Newton steps.
 
-    Parameters
-    ----------
-    pixels
-        The bands' pixels.
-    n_sectors
-        K.
-    blur_px
-        (N,) blur to start from.
-    before
-        An earlier fit: the levels of a circle's sectors are then taken to scatter by
-        `LEVEL_SCATTER` of the contrast around their medians. A sector of a small circle has too
-        few pixels to tell its levels from its shift; in a large one this changes nothing.
+    ``pixels``: The bands' pixels. ``n_sectors``: K. ``blur_px``: (N,) blur to start from.
+    ``before``: An earlier fit: the levels of a circle's sectors are then taken to scatter by
+    `LEVEL_SCATTER` of the contrast around their medians. A sector of a small circle has too few
+    pixels to tell its levels from its shift; in a large one this changes nothing.
     """
     n_circles = len(blur_px)
     turn = np.mod(pixels.angle_rad / (2.0 * np.pi), 1.0)
@@ -222,20 +202,10 @@ _MAX_SLOPE = 0.02
 class MeasuredCircles:
     """Edge points of N circles in K sectors.
 
-    Parameters
-    ----------
-    points_px
-        (N, K, 2) edge points, image pixels.
-    sigma_px
-        (N, K) standard deviation along the normal; infinite where a sector was rejected.
-    is_good
-        (N,) False where too few sectors show an edge, or they lie on no ellipse.
-    ellipses
-        The fits.
-    blur_px
-        (N,) standard deviation of the edges.
-    contrast_levels
-        (N,) level outside minus level inside.
+    ``points_px``: (N, K, 2) edge points, image pixels. ``sigma_px``: (N, K) standard deviation
+    along the normal; infinite where a sector was rejected. ``is_good``: (N,) False where too few
+    sectors show an edge, or they lie on no ellipse. ``ellipses``: The fits. ``blur_px``: (N,)
+    standard deviation of the edges. ``contrast_levels``: (N,) level outside minus level inside.
     """
 
     points_px: FloatArray
@@ -255,16 +225,10 @@ def measure_circles(
 ) -> MeasuredCircles:
     """Measure circles on raw pixels.
 
-    Parameters
-    ----------
-    grey
-        (H, W) raw levels.
-    centres_px, shapes_px2
-        (N, 2) and (N, 2, 2): ellipses to about 2 px; ``d' S^-1 d = 1`` on the rim.
-    min_contrast_levels
-        Circles with less contrast are not good.
-    max_band_px
-        (N,) largest half width of the band of pixels looked at, where other edges are near.
+    ``grey``: (H, W) raw levels. ``centres_px``, ``shapes_px2``: (N, 2) and (N, 2, 2): ellipses to
+    about 2 px; ``d' S^-1 d = 1`` on the rim. ``min_contrast_levels``: Circles with less contrast
+    are not good. ``max_band_px``: (N,) largest half width of the band of pixels looked at, where
+    other edges are near.
     """
     rims = Rims.from_shapes(centres_px, shapes_px2)
     perimeter = float(np.median(np.pi * rims.half_px.sum(axis=1)))

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Circle grids, symmetric and asymmetric, of either tone, and where their centres are imaged.
 
-The centre of the ellipse is not the image of the circle's centre (0.1 px at 45 degrees for a
-circle of 69 px). The image of the centre is the pole of the plane's vanishing line in the
-conic:
-with the homography H from board to image, line ``l = H^-T (0, 0, 1)'``, centre ``Q^-1 l``. H
-itself
-comes from the centres, hence a few rounds.
+The centre of the ellipse is not the image of the circle's centre (0.1 px at 45 degrees for a circle
+of 69 px). The image of the centre is the pole of the plane's vanishing line in the conic: with the
+homography H from board to image, line ``l = H^-T (0, 0, 1)'``, centre ``Q^-1 l``. H itself comes
+from the centres, hence a few rounds.
 """
 
 from __future__ import annotations
@@ -27,17 +25,15 @@ from armscan.vision.targets.circle_lattice import (
     NumberedGrid,
     find_blobs,
     grow_lattices,
-    is_symmetric,
     lattice_size,
     number_grid,
 )
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
-from armscan.vision.targets.grey import RawGrey, grey_channels, to_grey8
+from armscan.vision.targets.grey import MIN_CONTRAST, RawGrey, grey_channels, to_grey8
 from armscan.vision.targets.target import (
     CircleEdges,
     CircleGrid,
     OtherCountSeen,
-    TargetOptions,
     TargetView,
 )
 
@@ -84,17 +80,11 @@ def centres_of_circles(
 ) -> tuple[FloatArray, FloatArray]:
     """Images of the centres of coplanar circles, and their covariance.
 
-    Parameters
-    ----------
-    ellipses
-        N conics, free of distortion.
-    points_board_mm
-        (N, 2) or (N, 3) centres on the board.
+    ``ellipses``: N conics, free of distortion. ``points_board_mm``: (N, 2) or (N, 3) centres on the
+    board.
 
-    Returns
-    -------
-    centres_px, covariance_px2
-        (N, 2) and (N, 2, 2); with fewer than four circles those of the ellipses.
+    Returns ``centres_px``, ``covariance_px2``: (N, 2) and (N, 2, 2); with fewer than four circles
+    those of the ellipses.
     """
     centres, covariance = ellipses.centres()
     board = np.asarray(points_board_mm, dtype=np.float64)[:, :2]
@@ -151,6 +141,8 @@ def _distorted(ideal_px: FloatArray, camera: CameraModel) -> tuple[FloatArray, F
     return points, dq_dray[:, :, :2] / focal
 
 
+MIN_CIRCLES_FRACTION = 0.8
+"""Least fraction of a grid's circles that must be found; each border row must be among them."""
 WHOLE_FRACTION = 0.95
 """Least filled fraction of a lattice that may be a whole grid."""
 
@@ -165,18 +157,14 @@ class _Candidate:
     size_seen: tuple[int, int]
 
 
-def detect_circle_grid(
-    exposure: Exposure, target: CircleGrid, options: TargetOptions
-) -> TargetView | FitFailure:
+def detect_circle_grid(exposure: Exposure, target: CircleGrid) -> TargetView | FitFailure:
     """Find a circle grid and measure its circles.
 
-    Returns
-    -------
-    The view, centres corrected for eccentricity without intrinsics; or why there is none.
+    Returns the view, centres corrected for eccentricity without intrinsics; or why there is none.
     """
     best_seen = (0, (0, 0))
     for grey in grey_channels(exposure):
-        for candidate in _candidates(grey, exposure, target, options):
+        for candidate in _candidates(grey, exposure, target):
             best_seen = max(best_seen, (candidate.n_seen, candidate.size_seen))
             if candidate.grid is None:
                 continue
@@ -185,27 +173,25 @@ def detect_circle_grid(
                 grey,
                 candidate.blobs.centres_px[index],
                 candidate.blobs.shapes_px2[index],
-                options.min_contrast * exposure.full_scale,
+                MIN_CONTRAST * exposure.full_scale,
             )
-            if circles.is_good.mean() >= options.min_circles_fraction:
+            if circles.is_good.mean() >= MIN_CIRCLES_FRACTION:
                 return correct_centres(_view(exposure, target, candidate.grid, circles))
     return _failure(exposure, target, *best_seen)
 
 
-def _candidates(
-    grey: RawGrey, exposure: Exposure, target: CircleGrid, options: TargetOptions
-) -> list[_Candidate]:
+def _candidates(grey: RawGrey, exposure: Exposure, target: CircleGrid) -> list[_Candidate]:
     """Lattices among the dark and among the light blobs, the target's own and the largest first.
 
     The thresholds also outline the ground between circles: such a lattice fits as well, but its
     rims show no edge, so that measuring it tells.
     """
-    blobs = find_blobs(to_grey8(grey, exposure.full_scale), options)
+    blobs = find_blobs(to_grey8(grey, exposure.full_scale))
     found = []
     for is_light in (False, True):
         alike = blobs.subset(blobs.is_light == is_light)
         for lattice in grow_lattices(alike):
-            grid = number_grid(lattice, alike.centres_px, target, options.min_circles_fraction)
+            grid = number_grid(lattice, alike.centres_px, target, MIN_CIRCLES_FRACTION)
             size = lattice_size(lattice, target.is_asymmetric)
             found.append(_Candidate(alike, grid, len(lattice), size))
     return sorted(found, key=lambda c: (c.grid is None, -c.n_seen))
@@ -216,28 +202,15 @@ def _view(
 ) -> TargetView:
     good = np.flatnonzero(circles.is_good)
     used = np.isfinite(circles.sigma_px[good])
-    binning = exposure.window.binning
     centres, covariance = circles.ellipses.centres()
     number = grid.point_index[good]
-    return TargetView(
-        source=exposure.source,
-        width_px=exposure.window.x_px + exposure.width_px * binning,
-        height_px=exposure.window.y_px + exposure.height_px * binning,
-        point_index=number,
-        points_px=exposure.window.to_full_sensor(centres[good]),
-        covariance_px2=covariance[good] * binning**2,
-        points_board_mm=target.points_board_mm[number],
-        edges=CircleEdges(
-            points_px=exposure.window.to_full_sensor(_flat(circles.points_px[good], used)),
-            circle=np.repeat(np.arange(len(good)), used.sum(axis=1)),
-            sigma_px=circles.sigma_px[good][used] * binning,
-        ),
-        is_ambiguous=is_symmetric(target),
+    view = TargetView.of_image(exposure, target, number, centres[good], covariance[good])
+    edges = CircleEdges(
+        points_px=exposure.window.to_full_sensor(circles.points_px[good][used]),
+        circle=np.repeat(np.arange(len(good)), used.sum(axis=1)),
+        sigma_px=circles.sigma_px[good][used] * exposure.window.binning,
     )
-
-
-def _flat(points: FloatArray, used: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> FloatArray:
-    return np.asarray(points[used])
+    return replace(view, edges=edges)
 
 
 def _failure(

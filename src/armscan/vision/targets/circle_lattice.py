@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blobs that may be circles, a lattice grown over them, and the numbers of its cells.
 
-Both kinds of circle grid are square lattices (the asymmetric one turned by 45 degrees). The
-ellipse into which a circle is seen gives the local affine map up to a rotation; in
-coordinates
-that make it round again, the four nearest neighbours are equally far and at right angles, at
-any
-tilt.
+Both kinds of circle grid are square lattices (the asymmetric one turned by 45 degrees). The ellipse
+into which a circle is seen gives the local affine map up to a rotation; in coordinates that make it
+round again, the four nearest neighbours are equally far and at right angles, at any tilt.
 """
 
 from __future__ import annotations
@@ -20,9 +17,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.vision.targets.grey import Grey8
-from armscan.vision.targets.target import CircleGrid, TargetOptions
+from armscan.vision.targets.grey import MIN_CONTRAST, Grey8
+from armscan.vision.targets.target import CircleGrid, rightness
 
+MIN_CIRCLE_PX, MAX_CIRCLE_PX = 8.0, 400.0
+"""Diameters of a target's circles in the image."""
 BLOCK_FRACTIONS = (1 / 40, 1 / 12, 1 / 4)
 """Sides of the squares over which a threshold is the local mean, as fractions of the image."""
 MAX_ROUNDNESS_ERROR = 0.12
@@ -40,14 +39,9 @@ _PARENT = 3
 class Blobs:
     """Ellipse-shaped blobs.
 
-    Parameters
-    ----------
-    centres_px
-        (N, 2) centres, image pixels.
-    shapes_px2
-        (N, 2, 2) matrices S with ``d' S^-1 d = 1`` on the rim, ``d`` from the centre.
-    is_light
-        (N,) True for a light blob on a dark ground.
+    ``centres_px``: (N, 2) centres, image pixels. ``shapes_px2``: (N, 2, 2) matrices S with ``d'
+    S^-1 d = 1`` on the rim, ``d`` from the centre. ``is_light``: (N,) True for a light blob on a
+    dark ground.
     """
 
     centres_px: FloatArray
@@ -63,22 +57,24 @@ class Blobs:
         return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
 
 
-def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME_LOG_AREA) -> Blobs:
+def find_blobs(
+    grey8: Grey8,
+    *,
+    smallest_px: float = MIN_CIRCLE_PX,
+    largest_px: float = MAX_CIRCLE_PX,
+    min_contrast: float = MIN_CONTRAST,
+    same_log_area: float = SAME_LOG_AREA,
+) -> Blobs:
     """Return every contour that is an ellipse within the range of sizes, once.
 
     A blob found at several threshold scales is kept where its contour is roundest.
 
-    Parameters
-    ----------
-    grey8
-        The image.
-    options
-        Sizes and contrast.
-    same_log_area
-        Where circles nest, less than `SAME_LOG_AREA`, so that their rims stay apart.
+    ``grey8``: The image. ``smallest_px``, ``largest_px``: Range of the diameters. ``min_contrast``:
+    Least contrast, as a fraction of full scale. ``same_log_area``: Where circles nest, less than
+    `SAME_LOG_AREA`, so that their rims stay apart.
     """
     rows: list[tuple[float, ...]] = []
-    margin = max(255.0 * options.min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
+    margin = max(255.0 * min_contrast / 2.0, _NOISE_SIGMAS * _noise(grey8))
     for fraction in BLOCK_FRACTIONS:
         block = max(11, round(fraction * max(grey8.shape)) | 1)
         mean = cv2.boxFilter(grey8, -1, (block, block), borderType=cv2.BORDER_REPLICATE)
@@ -90,7 +86,8 @@ def find_blobs(grey8: Grey8, options: TargetOptions, same_log_area: float = SAME
                 (*ellipse, float(is_light))
                 for contour, links in zip(contours, _links(hierarchy), strict=True)
                 if links[_PARENT] < 0
-                and (ellipse := _ellipse_of(np.asarray(contour), options)) is not None
+                and (ellipse := _ellipse_of(np.asarray(contour), smallest_px, largest_px))
+                is not None
             ]
     table = np.array(rows).reshape(-1, 7)
     table = table[np.argsort(table[:, 5], kind="stable")]
@@ -112,19 +109,19 @@ def _noise(grey8: Grey8) -> float:
 
 
 def _ellipse_of(
-    contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], options: TargetOptions
+    contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], smallest_px: float, largest_px: float
 ) -> tuple[float, float, float, float, float, float] | None:
     """Centre u, v, shape uu, uv, vv and roundness error of a contour, if it is an ellipse."""
-    if len(contour) < 2.0 * options.min_circle_px:
+    if len(contour) < 2.0 * smallest_px:
         return None
     low = contour.reshape(-1, 2).min(axis=0)
     high = contour.reshape(-1, 2).max(axis=0)
     extent = float((high - low).max())
-    if not options.min_circle_px - 2.0 <= extent <= options.max_circle_px:
+    if not smallest_px - 2.0 <= extent <= largest_px:
         return None
     moments = cv2.moments(contour)
     area = moments["m00"]
-    if area < 0.4 * options.min_circle_px**2:
+    if area < 0.4 * smallest_px**2:
         return None
     centre = np.array([moments["m10"], moments["m01"]]) / area
     inertia = (
@@ -273,119 +270,62 @@ class _Grower:
 class NumberedGrid:
     """Blobs with the numbers of their circles.
 
-    Parameters
-    ----------
-    point_index
-        (M,) index into the target's points, ascending.
-    blob_index
-        (M,) blob of each.
+    ``point_index``: (M,) index into the target's points, ascending. ``blob_index``: (M,) blob of
+    each.
     """
 
     point_index: IntArray
     blob_index: IntArray
 
 
-def is_symmetric(target: CircleGrid) -> bool:
-    """Tell whether the grid looks the same after half a turn.
-
-    A symmetric grid always does; an asymmetric one does if its count of rows is even.
-    """
-    return not target.is_asymmetric or target.rows % 2 == 0
-
-
 def number_grid(
     lattice: Lattice, centres_px: FloatArray, target: CircleGrid, min_fraction: float
 ) -> NumberedGrid | None:
-    """Lay the target over a lattice.
+    """Lay the target over a lattice (cell to blob) of blobs with centres (N, 2).
 
-    Parameters
-    ----------
-    lattice
-        Cell to blob.
-    centres_px
-        (N, 2) blob centres.
-    target
-        The grid.
-    min_fraction
-        Least fraction of its circles that must be there; its four border lines must be.
-
-    Returns
-    -------
-    The numbering whose x points most to the right; None if the lattice is not this grid.
+    ``min_fraction``: Least fraction of its circles that must be there; its four border lines must
+    be. Returns the numbering whose x points most to the right; None if the lattice is not this
+    grid.
     """
-    wanted = _target_cells(target)
-    have = np.array(list(lattice), dtype=np.int64)
     blobs = np.array(list(lattice.values()), dtype=np.int64)
+    wanted = np.rint(target.points_board_mm[:, :2] / target.pitch_mm).astype(np.int64)
+    number = {(x, y): k for k, (x, y) in enumerate(wanted.tolist())}
     best: tuple[float, NumberedGrid] | None = None
     for quarter_turns in range(4):
-        placed = _placed(_turned(have, quarter_turns), blobs, wanted, target.is_asymmetric)
-        if placed is None or len(placed.point_index) < min_fraction * len(wanted):
+        have = _in_pitches(lattice, quarter_turns, target.is_asymmetric)
+        if not np.array_equal(np.ptp(have, axis=0), np.ptp(wanted, axis=0)):
             continue
-        rightness = _rightness(placed, centres_px, target)
-        if best is None or rightness > best[0]:
-            best = rightness, placed
+        placed = have + (wanted.min(axis=0) - have.min(axis=0))
+        index = np.array([number.get((x, y), -1) for x, y in placed.tolist()], dtype=np.int64)
+        if index.min() < 0 or len(index) < min_fraction * len(wanted):
+            continue
+        order = np.argsort(index)
+        grid = NumberedGrid(index[order], blobs[order])
+        board = target.points_board_mm[grid.point_index, :2]
+        x_rightness = rightness(board, centres_px[grid.blob_index])
+        if best is None or x_rightness > best[0]:
+            best = x_rightness, grid
     return None if best is None else best[1]
 
 
 def lattice_size(lattice: Lattice, is_asymmetric: bool) -> tuple[int, int]:
     """Columns and rows that a lattice spans, of a symmetric grid the larger first: for messages."""
+    across, along = (np.ptp(_in_pitches(lattice, 0, is_asymmetric), axis=0) + 1).tolist()
+    if not is_asymmetric:
+        return max(across, along), min(across, along)
+    # A row of C circles spans 2 C places, since each second row is shifted.
+    sizes = [((u + 1) // 2, v) for u, v in ((across, along), (along, across))]
+    return min(sizes, key=lambda size: abs(size[0] * size[1] - len(lattice)))
+
+
+def _in_pitches(lattice: Lattice, quarter_turns: int, is_asymmetric: bool) -> IntArray:
+    """Places (N, 2) of a lattice's cells after a turn, in pitches along the target's x and y.
+
+    Cells step by one pitch, those of an asymmetric grid by (1, 1) and (-1, 1) pitches.
+    """
     cells = np.array(list(lattice), dtype=np.int64)
-    if is_asymmetric:
-        across, along = (
-            int(span) + 1 for span in np.ptp(_border(cells, is_asymmetric=True), axis=0)
-        )
-        # A row of C circles spans 2 C places of the turned lattice, since each second is shifted.
-        sizes = [((u + 1) // 2, v) for u, v in ((across, along), (along, across))]
-        return min(sizes, key=lambda size: abs(size[0] * size[1] - len(cells)))
-    spans = np.ptp(cells, axis=0) + 1
-    return int(spans.max()), int(spans.min())
-
-
-def _target_cells(target: CircleGrid) -> IntArray:
-    """Lattice cells (N, 2) of the target's points; y is clockwise of x, b of a."""
-    unit = np.rint(target.points_board_mm[:, :2] / target.pitch_mm).astype(np.int64)
-    if not target.is_asymmetric:
-        return unit
-    # Steps of the turned lattice: a = (1, 1) and b = (-1, 1) pitches.
-    return np.stack([unit[:, 0] + unit[:, 1], unit[:, 1] - unit[:, 0]], axis=-1) // 2
-
-
-def _turned(cells: IntArray, quarter_turns: int) -> IntArray:
-    turned = cells
     for _ in range(quarter_turns):
-        turned = np.stack([-turned[:, 1], turned[:, 0]], axis=-1)
-    return turned
-
-
-def _placed(
-    cells: IntArray, blobs: IntArray, wanted: IntArray, is_asymmetric: bool
-) -> NumberedGrid | None:
-    """Shift the cells onto the target; None unless the borders agree and no cell is left over."""
-    have, want = (_border(c, is_asymmetric) for c in (cells, wanted))
-    if not np.array_equal(np.ptp(have, axis=0), np.ptp(want, axis=0)):
-        return None
-    shift = want.min(axis=0) - have.min(axis=0)
-    if is_asymmetric:
-        if (shift[0] + shift[1]) % 2:
-            return None
-        shift = np.array([shift[0] + shift[1], shift[1] - shift[0]]) // 2
-    number = {(int(a), int(b)): k for k, (a, b) in enumerate(wanted)}
-    points = [number.get((int(a), int(b)), -1) for a, b in cells + shift]
-    if min(points) < 0:
-        return None
-    order = np.argsort(points)
-    return NumberedGrid(np.array(points, dtype=np.int64)[order], blobs[order])
-
-
-def _border(cells: IntArray, is_asymmetric: bool) -> IntArray:
-    """Coordinates in which the target's border is a rectangle."""
+        cells = np.stack([-cells[:, 1], cells[:, 0]], axis=-1)
     if not is_asymmetric:
         return cells
     return np.stack([cells[:, 0] - cells[:, 1], cells[:, 0] + cells[:, 1]], axis=-1)
-
-
-def _rightness(placed: NumberedGrid, centres_px: FloatArray, target: CircleGrid) -> float:
-    board = target.points_board_mm[placed.point_index, :2]
-    design = np.column_stack([board, np.ones(len(board))])
-    affine = np.linalg.lstsq(design, centres_px[placed.blob_index], rcond=None)[0]
-    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))

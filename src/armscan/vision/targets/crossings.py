@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Crossings of two edges with alternating sectors, and the lattices they form: chessboards.
 
-The blurred image has a saddle there, whatever the contrast. On a ring around a crossing
-opposite
-sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the
-outer
+The blurred image has a saddle there, whatever the contrast. On a ring around a crossing opposite
+sectors are alike, so that the ring's half-turn average keeps the contrast (an edge, the outer
 corner of a square or a blob lose it), and it changes its tone twice: the two edges.
 
-From a corner of a chessboard four edges run to its four neighbours, and each neighbour has
-light
-and dark sectors swapped. Crossings that are the nearest such neighbours of each other are
-linked;
+From a corner of a chessboard four edges run to its four neighbours, and each neighbour has light
+and dark sectors swapped. Crossings that are the nearest such neighbours of each other are linked;
 what hangs together is a lattice. Cells in which no crossing was found (a light stripe, a
 reflection, a finger) are bridged by a homography of the cells around them.
 """
@@ -44,15 +40,10 @@ _LEVELS = (1.0, 2.0, 4.0)
 class Crossings:
     """Crossings of two edges.
 
-    Parameters
-    ----------
-    points_px
-        (N, 2) places, image pixels, to about half a pixel.
-    rising_rad, falling_rad
-        (N,) directions of the edges, from u towards v: turning further that way, the image gets
-        lighter at the rising one and darker at the falling one. Modulo half a turn.
-    contrast
-        (N,) difference in level between light and dark sectors.
+    ``points_px``: (N, 2) places, image pixels, to about half a pixel. ``rising_rad``,
+    ``falling_rad``: (N,) directions of the edges, from u towards v: turning further that way, the
+    image gets lighter at the rising one and darker at the falling one. Modulo half a turn.
+    ``contrast``: (N,) difference in level between light and dark sectors.
     """
 
     points_px: FloatArray
@@ -219,16 +210,9 @@ def cell_arrays(lattice: Lattice) -> tuple[IntArray, IntArray]:
 def predict_cells(cells: IntArray, points_px: FloatArray, wanted: IntArray) -> FloatArray:
     """Image points (M, 2) of ``wanted`` cells (M, 2), each from the known cells nearest to it.
 
-    Parameters
-    ----------
-    cells, points_px
-        (N, 2) known cells and their image points.
-    wanted
-        (M, 2) cells.
+    ``cells``, ``points_px``: (N, 2) known cells and their image points. ``wanted``: (M, 2) cells.
 
-    Returns
-    -------
-    (M, 2) image points; NaN where the cells around do not fix a homography.
+    Returns (M, 2) image points; NaN where the cells around do not fix a homography.
     """
     _, near = _nearest(cells, wanted, min(_NEAR_CELLS, len(cells)))
     return _mapped_by_homography(

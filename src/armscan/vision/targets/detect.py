@@ -13,9 +13,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.chessboard import detect_chessboard
-from armscan.vision.targets.chessboard import is_symmetric as is_symmetric_chessboard
 from armscan.vision.targets.circle_grid import detect_circle_grid
-from armscan.vision.targets.circle_lattice import is_symmetric as is_symmetric_grid
 from armscan.vision.targets.grey import grey_channels, to_grey8
 from armscan.vision.targets.saddle import WINDOW_FRACTION, fit_saddles
 from armscan.vision.targets.target import (
@@ -23,7 +21,6 @@ from armscan.vision.targets.target import (
     Chessboard,
     CircleGrid,
     Target,
-    TargetOptions,
     TargetView,
 )
 
@@ -32,11 +29,12 @@ MIN_CORNERS = 6
 _CLEARANCE = 0.85
 
 
-def detect_charuco(
-    exposure: Exposure, target: Charuco, options: TargetOptions
-) -> TargetView | FitFailure:
+def detect_charuco(exposure: Exposure, target: Charuco) -> TargetView | FitFailure:
     """Find a ChArUco board, whole or in part; the markers number its corners."""
-    detector = cv2.aruco.CharucoDetector(_board(target))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    size = (target.columns, target.rows)
+    board = cv2.aruco.CharucoBoard(size, target.square_mm, target.marker_mm, dictionary)
+    detector = cv2.aruco.CharucoDetector(board)
     n_markers = 0
     n_corners = 0
     for grey in grey_channels(exposure):
@@ -53,24 +51,9 @@ def detect_charuco(
         n_corners = max(n_corners, int(is_good.sum()))
         if n_corners < MIN_CORNERS:
             continue
-        binning = exposure.window.binning
-        return TargetView(
-            source=exposure.source,
-            width_px=exposure.window.x_px + exposure.width_px * binning,
-            height_px=exposure.window.y_px + exposure.height_px * binning,
-            point_index=index[is_good],
-            points_px=exposure.window.to_full_sensor(refined[is_good]),
-            covariance_px2=covariance[is_good] * binning**2,
-            points_board_mm=target.points_board_mm[index[is_good]],
-        )
+        found, number = refined[is_good], index[is_good]
+        return TargetView.of_image(exposure, target, number, found, covariance[is_good])
     return _failure(exposure, target, n_markers, n_corners)
-
-
-def _board(target: Charuco) -> cv2.aruco.CharucoBoard:
-    code = getattr(cv2.aruco, target.dictionary)
-    dictionary = cv2.aruco.getPredefinedDictionary(code)
-    size = (target.columns, target.rows)
-    return cv2.aruco.CharucoBoard(size, target.square_mm, target.marker_mm, dictionary)
 
 
 def _steps(
@@ -111,9 +94,7 @@ def _failure(exposure: Exposure, target: Charuco, n_markers: int, n_corners: int
 SMALLEST_IMAGE_PX = 32
 
 
-def detect_target(
-    exposure: Exposure, target: Target, options: TargetOptions | None = None
-) -> TargetView | FitFailure:
+def detect_target(exposure: Exposure, target: Target) -> TargetView | FitFailure:
     """Find a target and measure its points (section 2.3.1.1).
 
     Parameters
@@ -122,14 +103,11 @@ def detect_target(
         Grey or colour, 8 to 16 bit, any sensor window.
     target
         What to look for.
-    options
-        How; None for the defaults.
 
     Returns
     -------
     The points in full-sensor pixels with their covariance, or the reason why there are none.
     """
-    chosen = TargetOptions() if options is None else options
     if min(exposure.width_px, exposure.height_px) < SMALLEST_IMAGE_PX:
         return FitFailure(
             f"{exposure.source}: an image of {exposure.width_px} x {exposure.height_px} px is too "
@@ -137,31 +115,19 @@ def detect_target(
             "give the full image",
         )
     if isinstance(target, CircleGrid):
-        return detect_circle_grid(exposure, target, chosen)
+        return detect_circle_grid(exposure, target)
     if isinstance(target, Chessboard):
-        return detect_chessboard(exposure, target, chosen)
-    return detect_charuco(exposure, target, chosen)
-
-
-QUARTER_TURNS = {
-    1: np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    2: np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]),
-    3: np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-}
+        return detect_chessboard(exposure, target)
+    return detect_charuco(exposure, target)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Numbering:
     """Another numbering of a target's points.
 
-    Parameters
-    ----------
-    quarter_turns
-        How far the target is turned, 0 to 3.
-    new_index
-        (N,) number that each of the target's points bears now.
-    new_from_found
-        Maps places on the board as it was found numbered to places by the new numbers.
+    ``quarter_turns``: How far the target is turned, 0 to 3. ``new_index``: (N,) number that each of
+    the target's points bears now. ``new_from_found``: Maps places on the board as it was found
+    numbered to places by the new numbers.
     """
 
     quarter_turns: int
@@ -173,7 +139,7 @@ def numberings(target: Target) -> tuple[Numbering, ...]:
     """All numberings that no view can tell apart, the one as found first."""
     points = target.points_board_mm
     found = Numbering(0, np.arange(len(points)), Pose(np.eye(3), np.zeros(3)))
-    return (found, *(_turned(target, turns) for turns in _symmetries(target)))
+    return (found, *(_turned(target, turns) for turns in target.symmetric_turns))
 
 
 def renumbered(view: TargetView, target: Target, numbering: Numbering) -> TargetView:
@@ -184,26 +150,12 @@ def renumbered(view: TargetView, target: Target, numbering: Numbering) -> Target
     return replace(view, point_index=index, points_board_mm=target.points_board_mm[index])
 
 
-def _symmetries(target: Target) -> tuple[int, ...]:
-    """Quarter turns after which the target looks the same."""
-    if isinstance(target, Charuco):
-        return ()
-    is_square = target.columns == target.rows
-    if isinstance(target, CircleGrid):
-        if not is_symmetric_grid(target):
-            return ()
-        return (1, 2, 3) if is_square and not target.is_asymmetric else (2,)
-    if not is_symmetric_chessboard(target):
-        return ()
-    # A quarter turn of a board with an odd count of inner corners a side swaps its colours.
-    return (1, 2, 3) if is_square and target.columns % 2 == 0 else (2,)
-
-
 def _turned(target: Target, quarter_turns: int) -> Numbering:
     points = target.points_board_mm
-    rotation = QUARTER_TURNS[quarter_turns]
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    rotation = np.linalg.matrix_power(quarter, quarter_turns)
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     shift = middle - rotation @ middle
-    places: FloatArray = points @ rotation.T + shift
-    apart = np.abs(places[:, None, :] - points[None, :, :]).max(axis=2)
-    return Numbering(quarter_turns, np.argmin(apart, axis=1), Pose(rotation, shift))
+    pose: Pose[Board, Board] = Pose(rotation, shift)
+    apart = np.abs(pose.apply(points)[:, None, :] - points[None, :, :]).max(axis=2)
+    return Numbering(quarter_turns, np.argmin(apart, axis=1), pose)

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ellipses through edge points with the covariance of each conic, and the pixels along their
-rims.
+"""Ellipses through edge points with the covariance of each conic, and the pixels along their rims.
 
-A conic is a symmetric matrix Q with ``[u v 1] Q [u v 1]' = 0``. Each ellipse is fitted in
-its own
-coordinates, shifted to ``origin`` and divided by ``scale``, where the conic's last element
-is -1;
+A conic is a symmetric matrix Q with ``[u v 1] Q [u v 1]' = 0``. Each ellipse is fitted in its own
+coordinates, shifted to ``origin`` and divided by ``scale``, where the conic's last element is -1;
 this cannot fail for an ellipse, because the origin lies inside it.
 """
 
@@ -30,20 +27,11 @@ _TERM_MATRICES.setflags(write=False)
 class Ellipses:
     """N fitted ellipses.
 
-    Parameters
-    ----------
-    origin_px
-        (N, 2) origin of each ellipse's own coordinates.
-    scale_px
-        (N,) unit of each ellipse's own coordinates.
-    terms
-        (N, 5) elements 11, 12, 22, 13, 23 of Q in own coordinates; element 33 is -1.
-    covariance
-        (N, 5, 5) covariance of ``terms`` for the sigmas given, not scaled by ``chi2``.
-    chi2
-        (N,) sum of squared distances over sigma.
-    degrees_of_freedom
-        (N,) edge points minus 5.
+    ``origin_px``: (N, 2) origin of each ellipse's own coordinates. ``scale_px``: (N,) unit of each
+    ellipse's own coordinates. ``terms``: (N, 5) elements 11, 12, 22, 13, 23 of Q in own
+    coordinates; element 33 is -1. ``covariance``: (N, 5, 5) covariance of ``terms`` for the sigmas
+    given, not scaled by ``chi2``. ``chi2``: (N,) sum of squared distances over sigma.
+    ``degrees_of_freedom``: (N,) edge points minus 5.
     """
 
     origin_px: FloatArray
@@ -70,17 +58,10 @@ class Ellipses:
         The pole of the line at infinity (0, 0, 1) is the ellipse's centre; the pole of the
         vanishing line of a circle's plane is the image of the circle's centre.
 
-        Parameters
-        ----------
-        lines_px
-            (3,) or (N, 3) lines ``l . [u v 1] = 0``.
+        ``lines_px``: (3,) or (N, 3) lines ``l . [u v 1] = 0``.
 
-        Returns
-        -------
-        poles_px
-            (N, 2) points ``Q^-1 l``.
-        covariance_px2
-            (N, 2, 2), the line taken as known.
+        Returns ``poles_px``: (N, 2) points ``Q^-1 l``. ``covariance_px2``: (N, 2, 2), the line
+        taken as known.
         """
         own = self._own_lines(np.broadcast_to(lines_px, (len(self.terms), 3)))
         inverse = np.linalg.inv(self.matrices)
@@ -118,12 +99,8 @@ class Ellipses:
     ) -> tuple[FloatArray, FloatArray]:
         """Conics in coordinates shifted to (N, 2) origins and divided by (N,) units.
 
-        Returns
-        -------
-        conics
-            (N, 3, 3); positive outside the ellipse, negative inside.
-        by_terms
-            (N, 5, 3, 3) their derivative by ``terms``.
+        Returns ``conics``: (N, 3, 3); positive outside the ellipse, negative inside. ``by_terms``:
+        (N, 5, 3, 3) their derivative by ``terms``.
         """
         change = np.zeros((len(self.terms), 3, 3))
         change[:, 0, 0] = change[:, 1, 1] = unit_px / self.scale_px
@@ -167,16 +144,10 @@ class Ellipses:
 def fit_ellipses(points_px: FloatArray, weights_per_px2: FloatArray) -> Ellipses:
     """Fit ellipses to edge points by minimising the weighted Sampson distance.
 
-    Parameters
-    ----------
-    points_px
-        (N, K, 2) edge points.
-    weights_per_px2
-        (N, K) inverse variance along the edge's normal; 0 leaves a point out.
+    ``points_px``: (N, K, 2) edge points. ``weights_per_px2``: (N, K) inverse variance along the
+    edge's normal; 0 leaves a point out.
 
-    Returns
-    -------
-    The fits. Fewer than 5 points give a covariance that is meaningless: check
+    Returns the fits. Fewer than 5 points give a covariance that is meaningless: check
     ``degrees_of_freedom``.
     """
     has_weight = weights_per_px2 > 0.0
@@ -250,14 +221,8 @@ _NEWTON_STEPS = 4
 class Rims:
     """Ellipses by centre and axes.
 
-    Parameters
-    ----------
-    centres_px
-        (N, 2) centres.
-    half_px
-        (N, 2) half axes, the shorter one first.
-    directions
-        (N, 2, 2) unit vectors of the two axes, as columns.
+    ``centres_px``: (N, 2) centres. ``half_px``: (N, 2) half axes, the shorter one first.
+    ``directions``: (N, 2, 2) unit vectors of the two axes, as columns.
     """
 
     centres_px: FloatArray
@@ -301,16 +266,9 @@ def band_pixels(
 ) -> BandPixels:
     """Collect the pixels along the rims.
 
-    Parameters
-    ----------
-    grey
-        (H, W) raw levels.
-    rims
-        N ellipses.
-    half_width_px
-        (N,) largest distance from the rim.
-    gradient
-        (N, 2) relative slope of the illumination per px, divided out of the levels.
+    ``grey``: (H, W) raw levels. ``rims``: N ellipses. ``half_width_px``: (N,) largest distance from
+    the rim. ``gradient``: (N, 2) relative slope of the illumination per px, divided out of the
+    levels.
     """
     parts = [_patch(grey.shape, rims, k, half_width_px[k]) for k in range(len(rims))]
     ellipse = np.repeat(np.arange(len(rims)), [len(part) for part in parts])

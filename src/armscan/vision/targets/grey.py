@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import FloatArray, ImageArray
 from armscan.records.exposure import Exposure
 
+MIN_CONTRAST = 0.02
+"""Least contrast of a circle or square, as a fraction of full scale."""
 SAME_CHANNEL_LEVELS = 1.5
 """Channels whose mean difference is below this (8-bit levels) show the same."""
 _WEIGHTS = (0.299, 0.587, 0.114)

@@ -3,11 +3,9 @@
 
 Near a corner the image is the product of two blurred edges that cross,
 
-``I = m + g . (q - q0) + c erf(d1 / (sqrt 2 s)) erf(d2 / (sqrt 2 s))``, ``dk = nk . (q -
-q0)``,
+``I = m + g . (q - q0) + c erf(d1 / (sqrt 2 s)) erf(d2 / (sqrt 2 s))``, ``dk = nk . (q - q0)``,
 
-so the corner q0, the two edge directions, the blur s, contrast and a linear illumination
-follow
+so the corner q0, the two edge directions, the blur s, contrast and a linear illumination follow
 from one fit. White pixel noise then gives the covariance of q0 without further assumption.
 """
 
@@ -49,24 +47,13 @@ def fit_saddles(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Refine chessboard corners.
 
-    Parameters
-    ----------
-    grey
-        (H, W) image, raw levels.
-    corners_px
-        (N, 2) corners to about 2 px, image pixels.
-    step_x_px, step_y_px
-        (N, 2) way to the next corner along the board's x and y.
+    ``grey``: (H, W) image, raw levels. ``corners_px``: (N, 2) corners to about 2 px, image pixels.
+    ``step_x_px``, ``step_y_px``: (N, 2) way to the next corner along the board's x and y.
 
-    Returns
-    -------
-    corners_px
-        (N, 2) refined corners.
-    covariance_px2
-        (N, 2, 2) covariance from the pixel noise that the fit's residuals show.
-    is_good
-        (N,) False where the fit left its window, found no crossing of two edges, or leaves
-        residuals that other corners of the board do not have.
+    Returns ``corners_px``: (N, 2) refined corners. ``covariance_px2``: (N, 2, 2) covariance from
+    the pixel noise that the fit's residuals show. ``is_good``: (N,) False where the fit left its
+    window, found no crossing of two edges, or leaves residuals that other corners of the board do
+    not have.
     """
     radius = _window_radius(step_x_px, step_y_px)
     origin = np.rint(corners_px)

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import ClassVar, TypeAlias
 
 import cv2
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.estimate import FitFailure
+from armscan.records.exposure import Exposure
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,13 @@ class CircleGrid:
         """The length whose wrong value scales every result."""
         return self.pitch_mm
 
+    @property
+    def symmetric_turns(self) -> tuple[int, ...]:
+        """Quarter turns, of 1 to 3, after which the target looks the same."""
+        if self.is_asymmetric:
+            return (2,) if self.rows % 2 == 0 else ()
+        return (1, 2, 3) if self.columns == self.rows else (2,)
+
 
 @dataclass(frozen=True, slots=True)
 class Chessboard:
@@ -58,6 +65,13 @@ class Chessboard:
         """The length whose wrong value scales every result."""
         return self.square_mm
 
+    @property
+    def symmetric_turns(self) -> tuple[int, ...]:
+        """As of `CircleGrid`; a quarter turn of an odd count of corners a side swaps the tones."""
+        if (self.columns + self.rows) % 2:
+            return ()
+        return (1, 2, 3) if self.columns == self.rows and self.columns % 2 == 0 else (2,)
+
 
 @dataclass(frozen=True, slots=True)
 class Charuco:
@@ -68,6 +82,7 @@ class Charuco:
     square_mm: float
     marker_mm: float
     dictionary: str
+    symmetric_turns: ClassVar[tuple[int, ...]] = ()
 
     @property
     def points_board_mm(self) -> FloatArray:
@@ -115,17 +130,29 @@ def parse_target(text: str) -> Target:
         If the text is none of these; the message shows a right example.
     """
     kind, *fields = text.strip().split(":")
-    if kind not in _PARSERS:
-        known = ", ".join(EXAMPLES)
+    if kind not in EXAMPLES:
         raise OptionError(
-            f"'{kind}' is no kind of target; known are {known}",
+            f"'{kind}' is no kind of target; known are {', '.join(EXAMPLES)}",
             where=f"target '{text}'",
             remedy=f"write for example {EXAMPLES['chessboard']}",
         )
     n_fields = 4 if kind == "charuco" else 2
     if len(fields) != n_fields:
         raise _wrong(text, kind, f"needs {n_fields} fields after '{kind}', has {len(fields)}")
-    return _PARSERS[kind](text, kind, fields)
+    columns, rows = _counts(text, kind, fields[0])
+    if kind == "chessboard":
+        return Chessboard(columns, rows, _length_mm(text, kind, "square", fields[1]))
+    if kind == "charuco":
+        return _charuco(text, columns, rows, fields)
+    is_asymmetric = kind == "asymmetric-circle-grid"
+    return CircleGrid(columns, rows, _length_mm(text, kind, "pitch", fields[1]), is_asymmetric)
+
+
+def rightness(board: FloatArray, points_px: FloatArray) -> float:
+    """Cosine of the angle between the board's x, places (N, 2), and the image's, points (N, 2)."""
+    design = np.column_stack([board, np.ones(len(board))])
+    affine = np.linalg.lstsq(design, points_px, rcond=None)[0]
+    return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
 
 
 def format_target(target: Target) -> str:
@@ -142,31 +169,17 @@ def format_target(target: Target) -> str:
 
 def describe_target(target: Target) -> str:
     """The target in words, with its size in mm, so that a wrong length or unit is noticed."""
-    width, height = target.points_board_mm[-1, :2] - target.points_board_mm[0, :2]
+    width, height, _ = target.points_board_mm.max(axis=0) - target.points_board_mm.min(axis=0)
+    size = f"{width:.4g} x {height:.4g} mm"
     if isinstance(target, CircleGrid):
-        reach = target.points_board_mm.max(axis=0)
-        what = "circles, first to last centre"
-        return f"{target.columns} x {target.rows} {what} {reach[0]:.4g} x {reach[1]:.4g} mm"
-    what = "inner corners, first to last"
-    n = (target.columns, target.rows)
-    if isinstance(target, Charuco):
-        n = (target.columns - 1, target.rows - 1)
-    return f"{n[0]} x {n[1]} {what} {width:.4g} x {height:.4g} mm"
+        return f"{target.columns} x {target.rows} circles, first to last centre {size}"
+    less = 1 if isinstance(target, Charuco) else 0
+    counts = f"{target.columns - less} x {target.rows - less}"
+    return f"{counts} inner corners, first to last {size}"
 
 
-def _circle_grid(text: str, kind: str, fields: list[str]) -> Target:
-    columns, rows = _counts(text, kind, fields[0])
-    is_asymmetric = kind == "asymmetric-circle-grid"
-    return CircleGrid(columns, rows, _length_mm(text, kind, "pitch", fields[1]), is_asymmetric)
-
-
-def _chessboard(text: str, kind: str, fields: list[str]) -> Target:
-    columns, rows = _counts(text, kind, fields[0])
-    return Chessboard(columns, rows, _length_mm(text, kind, "square", fields[1]))
-
-
-def _charuco(text: str, kind: str, fields: list[str]) -> Target:
-    columns, rows = _counts(text, kind, fields[0])
+def _charuco(text: str, columns: int, rows: int, fields: list[str]) -> Charuco:
+    kind = "charuco"
     square_mm = _length_mm(text, kind, "square", fields[1])
     marker_mm = _length_mm(text, kind, "marker", fields[2])
     if marker_mm >= square_mm:
@@ -181,14 +194,6 @@ def _charuco(text: str, kind: str, fields: list[str]) -> Target:
     if n_markers > n_known:
         raise _wrong(text, kind, f"the board needs {n_markers} markers, {name} has {n_known}")
     return Charuco(columns, rows, square_mm, marker_mm, name)
-
-
-_PARSERS: dict[str, Callable[[str, str, list[str]], Target]] = {
-    "circle-grid": _circle_grid,
-    "asymmetric-circle-grid": _circle_grid,
-    "chessboard": _chessboard,
-    "charuco": _charuco,
-}
 
 
 def _counts(text: str, kind: str, field: str) -> tuple[int, int]:
@@ -219,47 +224,7 @@ def _wrong(text: str, kind: str, what: str) -> OptionError:
     return OptionError(what, where=f"target '{text}'", remedy=f"write for example {EXAMPLES[kind]}")
 
 
-@dataclass(frozen=True, slots=True)
-class TargetOptions:
-    """How targets are looked for.
-
-    Parameters
-    ----------
-    search_size_px
-        Larger images are reduced to this size for the search of chessboards; the corners are then
-        measured in the full image.
-    min_circle_px, max_circle_px
-        Range of the circles' diameters in the image.
-    min_contrast
-        Least contrast of a circle or square, as a fraction of full scale.
-    min_circles_fraction
-        Least fraction of a grid's circles that must be found; each border row must be among them.
-    """
-
-    search_size_px: int = 1400
-    min_circle_px: float = 8.0
-    max_circle_px: float = 400.0
-    min_contrast: float = 0.02
-    min_circles_fraction: float = 0.8
-
-    def __post_init__(self) -> None:
-        if self.search_size_px < 100:
-            raise OptionError(f"search_size_px = {self.search_size_px} is below 100")
-        if not 6.0 <= self.min_circle_px < self.max_circle_px:
-            raise OptionError(
-                f"circles of {self.min_circle_px} to {self.max_circle_px} px across: the smallest "
-                "must be at least 6 px and below the largest"
-            )
-        if not 0.0 < self.min_contrast < 1.0:
-            raise OptionError(f"min_contrast = {self.min_contrast} is not between 0 and 1")
-        if not 0.5 <= self.min_circles_fraction <= 1.0:
-            raise OptionError(
-                f"min_circles_fraction = {self.min_circles_fraction} is not between 0.5 and 1"
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CircleEdges:
+class CircleEdges(ArrayRecord):
     """Sub-pixel edge points of circles, kept so that centres can be recomputed with intrinsics.
 
     Parameters
@@ -272,19 +237,12 @@ class CircleEdges:
         (K,) standard deviation along the edge's normal.
     """
 
-    points_px: FloatArray
-    circle: IntArray
-    sigma_px: FloatArray
-
-    def __post_init__(self) -> None:
-        k = len(self.points_px)
-        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (k, 2), "edges (px)"))
-        object.__setattr__(self, "circle", frozen_ints(self.circle, (k,), "circle"))
-        object.__setattr__(self, "sigma_px", frozen_floats(self.sigma_px, (k,), "sigma_px"))
+    points_px: FloatArray = floats("K", 2)
+    circle: IntArray = ints("K")
+    sigma_px: FloatArray = floats("K")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TargetView:
+class TargetView(RowRecord):
     """Target points found in one exposure.
 
     Parameters
@@ -294,13 +252,13 @@ class TargetView:
     width_px, height_px
         Size of the image, in full-sensor pixels.
     point_index
-        (M,) index into the target's points.
+        (N,) index into the target's points.
     points_px
-        (M, 2) image points, full-sensor pixels.
+        (N, 2) image points, full-sensor pixels.
     covariance_px2
-        (M, 2, 2) covariance of each image point.
+        (N, 2, 2) covariance of each image point.
     points_board_mm
-        (M, 3) the same points in the Board frame.
+        (N, 3) the same points in the Board frame.
     edges
         Edge points, for circle targets.
     is_ambiguous
@@ -310,29 +268,38 @@ class TargetView:
     source: str
     width_px: int
     height_px: int
-    point_index: IntArray
-    points_px: FloatArray
-    covariance_px2: FloatArray
-    points_board_mm: FloatArray
+    point_index: IntArray = ints("N")
+    points_px: FloatArray = floats("N", 2)
+    covariance_px2: FloatArray = floats("N", 2, 2)
+    points_board_mm: FloatArray = floats("N", 3)
     edges: CircleEdges | None = None
     is_ambiguous: bool = False
 
     def __post_init__(self) -> None:
-        m = len(self.points_px)
-        object.__setattr__(self, "point_index", frozen_ints(self.point_index, (m,), "point_index"))
-        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (m, 2), "points_px"))
-        object.__setattr__(
-            self, "points_board_mm", frozen_floats(self.points_board_mm, (m, 3), "points_board_mm")
-        )
-        object.__setattr__(
-            self, "covariance_px2", frozen_floats(self.covariance_px2, (m, 2, 2), "covariance_px2")
-        )
-        if m and float(np.linalg.eigvalsh(self.covariance_px2).min()) <= 0.0:
+        super().__post_init__()
+        if len(self) and float(np.linalg.eigvalsh(self.covariance_px2).min()) <= 0.0:
             raise InputError("covariance_px2 is not positive definite", where=self.source)
 
-    def __len__(self) -> int:
-        """Count of points found."""
-        return len(self.points_px)
+    @staticmethod
+    def of_image(
+        exposure: Exposure,
+        target: Target,
+        number: IntArray,
+        image_px: FloatArray,
+        covariance_px2: FloatArray,
+    ) -> TargetView:
+        """Points (N, 2) of these numbers (N,), measured in the pixels of the exposure's image."""
+        window = exposure.window
+        return TargetView(
+            source=exposure.source,
+            width_px=window.x_px + exposure.width_px * window.binning,
+            height_px=window.y_px + exposure.height_px * window.binning,
+            point_index=number,
+            points_px=window.to_full_sensor(image_px),
+            covariance_px2=covariance_px2 * window.binning**2,
+            points_board_mm=target.points_board_mm[number],
+            is_ambiguous=bool(target.symmetric_turns),
+        )
 
 
 @dataclass(frozen=True, slots=True)

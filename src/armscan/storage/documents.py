@@ -281,8 +281,9 @@ LAYOUTS: Mapping[type, Layout] = {
         is_evidence=True,
     ),
     HandEyeCalibration: Layout(
+        keys={"dhand_eye_dsensor": "sensor_coupling"},
         codecs={
-            "sensor_coupling": FieldCodec(
+            "dhand_eye_dsensor": FieldCodec(
                 lambda matrix: matrix_tree(
                     matrix, row_names=HAND_EYE_PARAMETER_NAMES, column_names=()
                 ),
@@ -346,7 +347,7 @@ def scanner_document(calibration: ScannerCalibration, observations: Observations
         If the hand-eye depends on a sensor that is not given.
     """
     tree = CODEC.write(calibration)
-    coupling, sensor = calibration.hand_eye.sensor_coupling, calibration.sensor
+    coupling, sensor = calibration.hand_eye.dhand_eye_dsensor, calibration.sensor
     if coupling is not None:
         if sensor is None:
             raise InputError("the hand-eye depends on a sensor's parameters that have no names")
@@ -504,7 +505,7 @@ def _record(kind: type[T], schema: str, path: Path) -> T:
 
 
 def _check_coupling(scanner: ScannerCalibration, tree: dict[str, Any]) -> None:
-    if scanner.hand_eye.sensor_coupling is None:
+    if scanner.hand_eye.dhand_eye_dsensor is None:
         return
     key, coupling = "hand_eye.sensor_coupling", tree["hand_eye"]["sensor_coupling"]
     names = () if scanner.sensor is None else scanner.sensor.parameter_names

@@ -17,10 +17,9 @@ from armscan.models.calibration import CameraCalibration, Provenance, SensorCali
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.instants import pair_exposures
 from armscan.pipeline.laser import calibrate_sheets_from_pairs
-from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.reconstruct import reconstruct
-from armscan.reconstruction.label_single import DepthRange
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.storage.documents import camera_document, read_sensor_calibration
 from armscan.storage.images import read_exposure
 from armscan.vision.targets.target import Chessboard
@@ -152,7 +151,7 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
     options = MeasureOptions(depths=DepthRange(margin=3.0))
     result = reconstruct([on], sensor, backgrounds=[off], options=options)
     cloud = result.cloud
-    assert "B" in result.images[0].naming
+    assert "B" in result.images[0].reason
     assert set(cloud.sheet.tolist()) == {1}
     assert result.images[0].count(PointStatus.MEASURED) == len(cloud) > 700
     assert 215.0 < cloud.points_mm[:, 2].min() < cloud.points_mm[:, 2].max() < 300.0

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
@@ -21,7 +21,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector_from_rotation
 from armscan.geometry.shapes import Plane
-from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
+from armscan.pipeline.hand_eye import posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
 from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
@@ -37,7 +37,8 @@ ROBOT_MM = (0.10, 0.22)
 
 def solve(euler: EulerConvention, diameter_mm: float = DIAMETER_MM) -> HandEyeFit | FitFailure:
     poses = read_robot_poses(SPHERE / "RobPoses.rob", euler)
-    return calibrate_hand_eye_from_profiles(read_profiles([SPHERE]), poses, diameter_mm)
+    stripes = posed_stripes_from_profiles(read_profiles([SPHERE]), poses)
+    return calibrate_on_sphere(stripes, diameter_mm)
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,16 @@ def test_the_plate_by_the_printed_objective_stands_beside_ours(
     assert (tmp_path / "scanner.json").is_file()
 
 
+def test_printed_centres_are_those_of_circles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["calibrate", "camera", str(INPUTS / "left"), "--target", "chessboard:9x6:20"]
+    assert main([*words, "--method", "thesis"]) == 2
+    assert "--method thesis" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_sphere_without_pure_shifts_says_why_the_two_steps_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

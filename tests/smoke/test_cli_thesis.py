@@ -65,9 +65,8 @@ def test_markers_are_paired_by_the_eight_steps(
     monkeypatch.chdir(tmp_path)
     old, new = (INPUTS / "tables" / name for name in ("before.csv", "after.csv"))
     found = told(["register", str(old), "--moved", str(new), "--method", "thesis"], capsys)
-    pairs = match_after_thesis(
-        *(read_marker_list(path, frame="Base").markers for path in (old, new)), 0.16
-    )
+    before, after = (read_marker_list(path, frame="Base").markers for path in (old, new))
+    pairs = match_after_thesis(before, after, 0.16)
     assert found["n_matched"] == len(pairs) >= 4
 
 

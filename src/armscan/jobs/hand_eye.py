@@ -26,11 +26,14 @@ from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import HandEyeScanOptions, ObservedStripes, observe_stripes
+from armscan.pipeline.hand_eye import (
+    ObservedStripes,
+    observe_stripes,
+    posed_stripes_from_profiles,
+)
 from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.profiles import posed_stripes_from_profiles
 from armscan.pipeline.progress import Progress, ProgressEvent
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.exposure import Exposure
 from armscan.records.points import ProbedPoints
 from armscan.report.hand_eye import (
@@ -183,7 +186,7 @@ class HandEyeInputs:
         return tuple(stripe for _, seen in self.groups for stripe in seen.stripes)
 
     @property
-    def images(self) -> tuple[MeasuredProfile, ...]:
+    def images(self) -> tuple[LabelledProfile, ...]:
         """Stripe points of all groups' exposures."""
         return tuple(image for _, seen in self.groups for image in seen.images)
 
@@ -342,10 +345,9 @@ def read_hand_eye_inputs(
     sensor = read_sensor_calibration(source.sensor)
     plate, notes = _reference(artefact, _tool_places(recordings))
     measure = MeasureOptions(stripes=stripe_options)
-    scan_options = HandEyeScanOptions(hand_eye=options, measure=measure)
     groups = []
     for recording in recordings:
-        seen = observe_stripes(recording, sensor, scan_options, progress=progress)
+        seen = observe_stripes(recording, sensor, measure, progress=progress)
         groups.append((recording.name, _named(seen, _prefix(recording, len(recordings)))))
     tables = [folder / name for folder in source.scans for name in TABLES]
     files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
@@ -465,8 +467,8 @@ def _with_assumptions(failure: FitFailure, inputs: HandEyeInputs) -> FitFailure:
     return FitFailure(reason, failure.remedy)
 
 
-def _tried(image: MeasuredProfile) -> TriedImage:
-    is_measured = image.fate == int(PointStatus.MEASURED)
+def _tried(image: LabelledProfile) -> TriedImage:
+    is_measured = image.status == PointStatus.MEASURED
     n_points, n = int(is_measured.sum()), len(image.profile)
     remark = f"{n_points} of {n} stripe points measured" if n else "no stripe was found"
     points = image.profile.points_px[is_measured]

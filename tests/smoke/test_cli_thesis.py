@@ -70,6 +70,18 @@ def test_markers_are_paired_by_the_eight_steps(
     assert found["n_matched"] == len(pairs) >= 4
 
 
+def test_the_rule_of_rows_tells_crossed_lines_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Eqs. 3.1 to 3.7: one line has nothing to tell; without earlier exposures nothing is told."""
+    monkeypatch.chdir(tmp_path)
+    words = ["reconstruct", str(INPUTS / "plain/cross.jpg"), "--method", "thesis", "--sensor"]
+    assert main([*words, str(INPUTS / "documents/sensor.json")]) == 2
+    assert "--method thesis" in capsys.readouterr().err
+    assert main([*words, str(INPUTS / "documents/cross.json")]) == 2
+    assert "could be measured" in capsys.readouterr().err
+
+
 def test_the_eight_steps_need_two_lists(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -338,7 +338,8 @@ def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure |
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
     refused = refuse_underdetermined(conditioning, cause, TURN_THE_TOOL)
-    if refused is None and conditioning.singular_values[-1] * UNDERDETERMINED_PART * diameter_mm < 1.0:
+    least_part = UNDERDETERMINED_PART * diameter_mm
+    if refused is None and conditioning.singular_values[-1] * least_part < 1.0:
         return FitFailure(
             f"the postures hardly determine the hand-eye{cause} (least known: "
             f"{conditioning.weakest})",

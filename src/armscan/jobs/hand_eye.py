@@ -224,7 +224,7 @@ def calibrate_hand_eye(
     if diameter is not None and options.solve_plate:
         raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
     places = job.places(".json", beside=(".html",))
-    inputs = read_hand_eye_inputs(source, artefact, options, stripe_options, job.progress)
+    inputs = read_hand_eye_inputs(source, artefact, stripe_options, job.progress)
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
     used = (options, stripe_options)
 
@@ -282,7 +282,6 @@ def calibrate_hand_eye(
 def read_hand_eye_inputs(
     source: StripeSource,
     artefact: Artefact,
-    options: HandEyeOptions,
     stripe_options: StripeOptions,
     progress: Progress,
 ) -> HandEyeInputs:

@@ -15,6 +15,7 @@ from armscan.cli.options import (
     BitsAlign,
     BitsUsed,
     DefaultOf,
+    EulerAngles,
     Force,
     LaserColourOption,
     StripeMethodOption,
@@ -36,7 +37,8 @@ RECONSTRUCT_EXAMPLE = (
     "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
     "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
     "      --sheet A -o cloud.ply\n"
-    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply"
+    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
+    "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
 TWIN = "armscan.pipeline.simulate:SimulateOptions."
 
@@ -215,6 +217,15 @@ def reconstruct(
         str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
     ] = "",
     arm: ArmFile = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
+            "that delivers points.",
+            show_default=False,
+        ),
+    ] = None,
+    euler: EulerAngles = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
     ] = Path("cloud.ply"),
@@ -226,7 +237,7 @@ def reconstruct(
     as_json: AsJson = False,
 ) -> None:
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
-    from armscan.jobs.reconstruct import StillPaths
+    from armscan.jobs.reconstruct import PoseTable, StillPaths
     from armscan.jobs.reconstruct import reconstruct as reconstruct_points
     from armscan.pipeline.measure import MeasureOptions
     from armscan.reconstruction.triangulate import DepthRange
@@ -236,6 +247,7 @@ def reconstruct(
     paths = StillPaths(
         tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
     )
+    table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
         depths=None if depth_margin is None else DepthRange(depth_margin),
@@ -244,7 +256,14 @@ def reconstruct(
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: reconstruct_points(
-            job, sensor, paths, volume=volume, arm=arm, options=options, image_options=pixels
+            job,
+            sensor,
+            paths,
+            volume=volume,
+            arm=arm,
+            poses=table,
+            options=options,
+            image_options=pixels,
         ),
         as_json=as_json,
         output=output,

@@ -47,8 +47,13 @@ from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, 
 from armscan.report.quantity import Summary, Table, fact, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import read_sensor_calibration, scanner_document
-from armscan.storage.image_paths import are_simulated, expand_paths
-from armscan.storage.points import parse_plane, read_points_or_plane, read_profiles
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.points import (
+    parse_plane,
+    profile_files,
+    read_points_or_plane,
+    read_profiles,
+)
 from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
@@ -335,11 +340,7 @@ def _refuse_repeated(folders: Sequence[Path]) -> None:
 def _from_profiles(source: StripeSource, artefact: Artefact) -> HandEyeInputs:
     if source.poses is None:
         raise OptionError("profiles need a table of poses", remedy="give --poses")
-    files = [
-        path
-        for name in source.profiles
-        for path in ((Path(name),) if Path(name).is_dir() else expand_paths([name]))
-    ]
+    files = [path for name in source.profiles for path in profile_files(Path(name))]
     profiles = read_profiles(files)
     poses = read_robot_poses(source.poses, source.euler)
     stripes = posed_stripes_from_profiles(profiles, poses)

@@ -49,7 +49,7 @@ def stereo_scanner(head: StereoHead) -> ScannerCalibration:
     hand_eye = HandEyeCalibration(
         tool_from_sensor=TOOL_FROM_SENSOR,
         covariance=np.zeros((6, 6)),
-        sensor_coupling=None,
+        dhand_eye_dsensor=None,
         arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
         rms_mm=0.007,
         n_postures=12,

@@ -2,7 +2,6 @@
 """Profiles of a real sensor on a real robot: a sphere that is solved, a board that is refused."""
 
 import json
-import os
 from itertools import combinations
 from pathlib import Path
 
@@ -26,14 +25,11 @@ from armscan.pipeline.hand_eye import posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
 from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
+from rigs.photographs import DATA, needs
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))
 SPHERE, BOARD = DATA / "sphere_profiles", DATA / "plate_profiles"
-pytestmark = pytest.mark.skipif(
-    not (SPHERE.is_dir() and BOARD.is_dir()),
-    reason="test data not found: set ARMSCAN_DATA to the folder of sphere_profiles, plate_profiles",
-)
+pytestmark = needs("sphere_profiles", "plate_profiles")
 DIAMETER_MM = 80.0
 ROBOT_MM = (0.10, 0.22)
 """Scatter of the robot at the sphere, 0.9 m from its flange: 0.01 degrees of it make 0.16 mm."""

@@ -22,6 +22,7 @@ from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
@@ -44,7 +45,7 @@ from armscan.report.hand_eye import (
 )
 from armscan.report.page import Text
 from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, refused_page
-from armscan.report.quantity import Summary, Table, fact, sentences
+from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import read_sensor_calibration, scanner_document
 from armscan.storage.image_paths import are_simulated
@@ -57,6 +58,7 @@ from armscan.storage.points import (
 from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.thesis.hand_eye import PrintedHandEye, as_printed
 from armscan.vision.stripe.image import StripeOptions
 
 TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
@@ -206,6 +208,7 @@ def calibrate_hand_eye(
     *,
     options: HandEyeOptions | None = None,
     stripe_options: StripeOptions | None = None,
+    is_beside_thesis: bool = False,
 ) -> Summary:
     """Read, calibrate, write ``scanner.json`` and ``.html``, and say what came out.
 
@@ -217,6 +220,8 @@ def calibrate_hand_eye(
         What to calibrate from.
     options, stripe_options
         Of the calibration, and of stripe extraction.
+    is_beside_thesis
+        Tell what the printed equations give of the same stripes.
 
     Raises
     ------
@@ -281,7 +286,44 @@ def calibrate_hand_eye(
     written = job.write(dict(zip(places, (scanner_document(scanner), page), strict=True)))
     tables = (posture_table(fit),) if repeats is None else (repeats[0], posture_table(fit))
     summary = hand_eye_summary(fit, scanner, written, tables, is_simulated=inputs.is_simulated)
+    if is_beside_thesis:
+        reference = inputs.plate if diameter is None else diameter
+        pose = fit.calibration.tool_from_sensor
+        printed = (
+            FitFailure("there is no plate")
+            if reference is None
+            else as_printed(inputs.stripes, reference, pose)
+        )
+        table, data = _beside_thesis(printed, pose)
+        extra = {**summary.extra, "thesis": data}
+        summary = replace(summary, tables=(*summary.tables, table), extra=extra)
     return replace(summary, forced=provenance.forced)
+
+
+def _beside_thesis(
+    printed: PrintedHandEye | FitFailure, ours: Pose[Tool, Sensor]
+) -> tuple[Table, dict[str, Any]]:
+    """The printed equations' hand-eye beside ours, for people and for programs."""
+    columns = ("As the thesis prints it", "")
+    if isinstance(printed, FitFailure):
+        return Table(columns, (("not found", printed.reason),)), {"failure": printed.reason}
+    between = printed.tool_from_sensor @ ours.inverse()
+    turn_deg = float(np.degrees(np.linalg.norm(between.rotation_vector_rad)))
+    shift_mm = printed.tool_from_sensor.translation_mm - ours.translation_mm
+    rows = (
+        ("equations", printed.equations),
+        ("they leave, rms", f"{significant(printed.rms_mm)} mm"),
+        ("turned from ours", f"{significant(turn_deg)}°"),
+        ("origin of Sensor off ours", f"{significant(float(np.linalg.norm(shift_mm)))} mm"),
+    )
+    return Table(columns, rows), {
+        "equations": printed.equations,
+        "rms_mm": printed.rms_mm,
+        "rotation": printed.tool_from_sensor.rotation.tolist(),
+        "translation_mm": printed.tool_from_sensor.translation_mm.tolist(),
+        "turned_deg": turn_deg,
+        "shifted_mm": shift_mm.tolist(),
+    }
 
 
 def read_hand_eye_inputs(

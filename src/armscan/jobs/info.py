@@ -517,7 +517,6 @@ NEEDED = (
     "scipy",
     "numba",
     "opencv-python-headless",
-    "pydantic",
     "typer",
     "rich",
     "jinja2",

@@ -185,7 +185,7 @@ def test_images_and_poses_give_the_hand_eye() -> None:
     assert np.abs(error[:3]).max() < limit_mm / 33.0
     assert run.fit.calibration.n_postures == 8
     assert run.fit.calibration.n_exposures == 16
-    coupling = run.fit.calibration.sensor_coupling
+    coupling = run.fit.calibration.dhand_eye_dsensor
     assert coupling is not None and coupling.shape == (6, 17)
     assert len(run.seen.images) == len(run.seen.stripes) == 16
     assert run.seen.warnings == ()

@@ -30,7 +30,7 @@ def device() -> ScannerCalibration:
     """A scanner without camera, its hand-eye known to 0.01 mm and 0.1 mrad."""
     scanner = rig.scanner()
     covariance = np.diag([1e-4, 1e-4, 1e-4, 0.01, 0.01, 0.01]) ** 2
-    hand_eye = replace(scanner.hand_eye, sensor_coupling=None, covariance=covariance)
+    hand_eye = replace(scanner.hand_eye, dhand_eye_dsensor=None, covariance=covariance)
     return replace(scanner, sensor=None, hand_eye=hand_eye)
 
 

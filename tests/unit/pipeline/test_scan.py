@@ -157,7 +157,7 @@ def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> 
     with pytest.raises(InputError, match="no samples of the arm"):
         measure_scan(as_source(replace(scan, arm=None)), device)
     with pytest.raises(InputError, match="no camera"):
-        coupled = replace(device.hand_eye, sensor_coupling=None)
+        coupled = replace(device.hand_eye, dhand_eye_dsensor=None)
         measure_scan(as_source(scan), replace(device, sensor=None, hand_eye=coupled))
     with pytest.raises(EstimationError, match=r"could be measured: images/0\.png: the image"):
         measure_scan(as_source(replace(scan, broken=(0, 1, 2))), device)

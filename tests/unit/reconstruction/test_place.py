@@ -174,7 +174,7 @@ def test_the_arm_errs_least_at_the_scan_point() -> None:
 
 def test_points_that_a_sensor_delivered() -> None:
     """Without camera the hand-eye's covariance is all; the scan point is the points' middle."""
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None)
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None)
     placing = BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
     points = np.array([[0.0, -10.0, 100.0], [0.0, 10.0, 110.0]])
     noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])[:, :, None]
@@ -197,7 +197,7 @@ def test_combinations_known_a_thousand_times_better_are_kept() -> None:
     mixing = np.linalg.qr(np.random.default_rng(3).normal(size=(6, 6)))[0]
     units = np.array([1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.02])
     tight = mixing @ np.diag(np.geomspace(1e-8, 1.0, 6)) @ mixing.T * np.outer(units, units)
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=tight)
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None, covariance=tight)
     (factor,) = BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye)).factors
     combination = mixing[:, 0] / units
     variance = float(((combination @ factor) ** 2).sum())
@@ -206,7 +206,7 @@ def test_combinations_known_a_thousand_times_better_are_kept() -> None:
 
 def test_a_covariance_that_is_none_is_refused() -> None:
     broken = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=broken)
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None, covariance=broken)
     with pytest.raises(InputError, match="positive semi-definite"):
         BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
 

@@ -174,6 +174,25 @@ def simulate(
     show(summary, as_json=as_json)
 
 
+DepthMargin = Annotated[
+    float | None,
+    typer.Option(
+        help="Widen the calibrated depth range by this part of its width at either end; "
+        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
+        "extrapolated.",
+        show_default=False,
+    ),
+]
+ProfilePoses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
+        "that delivers points.",
+        show_default=False,
+    ),
+]
+
+
 def reconstruct(
     *,
     images: Annotated[
@@ -204,27 +223,12 @@ def reconstruct(
         list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
     ] = None,
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
-    depth_margin: Annotated[
-        float | None,
-        typer.Option(
-            help="Widen the calibrated depth range by this part of its width at either end; "
-            "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
-            "extrapolated.",
-            show_default=False,
-        ),
-    ] = None,
+    depth_margin: DepthMargin = None,
     volume: Annotated[
         str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
     ] = "",
     arm: ArmFile = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
-            "that delivers points.",
-            show_default=False,
-        ),
-    ] = None,
+    poses: ProfilePoses = None,
     euler: EulerAngles = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")

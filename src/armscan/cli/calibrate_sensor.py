@@ -17,6 +17,7 @@ from armscan.cli.options import (
     Cache,
     DefaultOf,
     Document,
+    EulerAngles,
     Force,
     ForceBad,
     LaserColourOption,
@@ -107,13 +108,6 @@ Profiles = Annotated[
 PoseTable = Annotated[
     Path | None,
     typer.Option(help="Table of the robot's poses, one a profile.", show_default=False),
-]
-EulerAngles = Annotated[
-    str | None,
-    typer.Option(
-        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
-        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
-    ),
 ]
 
 

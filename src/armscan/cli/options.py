@@ -113,6 +113,13 @@ StripeMethodOption = Annotated[
         show_default=DefaultOf(STRIPES + "method"),
     ),
 ]
+EulerAngles = Annotated[
+    str | None,
+    typer.Option(
+        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
+        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
+    ),
+]
 LaserColourOption = Annotated[
     str | None,
     typer.Option(

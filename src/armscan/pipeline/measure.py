@@ -319,16 +319,7 @@ def reconstruct(
     """
     options = options or MeasureOptions()
     left = pair_exposures(exposures, backgrounds)
-    if sensor.second is None and rights:
-        raise InputError(
-            f"{len(rights)} images of a right camera, but the sensor has one camera",
-            remedy="leave them out, or name the sensor of the stereo head",
-        )
-    if sensor.second is not None and len(rights) != len(left):
-        raise InputError(
-            f"{len(left)} images of the left camera but {len(rights)} of the right one",
-            remedy="give the right camera's image of every instant, in the same order",
-        )
+    _check_cameras(sensor, len(left), len(rights))
     cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
 
     def stills() -> Iterator[InstantImages]:
@@ -352,6 +343,20 @@ def reconstruct(
     depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
     warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
+
+
+def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None:
+    """Raise `InputError` unless the images are of as many cameras as the sensor has."""
+    if sensor.second is None and n_right:
+        raise InputError(
+            f"{n_right} images of a right camera, but the sensor has one camera",
+            remedy="leave them out, or name the sensor of the stereo head",
+        )
+    if sensor.second is not None and n_right != n_left:
+        raise InputError(
+            f"{n_left} images of the left camera but {n_right} of the right one",
+            remedy="give the right camera's image of every instant, in the same order",
+        )
 
 
 def nothing_measured(images: Sequence[LabelledProfile]) -> str:

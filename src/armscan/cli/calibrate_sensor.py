@@ -20,9 +20,9 @@ from armscan.cli.options import (
     Force,
     ForceBad,
     LaserColourOption,
+    OptionalTarget,
     Side,
     StripeMethodOption,
-    Target,
     given,
     run,
 )
@@ -118,13 +118,20 @@ EulerAngles = Annotated[
 def laser(
     *,
     camera: Annotated[
-        Path,
+        Path | None,
         typer.Option(
             help="Camera calibration, also of OpenCV or ROS; stereo.json for two cameras.",
             show_default=False,
         ),
-    ],
-    target: Target,
+    ] = None,
+    target: OptionalTarget = None,
+    again: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            help="Solve sensor.json again from its own observations; no camera, target, images.",
+        ),
+    ] = None,
     on: Annotated[
         list[str] | None,
         typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
@@ -152,11 +159,42 @@ def laser(
 ) -> None:
     """Calibrate light sheets from images of laser lines on a flat target."""
     from armscan.calibration.sheets.result import SheetOptions
-    from armscan.jobs.sheets import SheetImages, calibrate_sheets
+    from armscan.errors import OptionError
+    from armscan.jobs.sheets import (
+        SheetImages,
+        calibrate_sheets,
+        calibrate_sheets_from_file,
+    )
     from armscan.pipeline.laser import LaserOptions
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 
+    if again is not None:
+        if camera or target or on or off or scan or leave_out:
+            raise OptionError(
+                "--from takes cameras and stripes from the document's own files",
+                remedy="leave out --camera, --target and the images",
+            )
+        changed = {
+            "margin_mm": margin_mm,
+            "n_sheets": sheets,
+            "sheet_names": tuple(name) if name else None,
+            "is_bow_allowed": False if plane_only else None,
+        }
+        changes = {key: value for key, value in changed.items() if value is not None}
+        run(
+            lambda job: calibrate_sheets_from_file(job, again, changes),
+            as_json=as_json,
+            output=output,
+            force=force,
+            force_bad=force_bad,
+        )
+        return
+    if camera is None or target is None:
+        raise OptionError(
+            f"{'--camera' if camera is None else '--target'} is not given",
+            remedy="give --camera and --target, or --from sensor.json to solve it again",
+        )
     images = SheetImages(tuple(on or ()), tuple(off or ()), scan, tuple(leave_out or ()))
     options = LaserOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),

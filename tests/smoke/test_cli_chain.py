@@ -13,7 +13,6 @@ import pytest
 from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
-from armscan.storage.observations import read_observations
 from rigs.drawn_bench import FOCAL, HEIGHT, OBJECT_PLACE, SHEET, SHEET_D_MM, TARGET, WIDTH, Bench
 
 SIGMAS = 4.0
@@ -62,33 +61,20 @@ def test_points_lie_on_the_object(
     assert np.all(np.abs(off_plane) < SIGMAS * sigma)
 
 
-def test_observations_let_the_camera_be_solved_again(calibrated: Bench) -> None:
-    from armscan.calibration.cameras.calibrate import calibrate_camera
-    from armscan.calibration.cameras.result import CameraOptions
-
-    found = read_observations(calibrated.camera.with_suffix(".npz"))
-    again = calibrate_camera(found.views, CameraOptions(distortion="none"))
-    assert again
-    np.testing.assert_allclose(
-        again.camera.parameters,
-        read_camera_calibration(calibrated.camera).camera.parameters,
-        atol=1e-9,
-        rtol=1e-12,
-    )
-
-
-def test_the_sheet_is_solved_again_from_its_own_files(calibrated: Bench, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["camera", "laser"])
+def test_a_document_is_solved_again_from_its_own_files(
+    calibrated: Bench, tmp_path: Path, command: str
+) -> None:
+    document = calibrated.camera if command == "camera" else calibrated.sensor
     again = tmp_path / "again.json"
-    words = ["calibrate", "laser", "--from", str(calibrated.sensor), "-o", str(again)]
-    assert main(words) == 0
-    before, after = (json.loads(path.read_text("utf-8")) for path in (calibrated.sensor, again))
-    parents = after["provenance"]["parent_ids"]
-    assert parents == [before["provenance"]["document_id"]]
+    assert main(["calibrate", command, "--from", str(document), "-o", str(again)]) == 0
+    before, after = (json.loads(path.read_text("utf-8")) for path in (document, again))
+    assert after["provenance"]["parent_ids"] == [before["provenance"]["document_id"]]
     for content in (before, after):
         for key in ("provenance", "observations", "sha256"):
             del content[key]
     assert after == before
-    npz = calibrated.sensor.with_suffix(".npz").read_bytes()
+    npz = document.with_suffix(".npz").read_bytes()
     assert again.with_suffix(".npz").read_bytes() == npz
 
 

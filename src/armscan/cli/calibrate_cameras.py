@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +18,7 @@ from armscan.cli.options import (
     Document,
     Force,
     ForceBad,
+    OptionalTarget,
     Target,
     given,
     run,
@@ -51,7 +52,13 @@ def camera(
         list[str] | None,
         typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
     ] = None,
-    target: Target,
+    target: OptionalTarget = None,
+    again: Annotated[
+        Path | None,
+        typer.Option(
+            "--from", help="Solve camera.json again from its own observations; no target, images."
+        ),
+    ] = None,
     output: Document = Path("camera.json"),
     scan: Annotated[
         Path | None, typer.Option(help="Recording of the target instead of images.")
@@ -80,21 +87,41 @@ def camera(
     """Calibrate a camera from photographs of a flat target."""
     from armscan.calibration.cameras.result import CameraOptions
     from armscan.errors import OptionError
-    from armscan.jobs.camera import calibrate_camera
+    from armscan.jobs.camera import calibrate_camera, calibrate_camera_from_file
     from armscan.storage.images import ImageOptions
 
     held = set(fix or ())
     if unknown := sorted(held - {"aspect", "centre"}):
         raise OptionError(f"--fix {unknown[0]} is not known", remedy="choose aspect or centre")
-    options = given(
-        CameraOptions,
-        distortion=distortion,
-        is_aspect_fixed="aspect" in held,
-        is_principal_point_fixed="centre" in held,
-        solve_warp=board_warp,
-        leave_out=tuple(leave_out or ()),
-        leave_out_misfits=auto_leave_out,
-    )
+    changed: dict[str, Any] = {
+        "distortion": distortion,
+        "is_aspect_fixed": "aspect" in held or None,
+        "is_principal_point_fixed": "centre" in held or None,
+        "solve_warp": board_warp or None,
+        "leave_out": tuple(leave_out) if leave_out else None,
+        "leave_out_misfits": auto_leave_out or None,
+    }
+    if again is not None:
+        if images or scan or target:
+            raise OptionError(
+                "--from takes target and views from the document's own files",
+                remedy="leave out --target and the images",
+            )
+        changes = {key: value for key, value in changed.items() if value is not None}
+        run(
+            lambda job: calibrate_camera_from_file(job, again, changes),
+            as_json=as_json,
+            output=output,
+            force=force,
+            force_bad=force_bad,
+        )
+        return
+    if target is None:
+        raise OptionError(
+            "--target is not given",
+            remedy="give --target, or --from camera.json to solve it again",
+        )
+    options = given(CameraOptions, **changed)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: calibrate_camera(

@@ -40,7 +40,7 @@ import numpy as np
 from scipy.special import betaincinv
 
 from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.labels import LabelledProfile, LabelStatus, StripeLabeller
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeLabeller
 from armscan.thesis.row_rule import RowLabeller
 from rigs.cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
 
@@ -73,7 +73,7 @@ class Tally:
 
     def add(self, exposure: CrossExposure, named: LabelledProfile, alone: list[int]) -> None:
         """Take in one exposure; ``alone`` points has each laser's stripe if it alone is on."""
-        is_named = named.fate == int(LabelStatus.NAMED)
+        is_named = named.status == int(PointStatus.MEASURED)
         is_right = is_named & (named.sheet == exposure.true_sheet)
         for k, n_points in enumerate(alone):
             n_right = int((is_right & (named.sheet == k)).sum())
@@ -128,7 +128,7 @@ def scanned(
         exposure = stroke.expose(k, namer.next_lasers())
         pose = exposure.base_from_sensor if has_arm else None
         start = time.process_time()
-        named = namer.name(exposure.profile, exposure.lasers, pose, exposure.t_ns)
+        named = namer.label([exposure.profile], exposure.lasers, pose, exposure.t_ns).profiles[0]
         tally.seconds = max(tally.seconds, time.process_time() - start)
         tally.add(exposure, named, alone[k])
     return tally

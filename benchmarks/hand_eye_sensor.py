@@ -69,7 +69,7 @@ def moved_pair(
         stored,
         tool_from_sensor=fit.state.tool_from_sensor,
         covariance=fit.covariance[:6, :6],
-        sensor_coupling=-fit.linear.gain[:6] @ by_sensor,
+        dhand_eye_dsensor=-fit.linear.gain[:6] @ by_sensor,
     )
     step = -sensor.covariance @ by_sensor.T @ fit.explained
     model, sheet = sensor.camera.camera, sensor.sheets[0]

@@ -26,14 +26,13 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import armscan.pipeline.scan as scan_module
+import armscan.pipeline.measure as measure_module
 from armscan.devices.sources import TwinScene
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.pipeline.measure import LitProfile
 from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
 from armscan.pipeline.verify import Measured, verify_on_ball
 from armscan.records.exposure import Exposure
@@ -139,12 +138,12 @@ def measured(
 
     def stripes_of(
         pair: tuple[Exposure, Exposure | None], camera: CameraModel, options: object
-    ) -> LitProfile:
+    ) -> Profile:
         row = int(pair[0].image[0, 0]) * 256 + int(pair[0].image[0, 1])
-        return LitProfile(pixels(recording.profiles[row]), pair[0].lasers)
+        return pixels(recording.profiles[row])
 
-    scan_module.see = stripes_of  # type: ignore[assignment]
-    return measure_scan(recording, scanner, ScanOptions(normals=None))
+    measure_module.extract_profile = stripes_of  # type: ignore[assignment]
+    return measure_scan(recording, scanner, ScanOptions(has_normals=False))
 
 
 @dataclass(frozen=True)

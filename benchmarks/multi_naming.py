@@ -39,7 +39,8 @@ from armscan.reconstruction.epipolar import (
     possible_sheets,
     project_on_sheets,
 )
-from armscan.reconstruction.label_stereo import StereoLabelOptions, name_stripes
+from armscan.reconstruction.label_stereo import StereoLabeller
+from armscan.reconstruction.triangulate import LABEL_DEPTHS
 from armscan.records.profile import Profile
 from rigs.stereo_head import StereoHead
 from rigs.stereo_scenes import KINDS, Noise, SeenProfile, draw_surfaces, expose
@@ -120,12 +121,10 @@ class Tally:
         )
 
 
-def by_votes(
-    left: Profile, right: Profile, sensor: SensorCalibration, options: StereoLabelOptions
-) -> IntArray:
+def by_votes(left: Profile, right: Profile, sensor: SensorCalibration) -> IntArray:
     """The thesis's way."""
     row = np.flatnonzero(left.is_accepted)[::EVERY]
-    at, sheet = possible_sheets(left.points_px[row], sensor, options.depths)
+    at, sheet = possible_sheets(left.points_px[row], sensor, LABEL_DEPTHS)
     there = project_on_sheets(left.points_px[row[at]], sheet, sensor)
     beside = find_crossings(
         there,
@@ -143,17 +142,17 @@ def by_votes(
 
 def tallied(kind: str, noise: Noise, seeds: range, head: StereoHead) -> Tally:
     """Scenes of one kind, one a seed."""
-    tally, options = Tally(), StereoLabelOptions()
+    tally = Tally()
     for seed in seeds:
         rng = np.random.default_rng([seed, KINDS.index(kind)])
         sensor = head.drawn_calibration(rng)
         left, right = expose(head, draw_surfaces(kind, rng), noise, rng)
         start = time.process_time()
-        names = name_stripes(left.profile, right.profile, sensor, options)
+        names = StereoLabeller(sensor).label([left.profile, right.profile]).profiles[0]
         seconds = time.process_time() - start
-        votes = by_votes(left.profile, right.profile, sensor, options)
+        votes = by_votes(left.profile, right.profile, sensor)
         before = tally.wrong
-        tally.add(left, names.left.sheet, votes, seconds)
+        tally.add(left, names.sheet, votes, seconds)
         if tally.wrong > before:
             print(f"  {kind}, seed {seed}: {tally.wrong - before} points wrong")
     return tally

@@ -28,7 +28,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.stereo_points import measure_stereo
+from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from rigs.sheet_rig import PROVENANCE
@@ -127,7 +127,7 @@ def main() -> None:
         t_ns = scan.rows[left].t_ns
         right = next(i for i, row in enumerate(scan.rows) if row.camera == 1 and row.t_ns == t_ns)
         profiles = [extract_stripes(scan.exposure(i)) for i in (left, right)]
-        found = measure_stereo(profiles[0], profiles[1], sensor)
+        found = StereoLabeller(sensor).label(profiles).profiles
         truths = [
             true_sheets(scan.true_stripes(i), names, profile)
             for i, profile in zip((left, right), profiles, strict=True)
@@ -137,9 +137,9 @@ def main() -> None:
         shared = ok & (cKDTree(there).query(truths[0][1])[0] < SAME_MM)
         wrong = sum(
             int(((named.sheet >= 0) & (named.sheet != truth[0])).sum())
-            for named, truth in zip((found.left, found.right), truths, strict=True)
+            for named, truth in zip(found, truths, strict=True)
         )
-        share = (found.left.sheet == truths[0][0])[shared].mean()
+        share = (found[0].sheet == truths[0][0])[shared].mean()
         stray = int((profiles[0].is_accepted & (truths[0][0] < 0)).sum())
         print(
             f"{scene}: {len(profiles[0])} left points, shared {int(shared.sum())}, named "

@@ -51,7 +51,9 @@ def outer_centre(exposure: Exposure, rings: RingImages) -> FloatArray:
     angle, (short, long) = rings.direction_rad[0], rings.outer_half_px[0]
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     shape = turn @ np.diag([long**2, short**2]) @ turn.T
-    blob = Blobs(rings.centres_px[:1], shape[None], np.zeros(1, np.bool_))
+    blob = Blobs(
+        centres_px=rings.centres_px[:1], shapes_px2=shape[None], is_light=np.zeros(1, np.bool_)
+    )
     return measure_rims(exposure.image, blob, np.array([12.0]), 10.0).centres_px[0]
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.models.arm import forward, parameter_jacobian, thesis_arm
-from armscan.reconstruction.place import estimate_normals, prepare_placing, propagate_to_base
+from armscan.reconstruction.place import BaseTransform, estimate_normals, propagate_to_base
 from armscan.reconstruction.sync import exposure_poses
 from armscan.reconstruction.triangulate import triangulate_stripe
 from armscan.records.recording import ArmTrack, ExposureRow
@@ -67,7 +67,7 @@ def track(n: int = 20_000) -> ArmTrack:
 def main() -> None:
     repeats = int(sys.argv[1]) if len(sys.argv) > 1 else 15
     scanner = rig.scanner()
-    placing = prepare_placing(scanner)
+    placing = BaseTransform.of(scanner)
     sensor = rig.sensor_of(thesis_rig().camera, rig.sheets())
     pixels = np.stack([np.linspace(200.0, 1800.0, 3000), np.full(3000, 700.0)], axis=1)
     profile, sheet = rig.profile_at(pixels), np.zeros(3000, dtype=np.int64)

@@ -3,6 +3,20 @@
 
 from __future__ import annotations
 
+import re
+
+MOST_CHARACTERS = 1000
+"""Of a sentence about a file that quotes it: files may hold words of any length."""
+NOT_SHOWN = re.compile(r"[\x00-\x1f\x7f-\x9f\ud800-\udfff]")
+"""Characters that move the cursor or cannot be written: names of files may hold them."""
+
+
+def shown(text: str, most: int = MOST_CHARACTERS) -> str:
+    """The text on one line that any terminal and file takes, its middle left out if it is long."""
+    plain = NOT_SHOWN.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    half = most // 2 - 3
+    return plain if len(plain) <= most else f"{plain[:half]} ... {plain[-half:]}"
+
 
 class ArmscanError(Exception):
     """A failure that a person can act on.
@@ -18,8 +32,8 @@ class ArmscanError(Exception):
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
-        self.what = what
-        self.where = where
+        self.what = shown(what)
+        self.where = shown(where)
         self.remedy = remedy
         super().__init__(str(self))
 

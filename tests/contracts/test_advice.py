@@ -41,7 +41,7 @@ SHOWN_BY: dict[str, tuple[tuple[str, ...], ...]] = {
     "jobs/register": (("register",),),
     "jobs/probe": (("probe",),),
     "pipeline/register": (("register",),),
-    "pipeline/reconstruct": (RECONSTRUCT,),
+    "pipeline/measure": (RECONSTRUCT,),
 }
 """Commands that can show the messages of a module; the first entry that fits a path holds."""
 

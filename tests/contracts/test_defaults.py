@@ -19,8 +19,7 @@ import typer
 from armscan.cli.app import command
 from armscan.cli.options import DefaultOf
 from armscan.jobs.demo import DemoRequest
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.label_stereo import StereoLabelOptions
+from armscan.reconstruction.triangulate import CALIBRATED_DEPTHS, LABEL_DEPTHS
 
 
 def commands(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
@@ -84,10 +83,10 @@ def test_the_demo_without_options_is_the_library_s() -> None:
 
 
 def test_the_depth_margin_that_texts_name_is_the_default() -> None:
-    text = f"{DepthRange().margin:g}"
+    text = f"{CALIBRATED_DEPTHS.margin:g}"
     option = {item.name: item for item in COMMANDS["reconstruct",].params}["depth_margin"]
     assert option.default is None
-    stereo = f"{StereoLabelOptions().depths.margin:g}"
+    stereo = f"{LABEL_DEPTHS.margin:g}"
     assert f"Without it {text}; with two cameras {stereo};" in option.help
     page = Path(__file__).parents[2] / "docs" / "reference" / "commands.md"
     words = " ".join(page.read_text().split())

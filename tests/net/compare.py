@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,9 @@ MASKS = (
     (re.compile(r"armscan \d+\.\d+\S*"), "armscan <version>"),
 )
 
-Tree = object
+# anything that JSON can hold
+Tree = Any
+Sigma = float | dict[str, float]
 
 
 def masked(text: str, workspace: Path) -> str:
@@ -163,10 +166,37 @@ class Difference:
     old: Tree
     new: Tree
     is_warning: bool
+    relative: float = math.inf
+    sigmas: float | None = None
+
+    @property
+    def rank(self) -> float:
+        """How bad it is: in sigmas where they are known, else relative."""
+        return self.relative if self.sigmas is None else self.sigmas
 
     def __str__(self) -> str:
         word = "warning" if self.is_warning else "DIFFERS"
-        return f"{word}  {self.where}\n    old {short(self.old)}\n    new {short(self.new)}"
+        size = "" if math.isinf(self.relative) else f"  {self.relative:.1e} of it"
+        size += "" if self.sigmas is None else f", {self.sigmas:.1e} sigmas"
+        return f"{word}  {self.where}{size}\n    old {short(self.old)}\n    new {short(self.new)}"
+
+
+def told(found: list[Difference], *, is_whole: bool, n_worst: int = 4) -> str:
+    """The differences case by case, the worst of each first, the rest counted."""
+    cases: dict[str, list[Difference]] = {}
+    for difference in found:
+        word = "warnings" if difference.is_warning else "differ"
+        cases.setdefault(f"{'/'.join(difference.where.split('/')[:2])} {word}", []).append(
+            difference
+        )
+    lines = []
+    for case, members in cases.items():
+        members.sort(key=lambda d: -d.rank)
+        kept = members if is_whole else members[:n_worst]
+        lines += [str(difference) for difference in kept]
+        if len(kept) < len(members):
+            lines.append(f"... {case}: {len(members) - len(kept)} more that are smaller (--all)")
+    return "\n".join(lines)
 
 
 def short(value: Tree) -> str:
@@ -187,7 +217,7 @@ class Limits:
 
 
 def differences(
-    old: Tree, new: Tree, limits: Limits, where: str = "", *, scale: float = 0.0, sigma: float = 0.0
+    old: Tree, new: Tree, limits: Limits, where: str = "", *, scale: float = 0.0, sigma: Sigma = 0.0
 ) -> Iterator[Difference]:
     """Everything in ``old`` that ``new`` lacks or holds otherwise; what is new is a warning."""
     is_prose = "~" in where
@@ -199,7 +229,10 @@ def differences(
                 is_free = "~" in place or "/provenance/options/" in place
                 yield Difference(place, old[key], "(gone)", is_free)
                 continue
-            own = sigma or known_sigma(old, key)
+            own: float | dict[str, float] = (
+                sigma.get(key, 0.0) if isinstance(sigma, dict) else sigma
+            )
+            own = own or known_sigma(old, key)
             yield from differences(old[key], new[key], limits, place, scale=scale, sigma=own)
         for key in new.keys() - old.keys():
             yield Difference(f"{where}/{key}", "(none)", new[key], is_warning=True)
@@ -212,11 +245,14 @@ def differences(
         for k, (a, b) in enumerate(zip(old, new, strict=True)):
             yield from differences(a, b, limits, f"{where}[{k}]", scale=scale, sigma=sigma)
     elif is_number(old) and is_number(new):
+        part = sigma if isinstance(sigma, float) else 0.0
         allowed = limits.relative * max(abs(old), abs(new), scale) + 1e-13
-        if limits.of_sigma is not None and sigma:
-            allowed = max(allowed, limits.of_sigma * sigma)
+        if limits.of_sigma is not None and part:
+            allowed = max(allowed, limits.of_sigma * part)
         if abs(old - new) > allowed:
-            yield Difference(where, old, new, is_prose)
+            largest = max(abs(old), abs(new), scale)
+            in_sigmas = abs(old - new) / part if part else None
+            yield Difference(where, old, new, is_prose, abs(old - new) / largest, in_sigmas)
     elif old != new:
         yield Difference(where, old, new, is_prose)
 
@@ -225,17 +261,23 @@ def is_number(value: Tree) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def known_sigma(siblings: dict[str, Tree], key: str) -> float:
-    """Standard deviation of an entry, from its neighbours in the document; 0 if none tells it."""
+def known_sigma(siblings: dict[str, Tree], key: str) -> Sigma:
+    """Standard deviation of an entry, from its neighbours in the document; 0 if none tells it.
+
+    Of a group of values (intrinsics, a pose) a table, by the name of the value.
+    """
     stem, _, unit = key.rpartition("_")
     for name in (f"sigma_{key}", f"{key}_sigma", f"{stem}_sigma_{unit}", f"sigma_{stem}_{unit}"):
         if is_number(siblings.get(name)):
-            return abs(float(siblings[name]))  # type: ignore[arg-type]
-    covariance = siblings.get("covariance")
-    if key in ("intrinsics", "right_from_sensor", "tool_from_sensor") and covariance:
-        matrix = covariance.get("matrix") if isinstance(covariance, dict) else covariance
-        if isinstance(matrix, list) and len(matrix) <= 9:
-            return float(np.sqrt(np.diag(np.array(matrix, dtype=float))).min())
+            return abs(float(siblings[name]))
     if key in ("x", "y", "z") and isinstance(siblings.get("sigma_mm"), dict):
-        return float(siblings["sigma_mm"]["rms"][0])  # type: ignore[index]
+        return float(siblings["sigma_mm"]["rms"][0])
+    covariance = siblings.get("covariance")
+    if isinstance(covariance, dict) and key in ("intrinsics", "tool_from_sensor"):
+        matrix = covariance.get("matrix")
+        matrix = matrix.get("sample") if isinstance(matrix, dict) else matrix
+        sigmas = np.sqrt(np.abs(np.diag(np.array(matrix, dtype=float)))).tolist()
+        if key == "intrinsics":
+            return dict(zip(covariance["parameter_names"], sigmas, strict=False))
+        return {"rotation_rows": max(sigmas[:3]), "translation_tool_mm": max(sigmas[3:])}
     return 0.0

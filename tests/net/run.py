@@ -27,7 +27,7 @@ HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
 
 from net.cases import DOCUMENTS, GROUPS, prepare  # noqa: E402
-from net.compare import Difference, Limits, Tree, differences, masked, plain, read_result  # noqa: E402
+from net.compare import Difference, Limits, Tree, differences, masked, plain, read_result, told  # noqa: E402
 
 GOLDEN = HERE / "golden"
 INPUTS = HERE / "inputs"
@@ -169,6 +169,7 @@ def main(arguments: list[str] | None = None) -> int:
         metavar="PART",
         help="another machine: this part of each value's sigma (1e-2), else 1e-6 of it",
     )
+    parser.add_argument("--all", action="store_true", help="all, not the worst 4 of a case")
     parser.add_argument("--no-warnings", action="store_true", help="leave prose differences out")
     options = parser.parse_args(arguments)
     if options.what == "make-inputs":
@@ -189,8 +190,9 @@ def main(arguments: list[str] | None = None) -> int:
             found = compare_group(name, Path(temporary), limits)
             wrong = [d for d in found if not d.is_warning]
             n_wrong += len(wrong)
-            for difference in wrong if options.no_warnings else found:
-                print(difference)
+            shown = wrong if options.no_warnings else found
+            if shown:
+                print(told(shown, is_whole=options.all))
             print(f"{name}: {len(wrong)} differ, {len(found) - len(wrong)} warnings", flush=True)
     print(f"{time.perf_counter() - start:.0f} s")
     return 1 if n_wrong else 0

@@ -18,7 +18,7 @@ from armscan.calibration.sheets.result import LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration, SensorCalibration
-from armscan.reconstruction.place import prepare_placing, propagate_to_base
+from armscan.reconstruction.place import BaseTransform, propagate_to_base
 from armscan.reconstruction.triangulate import StripePoints, triangulate_stripe
 from armscan.records.profile import Profile
 from rigs.plate_rig import PlateRig, RigNoise, Surface, good_postures
@@ -118,7 +118,7 @@ class CalibratedHead:
         rng = np.random.default_rng([self.seed, 3])
         rig = replace(self.rig, postures=good_postures(n_postures, rng))
         surface = Surface.draw(rng, 0.0)
-        placing = prepare_placing(
+        placing = BaseTransform.of(
             ScannerCalibration(sensor=sensor, hand_eye=hand_eye, provenance=PROVENANCE)
         )
         errors, covariances = [], []

@@ -15,7 +15,7 @@ from armscan.models.calibration import CameraCalibration, SensorCalibration, She
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile, StripeFlag
-from armscan.simulation.arm.hand import HeadOrientation, Sway, sensor_over
+from armscan.simulation.arm.hand import HeadOrientation, sensor_over, sway
 from rigs.sheet_rig import PROVENANCE
 from rigs.thesis_instrument import CAMERA, DISTORTION, IMAGE_PX
 
@@ -190,14 +190,14 @@ class CrossStroke:
     def _walk(self, rng: np.random.Generator) -> list[Pose[Base, Sensor]]:
         times = np.arange(self.n_exposures) * TICK_NS * 1e-9
         mean = rng.uniform(1.2 * self.lowest_mm_s, self.highest_mm_s / 1.2)
-        speed = mean * (1.0 + 0.25 * Sway.draw(rng)(times))
+        speed = mean * (1.0 + 0.25 * sway(rng, times))
         speed = np.clip(speed, self.lowest_mm_s, self.highest_mm_s)
         self.way_mm = np.cumsum(speed) * TICK_NS * 1e-9
         way = self.way_mm - 0.5 * self.way_mm[-1]
         heading = rng.uniform(0.0, 2.0 * np.pi)
         tilt, lean, roll = rng.uniform(-30.0, -12.0), rng.uniform(-10.0, 10.0), rng.uniform(0, 360)
         size = self.disturbance.tilt_deg
-        stray = [s * Sway.draw(rng)(times) for s in (size, size, size, 1.0, 1.5)]
+        stray = [s * sway(rng, times) for s in (size, size, size, 1.0, 1.5)]
         lift = _LIFT_MM.get(self.scene, 0.0)
         poses = []
         for k in range(self.n_exposures):

@@ -11,7 +11,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile
 from armscan.reconstruction.sync import ExposurePoses
 from armscan.reconstruction.triangulate import intersect_sheets
 from armscan.records.cloud import PointCloud
@@ -170,10 +170,16 @@ def poses_of(rotations: FloatArray, translations_mm: FloatArray) -> ExposurePose
     """All found."""
     n = len(rotations)
     zeros = np.zeros(n, dtype=np.int64)
-    return ExposurePoses(rotations, translations_mm, zeros, np.arange(n), "trigger", 0)
+    return ExposurePoses(
+        rotations=rotations,
+        translations_mm=translations_mm,
+        status=zeros,
+        sample=np.arange(n),
+        source="trigger",
+    )
 
 
-def _image(source: str, pixels: FloatArray) -> MeasuredProfile:
+def _image(source: str, pixels: FloatArray) -> LabelledProfile:
     n = len(pixels)
     zeros: IntArray = np.zeros(n, dtype=np.int64)
     normals = np.tile([0.0, 1.0], (n, 1))
@@ -187,7 +193,7 @@ def _image(source: str, pixels: FloatArray) -> MeasuredProfile:
         flags=zeros,
         segment=zeros,
     )
-    return MeasuredProfile(profile, np.full(n, int(PointStatus.MEASURED)), zeros, "the only one")
+    return LabelledProfile(profile=profile, sheet=zeros, status=zeros, reason="the only one")
 
 
 def _cloud(points_mm: FloatArray, exposure: IntArray, n_exposures: int) -> PointCloud:

@@ -101,7 +101,7 @@ def scanner() -> ScannerCalibration:
         hand_eye=HandEyeCalibration(
             tool_from_sensor=TOOL_FROM_SENSOR,
             covariance=correlated(HAND_EYE_SIGMA, 11),
-            sensor_coupling=coupling(),
+            dhand_eye_dsensor=coupling(),
             arm_noise=ARM_NOISE,
             rms_mm=0.007,
             n_postures=12,

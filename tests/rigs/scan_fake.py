@@ -77,7 +77,7 @@ def scanner(latency_ns: int = 0) -> ScannerCalibration:
     hand_eye = HandEyeCalibration(
         tool_from_sensor=TOOL_FROM_SENSOR,
         covariance=np.zeros((6, 6)),
-        sensor_coupling=None,
+        dhand_eye_dsensor=None,
         arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
         rms_mm=0.007,
         n_postures=12,

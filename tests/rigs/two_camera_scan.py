@@ -13,7 +13,6 @@ from armscan.models.calibration import ArmNoise, HandEyeCalibration, ScannerCali
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import TwoViews
 from armscan.pipeline.instants import ExposurePair
-from armscan.pipeline.measure import LitProfile
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
@@ -50,7 +49,7 @@ def stereo_scanner(head: StereoHead) -> ScannerCalibration:
     hand_eye = HandEyeCalibration(
         tool_from_sensor=TOOL_FROM_SENSOR,
         covariance=np.zeros((6, 6)),
-        sensor_coupling=None,
+        dhand_eye_dsensor=None,
         arm_noise=ArmNoise(position_mm=0.005, rotation_rad=2e-5),
         rms_mm=0.007,
         n_postures=12,
@@ -116,11 +115,7 @@ class SeenAs:
 
     profiles: tuple[Profile, Profile]
 
-    def __call__(
-        self, pair: ExposurePair, camera: CameraModel, options: StripeOptions
-    ) -> LitProfile:
+    def __call__(self, pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> Profile:
         """The camera's profile under the image's name."""
         exposure = pair[0]
-        return LitProfile(
-            replace(self.profiles[exposure.camera], source=exposure.source), exposure.lasers
-        )
+        return replace(self.profiles[exposure.camera], source=exposure.source)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Both light sheets of a desktop scanner from real photographs, and the stripe on a bust."""
 
-import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,20 +17,17 @@ from armscan.models.calibration import CameraCalibration, Provenance, SensorCali
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_exposures
 from armscan.pipeline.instants import pair_exposures
 from armscan.pipeline.laser import calibrate_sheets_from_pairs
-from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.reconstruct import reconstruct
-from armscan.reconstruction.label_single import DepthRange
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.storage.documents import camera_document, read_sensor_calibration
 from armscan.storage.images import read_exposure
 from armscan.vision.targets.target import Chessboard
+from rigs.photographs import DATA, needs
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data")) / "ciclop"
-pytestmark = pytest.mark.skipif(
-    not DATA.is_dir(),
-    reason="test data not found: set ARMSCAN_DATA to the folder that holds ciclop",
-)
+CICLOP = DATA / "ciclop"
+pytestmark = needs("ciclop")
 BOARD = Chessboard(11, 6, 13.0)
 PLACEMENTS = ("0-255-255-8", "0-255-255-8-x")
 NO_PROVENANCE = Provenance(
@@ -47,7 +43,7 @@ STRIPE_PX = 0.7
 
 @pytest.fixture(scope="module")
 def laser() -> LaserFit:
-    photos = [read_exposure(DATA / "camera" / f"frame{k}.jpg") for k in range(16)]
+    photos = [read_exposure(CICLOP / "camera" / f"frame{k}.jpg") for k in range(16)]
     run = calibrate_camera_from_exposures(photos, BOARD)
     assert isinstance(run, CameraRun), run
     fit = run.fit
@@ -62,7 +58,7 @@ def laser() -> LaserFit:
         covered_px=fit.coverage.covered_px,
         provenance=NO_PROVENANCE,
     )
-    folder = DATA / "laser_pattern"
+    folder = CICLOP / "laser_pattern"
     pairs = pair_exposures(
         [read_exposure(folder / f"laser-{name}.png") for name in PLACEMENTS],
         [read_exposure(folder / f"laser-background-{name}.png") for name in PLACEMENTS],
@@ -101,7 +97,7 @@ def test_a_recording_gives_the_same_sheets(laser: LaserFit, tmp_path: Path) -> N
     for k, name in enumerate(PLACEMENTS):
         for j, kind in enumerate(("laser", "laser-background")):
             photo = f"images/{kind}-{name}.png"
-            shutil.copy(DATA / "laser_pattern" / Path(photo).name, scan / photo)
+            shutil.copy(CICLOP / "laser_pattern" / Path(photo).name, scan / photo)
             lit = "A+B" if kind == "laser" else ""
             rows.append(f"{2 * k + j},{1000 * (2 * k + j)},0,{photo},{lit},{k}")
     (scan / "exposures.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
@@ -150,12 +146,12 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
 
     Two boards calibrated 15 mm of depth, and the bust is 65 mm deep: the margin asks for that.
     """
-    folder = DATA / "laser_object"
+    folder = CICLOP / "laser_object"
     on, off = read_exposure(folder / "laser.png"), read_exposure(folder / "laser_background.png")
     options = MeasureOptions(depths=DepthRange(margin=3.0))
     result = reconstruct([on], sensor, backgrounds=[off], options=options)
     cloud = result.cloud
-    assert "B" in result.images[0].naming
+    assert "B" in result.images[0].reason
     assert set(cloud.sheet.tolist()) == {1}
     assert result.images[0].count(PointStatus.MEASURED) == len(cloud) > 700
     assert 215.0 < cloud.points_mm[:, 2].min() < cloud.points_mm[:, 2].max() < 300.0
@@ -166,8 +162,8 @@ def test_the_stripe_on_the_bust_is_in_front_of_the_turntables_axis(
 
 
 def test_an_ambiguous_stripe_is_asked_for_not_guessed(sensor: SensorCalibration) -> None:
-    on = read_exposure(DATA / "laser_object" / "laser.png")
-    off = read_exposure(DATA / "laser_object" / "laser_background.png")
+    on = read_exposure(CICLOP / "laser_object" / "laser.png")
+    off = read_exposure(CICLOP / "laser_object" / "laser_background.png")
     wide = MeasureOptions(depths=DepthRange(margin=30.0))
     with pytest.raises(EstimationError, match="--sheet"):
         reconstruct([on], sensor, backgrounds=[off], options=wide)

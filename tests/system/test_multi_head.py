@@ -12,7 +12,7 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
 from armscan.jobs.demo import Calibrated, DemoRequest, calibrate_head
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.pipeline.simulate import TwinName
 from armscan.pipeline.truth import hand_eye_errors, naming_errors, sheet_errors, true_names
 
@@ -31,7 +31,7 @@ def instrument(tmp_path_factory: pytest.TempPathFactory) -> Calibrated:
 
 @pytest.fixture(scope="module")
 def steps(instrument: Calibrated) -> ScanReconstruction:
-    return measure_scan(FewerViews(TWIN.scan("steps"), 3), instrument.scanner)
+    return measure_scan(fewer_views(TWIN.scan("steps"), 3), instrument.scanner)
 
 
 def test_all_five_lines_are_found_and_lie_where_they_are(instrument: Calibrated) -> None:
@@ -74,7 +74,7 @@ def test_wrong_names_are_noticed(instrument: Calibrated, steps: ScanReconstructi
 
 
 def test_the_plate_is_flat_and_where_it_was_probed(instrument: Calibrated) -> None:
-    scan = measure_scan(FewerViews(TWIN.scan("plate"), 2), instrument.scanner)
+    scan = measure_scan(fewer_views(TWIN.scan("plate"), 2), instrument.scanner)
     plane = inspect_plane(scan.cloud, instrument.plate.plane)
     assert isinstance(plane, PlaneInspection)
     assert np.mean(np.abs(plane.fitted.deviations_mm) < 0.05) > 0.99

@@ -2,7 +2,6 @@
 """Profiles of a real sensor on a real robot: a sphere that is solved, a board that is refused."""
 
 import json
-import os
 from itertools import combinations
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
 from armscan.calibration.hand_eye.observations import (
     HandEyeOptions,
     PlateReference,
@@ -22,18 +21,15 @@ from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import EulerConvention, nearest_rotation, vector_from_rotation
 from armscan.geometry.shapes import Plane
-from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
+from armscan.pipeline.hand_eye import posed_stripes_from_profiles
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
 from armscan.thesis.hand_eye import SAME_ROTATION_DEG, TwoStepHandEye, calibrate_in_two_steps
+from rigs.photographs import DATA, needs
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data"))
 SPHERE, BOARD = DATA / "sphere_profiles", DATA / "plate_profiles"
-pytestmark = pytest.mark.skipif(
-    not (SPHERE.is_dir() and BOARD.is_dir()),
-    reason="test data not found: set ARMSCAN_DATA to the folder of sphere_profiles, plate_profiles",
-)
+pytestmark = needs("sphere_profiles", "plate_profiles")
 DIAMETER_MM = 80.0
 ROBOT_MM = (0.10, 0.22)
 """Scatter of the robot at the sphere, 0.9 m from its flange: 0.01 degrees of it make 0.16 mm."""
@@ -41,7 +37,8 @@ ROBOT_MM = (0.10, 0.22)
 
 def solve(euler: EulerConvention, diameter_mm: float = DIAMETER_MM) -> HandEyeFit | FitFailure:
     poses = read_robot_poses(SPHERE / "RobPoses.rob", euler)
-    return calibrate_hand_eye_from_profiles(read_profiles([SPHERE]), poses, diameter_mm)
+    stripes = posed_stripes_from_profiles(read_profiles([SPHERE]), poses)
+    return calibrate_on_sphere(stripes, diameter_mm)
 
 
 @pytest.fixture(scope="module")

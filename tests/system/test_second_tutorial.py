@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 from pathlib import Path
@@ -11,12 +10,10 @@ from pathlib import Path
 import pytest
 
 from armscan.cli import main
+from rigs.photographs import DATA, needs
 
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "02-hand-eye-on-real-robot-data.md"
-pytestmark = pytest.mark.skipif(
-    not (DATA / "sphere_profiles").is_dir(), reason=f"no profiles in {DATA} (set ARMSCAN_DATA)"
-)
+pytestmark = needs("sphere_profiles")
 
 
 def steps() -> list[tuple[list[str], str]]:

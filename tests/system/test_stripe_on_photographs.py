@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stripes on real photographs of a desktop scanner (folder ``ciclop`` of the test data)."""
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,11 @@ from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.extract import extract_stripes
+from rigs.photographs import DATA, needs
 
 ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT.parent / "shared" / "data")) / "ciclop"
-pytestmark = pytest.mark.skipif(
-    not DATA.is_dir(),
-    reason="test data not found: set ARMSCAN_DATA to the folder that holds ciclop",
-)
+CICLOP = DATA / "ciclop"
+pytestmark = needs("ciclop")
 # (y, x) knots of the two laser lines on the board, read off the photographs by eye, +-2 px
 BOARDS: dict[str, Any] = {
     "8": {"top": 470, "bottom": 1000, "lines": ((276, 273), (597, 588)), "lean": 4.0},
@@ -30,7 +27,7 @@ BOARD_SCATTER_PX = 0.6
 
 
 def photograph(name: str) -> Exposure:
-    image = cv2.imread(str(DATA / name))
+    image = cv2.imread(str(CICLOP / name))
     assert image is not None
     return Exposure(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), name)
 

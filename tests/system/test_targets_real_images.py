@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import cv2
@@ -14,12 +13,10 @@ from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, CircleGrid, TargetView
+from rigs.photographs import DATA, needs
 
 ROOT = Path(__file__).parents[2]
-DATA = Path(os.environ.get("ARMSCAN_DATA", ROOT / "../shared/data"))
-pytestmark = pytest.mark.skipif(
-    not (DATA / "ciclop").is_dir(), reason=f"no real images at {DATA}: set ARMSCAN_DATA"
-)
+pytestmark = needs("ciclop")
 BOARD = Chessboard(11, 6, 13.0)
 
 

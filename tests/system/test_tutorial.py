@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 from pathlib import Path
@@ -14,12 +13,10 @@ import pytest
 from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_sensor_calibration
+from rigs.photographs import DATA, needs
 
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[3] / "shared" / "data"))
 PAGE = Path(__file__).parents[2] / "docs" / "tutorials" / "01-from-photographs-to-points.md"
-pytestmark = pytest.mark.skipif(
-    not (DATA / "ciclop").is_dir(), reason=f"no photographs in {DATA} (set ARMSCAN_DATA)"
-)
+pytestmark = needs("ciclop")
 
 SAME_FIGURE = 0.02
 """Decoders and linear algebra of other versions change the figures by less than this part."""

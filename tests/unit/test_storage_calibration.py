@@ -254,7 +254,7 @@ def test_a_scanner_keeps_its_second_camera(tmp_path: Path) -> None:
     stereo = replace(
         known,
         sensor=stereo_sensor_calibration(),
-        hand_eye=replace(known.hand_eye, sensor_coupling=coupling),
+        hand_eye=replace(known.hand_eye, dhand_eye_dsensor=coupling),
     )
     path.write_bytes(scanner_document(stereo))
     assert_same(read_scanner_calibration(path), stereo)

@@ -20,6 +20,8 @@ from armscan.cli.options import (
     Force,
     ForceBad,
     LaserColourOption,
+    Method,
+    MethodOption,
     OptionalTarget,
     Side,
     StripeMethodOption,
@@ -246,6 +248,7 @@ def hand_eye(
         float | None,
         typer.Option(help="Scatter of the plate's surface; left out, estimated."),
     ] = None,
+    method: MethodOption = Method.ARMSCAN,
     output: Document = Path("scanner.json"),
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
@@ -279,7 +282,12 @@ def hand_eye(
     stripes = given(StripeOptions, method=stripe_method, laser_colour=laser_colour)
     run(
         lambda job: calibrate_hand_eye(
-            job, source, artefact, options=options, stripe_options=stripes
+            job,
+            source,
+            artefact,
+            options=options,
+            stripe_options=stripes,
+            is_beside_thesis=method is Method.THESIS,
         ),
         as_json=as_json,
         output=output,

@@ -229,7 +229,7 @@ def reconstruct(
     from armscan.jobs.reconstruct import StillPaths
     from armscan.jobs.reconstruct import reconstruct as reconstruct_points
     from armscan.pipeline.measure import MeasureOptions
-    from armscan.reconstruction.label_single import DepthRange
+    from armscan.reconstruction.triangulate import DepthRange
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 

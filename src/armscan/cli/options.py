@@ -92,6 +92,19 @@ BitsAlign = Annotated[
         show_default=DefaultOf(PIXELS + "align"),
     ),
 ]
+
+
+class Method(StrEnum):
+    """Whose way a result is found."""
+
+    ARMSCAN = "armscan"
+    THESIS = "thesis"
+
+
+MethodOption = Annotated[
+    Method,
+    typer.Option("--method", help="thesis: as the thesis prints it, to set it beside armscan's."),
+]
 StripeMethodOption = Annotated[
     str | None,
     typer.Option(

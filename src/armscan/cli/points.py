@@ -14,6 +14,8 @@ from armscan.cli.options import (
     BitsUsed,
     DefaultOf,
     Force,
+    Method,
+    MethodOption,
     Side,
     given,
     run,
@@ -146,12 +148,21 @@ def markers(
     max_perimeter: MostPerimeter = None,
     max_roundness: Roundness = None,
     disc: Disc = None,
+    code: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=A,B,C,D: look for four rings on a line with the cross ratio of these places "
+            "(eq. 4.24); repeatable.",
+            show_default=False,
+        ),
+    ] = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Find ring markers in images; with two calibrated cameras, where they are."""
+    from armscan.errors import OptionError
     from armscan.jobs.markers import find_markers, measure_markers
     from armscan.markers.candidates import RingMatchOptions, parse_depth
     from armscan.storage.images import ImageOptions
@@ -164,12 +175,16 @@ def markers(
         max_roundness=max_roundness,
         disc=disc,
     )
+    if code and stereo is not None:
+        raise OptionError(
+            "codes are looked for in single images", where="--code", remedy="leave --stereo out"
+        )
     depth_mm = parse_depth(depth) if depth else None
     matching = given(RingMatchOptions, depth_mm=depth_mm, diameter_mm=diameter)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: (
-            find_markers(job, images, rings=rings, image_options=pixels)
+            find_markers(job, images, rings=rings, image_options=pixels, codes=code or ())
             if stereo is None
             else measure_markers(
                 job, images, stereo, rings=rings, matching=matching, image_options=pixels
@@ -229,6 +244,7 @@ def register(
         bool,
         typer.Option("--by-id", help="With --moved: equal ids in both lists are one marker."),
     ] = False,
+    method: MethodOption = Method.ARMSCAN,
     as_json: AsJson = False,
 ) -> None:
     """Join scans by markers: views of a handheld scanner, or an arm that moved to a new place.
@@ -246,6 +262,7 @@ def register(
         match=given(MarkerMatchOptions, least_common=least_common),
         sigma_mm=sigma_mm,
         is_by_id=by_id,
+        method=method.value,
     )
     run(
         lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options),

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import FloatArray
 
 S = TypeVar("S")
 L = TypeVar("L")
@@ -41,40 +41,6 @@ def robust_sigma(residuals: FloatArray) -> float:
 def huber_weights(residuals: FloatArray, limit: float = HUBER_LIMIT) -> FloatArray:
     """Huber's weights of residuals in standard deviations: 1, beyond the limit limit / size."""
     return np.asarray(limit / np.maximum(np.abs(residuals), limit))
-
-
-def reject_outliers(
-    fit: Callable[[BoolArray], FloatArray],
-    is_used: BoolArray,
-    *,
-    sigmas: float,
-    least_sigma: float = 0.0,
-    rounds: int = 20,
-) -> BoolArray:
-    """Fit and reject in turn until the rows used no longer change.
-
-    Parameters
-    ----------
-    fit
-        Residuals (N,) of ALL rows after a fit to those of a mask.
-    is_used
-        (N,) rows to begin with; the others never return.
-    sigmas
-        Rows further off than this many robust standard deviations of the rows used are rejected.
-    least_sigma
-        Least standard deviation, in the unit of the residuals: rounding is no outlier.
-    rounds
-        Most fits.
-    """
-    eligible, used = is_used, is_used
-    for _ in range(rounds):
-        size = np.abs(fit(used))
-        sigma = max(robust_sigma(size[used]), least_sigma)
-        kept = eligible & (size <= sigmas * sigma)
-        if np.array_equal(kept, used):
-            break
-        used = kept
-    return used
 
 
 def square_root(covariance: FloatArray, name: str = "the covariance") -> FloatArray:

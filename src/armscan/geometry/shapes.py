@@ -80,8 +80,8 @@ def fit_line(points: FloatArray, weights: FloatArray | None = None) -> Line | Fi
     if int((w > 0.0).sum()) < 2:
         return FitFailure("a line needs two points", "give more points")
     centre = w @ points / w.sum()
-    _, spread, axes = np.linalg.svd((points - centre) * np.sqrt(w)[:, None], full_matrices=False)
-    if spread[0] == 0.0:
+    _, singular, axes = np.linalg.svd((points - centre) * np.sqrt(w)[:, None], full_matrices=False)
+    if singular[0] == 0.0:
         return FitFailure("all points of the line coincide", "give points apart from each other")
     return Line(centre, axes[0])
 
@@ -147,8 +147,8 @@ def fit_plane(
     if n < 3:
         return FitFailure(f"a plane needs three points, got {n}", "give more points")
     centre = points.mean(axis=0)
-    _, spread, axes = np.linalg.svd(points - centre, full_matrices=False)
-    if spread[1] <= 1e-9 * max(spread[0], 1e-300):
+    _, singular, axes = np.linalg.svd(points - centre, full_matrices=False)
+    if singular[1] <= 1e-9 * max(singular[0], 1e-300):
         return FitFailure(
             "the points of the plane lie on one line", "give points that spread in two directions"
         )
@@ -159,7 +159,7 @@ def fit_plane(
     squares = float(residuals @ residuals)
     known = prior_freedom + freedom
     variance = (prior_freedom * prior_sigma_mm**2 + squares) / known if known > 0.0 else 0.0
-    information = np.array([spread[0] ** 2, spread[1] ** 2, float(n)])
+    information = np.array([singular[0] ** 2, singular[1] ** 2, float(n)])
     chi2 = squares / variance if variance > 0.0 else 0.0
     return Estimate(
         value=plane,
@@ -176,6 +176,8 @@ LARGEST_RADIUS_SIGMA = 0.5
 SCATTER_SIGMAS = 2.0
 """Points no thicker than this many standard deviations may as well lie on a line or plane."""
 ROUNDS_OF_REJECTION = 20
+SETTLED = 1e-17
+"""To rounding: a fit costs little, and its figures are then those of any other solver."""
 START_SAMPLES, START_POINTS = 150, 500
 """Surfaces through a few points that are tried, and points that judge them."""
 
@@ -298,7 +300,9 @@ def _solve_round(
         kept = size <= max(limit, 1e-12)
         if int(kept.sum()) < len(state):
             return None
-        fit = levenberg_marquardt(state, partial(_round_system, points[kept]), np.add)
+        fit = levenberg_marquardt(
+            state, partial(_round_system, points[kept]), np.add, settled=SETTLED
+        )
         is_same, is_used = np.array_equal(kept, is_used), kept
         if fit is None or is_same:
             break

@@ -34,9 +34,8 @@ from armscan.jobs.sheets import SheetImages, calibrate_sheets
 from armscan.jobs.stereo import calibrate_stereo
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.adaptive_scan import record_adaptively
-from armscan.pipeline.measure import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import Progress, silent
-from armscan.pipeline.reconstruct import reconstruct
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
 from armscan.pipeline.simulate import TwinName, record_scenes, record_touches
 from armscan.pipeline.truth import (
@@ -48,8 +47,8 @@ from armscan.pipeline.truth import (
     part_errors,
     true_names,
 )
-from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.cloud import PointCloud
 from armscan.report.demo import (
     FRACTION_RULE,
@@ -232,7 +231,7 @@ class _Run:
                 self.request.twin,
                 scene,
                 scanner,
-                longest_stroke=self.request.most_views.get(scene),
+                longest_pass=self.request.most_views.get(scene),
                 processes=self.request.processes,
                 progress=self.progress,
             )

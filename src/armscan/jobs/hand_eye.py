@@ -22,14 +22,18 @@ from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import HandEyeScanOptions, ObservedStripes, observe_stripes
+from armscan.pipeline.hand_eye import (
+    ObservedStripes,
+    observe_stripes,
+    posed_stripes_from_profiles,
+)
 from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.profiles import posed_stripes_from_profiles
 from armscan.pipeline.progress import Progress, ProgressEvent
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.exposure import Exposure
 from armscan.records.points import ProbedPoints
 from armscan.report.hand_eye import (
@@ -41,7 +45,7 @@ from armscan.report.hand_eye import (
 )
 from armscan.report.page import Text
 from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, refused_page
-from armscan.report.quantity import Summary, Table, fact, sentences
+from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import read_sensor_calibration, scanner_document
 from armscan.storage.image_paths import are_simulated, expand_paths
@@ -49,6 +53,7 @@ from armscan.storage.points import parse_plane, read_points_or_plane, read_profi
 from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.thesis.hand_eye import PrintedHandEye, as_printed
 from armscan.vision.stripe.image import StripeOptions
 
 TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
@@ -181,7 +186,7 @@ class HandEyeInputs:
         return tuple(stripe for _, seen in self.groups for stripe in seen.stripes)
 
     @property
-    def images(self) -> tuple[MeasuredProfile, ...]:
+    def images(self) -> tuple[LabelledProfile, ...]:
         """Stripe points of all groups' exposures."""
         return tuple(image for _, seen in self.groups for image in seen.images)
 
@@ -198,6 +203,7 @@ def calibrate_hand_eye(
     *,
     options: HandEyeOptions | None = None,
     stripe_options: StripeOptions | None = None,
+    is_beside_thesis: bool = False,
 ) -> Summary:
     """Read, calibrate, write ``scanner.json`` and ``.html``, and say what came out.
 
@@ -209,6 +215,8 @@ def calibrate_hand_eye(
         What to calibrate from.
     options, stripe_options
         Of the calibration, and of stripe extraction.
+    is_beside_thesis
+        Tell what the printed equations give of the same stripes.
 
     Raises
     ------
@@ -273,7 +281,44 @@ def calibrate_hand_eye(
     written = job.write(dict(zip(places, (scanner_document(scanner), page), strict=True)))
     tables = (posture_table(fit),) if repeats is None else (repeats[0], posture_table(fit))
     summary = hand_eye_summary(fit, scanner, written, tables, is_simulated=inputs.is_simulated)
+    if is_beside_thesis:
+        reference = inputs.plate if diameter is None else diameter
+        pose = fit.calibration.tool_from_sensor
+        printed = (
+            FitFailure("there is no plate")
+            if reference is None
+            else as_printed(inputs.stripes, reference, pose)
+        )
+        table, data = _beside_thesis(printed, pose)
+        extra = {**summary.extra, "thesis": data}
+        summary = replace(summary, tables=(*summary.tables, table), extra=extra)
     return replace(summary, forced=provenance.forced)
+
+
+def _beside_thesis(
+    printed: PrintedHandEye | FitFailure, ours: Pose[Tool, Sensor]
+) -> tuple[Table, dict[str, Any]]:
+    """The printed equations' hand-eye beside ours, for people and for programs."""
+    columns = ("As the thesis prints it", "")
+    if isinstance(printed, FitFailure):
+        return Table(columns, (("not found", printed.reason),)), {"failure": printed.reason}
+    between = printed.tool_from_sensor @ ours.inverse()
+    turn_deg = float(np.degrees(np.linalg.norm(between.rotation_vector_rad)))
+    shift_mm = printed.tool_from_sensor.translation_mm - ours.translation_mm
+    rows = (
+        ("equations", printed.equations),
+        ("they leave, rms", f"{significant(printed.rms_mm)} mm"),
+        ("turned from ours", f"{significant(turn_deg)}°"),
+        ("origin of Sensor off ours", f"{significant(float(np.linalg.norm(shift_mm)))} mm"),
+    )
+    return Table(columns, rows), {
+        "equations": printed.equations,
+        "rms_mm": printed.rms_mm,
+        "rotation": printed.tool_from_sensor.rotation.tolist(),
+        "translation_mm": printed.tool_from_sensor.translation_mm.tolist(),
+        "turned_deg": turn_deg,
+        "shifted_mm": shift_mm.tolist(),
+    }
 
 
 def read_hand_eye_inputs(
@@ -300,10 +345,9 @@ def read_hand_eye_inputs(
     sensor = read_sensor_calibration(source.sensor)
     plate, notes = _reference(artefact, _tool_places(recordings))
     measure = MeasureOptions(stripes=stripe_options)
-    scan_options = HandEyeScanOptions(hand_eye=options, measure=measure)
     groups = []
     for recording in recordings:
-        seen = observe_stripes(recording, sensor, scan_options, progress=progress)
+        seen = observe_stripes(recording, sensor, measure, progress=progress)
         groups.append((recording.name, _named(seen, _prefix(recording, len(recordings)))))
     tables = [folder / name for folder in source.scans for name in TABLES]
     files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
@@ -423,8 +467,8 @@ def _with_assumptions(failure: FitFailure, inputs: HandEyeInputs) -> FitFailure:
     return FitFailure(reason, failure.remedy)
 
 
-def _tried(image: MeasuredProfile) -> TriedImage:
-    is_measured = image.fate == int(PointStatus.MEASURED)
+def _tried(image: LabelledProfile) -> TriedImage:
+    is_measured = image.status == PointStatus.MEASURED
     n_points, n = int(is_measured.sum()), len(image.profile)
     remark = f"{n_points} of {n} stripe points measured" if n else "no stripe was found"
     points = image.profile.points_px[is_measured]

@@ -31,7 +31,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
-from armscan.reconstruction.sync import SyncOptions, exposure_poses, largest_gap_ns
+from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
@@ -253,7 +253,7 @@ def _steps(what: str, t_ns: IntArray) -> dict[str, float]:
 
 def _poses(scan: FolderRecording, track: ArmTrack) -> dict[str, Any]:
     """How many exposures have a pose, how it is found, and why the others have none."""
-    limit_ns = largest_gap_ns(track, SyncOptions())
+    limit_ns = largest_gap_ns(track)
     gaps = {
         "arm_gap_limit_ms": limit_ns / NS_PER_MS,
         "arm_steps_above_gap_limit": int((np.diff(track.t_ns) > limit_ns).sum()),
@@ -517,7 +517,6 @@ NEEDED = (
     "scipy",
     "numba",
     "opencv-python-headless",
-    "pydantic",
     "typer",
     "rich",
     "jinja2",

@@ -28,6 +28,7 @@ from armscan.storage.documents import read_stereo_calibration
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import markers_csv
+from armscan.thesis.marker_rules import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 
 FEW_MARKERS = 4
@@ -41,8 +42,9 @@ def find_markers(
     *,
     rings: RingOptions | None = None,
     image_options: ImageOptions | None = None,
+    codes: Sequence[str] = (),
 ) -> Summary:
-    """Find rings in images.
+    """Find rings in images, and lines of four among them that bear a code.
 
     Parameters
     ----------
@@ -52,6 +54,8 @@ def find_markers(
         Files, folders or patterns.
     rings, image_options
         What is a ring, and how pixels are read.
+    codes
+        Codes as `parse_code` reads them; images must be free of distortion then.
 
     Raises
     ------
@@ -61,6 +65,7 @@ def find_markers(
     rings, image_options = rings or RingOptions(), image_options or ImageOptions()
     job = job if job.output else replace(job, output=Path("markers.html"))
     places = job.places(".html", hint="; a table of markers needs --stereo")
+    known = tuple(parse_code(text) for text in codes)
     paths = expand_paths(images)
     exposures = read_exposures(paths, image_options)
     detections = _detect(exposures, rings, job.progress)
@@ -68,12 +73,17 @@ def find_markers(
         f"no ring was found in {found.rings.source}" for found in detections if not found.rings
     )
     provenance = job.provenance(paths, (rings, image_options), warnings=warnings)
+    lines = [
+        (found.rings.source, line)
+        for found in detections
+        for line in find_coded_lines(found.rings.centres_px, found.rings.covariance_px2, known)
+    ]
     is_simulated = are_simulated(paths)
     page = detection_page(exposures, detections, warnings, provenance, is_simulated=is_simulated)
     return Summary(
         title="Ring markers in simulated images." if is_simulated else "Ring markers.",
         quantities=ring_quantities(detections),
-        tables=(_counts(detections),),
+        tables=(_counts(detections), *((_coded_lines(lines),) if known else ())),
         warnings=warnings,
         written=job.write({places[0]: page}),
         next_step=f"open {places[0]}",
@@ -81,8 +91,35 @@ def find_markers(
             "kind": "ring markers",
             "simulated": is_simulated,
             "images": [_ring_data(found) for found in detections],
+            **({"lines": [_line_data(*line) for line in lines]} if known else {}),
         },
     )
+
+
+def _coded_lines(lines: Sequence[tuple[str, DecodedLine]]) -> Table:
+    """Lines whose cross ratio is that of a code (eq. 4.24)."""
+    rows = tuple(
+        (
+            source,
+            line.name,
+            " ".join(str(k) for k in line.points),
+            "known" if line.is_direction_known else "either",
+            f"{line.ratio:.4f} ± {line.sigma:.4f}",
+        )
+        for source, line in lines
+    )
+    return Table(("coded lines in", "code", "rings", "direction", "cross ratio"), rows)
+
+
+def _line_data(source: str, line: DecodedLine) -> dict[str, object]:
+    return {
+        "source": source,
+        "code": line.name,
+        "rings": line.points.tolist(),
+        "is_direction_known": line.is_direction_known,
+        "cross_ratio": line.ratio,
+        "sigma": line.sigma,
+    }
 
 
 def measure_markers(

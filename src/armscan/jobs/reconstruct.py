@@ -15,10 +15,10 @@ from armscan.geometry.arrays import Box
 from armscan.jobs.job import Job
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasureOptions, cameras_of
-from armscan.pipeline.reconstruct import reconstruct as reconstruct_images
+from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
+from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.scan import ScanOptions, measure_scan
-from armscan.reconstruction.labels import Reconstruction
+from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.cloud import (
@@ -209,8 +209,8 @@ def _image_data(result: Reconstruction) -> list[dict[str, Any]]:
         {
             "source": image.profile.source,
             "n_stripe_points": len(image.profile),
-            "n_measured": int((image.fate == 0).sum()),
-            "naming": image.naming,
+            "n_measured": image.count(PointStatus.MEASURED),
+            "naming": image.reason,
         }
         for image in result.images
     ]

@@ -20,6 +20,8 @@ from armscan.geometry.registration import spread_mm
 from armscan.jobs.job import Job
 from armscan.markers.join_views import JoinedViews
 from armscan.pipeline.register import (
+    BY_ID,
+    UNCHECKED,
     MarkerResiduals,
     PlaceRegistration,
     RegisterOptions,
@@ -208,7 +210,11 @@ def _check(
                 where=str(lists[0]) if lists else "",
                 remedy="name two views or more, or give --moved NEW for an arm that moved",
             )
-        for is_given, option in ((bool(clouds), "--cloud"), (options.is_by_id, "--by-id")):
+        for is_given, option in (
+            (bool(clouds), "--cloud"),
+            (options.is_by_id, "--by-id"),
+            (options.method == "thesis", "--method"),
+        ):
             if is_given:
                 raise OptionError("it needs --moved", where=option, remedy="leave it out")
     elif len(lists) != 1:
@@ -560,10 +566,12 @@ def _place_quantities(
     pose, sigma = place.fit.value, place.fit.sigma
     turns = np.degrees(pose.rotation_vector_rad), np.degrees(sigma[:3])
     shift = zip(pose.translation_mm, sigma[3:], strict=True)
-    rival = (
-        "given by their ids"
-        if place.n_rival < 0
-        else f"found by distances; no other way explains more than {max(place.n_rival, 3)}"
+    rival = {
+        BY_ID: "given by their ids",
+        UNCHECKED: "paired by the thesis's eight steps, unchecked",
+    }.get(
+        place.n_rival,
+        f"found by distances; no other way explains more than {max(place.n_rival, 3)}",
     )
     return (
         Quantity(

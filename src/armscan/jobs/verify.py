@@ -25,7 +25,6 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
-from armscan.reconstruction.sync import PoseStatus
 from armscan.report.inspect import InspectionReport, inspection_page, plane_report, sphere_report
 from armscan.report.page import Section, Text
 from armscan.report.quantity import (
@@ -180,7 +179,7 @@ def _measured(scan: Path, scanner: Path | None, progress: Progress) -> tuple[Mea
             )
         return Measured(cloud), cloud.is_simulated
     source, calibration = read_recording(scan), read_scanner_calibration(scanner)
-    found = measure_scan(source, calibration, ScanOptions(normals=None), progress=progress)
+    found = measure_scan(source, calibration, ScanOptions(has_normals=False), progress=progress)
     return Measured(found.cloud, found, calibration), source.is_simulated
 
 
@@ -206,7 +205,7 @@ def _tool_places(measured: Measured) -> FloatArray | None:
     if measured.scan is None:
         return None
     poses = measured.scan.poses
-    found = poses.translations_mm[poses.fate == PoseStatus.FOUND]
+    found = poses.translations_mm[poses.has_pose]
     return found if len(found) else None
 
 

@@ -434,7 +434,7 @@ class HandEyeCalibration(ArrayRecord):
     covariance
         (6, 6) in the order of `HAND_EYE_PARAMETER_NAMES`: arm, plate and stripe noise, the sensor
         being held fixed.
-    sensor_coupling
+    dhand_eye_dsensor
         (6, P) derivative of these parameters by the sensor's, in the order of the sensor's
         ``parameter_names``: an error of the sensor moves the hand-eye. None where points came
         without a sensor's calibration.
@@ -452,7 +452,7 @@ class HandEyeCalibration(ArrayRecord):
 
     tool_from_sensor: Pose[Tool, Sensor]
     covariance: FloatArray = floats(6, 6)
-    sensor_coupling: FloatArray | None = floats(6, None)
+    dhand_eye_dsensor: FloatArray | None = floats(6, None)
     arm_noise: ArmNoise
     rms_mm: float
     n_postures: int
@@ -484,7 +484,7 @@ class ScannerCalibration:
     latency_ns: int = 0
 
     def __post_init__(self) -> None:
-        coupling = self.hand_eye.sensor_coupling
+        coupling = self.hand_eye.dhand_eye_dsensor
         if self.sensor is None or coupling is None:
             return
         if coupling.shape[1] != len(self.sensor.parameter_names):
@@ -502,10 +502,10 @@ class ScannerCalibration:
         """
         if self.sensor is None:
             return self.hand_eye.covariance
-        coupling = self.hand_eye.sensor_coupling
+        coupling = self.hand_eye.dhand_eye_dsensor
         n = len(self.sensor.parameter_names)
         follow = np.zeros((6, n)) if coupling is None else coupling
-        spread = np.vstack([np.eye(n), follow])
-        joint = spread @ self.sensor.covariance @ spread.T
+        follow_all = np.vstack([np.eye(n), follow])
+        joint = follow_all @ self.sensor.covariance @ follow_all.T
         joint[n:, n:] += self.hand_eye.covariance
         return np.asarray(joint)

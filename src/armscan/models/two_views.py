@@ -62,8 +62,7 @@ class TwoViews:
 
     def points_right_mm(self, points_sensor_mm: FloatArray) -> FloatArray:
         """(N, 3) points of the Sensor frame in the right camera's (eqs. 4.3 and 4.17)."""
-        pose = self.right_from_left
-        return np.asarray(points_sensor_mm @ pose.rotation.T + pose.translation_mm)
+        return self.right_from_left.apply(points_sensor_mm)
 
     def project_right(self, points_sensor_mm: FloatArray) -> FloatArray:
         """Project (N, 3) points into the right image (eqs. 4.17 and 4.18); NaN behind it."""
@@ -91,14 +90,9 @@ class TwoViews:
             nothing in the right image while the point stays.
         """
         pose = self.right_from_left
-        turned = np.asarray(points_sensor_mm, dtype=np.float64) @ pose.rotation.T
-        q, by_right_point, by_camera = self.right.project_with_jacobian(
-            turned + pose.translation_mm
-        )
-        by_second = np.concatenate(
-            [by_camera, -by_right_point @ skew(turned), by_right_point], axis=2
-        )
-        return q, by_right_point @ pose.rotation, by_second
+        q, dq_dright, dq_dcamera = self.right.project_with_jacobian(pose.apply(points_sensor_mm))
+        dq_dpose = dq_dright @ pose.jacobian(points_sensor_mm)
+        return q, dq_dright @ pose.rotation, np.concatenate([dq_dcamera, dq_dpose], axis=2)
 
     @property
     def essential(self) -> FloatArray:
@@ -140,16 +134,16 @@ def epipolar_distances_px(
         ``x_r' E x_l``, which swapping the cameras leaves as it is. NaN where a pixel lies beyond
         the part of the image that the distortion model can invert, and in an epipole.
     """
-    left, left_ok, left_by_px, _ = views.left.undistort_with_jacobian(left_px)
-    right, right_ok, right_by_px, _ = views.right.undistort_with_jacobian(right_px)
+    left, left_ok, left_dxy_dq, _ = views.left.undistort_with_jacobian(left_px)
+    right, right_ok, right_dxy_dq, _ = views.right.undistort_with_jacobian(right_px)
     essential = views.essential
     line_right = _homogeneous(left) @ essential.T
     line_left = _homogeneous(right) @ essential
     value = np.sum(_homogeneous(right) * line_right, axis=1)
     is_valid = left_ok & right_ok
     return (
-        _over_gradient(value, line_left, left_by_px, is_valid),
-        _over_gradient(value, line_right, right_by_px, is_valid),
+        _over_gradient(value, line_left, left_dxy_dq, is_valid),
+        _over_gradient(value, line_right, right_dxy_dq, is_valid),
     )
 
 
@@ -176,9 +170,9 @@ def _homogeneous(xy: FloatArray) -> FloatArray:
 
 
 def _over_gradient(
-    value: FloatArray, line: FloatArray, by_px: FloatArray, is_valid: BoolArray
+    value: FloatArray, line: FloatArray, dxy_dq: FloatArray, is_valid: BoolArray
 ) -> FloatArray:
-    gradient = (line[:, None, :2] @ by_px)[:, 0]
+    gradient = (line[:, None, :2] @ dxy_dq)[:, 0]
     length = np.linalg.norm(gradient, axis=1)
     is_known = is_valid & (length > 0.0)
     return np.asarray(np.where(is_known, value / np.where(is_known, length, 1.0), np.nan))
@@ -202,7 +196,7 @@ class TriangulatedPoints:
         (N, 3) in the Sensor frame; NaN where not valid.
     noise_mm2
         (N, 3, 3) covariance due to the pixels' noise alone.
-    by_parameters
+    dpoint_dparameters
         (N, 3, 24) derivative by the cameras' parameters at fixed pixels, in the order of
         `armscan.models.two_views.STEREO_PARAMETER_NAMES`.
     chi2
@@ -215,7 +209,7 @@ class TriangulatedPoints:
 
     points_sensor_mm: FloatArray
     noise_mm2: FloatArray
-    by_parameters: FloatArray
+    dpoint_dparameters: FloatArray
     chi2: FloatArray
     is_valid: BoolArray
 
@@ -283,19 +277,19 @@ def triangulate_points(
     start, is_valid = _midway(views, left_px, right_px)
     points = np.where(is_valid[:, None], start, [0.0, 0.0, 1.0])
     for _ in range(GAUSS_NEWTON_STEPS):
-        residual, by_point, _ = _residuals(views, points, observed)
+        residual, dq_dpoint, _ = _residuals(views, points, observed)
         is_valid &= np.isfinite(residual).all(axis=1)
-        normal, right_side = _normal(residual, by_point, weight, is_valid)
+        normal, right_side = _normal(residual, dq_dpoint, weight, is_valid)
         step = np.linalg.solve(normal, right_side)[:, :, 0]
         points = points + np.where(is_valid[:, None], step, 0.0)
         if np.all(np.abs(step) <= CONVERGED_MM_PER_MM * np.abs(points).max(axis=1)[:, None]):
             break
-    residual, by_point, by_parameters = _residuals(views, points, observed)
+    residual, dq_dpoint, dq_dparameters = _residuals(views, points, observed)
     is_valid &= np.isfinite(residual).all(axis=1)
-    normal, _ = _normal(residual, by_point, weight, is_valid)
+    normal, _ = _normal(residual, dq_dpoint, weight, is_valid)
     noise = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     # The point follows the parameters so that the weighted residual stays at its minimum.
-    carried = -noise @ by_point.transpose(0, 2, 1) @ weight @ by_parameters
+    carried = -noise @ dq_dpoint.transpose(0, 2, 1) @ weight @ dq_dparameters
     chi2 = (residual[:, None, :] @ weight @ residual[:, :, None])[:, 0, 0]
     gap = ~is_valid
     points, chi2 = np.where(gap[:, None], np.nan, points), np.where(gap, np.nan, chi2)
@@ -303,7 +297,7 @@ def triangulate_points(
     return TriangulatedPoints(
         points_sensor_mm=points,
         noise_mm2=noise,
-        by_parameters=carried,
+        dpoint_dparameters=carried,
         chi2=np.asarray(chi2),
         is_valid=is_valid,
     )
@@ -336,21 +330,21 @@ def _residuals(
     views: TwoViews, points: FloatArray, observed: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Observed minus predicted (N, 4); prediction by point (N, 4, 3), by parameters (N, 4, 24)."""
-    left, left_by_point, left_by_camera = views.left.project_with_jacobian(points)
-    right, right_by_point, right_by_second = views.project_right_with_jacobian(points)
-    by_parameters = np.zeros((len(points), 4, N_CAMERA + N_SECOND))
-    by_parameters[:, :2, :N_CAMERA] = left_by_camera
-    by_parameters[:, 2:, N_CAMERA:] = right_by_second
+    left, dleft_dpoint, dleft_dcamera = views.left.project_with_jacobian(points)
+    right, dright_dpoint, dright_dsecond = views.project_right_with_jacobian(points)
+    dq_dparameters = np.zeros((len(points), 4, N_CAMERA + N_SECOND))
+    dq_dparameters[:, :2, :N_CAMERA] = dleft_dcamera
+    dq_dparameters[:, 2:, N_CAMERA:] = dright_dsecond
     residual = observed - np.concatenate([left, right], axis=1)
-    return residual, np.concatenate([left_by_point, right_by_point], axis=1), by_parameters
+    return residual, np.concatenate([dleft_dpoint, dright_dpoint], axis=1), dq_dparameters
 
 
 def _normal(
-    residual: FloatArray, by_point: FloatArray, weight: FloatArray, is_valid: BoolArray
+    residual: FloatArray, dq_dpoint: FloatArray, weight: FloatArray, is_valid: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Normal matrices (N, 3, 3) and right-hand sides (N, 3, 1); the identity where not valid."""
-    weighted = by_point.transpose(0, 2, 1) @ weight
-    normal = np.where(is_valid[:, None, None], weighted @ by_point, np.eye(3))
+    weighted = dq_dpoint.transpose(0, 2, 1) @ weight
+    normal = np.where(is_valid[:, None, None], weighted @ dq_dpoint, np.eye(3))
     right_side = np.where(is_valid[:, None, None], weighted @ residual[:, :, None], 0.0)
     return normal, right_side
 

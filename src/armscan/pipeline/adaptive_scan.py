@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan whose lasers are chosen while it is taken: switched on, exposed, named, chosen again."""
+"""A scan whose lasers are chosen while it is taken: exposed, labelled, chosen again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,45 +11,35 @@ from typing import Any
 
 from armscan.devices.sources import SimulatedScan, TwinScene
 from armscan.errors import InputError
-from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.instants import Instant, InstantImages
+from armscan.pipeline.measure import MeasureOptions, measure_instants
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.scan_part import ScanPart
+from armscan.pipeline.scan import sensor_poses
+from armscan.pipeline.scan_part import SimulatedPart
 from armscan.pipeline.simulate import TwinName, in_processes
 from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, StripeLabeller
-from armscan.reconstruction.sync import ExposurePoses, exposure_poses
+from armscan.reconstruction.labels import PASS_GAP_NS, StripeLabeller
+from armscan.reconstruction.sync import exposure_poses
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.storage.recording import encoded_png, write_recording, written_session
-from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import StripeOptions
 
 Keep = Callable[[int, Exposure], None]
 """Told of every exposure that was taken, with its row."""
+STAGE = "scan with chosen lasers"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class TakenPass:
-    """What one stroke of a hand gave.
-
-    Parameters
-    ----------
-    rows
-        Its rows of the scan, in order of time.
-    lasers
-        Sources that were on in each.
-    named
-        Its stripe points and their sheets.
-    """
+    """Rows of one pass, in order of time, and the sources that were on in each."""
 
     rows: tuple[int, ...]
     lasers: tuple[tuple[str, ...], ...]
-    named: tuple[LabelledProfile, ...]
 
 
-def strokes(rows: Sequence[ExposureRow], gap_ns: int = STROKE_GAP_NS) -> tuple[range, ...]:
-    """Rows of each stroke: exposures in order of time without a pause longer than ``gap_ns``.
+def scan_passes(rows: Sequence[ExposureRow], gap_ns: int = PASS_GAP_NS) -> tuple[range, ...]:
+    """Rows of each pass: exposures in order of time without a pause longer than ``gap_ns``.
 
     Raises
     ------
@@ -71,66 +61,59 @@ def strokes(rows: Sequence[ExposureRow], gap_ns: int = STROKE_GAP_NS) -> tuple[r
     )
 
 
-def sensor_poses(
-    scan: SimulatedScan, scanner: ScannerCalibration
-) -> Callable[[int], Pose[Base, Sensor] | None]:
-    """Where the sensor was in each row of a scan; None where the arm's pose is not known.
-
-    Raises
-    ------
-    InputError, EstimationError
-        As `exposure_poses`.
-    """
-    poses: ExposurePoses = exposure_poses(
-        scan.rows, scan.arm, scan.session.clock, scanner.latency_ns
-    )
-
-    def pose(row: int) -> Pose[Base, Sensor] | None:
-        if not poses.has_pose[row]:
-            return None
-        return poses.pose(row) @ scanner.hand_eye.tool_from_sensor
-
-    return pose
-
-
-def take_stroke(
+def take_pass(
     scan: SimulatedScan,
     rows: Sequence[int],
-    namer: StripeLabeller,
-    base_from_sensor: Callable[[int], Pose[Base, Sensor] | None],
+    labeller: StripeLabeller,
+    scanner: ScannerCalibration,
     *,
-    stripes: StripeOptions | None = None,
     keep: Keep | None = None,
 ) -> TakenPass:
-    """Take one stroke, exposure by exposure, with the lasers that the namer asks for.
+    """Take one pass, exposure by exposure, with the lasers that the labeller asks for.
 
-    Strokes do not depend on each other, so that several processes may take one each.
+    Passes do not depend on each other, so that several processes may take one each.
 
     Parameters
     ----------
     scan
         What exposes.
     rows
-        Rows of the stroke, from `strokes`.
-    namer
+        Rows of the pass, from `scan_passes`.
+    labeller
         Forgets what it knew first.
-    base_from_sensor
-        From `sensor_poses`.
-    stripes
-        Stripe extraction; defaults if None.
+    scanner
+        The calibrated scanner.
     keep
         Told of every exposure.
+
+    Raises
+    ------
+    InputError
+        If the scanner has no camera, or as `exposure_poses`.
+    EstimationError
+        As `exposure_poses`.
     """
-    namer.reset()
-    lasers, named = [], []
-    for row in rows:
-        lasers.append(namer.next_lasers())
-        exposure = scan.expose(row, lasers[-1])
-        if keep is not None:
-            keep(row, exposure)
-        profile = extract_stripes(exposure, stripes)
-        named.append(namer.name(profile, lasers[-1], base_from_sensor(row), scan.rows[row].t_ns))
-    return TakenPass(tuple(rows), tuple(lasers), tuple(named))
+    if scanner.sensor is None:
+        raise InputError("a scanner without camera has no stripes to label")
+    poses = exposure_poses(scan.rows, scan.arm, scan.session.clock, scanner.latency_ns)
+    base_from_sensor = sensor_poses(poses, scanner)
+    lasers = []
+
+    def exposures() -> Iterator[InstantImages]:
+        for row in rows:
+            lasers.append(labeller.next_lasers())
+            exposure = scan.expose(row, lasers[-1])
+            if keep is not None:
+                keep(row, exposure)
+            instant = Instant((row,), scan.rows[row].t_ns)
+            yield InstantImages(((exposure, None),), base_from_sensor(instant), instant)
+
+    labeller.reset()
+    for _ in measure_instants(
+        exposures(), labeller, scanner.sensor, MeasureOptions(), is_pass=True, reads_ahead=False
+    ):
+        """The labels of one exposure choose the lasers of the next."""
+    return TakenPass(tuple(rows), tuple(lasers))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +121,7 @@ class ChosenLasers:
     """A scan with the lasers that were chosen for its rows, as a source like any other.
 
     Written as a recording, its rows name their lasers, so that the same exposures are read and
-    named again.
+    labelled again.
 
     Parameters
     ----------
@@ -162,20 +145,18 @@ class ChosenLasers:
             )
 
     @staticmethod
-    def of_strokes(scan: SimulatedScan, taken: Sequence[TakenPass]) -> ChosenLasers:
-        """Join the strokes of a scan.
+    def of_passes(scan: SimulatedScan, taken: Sequence[TakenPass]) -> ChosenLasers:
+        """Join the passes of a scan.
 
         Raises
         ------
         InputError
             If they are not all its rows, each once.
         """
-        lasers = {
-            row: on for stroke in taken for row, on in zip(stroke.rows, stroke.lasers, strict=True)
-        }
+        lasers = {row: on for one in taken for row, on in zip(one.rows, one.lasers, strict=True)}
         if sorted(lasers) != list(range(len(scan.rows))):
             raise InputError(
-                f"strokes with {len(lasers)} of {len(scan.rows)} exposures", where=scan.name
+                f"passes with {len(lasers)} of {len(scan.rows)} exposures", where=scan.name
             )
         return ChosenLasers(scan, tuple(lasers[row] for row in range(len(scan.rows))))
 
@@ -216,75 +197,50 @@ class ChosenLasers:
 def scan_adaptively(
     scan: SimulatedScan,
     scanner: ScannerCalibration,
-    namer: StripeLabeller,
+    labeller: StripeLabeller,
     *,
-    stripes: StripeOptions | None = None,
     keep: Keep | None = None,
-) -> tuple[ChosenLasers, tuple[TakenPass, ...]]:
-    """Take all strokes of a scan one after the other.
-
-    Parameters
-    ----------
-    scan
-        What exposes.
-    scanner
-        The calibrated scanner.
-    namer
-        Of the scanner's sensor.
-    stripes
-        Stripe extraction; defaults if None.
-    keep
-        Told of every exposure.
-
-    Raises
-    ------
-    InputError, EstimationError
-        As `exposure_poses`, and if the rows are not in order of time.
-    """
-    pose = sensor_poses(scan, scanner)
-    taken = tuple(
-        take_stroke(scan, rows, namer, pose, stripes=stripes, keep=keep)
-        for rows in strokes(scan.rows)
-    )
-    return ChosenLasers.of_strokes(scan, taken), taken
-
-
-STAGE = "scan with chosen lasers"
-
-
-@dataclass(frozen=True, slots=True)
-class _Taken:
-    """A stroke with its images as PNG files."""
-
-    stroke: TakenPass
-    images: tuple[bytes, ...]
+) -> ChosenLasers:
+    """Take all passes of a scan one after the other; parameters and errors as of `take_pass`."""
+    taken = [take_pass(scan, rows, labeller, scanner, keep=keep) for rows in scan_passes(scan.rows)]
+    return ChosenLasers.of_passes(scan, taken)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rig:
-    """What takes strokes in one process."""
+    """What takes passes in one process: a scene of a twin, of each pass its first exposures."""
 
     scan: SimulatedScan
     scanner: ScannerCalibration
 
-    def take(self, rows: range) -> _Taken:
-        """Take one stroke, and keep its images."""
-        scan, sensor = self.scan, self.scanner.sensor
-        if sensor is None:
-            raise ValueError("a scanner without sensor names no stripes")
-        setup = written_session(scan).cameras[0]
+    @staticmethod
+    def of(
+        name: TwinName, scene: TwinScene, scanner: ScannerCalibration, longest_pass: int | None
+    ) -> _Rig:
+        scan = name.build().scan(scene)
+        if longest_pass is not None:
+            kept = [row for rows in scan_passes(scan.rows) for row in rows[:longest_pass]]
+            scan = SimulatedPart(scan, tuple(kept))
+        return _Rig(scan, scanner)
+
+    def take(self, rows: range) -> tuple[TakenPass, list[bytes]]:
+        """Take one pass; its images as PNG files."""
+        if self.scanner.sensor is None:
+            raise ValueError("a scanner without sensor labels no stripes")
+        setup = written_session(self.scan).cameras[0]
         images: list[bytes] = []
-
-        def keep(_row: int, exposure: Exposure) -> None:
-            images.append(encoded_png(exposure, setup))
-
-        pose = sensor_poses(scan, self.scanner)
-        stroke = take_stroke(scan, rows, CrossLabeller(sensor), pose, keep=keep)
-        return _Taken(stroke, tuple(images))
+        taken = take_pass(
+            self.scan,
+            rows,
+            CrossLabeller(self.scanner.sensor),
+            self.scanner,
+            keep=lambda _, exposure: images.append(encoded_png(exposure, setup)),
+        )
+        return taken, images
 
 
 _here: list[_Rig] = []
-"""What this process takes strokes with; empty in any but a process of the pool."""
+"""What this process takes passes with; empty in any but a process of the pool."""
 
 
 def record_adaptively(
@@ -293,11 +249,11 @@ def record_adaptively(
     scene: TwinScene,
     scanner: ScannerCalibration,
     *,
-    longest_stroke: int | None = None,
+    longest_pass: int | None = None,
     processes: int = 2,
     progress: Progress = silent,
 ) -> None:
-    """Take a scene of a twin with the lasers that the naming asks for, and write the recording.
+    """Take a scene of a twin with the lasers that the labelling asks for; write the recording.
 
     Parameters
     ----------
@@ -307,12 +263,12 @@ def record_adaptively(
         The twin, and what it looks at.
     scanner
         The calibrated scanner.
-    longest_stroke
-        Exposures that are taken of each stroke, its first ones; None for all.
+    longest_pass
+        Exposures that are taken of each pass, its first ones; None for all.
     processes
-        Processes that take strokes; 1 takes them in this one.
+        Processes that take passes; 1 takes them in this one.
     progress
-        Told of every stroke.
+        Told of every pass.
 
     Raises
     ------
@@ -321,51 +277,33 @@ def record_adaptively(
     EstimationError
         If a process came to an end.
     """
-    scan = _planned(name, scene, longest_stroke)
-    pieces = strokes(scan.rows)
-    done: list[_Taken] = []
-    given = (name, scene, scanner, longest_stroke)
-    with closing(_taken(pieces, processes, given)) as results:
-        for taken in results:
-            progress(ProgressEvent(STAGE, len(done), len(pieces), scene))
+    given = (name, scene, scanner, longest_pass)
+    rig = _Rig.of(*given)
+    ranges = scan_passes(rig.scan.rows)
+    done: list[TakenPass] = []
+    images: list[bytes] = []
+    with closing(_taken(rig, ranges, processes, given)) as results:
+        for taken, encoded in results:
+            progress(ProgressEvent(STAGE, len(done), len(ranges), scene))
             done.append(taken)
-    progress(ProgressEvent(STAGE, len(pieces), len(pieces)))
-    chosen = ChosenLasers.of_strokes(scan, [taken.stroke for taken in done])
-    write_recording(folder, chosen, encoded=[image for taken in done for image in taken.images])
+            images += encoded
+    progress(ProgressEvent(STAGE, len(ranges), len(ranges)))
+    write_recording(folder, ChosenLasers.of_passes(rig.scan, done), encoded=images)
 
 
-_Given = tuple[TwinName, TwinScene, ScannerCalibration, int | None]
-"""What a rig is made of, in any process."""
-
-
-def _taken(pieces: Sequence[range], processes: int, given: _Given) -> Generator[_Taken]:
-    n_processes = min(processes, len(pieces))
+def _taken(
+    rig: _Rig, ranges: Sequence[range], processes: int, given: tuple[Any, ...]
+) -> Generator[tuple[TakenPass, list[bytes]]]:
+    n_processes = min(processes, len(ranges))
     if n_processes > 1:
-        yield from in_processes(_take, pieces, n_processes, _prepare, given)
+        yield from in_processes(_take, ranges, n_processes, _prepare, given)
         return
-    rig = _rig(*given)
-    for rows in pieces:
-        yield rig.take(rows)
-
-
-def _planned(name: TwinName, scene: TwinScene, longest_stroke: int | None) -> SimulatedScan:
-    """The scene, of each stroke as many exposures as are wanted."""
-    whole = name.build().scan(scene)
-    if longest_stroke is None:
-        return whole
-    kept = [row for rows in strokes(whole.rows) for row in rows[:longest_stroke]]
-    return ScanPart(whole, tuple(kept))
-
-
-def _rig(
-    name: TwinName, scene: TwinScene, scanner: ScannerCalibration, longest_stroke: int | None
-) -> _Rig:
-    return _Rig(_planned(name, scene, longest_stroke), scanner)
+    yield from (rig.take(rows) for rows in ranges)
 
 
 def _prepare(*given: Any) -> None:
-    _here.append(_rig(*given))
+    _here.append(_Rig.of(*given))
 
 
-def _take(rows: range) -> _Taken:
+def _take(rows: range) -> tuple[TakenPass, list[bytes]]:
     return _here[0].take(rows)

@@ -4,99 +4,45 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import (
     MIN_POINTS,
-    HandEyeOptions,
-    PlateReference,
     PosedStripe,
 )
-from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.devices.sources import ScanSource
-from armscan.errors import ArmscanError, EstimationError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.geometry.estimate import FitFailure
+from armscan.errors import EstimationError
+from armscan.geometry.arrays import IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import (
-    MeasuredImage,
     MeasureOptions,
     cameras_of,
-    collected,
-    see,
-    stripes_for,
+    labeller_for,
+    measure_instants,
+    summarised,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import measurer_for
-from armscan.reconstruction.labels import MeasuredProfile
-from armscan.reconstruction.sync import SyncOptions, exposure_poses
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns
+from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.scan import check_poses
+from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.place import delivered_points
+from armscan.reconstruction.points import MeasuredProfile
+from armscan.reconstruction.sync import exposure_poses
+from armscan.reconstruction.triangulate import sensor_columns
+from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
 STAGE = "stripes of the postures"
+MAX_EXPOSURES = 200
+"""Of a longer scan, so many are used, evenly spread."""
 SAME_PLACE_MM = 0.05
 SAME_TURN_RAD = 2e-4
 """Consecutive exposures without a view whose poses differ by less are one posture."""
-
-
-@dataclass(frozen=True, slots=True)
-class HandEyeScanOptions:
-    """How a scan of the plate becomes a hand-eye.
-
-    Parameters
-    ----------
-    hand_eye
-        The calibration itself.
-    measure
-        Stripe extraction and the depths accepted.
-    sync
-        How exposures find their pose.
-    max_exposures
-        Of a longer scan, so many are used, evenly spread.
-    """
-
-    hand_eye: HandEyeOptions = field(default_factory=HandEyeOptions)
-    measure: MeasureOptions = field(default_factory=MeasureOptions)
-    sync: SyncOptions = field(default_factory=SyncOptions)
-    max_exposures: int = 200
-
-    def __post_init__(self) -> None:
-        if self.max_exposures < 3:
-            raise OptionError(
-                f"at most {self.max_exposures} exposures",
-                where="hand-eye options",
-                remedy="allow at least 3",
-            )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HandEyeRun:
-    """A hand-eye, and what was seen on the way.
-
-    Parameters
-    ----------
-    fit
-        The result.
-    stripes
-        The stripes that it rests on, with their poses.
-    images
-        What each of these exposures gave, in the same order.
-    not_used
-        (source, reason) of exposures that were left out.
-    warnings
-        What is weak about the scan, in words; those of the calibration are in ``fit``.
-    """
-
-    fit: HandEyeFit
-    stripes: tuple[PosedStripe, ...]
-    images: tuple[MeasuredProfile, ...]
-    not_used: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
+REPEATED_DEG, REPEATED_MM = 0.1, 0.1
+"""Profiles whose poses, as a robot tells them, differ by less are one posture."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,28 +51,36 @@ class ObservedStripes:
 
     Parameters
     ----------
-    stripes, images, not_used, warnings
-        As of `HandEyeRun`.
+    stripes
+        The stripes with their poses.
+    images
+        What each of these exposures gave, in the same order.
+    not_used
+        (source, reason) of exposures that were left out.
+    warnings
+        What is weak about the scan, in words.
     """
 
     stripes: tuple[PosedStripe, ...]
-    images: tuple[MeasuredProfile, ...]
+    images: tuple[LabelledProfile, ...]
     not_used: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
 
 
-def calibrate_hand_eye_from_scan(
+def observe_stripes(
     source: ScanSource,
     sensor: SensorCalibration,
-    plate: PlateReference,
-    options: HandEyeScanOptions | None = None,
+    options: MeasureOptions | None = None,
     *,
+    max_exposures: int = MAX_EXPOSURES,
     progress: Progress = silent,
-) -> HandEyeRun | FitFailure:
-    """Measure the stripe of every exposure on the plate and calibrate.
+) -> ObservedStripes:
+    """Measure the stripe of every exposure that has a pose.
 
-    Exposures of equal view are one posture; without views, consecutive exposures whose poses agree
-    are one, so that a moving scan has a posture an exposure.
+    Whatever reference the stripes lie on: a plate or a sphere. Exposures of equal view are one
+    posture; without views, consecutive exposures whose poses agree are one, so that a moving scan
+    has a posture an exposure. An image that cannot be read is left out and named, and so is one
+    without its partner of the other camera.
 
     Parameters
     ----------
@@ -134,11 +88,11 @@ def calibrate_hand_eye_from_scan(
         The scan, with an arm and the sensor's cameras; exposures with the laser off serve as
         background of their view.
     sensor
-        Camera and sheets.
-    plate
-        The plate in Base.
+        Camera or cameras and sheets.
     options
-        Defaults if None.
+        Stripe extraction and the depths accepted.
+    max_exposures
+        Of a longer scan, so many are used, evenly spread.
     progress
         Told of every exposure.
 
@@ -151,81 +105,61 @@ def calibrate_hand_eye_from_scan(
         If no exposure has a pose, none of the images can be read, or the sheet of a stripe is
         ambiguous.
     """
-    options = options or HandEyeScanOptions()
-    seen = observe_stripes(source, sensor, options, progress=progress)
-    fit = calibrate_on_plate(
-        seen.stripes, plate, options.hand_eye, sensor_covariance=sensor.covariance
-    )
-    if isinstance(fit, FitFailure):
-        return fit
-    return HandEyeRun(fit, seen.stripes, seen.images, seen.not_used, seen.warnings)
-
-
-def observe_stripes(
-    source: ScanSource,
-    sensor: SensorCalibration,
-    options: HandEyeScanOptions,
-    *,
-    progress: Progress = silent,
-) -> ObservedStripes:
-    """Measure the stripe of every exposure that has a pose; else `calibrate_hand_eye_from_scan`.
-
-    Whatever reference the stripes lie on: a plate or a sphere. An image that cannot be read is
-    left out and named, as `armscan.pipeline.scan.measure_scan` does, and so is one without its
-    partner of the other camera.
-    """
-    poses = exposure_poses(source.rows, source.arm, source.session.clock, options=options.sync)
-    cameras = cameras_of(sensor)
-    exposures = ScanInstants(source, len(cameras))
-    lit = exposures.lit
-    has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in lit], dtype=np.bool_)
-    chosen = [lit[k] for k in _spread(np.flatnonzero(has_pose), options.max_exposures)]
+    options = options or MeasureOptions()
+    poses = exposure_poses(source.rows, source.arm, source.session.clock)
+    scan = ScanInstants(source, len(cameras_of(sensor)))
+    has_pose = np.array([poses.has_pose[list(one.rows)].all() for one in scan.lit], dtype=np.bool_)
+    chosen = [scan.lit[k] for k in _spread(np.flatnonzero(has_pose), max_exposures)]
     postures, merged = _postures(
         [source.rows[one.rows[0]] for one in chosen], [poses.pose(one.rows[0]) for one in chosen]
     )
+    posture_of = dict(zip(chosen, postures, strict=True))
     stripes: list[PosedStripe] = []
-    images: list[MeasuredProfile] = []
-    not_used = [
-        (source.rows[row].source, "the arm gave no pose for it")
-        for one, known in zip(lit, has_pose, strict=True)
+    images: list[LabelledProfile] = []
+    without_stripe: dict[int, str] = {}
+    weak: list[str] = []
+    # Each still is labelled by itself: where the sensor is on the arm is not known yet.
+    measured = measure_instants(
+        scan.read(chosen, STAGE, progress),
+        labeller_for(sensor, options),
+        sensor,
+        options,
+        is_pass=False,
+    )
+    for one in measured:
+        instant = one.images.instant
+        for row, found in zip(instant.rows, one.profiles, strict=True):
+            weak += found.warnings
+            if len(found.points) < MIN_POINTS:
+                without_stripe[row] = "no stripe was measured in it"
+                continue
+            images.append(found.labelled)
+            pose = poses.pose(instant.rows[0])
+            stripes.append(posed_stripe(found, sensor, posture_of[instant], pose))
+    if chosen and all(one.rows[0] in scan.unreadable for one in chosen):
+        raise EstimationError(
+            f"no exposure with a pose could be read: {scan.unreadable[chosen[-1].rows[0]]}"
+        )
+    reasons = {
+        row: "the arm gave no pose for it"
+        for one, known in zip(scan.lit, has_pose, strict=True)
         for row in one.rows
         if not known
-    ]
-    not_used += [(source.rows[row].source, PARTNER_MISSING) for row in exposures.without_partner]
-    n_unreadable = 0
-    weak: list[str] = []
-    for done, (instant, posture) in enumerate(zip(chosen, postures, strict=True)):
-        first = source.rows[instant.rows[0]].source
-        progress(ProgressEvent(STAGE, done, len(chosen), first))
-        try:
-            pairs = [exposures.pair(row) for row in instant.rows]
-        except ArmscanError as error:
-            not_used.append((first, str(error)))
-            n_unreadable += 1
-            continue
-        seen = [
-            see(pair, camera, stripes_for(sensor, options.measure.stripes))
-            for pair, camera in zip(pairs, cameras, strict=True)
-        ]
-        # Each still is named by itself: where the sensor is on the arm is not known yet.
-        for one in measurer_for(sensor, options.measure).measure(seen, None, instant.t_ns):
-            weak += one.warnings
-            if len(one.points.row) < MIN_POINTS:
-                not_used.append((one.image.profile.source, "no stripe was measured in it"))
-                continue
-            images.append(one.image)
-            stripes.append(posed_stripe(one, sensor, posture, poses.pose(instant.rows[0])))
-    progress(ProgressEvent(STAGE, len(chosen), len(chosen)))
-    if n_unreadable == len(chosen) > 0:
-        raise EstimationError(f"no exposure with a pose could be read: {not_used[-1][1]}")
-    n_posed = int(has_pose.sum())
+    }
+    reasons |= dict.fromkeys(scan.without_partner, PARTNER_MISSING)
+    for one in chosen:
+        first = one.rows[0]
+        if first in scan.unreadable:
+            reasons[first] = scan.unreadable[first]
+        reasons |= {row: without_stripe[row] for row in one.rows if row in without_stripe}
+    not_used = tuple((source.rows[row].source, reason) for row, reason in reasons.items())
     warnings = (
         *poses.warnings,
-        *_left_out(len(chosen), n_posed, not_used),
+        *_left_out(len(chosen), int(has_pose.sum()), not_used),
         *merged,
-        *collected(weak),
+        *summarised(weak),
     )
-    return ObservedStripes(tuple(stripes), tuple(images), tuple(not_used), warnings)
+    return ObservedStripes(tuple(stripes), tuple(images), not_used, warnings)
 
 
 def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:
@@ -240,7 +174,7 @@ def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) 
 
 
 def posed_stripe(
-    measured: MeasuredImage,
+    measured: MeasuredProfile,
     sensor: SensorCalibration,
     posture: str,
     base_from_tool: Pose[Base, Tool],
@@ -259,23 +193,19 @@ def posed_stripe(
         As the arm reported it.
     """
     points = measured.points
+    by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
+    for k in range(len(sensor.sheets)):
+        rows = np.flatnonzero(points.sheet == k)
+        by_all[np.ix_(rows, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[rows]
     return PosedStripe(
-        source=measured.image.profile.source,
+        source=measured.labelled.profile.source,
         posture=posture,
         base_from_tool=base_from_tool,
         points_mm=points.points_mm,
         noise_mm=points.noise_mm,
         sheet=points.sheet,
-        dpoint_dsensor=_by_all_parameters(points, sensor),
+        dpoint_dsensor=by_all,
     )
-
-
-def _by_all_parameters(points: StripePoints, sensor: SensorCalibration) -> FloatArray:
-    spread = np.zeros((len(points.row), 3, len(sensor.parameter_names)))
-    for k in range(len(sensor.sheets)):
-        own = np.flatnonzero(points.sheet == k)
-        spread[np.ix_(own, np.arange(3), sensor_columns(sensor, k))] = points.by_sensor[own]
-    return spread
 
 
 def _spread(rows: IntArray, most: int) -> IntArray:
@@ -315,3 +245,46 @@ def _agree(pose: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
     turn: Pose[Tool, Tool] = pose.inverse() @ other
     angle = float(np.linalg.norm(turn.rotation_vector_rad))
     return shift < SAME_PLACE_MM and angle < SAME_TURN_RAD
+
+
+def posed_stripes_from_profiles(
+    profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]
+) -> tuple[PosedStripe, ...]:
+    """Join profiles that a sensor delivered and poses of equal order.
+
+    Parameters
+    ----------
+    profiles
+        One an exposure, in the Sensor frame.
+    poses
+        ``base_from_tool`` of each.
+
+    Raises
+    ------
+    InputError
+        If the counts differ.
+    """
+    check_poses(profiles, poses)
+    postures: list[str] = []
+    for k, pose in enumerate(poses):
+        same = [
+            j
+            for j in range(k)
+            if np.linalg.norm(poses[j].translation_mm - pose.translation_mm) < REPEATED_MM
+            and np.abs(poses[j].rotation - pose.rotation).max() < np.radians(REPEATED_DEG)
+        ]
+        postures.append(postures[same[0]] if same else profiles[k].source)
+    stripes = []
+    for profile, posture, pose in zip(profiles, postures, poses, strict=True):
+        points = delivered_points(profile)
+        stripes.append(
+            PosedStripe(
+                source=profile.source,
+                posture=posture,
+                base_from_tool=pose,
+                points_mm=points.points_mm,
+                noise_mm=points.noise_mm,
+                sheet=points.sheet,
+            )
+        )
+    return tuple(stripes)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
 
@@ -11,9 +11,11 @@ import numpy as np
 from scipy.ndimage import grey_opening
 
 from armscan.devices.sources import ScanSource
-from armscan.errors import InputError
+from armscan.errors import ArmscanError, InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.camera import CameraModel
+from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ExposureRow
 
@@ -322,6 +324,35 @@ def _by_time(rows: Sequence[ExposureRow], chosen: list[int]) -> dict[tuple[str, 
     return groups
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class InstantImages:
+    """What the cameras of a head took at one instant.
+
+    Parameters
+    ----------
+    pairs
+        The exposure of each camera with its partner without laser, left first.
+    base_from_sensor
+        Where the sensor was; None if unknown.
+    instant
+        Its rows and time in a scan; of still images there are none.
+    """
+
+    pairs: tuple[ExposurePair, ...]
+    base_from_sensor: Pose[Base, Sensor] | None = None
+    instant: Instant = Instant((), 0)
+
+    @property
+    def lasers(self) -> tuple[str, ...]:
+        """Sources that were on; empty if unknown."""
+        return self.pairs[0][0].lasers
+
+    @property
+    def t_ns(self) -> int:
+        """Mid-exposure time."""
+        return self.instant.t_ns
+
+
 class ScanInstants:
     """Reads the exposures of a scan, one background of each camera at a time in memory.
 
@@ -364,6 +395,8 @@ class ScanInstants:
             if len(one.rows) == n_cameras and self.is_lit[list(one.rows)].all()
         )
         """Instants at which a laser was on and of which every camera has an image."""
+        self.unreadable: dict[int, str] = {}
+        """Why rows could not be read, once `read` met them."""
         complete = {row for one in self.lit for row in one.rows}
         lit_rows = np.flatnonzero(self.is_lit).tolist()
         self.without_partner: tuple[int, ...] = tuple(k for k in lit_rows if k not in complete)
@@ -376,6 +409,35 @@ class ScanInstants:
                 remedy="give the images of one instant the same trigger_id, or, without trigger "
                 f"ids, times within {SAME_TIME_NS / 1e6:g} ms and a quarter of the frame period",
             )
+
+    def read(
+        self,
+        instants: Sequence[Instant],
+        stage: str,
+        progress: Progress,
+        base_from_sensor: Callable[[Instant], Pose[Base, Sensor] | None] = lambda _: None,
+    ) -> Iterator[InstantImages]:
+        """Read instants one by one; what cannot be read is left out and kept in `unreadable`.
+
+        Parameters
+        ----------
+        instants
+            Which.
+        stage, progress
+            Told of every instant.
+        base_from_sensor
+            Where the sensor was.
+        """
+        n = len(instants)
+        for done, one in enumerate(instants):
+            progress(ProgressEvent(stage, done, n, self._source.rows[one.rows[0]].source))
+            try:
+                pairs = tuple(self.pair(row) for row in one.rows)
+            except ArmscanError as error:
+                self.unreadable.update(dict.fromkeys(one.rows, str(error)))
+                continue
+            yield InstantImages(pairs, base_from_sensor(one), one)
+        progress(ProgressEvent(stage, n, n))
 
     def pair(self, row: int) -> ExposurePair:
         """Read one exposure and its background, if there is one.

@@ -1,25 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One exposure to measured points in the Sensor frame."""
+"""The measuring loop: instants come in, labelled stripes and points in the Sensor frame go out.
+
+Still images, hand-eye calibration, scans and scans that choose their lasers meanwhile all drive
+`measure_instants`; heads differ in their `StripeLabeller` alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 
-from armscan.geometry.arrays import IntArray
-from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.errors import EstimationError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
-from armscan.pipeline.instants import ExposurePair, check_sizes
-from armscan.reconstruction.label_single import DepthRange, is_without_ray
-from armscan.reconstruction.labels import LabelledProfile, LabelStatus, MeasuredProfile, PointStatus
-from armscan.reconstruction.triangulate import StripePoints, intersect_sheets, triangulate_stripe
+from armscan.pipeline.instants import (
+    ExposurePair,
+    InstantImages,
+    check_sizes,
+    pair_exposures,
+)
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.reconstruction.label_cross import CrossLabeller
+from armscan.reconstruction.label_single import SingleLabeller
+from armscan.reconstruction.label_stereo import StereoLabeller
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeLabeller
+from armscan.reconstruction.place import merge_clouds
+from armscan.reconstruction.points import MeasuredProfile, measure_points, points_again
+from armscan.reconstruction.triangulate import (
+    CALIBRATED_DEPTHS,
+    LABEL_DEPTHS,
+    DepthRange,
+    StripePoints,
+    cloud_in_sensor,
+)
+from armscan.records.cloud import PointCloud
+from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import LaserColour, StripeOptions
+
+STAGE = "reconstruct"
+LEAST_APART_RAD = 0.5
+"""Stripes whose directions differ by more are told from each other by direction."""
+LOOK_AHEAD = 1
+"""Instants that are read while the stripes of an earlier one are extracted."""
+CLEAN_SHARE = 0.5
+"""An image of which less than this share of the stripe points is measured is pointed out."""
+LISTED = 4
+NOTHING_MEASURED_REMEDY = (
+    "check that the images show a laser line, that camera and sheet are the right ones, and give a "
+    "larger --depth-margin if the object stood further outside the calibrated depths"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +69,7 @@ class MeasureOptions:
         Stripe extraction.
     depths
         Depths that are accepted; points outside are left out and counted. None for those that the
-        head's own rule takes: `DepthRange` of one camera, `StereoLabelOptions.depths` of two.
+        head's own rule takes.
     sheet
         Name of the sheet that drew all stripes; empty to find it. For one camera only.
     """
@@ -41,52 +78,131 @@ class MeasureOptions:
     depths: DepthRange | None = None
     sheet: str = ""
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LitProfile:
-    """Stripes of one exposure, and the lasers that its row names.
-
-    Parameters
-    ----------
-    profile
-        Stripe points.
-    lasers
-        Names of the sources that were on; empty if unknown.
-    """
-
-    profile: Profile
-    lasers: tuple[str, ...] = ()
+    def accepted_depths(self, sensor: SensorCalibration) -> DepthRange:
+        """Depths in which points are kept."""
+        return self.depths or (CALIBRATED_DEPTHS if sensor.second is None else LABEL_DEPTHS)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredImage:
-    """What one exposure gave.
+def labeller_for(
+    sensor: SensorCalibration, options: MeasureOptions, *, is_scan: bool = False
+) -> StripeLabeller:
+    """The rule by which this sensor's stripes are given to sheets.
 
     Parameters
     ----------
-    image
-        Its stripe points, the sheet of each and what became of it.
-    points
-        The measured ones in the Sensor frame.
-    warnings
-        What is weak, in words.
+    sensor
+        Camera or cameras and sheets.
+    options
+        Depths accepted, and the user's choice of a sheet.
+    is_scan
+        True for exposures in order of time with the arm's pose; else each is labelled by itself.
+
+    Raises
+    ------
+    OptionError
+        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves, or
+        if there is no such sheet.
     """
+    n_sheets = len(sensor.sheets)
+    if sensor.second is not None:
+        if options.sheet:
+            raise OptionError(
+                f"sheet {options.sheet!r} was asked for, but two cameras tell each stripe's sheet",
+                where="--sheet",
+                remedy="leave --sheet out",
+            )
+        return StereoLabeller(sensor, options.depths or LABEL_DEPTHS)
+    if n_sheets > 1 and not options.sheet and (is_scan or stripes_cross(sensor)):
+        return CrossLabeller(sensor, options.depths or LABEL_DEPTHS)
+    return SingleLabeller(sensor, options.accepted_depths(sensor), options.sheet)
 
-    image: MeasuredProfile
-    points: StripePoints
-    warnings: tuple[str, ...] = ()
+
+def stripes_cross(sensor: SensorCalibration) -> bool:
+    """True if the stripes of two sheets on a wall that faces the camera run clearly apart."""
+    normals = np.array([calibrated.sheet.axes[2][:2] for calibrated in sensor.sheets])
+    angles = np.arctan2(normals[:, 1], normals[:, 0])
+    apart = np.abs(np.sin(angles[:, None] - angles))
+    return bool((apart > np.sin(LEAST_APART_RAD)).any())
 
 
-class Measurer(Protocol):
-    """Names the sheets of stripes and triangulates them, instant by instant in order of time."""
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredInstant:
+    """One instant, and what each of its cameras gave."""
 
-    def measure(
-        self,
-        seen: Sequence[LitProfile],
-        base_from_sensor: Pose[Base, Sensor] | None = None,
-        t_ns: int = 0,
-    ) -> tuple[MeasuredImage, ...]:
-        """Measure what the cameras saw at one instant; one result a camera."""
+    images: InstantImages
+    profiles: tuple[MeasuredProfile, ...]
+
+
+def measure_instants(
+    instants: Iterable[InstantImages],
+    labeller: StripeLabeller,
+    sensor: SensorCalibration,
+    options: MeasureOptions,
+    *,
+    is_pass: bool,
+    reads_ahead: bool = True,
+) -> Iterator[MeasuredInstant]:
+    """Extract the stripes of each instant, label them, and turn them into points.
+
+    Parameters
+    ----------
+    instants
+        In order of time; read one by one.
+    labeller
+        From `labeller_for`.
+    sensor
+        Camera or cameras and sheets.
+    options
+        Stripe extraction and the depths accepted.
+    is_pass
+        True where each instant follows the one before; else the labeller forgets it.
+    reads_ahead
+        Read the next instant meanwhile; False where its exposure depends on the labels of this one.
+
+    Raises
+    ------
+    InputError
+        If an image is not of its camera's sensor.
+    EstimationError
+        If the sheet of a stripe is ambiguous.
+    """
+    depths = options.accepted_depths(sensor)
+    for images, profiles in _extracted(instants, sensor, options.stripes, reads_ahead):
+        if not is_pass:
+            labeller.reset()
+        labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
+        yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
+
+
+def _extracted(
+    instants: Iterable[InstantImages],
+    sensor: SensorCalibration,
+    options: StripeOptions,
+    reads_ahead: bool,
+) -> Iterator[tuple[InstantImages, list[Profile]]]:
+    """Profiles of each instant, in order, with few instants in memory; ends at the first error."""
+    cameras, stripes = cameras_of(sensor), stripes_for(sensor, options)
+
+    def extract(images: InstantImages) -> list[Profile]:
+        pairs = zip(images.pairs, cameras, strict=True)
+        return [extract_profile(pair, camera, stripes) for pair, camera in pairs]
+
+    if not reads_ahead:
+        yield from ((images, extract(images)) for images in instants)
+        return
+    pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
+    with ThreadPoolExecutor(LOOK_AHEAD) as pool:
+        try:
+            for images in instants:
+                pending.append((images, pool.submit(extract, images)))
+                if len(pending) > LOOK_AHEAD:
+                    first, found = pending.popleft()
+                    yield first, found.result()
+            while pending:
+                first, found = pending.popleft()
+                yield first, found.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOptions:
@@ -96,7 +212,7 @@ def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOpti
     return replace(options, laser_colour=cast(LaserColour, sensor.laser_colour))
 
 
-def see(pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> LitProfile:
+def extract_profile(pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> Profile:
     """Extract the stripes of one exposure.
 
     Raises
@@ -106,7 +222,7 @@ def see(pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> LitP
     """
     exposure, background = pair
     check_sizes([image for image in pair if image is not None], camera)
-    return LitProfile(extract_stripes(exposure, options, background), exposure.lasers)
+    return extract_stripes(exposure, options, background)
 
 
 def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
@@ -116,51 +232,181 @@ def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
     return sensor.camera.camera, sensor.second.camera.camera
 
 
-def triangulated(
-    image: MeasuredProfile, sensor: SensorCalibration, depths: DepthRange
-) -> MeasuredImage:
-    """Triangulate the points that passed so far; those beyond the accepted depths do not."""
-    points, is_met = intersect_sheets(image.profile.points_px, image.sheet, sensor)
-    fate = np.array(image.fate)
-    is_open = fate == int(PointStatus.MEASURED)
-    for k, sheet in enumerate(sensor.sheets):
-        low, high = depths.limits_mm(sheet)
-        outside = (points[:, 2] < low) | (points[:, 2] > high)
-        fate[is_open & (image.sheet == k) & outside] = int(PointStatus.OUT_OF_DEPTH)
-    fate[is_open & ~is_met] = int(PointStatus.NO_RAY)
-    for k, calibrated in enumerate(sensor.sheets):
-        own = np.flatnonzero((fate == int(PointStatus.MEASURED)) & (image.sheet == k))
-        profile = image.profile
-        lost = is_without_ray(
-            points[own], profile.intensity[own], profile.segment[own], calibrated.sheet
+def measured_again(
+    profiles: Sequence[LabelledProfile], sensor: SensorCalibration
+) -> Iterator[tuple[int, StripePoints]]:
+    """Number and measured points of each profile of a scan: what it does not keep of them.
+
+    Of a head of two cameras, the profiles of one instant follow each other.
+    """
+    if sensor.second is None:
+        for k, labelled in enumerate(profiles):
+            yield k, points_again(labelled, sensor)
+        return
+    labeller = StereoLabeller(sensor)
+    for k in range(0, len(profiles) - 1, 2):
+        labels = labeller.label([profiles[k].profile, profiles[k + 1].profile])
+        for camera, found in enumerate(measure_points(labels, sensor, labeller.depths)):
+            yield k + camera, found.points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """Measured points and the evidence of each image.
+
+    Parameters
+    ----------
+    cloud
+        Points in the Sensor frame.
+    images
+        One entry an exposure, in the order given; ``cloud.exposure`` points into it.
+    warnings
+        What is weak, in words.
+    """
+
+    cloud: PointCloud
+    images: tuple[LabelledProfile, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def reconstruct(
+    exposures: Sequence[Exposure],
+    sensor: SensorCalibration,
+    *,
+    backgrounds: Sequence[Exposure] = (),
+    rights: Sequence[Exposure] = (),
+    right_backgrounds: Sequence[Exposure] = (),
+    options: MeasureOptions | None = None,
+    progress: Progress = silent,
+) -> Reconstruction:
+    """Extract the stripes of every exposure, label their sheets and triangulate them.
+
+    Parameters
+    ----------
+    exposures
+        With the laser on, of the left camera or the only one; each is measured by itself.
+    sensor
+        Camera or cameras and sheets.
+    backgrounds
+        The same views without laser, one for each exposure, or none.
+    rights, right_backgrounds
+        The right camera's exposures of the same instants, in the same order, and theirs without
+        laser; for a sensor of two cameras.
+    options
+        Defaults if None.
+    progress
+        Told of every image.
+
+    Raises
+    ------
+    InputError
+        If images and backgrounds do not pair, are not of the camera's sensor, or if the images are
+        not of as many cameras as the sensor has.
+    EstimationError
+        If the sheet of a stripe is ambiguous, or nothing was measured at all.
+    """
+    options = options or MeasureOptions()
+    left = pair_exposures(exposures, backgrounds)
+    if sensor.second is None and rights:
+        raise InputError(
+            f"{len(rights)} images of a right camera, but the sensor has one camera",
+            remedy="leave them out, or name the sensor of the stereo head",
         )
-        fate[own[lost]] = int(PointStatus.NO_LASER_RAY)
-    measured = replace(image, fate=fate)
-    return MeasuredImage(measured, stripe_points(measured, sensor))
+    if sensor.second is not None and len(rights) != len(left):
+        raise InputError(
+            f"{len(left)} images of the left camera but {len(rights)} of the right one",
+            remedy="give the right camera's image of every instant, in the same order",
+        )
+    cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
+
+    def stills() -> Iterator[InstantImages]:
+        for done, pairs in enumerate(zip(*cameras, strict=True)):
+            progress(ProgressEvent(STAGE, done, len(left), pairs[0][0].source))
+            yield InstantImages(pairs)
+
+    images: list[LabelledProfile] = []
+    clouds: list[PointCloud] = []
+    weak: list[str] = []
+    labeller = labeller_for(sensor, options)
+    for instant in measure_instants(stills(), labeller, sensor, options, is_pass=False):
+        for found in instant.profiles:
+            images.append(found.labelled)
+            weak += found.warnings
+            clouds.append(cloud_in_sensor(found.points, found.labelled.profile, sensor))
+    progress(ProgressEvent(STAGE, len(left), len(left)))
+    cloud = merge_clouds(clouds)
+    if len(cloud) == 0:
+        raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
+    depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
+    warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
+    return Reconstruction(cloud, tuple(images), warnings)
 
 
-def stripe_points(image: MeasuredProfile, sensor: SensorCalibration) -> StripePoints:
-    """The measured points of an image of one camera in the Sensor frame."""
-    sheet = np.where(image.fate == int(PointStatus.MEASURED), image.sheet, -1)
-    return triangulate_stripe(image.profile, sheet, sensor)
+def nothing_measured(images: Sequence[LabelledProfile]) -> str:
+    """Say why these images gave no point at all."""
+    n_points = sum(len(image.profile) for image in images)
+    if n_points == 0:
+        return f"no stripe was found in {len(images)} images"
+    counts = ", ".join(
+        f"{count} {status.label}"
+        for status in PointStatus
+        if (count := sum(image.count(status) for image in images))
+    )
+    return f"none of {n_points} stripe points could be measured: {counts}"
 
 
-_FATES = {
-    LabelStatus.NAMED: PointStatus.MEASURED,
-    LabelStatus.AMBIGUOUS: PointStatus.AMBIGUOUS,
-    LabelStatus.UNEXPLAINED: PointStatus.STRAY,
-    LabelStatus.NOT_ASKED: PointStatus.FLAGGED,
-}
-
-
-def collected(warnings: Sequence[str]) -> tuple[str, ...]:
+def summarised(warnings: Sequence[str]) -> tuple[str, ...]:
     """Of warnings of single exposures, how many there are and what the first says."""
-    if not warnings:
-        return ()
-    return (f"{len(warnings)} exposures: {warnings[0]}",)
+    return (f"{len(warnings)} exposures: {warnings[0]}",) if warnings else ()
 
 
-def fates_of(named: LabelledProfile) -> IntArray:
-    """(N,) `PointStatus` of named stripe points, before they are triangulated."""
-    table = np.array([int(_FATES[fate]) for fate in sorted(LabelStatus)])
-    return np.asarray(table[named.fate])
+def measurement_warnings(
+    images: Sequence[LabelledProfile],
+    depths_mm: Sequence[FloatArray],
+    sensor: SensorCalibration,
+) -> tuple[str, ...]:
+    """Say what a person should know of these images; the same for still images and for scans.
+
+    Parameters
+    ----------
+    images
+        What each gave.
+    depths_mm
+        One array a sheet: the Z in Sensor of the points measured with it.
+    sensor
+        Camera and sheets.
+    """
+    warnings = []
+    n_measured = [one.count(PointStatus.MEASURED) + one.count(PointStatus.SHARED) for one in images]
+    both = list(zip((one.profile for one in images), n_measured, strict=True))
+    empty = [profile.source for profile, n in both if n == 0]
+    if empty:
+        warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
+    doubtful = [profile.source for profile, n in both if 0 < n < CLEAN_SHARE * len(profile)]
+    if doubtful:
+        warnings.append(
+            f"less than half of what looked like a stripe could be measured in "
+            f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line"
+        )
+    n_outside = sum(image.count(PointStatus.OUT_OF_DEPTH) for image in images)
+    if n_outside:
+        warnings.append(f"{n_outside} points were left out: too far outside the calibrated depths")
+    if not sensor.camera.has_covariance:
+        warnings.append(
+            "the camera came without covariance: the points' sigmas leave its errors out"
+        )
+    for sheet, depth in zip(sensor.sheets, depths_mm, strict=True):
+        low, high = sheet.depth_range_mm
+        beyond = np.maximum(low - depth, depth - high)
+        if (beyond > 0.0).any():
+            warnings.append(
+                f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
+                f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
+                f"{high:.1f} mm: their sigma supposes that the sheet goes on as it was calibrated"
+            )
+        if len(depth) and not sheet.is_redundant:
+            warnings.append(
+                f"sheet {sheet.name} rests on two boards only: nothing but the coplanarity of two "
+                "stripes checks it"
+            )
+    return tuple(warnings)

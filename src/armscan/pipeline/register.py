@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import chi2
@@ -27,12 +27,17 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.points import MarkerSet
 from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList
+from armscan.thesis.marker_rules import match_after_thesis
 
 MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""
 MOVED_WITHIN_MM = 5.0
 """Two markers without partner that lie this near to each other are one that moved."""
 LEAST_LEFT = 4
+BY_ID, UNCHECKED = -1, -2
+"""In place of a count of rivals: ids said which markers are common, or nothing was checked."""
+THESIS_SIGMAS = 8.0
+"""Limit of the eight steps for distances: a distance errs by up to 4 sigmas at either end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +52,14 @@ class RegisterOptions:
         Standard deviation an axis of markers whose list gives no covariance.
     is_by_id
         Take markers with the same ``id`` in both lists as the same, instead of matching them.
+    method
+        ``thesis`` for the eight steps of section 4.3.1, which check nothing afterwards.
     """
 
     match: MarkerMatchOptions = field(default_factory=MarkerMatchOptions)
     sigma_mm: float = ASSUMED_SIGMA_MM
     is_by_id: bool = False
+    method: Literal["armscan", "thesis"] = "armscan"
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sigma_mm < 100.0:
@@ -98,7 +106,7 @@ class PlaceRegistration:
     only_old, only_new
         Numbers of markers without partner.
     n_rival
-        Markers that the next best alignment explains; -1 where ids said which are common.
+        Markers that the next best alignment explains; or `BY_ID` or `UNCHECKED`.
     """
 
     fit: Estimate[Pose[Base, Base]]
@@ -172,7 +180,16 @@ def register_views(
 
 def _common(old: MarkerList, new: MarkerList, options: RegisterOptions) -> tuple[IntArray, int]:
     if options.is_by_id:
-        return _same_ids(old, new), -1
+        return _same_ids(old, new), BY_ID
+    if options.method == "thesis":
+        pairs = match_after_thesis(old.markers, new.markers, THESIS_SIGMAS * options.sigma_mm)
+        if len(pairs) < LEAST_LEFT:
+            raise EstimationError(
+                f"the eight steps pair {len(pairs)} markers, {LEAST_LEFT} are needed",
+                where=f"{old.path} and {new.path}",
+                remedy="leave --method thesis out",
+            )
+        return pairs, UNCHECKED
     found = match_markers(old.markers, new.markers, options.match)
     if not isinstance(found, Matched):
         remedy = found.remedy

@@ -3,58 +3,56 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
 
 from armscan.devices.sources import ScanSource
-from armscan.errors import ArmscanError, EstimationError, InputError, OptionError
+from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import Box, FloatArray
-from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.instants import PARTNER_MISSING, ExposurePair, Instant, ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
 from armscan.pipeline.measure import (
-    LitProfile,
-    MeasuredImage,
+    NOTHING_MEASURED_REMEDY,
     MeasureOptions,
     cameras_of,
-    collected,
-    see,
-    stripes_for,
-)
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.reconstruct import (
-    NOTHING_MEASURED_REMEDY,
+    labeller_for,
+    measure_instants,
     measurement_warnings,
-    measurer_for,
     nothing_measured,
+    summarised,
 )
+from armscan.pipeline.progress import Progress, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import (
+    DELIVERED,
     BaseTransform,
-    NormalOptions,
     choose_radius_mm,
     cut_cloud,
+    delivered_points,
     estimate_normals,
     merge_clouds,
-    prepare_placing,
     propagate_to_base,
 )
+from armscan.reconstruction.points import MeasuredProfile
 from armscan.reconstruction.sync import (
     ExposurePoses,
     PoseStatus,
-    SyncOptions,
     exposure_poses,
     stripes_at_equal_poses,
 )
 from armscan.records.cloud import PointCloud
+from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
+STAGE = "scan"
+MANY_WITHOUT_NORMAL = 0.1
+"""A larger share of points without normal is warned of."""
 LISTED = 4
 
 
@@ -77,7 +75,7 @@ class ScanExposure:
     ----------
     row
         What the recording says of it.
-    fate
+    status
         What became of it.
     reason
         Why it was not placed; empty if it was.
@@ -90,7 +88,7 @@ class ScanExposure:
     """
 
     row: ExposureRow
-    fate: ExposureStatus
+    status: ExposureStatus
     reason: str = ""
     n_stripe_points: int = 0
     n_measured: int = 0
@@ -122,7 +120,7 @@ class ScanReconstruction:
     """
 
     cloud: PointCloud
-    images: tuple[MeasuredProfile, ...]
+    images: tuple[LabelledProfile, ...]
     image_rows: tuple[int, ...]
     exposures: tuple[ScanExposure, ...]
     poses: ExposurePoses
@@ -141,71 +139,22 @@ class ScanReconstruction:
     @property
     def without_pose(self) -> tuple[tuple[str, str], ...]:
         """(source, reason) of the exposures with the laser on that have no pose."""
-        return tuple(
-            (exposure.row.source, exposure.reason)
-            for exposure in self.exposures
-            if exposure.fate in (ExposureStatus.NO_POSE, ExposureStatus.EQUAL_POSE)
-        )
+        found = self.of(ExposureStatus.NO_POSE, ExposureStatus.EQUAL_POSE)
+        return tuple((exposure.row.source, exposure.reason) for exposure in found)
 
     @property
     def unreadable(self) -> tuple[tuple[str, str], ...]:
         """(source, reason) of the exposures whose image could not be read."""
-        return tuple(
-            (exposure.row.source, exposure.reason)
-            for exposure in self.exposures
-            if exposure.fate is ExposureStatus.UNREADABLE
-        )
+        found = self.of(ExposureStatus.UNREADABLE)
+        return tuple((exposure.row.source, exposure.reason) for exposure in found)
 
-    def count(self, fate: ExposureStatus) -> int:
-        """Count of exposures of this fate."""
-        return sum(exposure.fate is fate for exposure in self.exposures)
+    def count(self, status: ExposureStatus) -> int:
+        """Count of exposures of this status."""
+        return len(self.of(status))
 
-
-def scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tuple[str, ...]:
-    """What a person should know of the exposures that are not in the cloud."""
-    warnings = list(poses.warnings)
-    without = [e for e in exposures if e.fate is ExposureStatus.NO_POSE]
-    if without:
-        counts: dict[str, int] = {}
-        for exposure in without:
-            counts[exposure.reason] = counts.get(exposure.reason, 0) + 1
-        reasons = ", ".join(f"{n} {reason}" for reason, n in counts.items())
-        warnings.append(f"{len(without)} of {len(exposures)} exposures have no pose: {reasons}")
-    broken = [e for e in exposures if e.fate is ExposureStatus.UNREADABLE]
-    if broken:
-        named = "; ".join(exposure.reason.rstrip(".") for exposure in broken[:LISTED])
-        warnings.append(f"{len(broken)} of {len(exposures)} images cannot be read: {named}")
-    alone = [e.row.source for e in exposures if e.fate is ExposureStatus.NO_PARTNER]
-    if alone:
-        warnings.append(
-            f"{len(alone)} of {len(exposures)} images were not used, {PARTNER_MISSING}: "
-            f"{', '.join(alone[:LISTED])}"
-        )
-    hung = [e for e in exposures if e.fate is ExposureStatus.EQUAL_POSE]
-    if hung:
-        warnings.append(
-            f"{len(hung)} of {len(exposures)} exposures were left out: {hung[0].reason}: the arm's "
-            "pose hung or was repeated, or the object moved"
-        )
-    n_outside = sum(exposure.n_outside_volume for exposure in exposures)
-    if n_outside:
-        warnings.append(f"{n_outside} measured points lie outside the volume asked for")
-    if not any(exposure.row.lasers for exposure in exposures):
-        warnings.append("no exposure names its lasers: the laser was taken to be on in all")
-    return tuple(warnings)
-
-
-def scan_exposure(row: ExposureRow, image: MeasuredProfile, n_outside: int) -> ScanExposure:
-    """The record of an exposure that was placed."""
-    n_measured = image.count(PointStatus.MEASURED)
-    return ScanExposure(row, ExposureStatus.PLACED, "", len(image.profile), n_measured, n_outside)
-
-
-__all__ = ["PlacedImage", "ScanOptions", "ScanReconstruction", "measure_scan", "place_image"]
-
-STAGE = "scan"
-MANY_WITHOUT_NORMAL = 0.1
-"""A larger share of points without normal is warned of."""
+    def of(self, *states: ExposureStatus) -> tuple[ScanExposure, ...]:
+        """The exposures of these states."""
+        return tuple(one for one in self.exposures if one.status in states)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,32 +165,22 @@ class ScanOptions:
     ----------
     measure
         Stripe extraction, the depths accepted in Sensor, the sheet.
-    sync
-        How exposures find their pose.
     volume
         Part of Base that is measured; None for all of it.
-    normals
-        Neighbourhood of the normals; None to leave them out.
-    threads
-        Exposures measured at a time, while the next one is read.
+    has_normals
+        Estimate the surface's normals.
     """
 
     measure: MeasureOptions = field(default_factory=MeasureOptions)
-    sync: SyncOptions = field(default_factory=SyncOptions)
     volume: Box | None = None
-    normals: NormalOptions | None = field(default_factory=NormalOptions)
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.threads <= 64:
-            raise OptionError(f"{self.threads} threads", remedy="give 1 to 64")
+    has_normals: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlacedImage:
+class _Placed:
     """What one exposure gave: its stripe, its points in Base, their depths, those cut away."""
 
-    image: MeasuredProfile
+    labelled: LabelledProfile
     cloud: PointCloud
     depths_mm: tuple[FloatArray, ...]
     n_outside_volume: int
@@ -258,8 +197,8 @@ def measure_scan(
 
     Instants are read one after another and dropped once measured; an image that cannot be read
     is counted and named, and so is its partner of the same instant, or an image of one camera of
-    which the other has none. Where rows name lasers, rows
-    without any serve as background of the exposures of their view.
+    which the other has none. Where rows name lasers, rows without any serve as background of the
+    exposures of their view.
 
     Parameters
     ----------
@@ -281,108 +220,102 @@ def measure_scan(
         If no exposure has a pose, the sheet of a stripe is ambiguous, or nothing was measured.
     """
     options = options or ScanOptions()
-    if scanner.sensor is None:
+    sensor = scanner.sensor
+    if sensor is None:
         raise InputError(
             "the scanner's document has no camera and light sheet", remedy="give one with a sensor"
         )
-    stripes = stripes_for(scanner.sensor, options.measure.stripes)
-    poses = exposure_poses(
-        source.rows, source.arm, source.session.clock, scanner.latency_ns, options.sync
-    )
-    cameras = cameras_of(scanner.sensor)
-    images = ScanInstants(source, len(cameras))
-    wanted = [one for one in images.lit if poses.has_pose[list(one.rows)].all()]
-    placing = prepare_placing(scanner)
-    placed: dict[int, PlacedImage] = {}
-    reasons: dict[int, str] = {}
-
-    def readings() -> Iterator[tuple[Instant, tuple[ExposurePair, ...]]]:
-        for done, instant in enumerate(wanted):
-            progress(ProgressEvent(STAGE, done, len(wanted), source.rows[instant.rows[0]].source))
-            try:
-                pairs = tuple(images.pair(row) for row in instant.rows)
-            except ArmscanError as error:
-                reasons.update(dict.fromkeys(instant.rows, str(error)))
-                continue
-            yield instant, pairs
-
-    def extract(pairs: tuple[ExposurePair, ...]) -> list[LitProfile]:
-        return [see(pair, camera, stripes) for pair, camera in zip(pairs, cameras, strict=True)]
-
-    measurer = measurer_for(scanner.sensor, options.measure, is_scan=True)
-    hand_eye = scanner.hand_eye.tool_from_sensor
+    poses = exposure_poses(source.rows, source.arm, source.session.clock, scanner.latency_ns)
+    scan = ScanInstants(source, len(cameras_of(sensor)))
+    wanted = [one for one in scan.lit if poses.has_pose[list(one.rows)].all()]
+    transform = BaseTransform.of(scanner)
+    labeller = labeller_for(sensor, options.measure, is_scan=True)
+    placed: dict[int, _Placed] = {}
     weak: list[str] = []
-    for instant, seen in _in_threads(extract, readings(), options.threads):
-        pose = poses.pose(instant.rows[0])
-        measured = measurer.measure(seen, pose @ hand_eye, instant.t_ns)
-        for row, one in zip(instant.rows, measured, strict=True):
-            placed[row] = place_image(one, pose, placing, options.volume)
-            weak += one.warnings
-    progress(ProgressEvent(STAGE, len(wanted), len(wanted)))
+    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner))
+    for one in measure_instants(instants, labeller, sensor, options.measure, is_pass=True):
+        rows = one.images.instant.rows
+        for row, measured in zip(rows, one.profiles, strict=True):
+            placed[row] = _place(measured, poses.pose(rows[0]), transform, options.volume)
+            weak += measured.warnings
     hung = _hung(placed, wanted, poses)
     kept = {row: one for row, one in placed.items() if row not in hung}
-    exposures = _records(source, images, poses, kept, reasons=reasons, hung=hung)
-    found = _joined(kept, exposures, poses, placing, options)
+    exposures = _exposures(source, scan, poses, kept, hung)
+    cloud, extra = _joined(kept, exposures, poses, transform, options)
+    images = tuple(one.labelled for one in kept.values())
     first_row = {row: instant.rows[0] for instant in wanted for row in instant.rows}
     doubt = doubt_scan(
         source,
         scanner,
         poses,
-        cloud=found.cloud,
-        images=found.images,
-        pose_rows=tuple(first_row[row] for row in found.image_rows),
+        cloud=cloud,
+        images=images,
+        pose_rows=tuple(first_row[row] for row in kept),
     )
-    return replace(
-        found,
-        cloud=replace(
-            found.cloud,
-            is_simulated=source.is_simulated,
-            forced=scanner.provenance.forced,
-        ),
+    depths = [
+        np.concatenate([one.depths_mm[k] for one in kept.values()])
+        for k in range(len(sensor.sheets))
+    ]
+    return ScanReconstruction(
+        cloud=replace(cloud, is_simulated=source.is_simulated, forced=scanner.provenance.forced),
+        images=images,
+        image_rows=tuple(kept),
+        exposures=exposures,
+        poses=poses,
         warnings=(
-            *found.warnings,
+            *_scan_warnings(exposures, poses),
+            *measurement_warnings(images, depths, sensor),
+            *extra,
             *doubt.warnings,
-            *_unknown_lasers(source, scanner.sensor, options.measure),
-            *collected(weak),
+            *_unknown_lasers(source, sensor, options.measure),
+            *summarised(weak),
         ),
         doubt=doubt,
     )
 
 
-def place_image(
-    measured: MeasuredImage,
+def sensor_poses(
+    poses: ExposurePoses, scanner: ScannerCalibration
+) -> Callable[[Instant], Pose[Base, Sensor] | None]:
+    """Where the sensor was at each instant of a scan; None where the arm's pose is not known."""
+
+    def pose(instant: Instant) -> Pose[Base, Sensor] | None:
+        row = instant.rows[0]
+        if not poses.has_pose[row]:
+            return None
+        return poses.pose(row) @ scanner.hand_eye.tool_from_sensor
+
+    return pose
+
+
+def _place(
+    measured: MeasuredProfile,
     base_from_tool: Pose[Base, Tool],
-    placing: BaseTransform,
+    transform: BaseTransform,
     volume: Box | None,
-) -> PlacedImage:
+) -> _Placed:
     """Place the measured points of one exposure in Base and cut those outside a volume."""
-    stripe, image = measured.points, measured.image
-    cloud = propagate_to_base(stripe, image.profile, base_from_tool, placing)
-    n_sheets = len(placing.factors)
-    depths = tuple(stripe.points_mm[stripe.sheet == k, 2] for k in range(n_sheets))
+    points, labelled = measured.points, measured.labelled
+    cloud = propagate_to_base(points, labelled.profile, base_from_tool, transform)
+    n_sheets = len(transform.factors)
+    depths = tuple(points.points_mm[points.sheet == k, 2] for k in range(n_sheets))
     inside = cloud if volume is None else cut_cloud(cloud, volume)
-    return PlacedImage(image, inside, depths, len(cloud) - len(inside))
+    return _Placed(labelled, inside, depths, len(cloud) - len(inside))
 
 
 def _hung(
-    placed: dict[int, PlacedImage], instants: Sequence[Instant], poses: ExposurePoses
+    placed: dict[int, _Placed], instants: Sequence[Instant], poses: ExposurePoses
 ) -> dict[int, float]:
     """Rows whose pose stood still, and how far in mm their stripes lie from an earlier one's.
 
     The cameras of one instant share its pose and see parts of one stripe: they count as one.
     """
-    seen = [instant for instant in instants if instant.rows[0] in placed]
+    measured = {one.rows[0]: one.rows for one in instants if one.rows[0] in placed}
     clouds = {
-        instant.rows[0]: merge_clouds([placed[row].cloud for row in instant.rows])
-        for instant in seen
+        first: merge_clouds([placed[row].cloud for row in rows]) for first, rows in measured.items()
     }
     apart = stripes_at_equal_poses(clouds, poses)
-    return {
-        row: apart[instant.rows[0]]
-        for instant in seen
-        if instant.rows[0] in apart
-        for row in instant.rows
-    }
+    return {row: apart[first] for first in apart for row in measured[first]}
 
 
 def _unknown_lasers(
@@ -401,113 +334,194 @@ def _unknown_lasers(
     )
 
 
-def _in_threads(
-    extract: Callable[[tuple[ExposurePair, ...]], list[LitProfile]],
-    readings: Iterator[tuple[Instant, tuple[ExposurePair, ...]]],
-    threads: int,
-) -> Iterator[tuple[Instant, list[LitProfile]]]:
-    """Extract in order with a bounded number of exposures in memory; stops at the first error."""
-    pending: deque[tuple[Instant, Future[list[LitProfile]]]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for instant, pairs in readings:
-                pending.append((instant, pool.submit(extract, pairs)))
-                if len(pending) > threads:
-                    first, result = pending.popleft()
-                    yield first, result.result()
-            while pending:
-                first, result = pending.popleft()
-                yield first, result.result()
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _records(
+def _exposures(
     source: ScanSource,
-    images: ScanInstants,
+    scan: ScanInstants,
     poses: ExposurePoses,
-    placed: dict[int, PlacedImage],
-    *,
-    reasons: dict[int, str],
+    placed: dict[int, _Placed],
     hung: dict[int, float],
 ) -> tuple[ScanExposure, ...]:
+    """What became of every row."""
     records = []
-    alone = set(images.without_partner)
     for k, row in enumerate(source.rows):
         if k in placed:
-            records.append(scan_exposure(row, placed[k].image, placed[k].n_outside_volume))
-        elif k in reasons:
-            records.append(ScanExposure(row, ExposureStatus.UNREADABLE, reasons[k]))
+            one = placed[k]
+            records.append(
+                ScanExposure(
+                    row,
+                    ExposureStatus.PLACED,
+                    n_stripe_points=len(one.labelled.profile),
+                    n_measured=one.labelled.count(PointStatus.MEASURED),
+                    n_outside_volume=one.n_outside_volume,
+                )
+            )
+            continue
+        status, reason = ExposureStatus.NO_POSE, PoseStatus(int(poses.status[k])).label
+        if k in scan.unreadable:
+            status, reason = ExposureStatus.UNREADABLE, scan.unreadable[k]
         elif k in hung:
+            status = ExposureStatus.EQUAL_POSE
             reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
-            records.append(ScanExposure(row, ExposureStatus.EQUAL_POSE, reason))
-        elif not images.is_lit[k]:
-            records.append(ScanExposure(row, ExposureStatus.LASER_OFF, "no laser was on"))
-        elif k in alone:
-            records.append(ScanExposure(row, ExposureStatus.NO_PARTNER, PARTNER_MISSING))
-        else:
-            own = PoseStatus(int(poses.fate[k]))
-            reason = "the other camera's image has none" if own is PoseStatus.FOUND else own.label
-            records.append(ScanExposure(row, ExposureStatus.NO_POSE, reason))
+        elif not scan.is_lit[k]:
+            status, reason = ExposureStatus.LASER_OFF, "no laser was on"
+        elif k in scan.without_partner:
+            status, reason = ExposureStatus.NO_PARTNER, PARTNER_MISSING
+        elif poses.has_pose[k]:
+            reason = "the other camera's image has none"
+        records.append(ScanExposure(row, status, reason))
     return tuple(records)
 
 
 def _joined(
-    placed: dict[int, PlacedImage],
+    placed: dict[int, _Placed],
     exposures: Sequence[ScanExposure],
     poses: ExposurePoses,
-    placing: BaseTransform,
+    transform: BaseTransform,
     options: ScanOptions,
-) -> ScanReconstruction:
-    sensor = placing.scanner.sensor
-    rows = list(placed)
-    if sensor is None or not rows:
-        broken = "; ".join(e.reason for e in exposures if e.fate is ExposureStatus.UNREADABLE)
-        raise EstimationError(f"no exposure with a pose could be measured: {broken or 'no laser'}")
-    images = tuple(placed[row].image for row in rows)
-    cloud = merge_clouds([placed[row].cloud for row in rows])
+) -> tuple[PointCloud, tuple[str, ...]]:
+    """All points in one cloud with normals towards the sensor, and what is weak about these."""
+    if not placed:
+        unreadable = [e.reason for e in exposures if e.status is ExposureStatus.UNREADABLE]
+        why = "; ".join(unreadable) or "no laser"
+        raise EstimationError(f"no exposure with a pose could be measured: {why}")
+    cloud = merge_clouds([one.cloud for one in placed.values()])
     if len(cloud) == 0:
-        n_outside = sum(placed[row].n_outside_volume for row in rows)
+        n_outside = sum(one.n_outside_volume for one in placed.values())
         if n_outside:
             raise EstimationError(
                 f"all {n_outside} measured points lie outside the volume {options.volume}",
                 remedy="give limits in mm in the arm's base frame, or none",
             )
+        images = [one.labelled for one in placed.values()]
         raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
-    cloud, extra = _with_normals(cloud, rows, poses, placing, options)
-    depths = [
-        np.concatenate([placed[row].depths_mm[k] for row in rows])
-        for k in range(len(sensor.sheets))
-    ]
-    warnings = (
-        *scan_warnings(exposures, poses),
-        *measurement_warnings(images, depths, sensor),
-        *extra,
-    )
-    return ScanReconstruction(cloud, images, tuple(rows), tuple(exposures), poses, warnings)
+    if not options.has_normals:
+        return cloud, ()
+    return _with_normals(cloud, list(placed), poses, transform)
 
 
 def _with_normals(
-    cloud: PointCloud,
-    rows: Sequence[int],
-    poses: ExposurePoses,
-    placing: BaseTransform,
-    options: ScanOptions,
+    cloud: PointCloud, rows: list[int], poses: ExposurePoses, transform: BaseTransform
 ) -> tuple[PointCloud, tuple[str, ...]]:
-    """The cloud with normals towards the camera of each point's exposure."""
-    if options.normals is None:
-        return cloud, ()
-    eye = placing.scanner.hand_eye.tool_from_sensor.translation_mm
-    cameras = poses.rotations[list(rows)] @ eye + poses.translations_mm[list(rows)]
-    chosen = options.normals
-    if chosen.radius_mm is None:
-        chosen = replace(chosen, radius_mm=choose_radius_mm(cloud.points_mm, cloud.exposure))
-    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], chosen)
+    """The cloud with normals towards the sensor of each exposure, and what is weak about these."""
+    eye = transform.scanner.hand_eye.tool_from_sensor.translation_mm
+    cameras = poses.rotations[rows] @ eye + poses.translations_mm[rows]
+    radius_mm = choose_radius_mm(cloud.points_mm, cloud.exposure)
+    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], radius_mm)
     share = float((~normals.any(axis=1)).mean())
     warnings: tuple[str, ...] = ()
     if share > MANY_WITHOUT_NORMAL:
         warnings = (
-            f"{100.0 * share:.0f} % of the points have no normal: within {chosen.radius_mm:.1f} mm "
+            f"{100.0 * share:.0f} % of the points have no normal: within {radius_mm:.1f} mm "
             "they lie on single lines, or on no plane",
         )
     return replace(cloud, normals=normals), warnings
+
+
+def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:
+    """Raise `InputError` unless there is one pose for each profile."""
+    if len(profiles) != len(poses):
+        raise InputError(
+            f"{len(profiles)} profiles but {len(poses)} poses",
+            remedy="give one pose for each profile, in the same order",
+        )
+
+
+def place_profiles(
+    profiles: Sequence[PointProfile],
+    poses: Sequence[Pose[Base, Tool]],
+    scanner: ScannerCalibration,
+    volume: Box | None = None,
+) -> ScanReconstruction:
+    """Place what a sensor that delivers profiles saw in Base, with covariance and normals.
+
+    Parameters
+    ----------
+    profiles
+        In the Sensor frame, one for each pose.
+    poses
+        ``base_from_tool`` of each.
+    scanner
+        Its hand-eye; without a camera.
+    volume
+        Part of Base that is kept; None for all of it.
+
+    Raises
+    ------
+    InputError
+        If the counts differ, or the scanner has a camera.
+    EstimationError
+        If no point lies in the volume.
+    """
+    check_poses(profiles, poses)
+    transform = BaseTransform.of(scanner)
+    found = ExposurePoses(
+        rotations=np.array([pose.rotation for pose in poses]),
+        translations_mm=np.array([pose.translation_mm for pose in poses]),
+        status=np.zeros(len(poses), dtype=np.int64),
+        sample=np.arange(len(poses)),
+        source="given",
+    )
+    clouds = [
+        propagate_to_base(delivered_points(profile), profile, pose, transform)
+        for profile, pose in zip(profiles, poses, strict=True)
+    ]
+    hung = stripes_at_equal_poses(dict(enumerate(clouds)), found)
+    exposures = []
+    for k, (profile, cloud) in enumerate(zip(profiles, clouds, strict=True)):
+        row = ExposureRow(index=k, t_ns=k, camera=0, source=profile.source, lasers=(DELIVERED,))
+        clouds[k] = inside = cloud if volume is None else cut_cloud(cloud, volume)
+        record = ScanExposure(
+            row,
+            ExposureStatus.PLACED,
+            n_stripe_points=len(profile),
+            n_measured=len(profile),
+            n_outside_volume=len(cloud) - len(inside),
+        )
+        if k in hung:
+            reason = f"the pose of an earlier one, but its stripe lies {hung[k]:.2g} mm away"
+            record = ScanExposure(row, ExposureStatus.EQUAL_POSE, reason)
+        exposures.append(record)
+    kept = [k for k in range(len(clouds)) if k not in hung]
+    merged = merge_clouds([clouds[k] for k in kept])
+    if len(merged) == 0:
+        raise EstimationError(
+            f"no point lies in the volume {volume}",
+            remedy="give limits in mm in the arm's base frame, or none",
+        )
+    merged, extra = _with_normals(merged, kept, found, transform)
+    return ScanReconstruction(
+        cloud=replace(merged, forced=scanner.provenance.forced),
+        images=(),
+        image_rows=tuple(kept),
+        exposures=tuple(exposures),
+        poses=found,
+        warnings=(*_scan_warnings(exposures, found), *extra),
+    )
+
+
+def _scan_warnings(exposures: Sequence[ScanExposure], poses: ExposurePoses) -> tuple[str, ...]:
+    """What a person should know of the exposures that are not in the cloud."""
+    n = len(exposures)
+    of = {status: [e for e in exposures if e.status is status] for status in ExposureStatus}
+    warnings = list(poses.warnings)
+    if without := of[ExposureStatus.NO_POSE]:
+        counts = Counter(exposure.reason for exposure in without)
+        reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
+        warnings.append(f"{len(without)} of {n} exposures have no pose: {reasons}")
+    if broken := of[ExposureStatus.UNREADABLE]:
+        named = "; ".join(exposure.reason.rstrip(".") for exposure in broken[:LISTED])
+        warnings.append(f"{len(broken)} of {n} images cannot be read: {named}")
+    if alone := of[ExposureStatus.NO_PARTNER]:
+        named = ", ".join(exposure.row.source for exposure in alone[:LISTED])
+        warnings.append(f"{len(alone)} of {n} images were not used, {PARTNER_MISSING}: {named}")
+    if hung := of[ExposureStatus.EQUAL_POSE]:
+        warnings.append(
+            f"{len(hung)} of {n} exposures were left out: {hung[0].reason}: the arm's pose hung or "
+            "was repeated, or the object moved"
+        )
+    n_outside = sum(exposure.n_outside_volume for exposure in exposures)
+    if n_outside:
+        warnings.append(f"{n_outside} measured points lie outside the volume asked for")
+    if not any(exposure.row.lasers for exposure in exposures):
+        warnings.append("no exposure names its lasers: the laser was taken to be on in all")
+    return tuple(warnings)

@@ -26,7 +26,7 @@ from armscan.geometry.rotations import (
     rotations_from_euler,
 )
 from armscan.models.calibration import ScannerCalibration
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.pass_agreement import (
     PassAgreement,
     Stripes,
@@ -125,7 +125,7 @@ def doubt_scan(
     poses: ExposurePoses,
     *,
     cloud: PointCloud,
-    images: tuple[MeasuredProfile, ...],
+    images: tuple[LabelledProfile, ...],
     pose_rows: tuple[int, ...],
 ) -> ScanDoubt:
     """Compare the passes of a scan with each other, and look for the mistake if they disagree.
@@ -172,7 +172,7 @@ def _thinned(
     poses: ExposurePoses,
     *,
     cloud: PointCloud,
-    images: tuple[MeasuredProfile, ...],
+    images: tuple[LabelledProfile, ...],
     pose_rows: tuple[int, ...],
 ) -> _Scan | None:
     if len(cloud) == 0 or scanner.sensor is None:
@@ -180,7 +180,7 @@ def _thinned(
     row_of = np.array(pose_rows)[cloud.exposure]
     kept = thinned_rows(cloud.points_mm, row_of)
     rows, exposure = np.unique(row_of[kept], return_inverse=True)
-    measured = [image.fate == int(PointStatus.MEASURED) for image in images]
+    measured = [image.status == PointStatus.MEASURED for image in images]
     pixels = np.concatenate([i.profile.points_px[m] for i, m in zip(images, measured, strict=True)])
     if len(pixels) != len(cloud):
         # points outside the volume asked for are cut away: their pixels are not told apart

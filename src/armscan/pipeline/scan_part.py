@@ -17,7 +17,7 @@ from armscan.records.recording import ArmTrack, ExposureRow, Session
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPart:
-    """See `armscan.devices.sources.SimulatedScan`; its rows keep the numbers that they have.
+    """See `armscan.devices.sources.ScanSource`; its rows keep the numbers that they have.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class ScanPart:
         Rows that are kept, increasing.
     """
 
-    whole: SimulatedScan
+    whole: ScanSource
     kept: tuple[int, ...]
 
     @property
@@ -59,6 +59,13 @@ class ScanPart:
         """Read the exposure of ``rows[row]``."""
         return self.whole.exposure(self.kept[row])
 
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedPart(ScanPart):
+    """Some rows of a simulated scan; see `armscan.devices.sources.SimulatedScan`."""
+
+    whole: SimulatedScan
+
     def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
         """Take the exposure of ``rows[row]`` with other lasers on."""
         return self.whole.expose(self.kept[row], lasers)
@@ -72,51 +79,18 @@ class ScanPart:
         return self.whole.true_stripes(self.kept[row])
 
 
-class FewerViews:
-    """Evenly chosen views of a scan; exposures of one view or instant stay together."""
+def fewer_views(source: ScanSource, n_views: int) -> ScanPart:
+    """Evenly chosen views of a scan, all if it has no more; those of one instant stay together.
 
-    def __init__(self, source: ScanSource, n_views: int) -> None:
-        """Choose ``n_views`` views of ``source``; all if it has no more.
-
-        Raises
-        ------
-        OptionError
-            If ``n_views`` is not positive.
-        """
-        if n_views < 1:
-            raise OptionError(f"{n_views} views", remedy="keep at least one")
-        names = [f"at {row.t_ns}" if row.view is None else row.view for row in source.rows]
-        views = list(dict.fromkeys(names))
-        places = np.linspace(0, len(views) - 1, min(n_views, len(views))).round().astype(int)
-        kept = {views[k] for k in places}
-        self._source = source
-        self._kept = [k for k, name in enumerate(names) if name in kept]
-
-    @property
-    def name(self) -> str:
-        """Name of the whole scan."""
-        return self._source.name
-
-    @property
-    def session(self) -> Session:
-        """Session of the whole scan."""
-        return self._source.session
-
-    @property
-    def rows(self) -> tuple[ExposureRow, ...]:
-        """Exposures of the views kept."""
-        return tuple(self._source.rows[k] for k in self._kept)
-
-    @property
-    def arm(self) -> ArmTrack | None:
-        """All samples of the arm."""
-        return self._source.arm
-
-    @property
-    def is_simulated(self) -> bool:
-        """As the whole scan."""
-        return self._source.is_simulated
-
-    def exposure(self, row: int) -> Exposure:
-        """Read the exposure of ``rows[row]``."""
-        return self._source.exposure(self._kept[row])
+    Raises
+    ------
+    OptionError
+        If ``n_views`` is not positive.
+    """
+    if n_views < 1:
+        raise OptionError(f"{n_views} views", remedy="keep at least one")
+    names = [f"at {row.t_ns}" if row.view is None else row.view for row in source.rows]
+    views = list(dict.fromkeys(names))
+    places = np.linspace(0, len(views) - 1, min(n_views, len(views))).round().astype(int)
+    kept = {views[k] for k in places}
+    return ScanPart(source, tuple(k for k, name in enumerate(names) if name in kept))

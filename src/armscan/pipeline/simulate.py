@@ -24,7 +24,7 @@ from armscan.devices.registry import load_driver
 from armscan.devices.sources import Preset, ScanSource, Twin, TwinScene
 from armscan.errors import EstimationError, OptionError, OutputError
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.storage.arm import ProbeTip, write_probing
 from armscan.storage.files import check_new_folder, check_outputs
 from armscan.storage.recording import encoded_png, write_recording, written_session
@@ -168,7 +168,7 @@ class Scenes:
         """The views of a scene that are wanted."""
         if scene not in self._planned:
             whole, most = self.twin.scan(scene), self.most_views[scene]
-            self._planned[scene] = whole if most is None else FewerViews(whole, most)
+            self._planned[scene] = whole if most is None else fewer_views(whole, most)
         return self._planned[scene]
 
     def png(self, scene: TwinScene, row: int) -> bytes:

@@ -29,9 +29,9 @@ from armscan.models.calibration import (
     SheetCalibration,
 )
 from armscan.pipeline.instants import group_instants
-from armscan.pipeline.reconstruct import measured_again
+from armscan.pipeline.measure import measured_again
 from armscan.pipeline.scan import ScanReconstruction
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import place_with_jacobian
 from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.cloud import PointCloud
@@ -424,7 +424,7 @@ def _lit(stripes: Sequence[TrueStripe], lasers: tuple[str, ...]) -> list[TrueStr
 
 
 def _of_instant(
-    images: Sequence[MeasuredProfile],
+    images: Sequence[LabelledProfile],
     true: Sequence[Sequence[TrueStripe]],
     names: tuple[str, ...],
 ) -> NamingErrors:
@@ -441,7 +441,7 @@ def _of_instant(
 
 
 def _of_image(
-    image: MeasuredProfile,
+    image: LabelledProfile,
     stripes: Sequence[TrueStripe],
     others: Sequence[Sequence[TrueStripe]],
     names: tuple[str, ...],
@@ -467,9 +467,9 @@ def _of_image(
     return errors, counts
 
 
-def _measured(image: MeasuredProfile) -> BoolArray:
+def _measured(image: LabelledProfile) -> BoolArray:
     """(N,) points whose name counts: measured here or with the other camera's."""
-    return np.isin(image.fate, (int(PointStatus.MEASURED), int(PointStatus.SHARED)))
+    return np.isin(image.status, (int(PointStatus.MEASURED), int(PointStatus.SHARED)))
 
 
 def _distances(points: FloatArray, stripes: Sequence[TrueStripe]) -> tuple[FloatArray, IntArray]:

@@ -3,18 +3,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import square_root
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.triangulate import N_CAMERA, N_SHEET, sensor_columns
+from armscan.reconstruction.triangulate import (
+    DepthRange,
+    intersect_with_jacobian,
+    sensor_columns,
+)
 from armscan.records.profile import Profile
 
+REACH_PX = 4.0
+"""A right stripe farther from the projected point than this is not its picture."""
 ALONG_PX = 2.0
 """A projected point farther than this beyond a stripe's end does not lie beside the stripe."""
 SINE_OF_SAME_DIRECTION = 0.42
@@ -37,41 +43,26 @@ class Projections:
         (H, 2) pixels of the right image (eqs. 4.17 and 4.18).
     is_met
         (H,) False where the ray does not meet the sheet in front of both cameras.
-    point_by_px
-        (H, 3, 2) derivative of the point by the left pixel.
-    point_by_sensor
-        (H, 3, 17) by the left camera and the sheet.
-    q_by_point
-        (H, 2, 3) derivative of the right pixel by the point.
-    q_by_second
-        (H, 2, 15) by what the second camera adds, at a fixed point.
+    dpoint_dpx, dpoint_dsensor
+        (H, 3, 2) and (H, 3, 17) derivatives of the point by the left pixel, and by the left camera
+        and the sheet.
+    dq_dpoint, dq_dsecond
+        (H, 2, 3) and (H, 2, 15) derivatives of the right pixel by the point, and by what the second
+        camera adds, at a fixed point.
     """
 
     sheet: IntArray
     points_mm: FloatArray
     q_px: FloatArray
     is_met: BoolArray
-    point_by_px: FloatArray
-    point_by_sensor: FloatArray
-    q_by_point: FloatArray
-    q_by_second: FloatArray
+    dpoint_dpx: FloatArray
+    dpoint_dsensor: FloatArray
+    dq_dpoint: FloatArray
+    dq_dsecond: FloatArray
 
-    def q_by_sensor(self) -> FloatArray:
-        """(H, 2, 32) derivative of the right pixel by all parameters of the point's sheet."""
-        return np.concatenate([self.q_by_point @ self.point_by_sensor, self.q_by_second], axis=2)
-
-    def select(self, chosen: BoolArray | IntArray) -> Projections:
+    def select(self, rows: BoolArray | IntArray) -> Projections:
         """Those that a mask or an index names."""
-        return Projections(
-            self.sheet[chosen],
-            self.points_mm[chosen],
-            self.q_px[chosen],
-            self.is_met[chosen],
-            self.point_by_px[chosen],
-            self.point_by_sensor[chosen],
-            self.q_by_point[chosen],
-            self.q_by_second[chosen],
-        )
+        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
 
 def possible_sheets(
@@ -89,11 +80,12 @@ def possible_sheets(
     planes = np.stack([s.sheet.plane for s in sensor.sheets])
     slope = rays @ planes[:, :3].T
     depth = -planes[:, 3] / np.where(np.abs(slope) > 1e-9, slope, np.nan)
-    limits = np.array([depths.limits_mm(s) for s in sensor.sheets])
-    low, high = limits[:, 0] * (1.0 - BOW_DEPTH_SHARE), limits[:, 1] * (1.0 + BOW_DEPTH_SHARE)
+    low, high = np.array([depths.limits_mm(s) for s in sensor.sheets]).T
     with np.errstate(invalid="ignore"):
-        inside = (depth >= low) & (depth <= high) & is_valid[:, None]
-    point, sheet = np.nonzero(inside)
+        inside = (depth >= low * (1.0 - BOW_DEPTH_SHARE)) & (
+            depth <= high * (1.0 + BOW_DEPTH_SHARE)
+        )
+    point, sheet = np.nonzero(inside & is_valid[:, None])
     return point, sheet
 
 
@@ -101,27 +93,18 @@ def project_on_sheets(
     points_px: FloatArray, sheet: IntArray, sensor: SensorCalibration
 ) -> Projections:
     """Put each left pixel (H, 2) on its sheet (H,) and project it into the right camera."""
-    camera = sensor.camera.camera
-    xy, has_ray, xy_by_px, xy_by_camera = camera.undistort_with_jacobian(points_px)
-    n = len(points_px)
-    points = np.tile([0.0, 0.0, 1.0], (n, 1))
-    point_by_xy, by_sheet = np.zeros((n, 3, 2)), np.zeros((n, 3, N_SHEET))
-    is_met = np.zeros(n, dtype=np.bool_)
-    for k, calibrated in enumerate(sensor.sheets):
-        own = np.flatnonzero(has_ray & (sheet == k))
-        if not len(own):
-            continue
-        found, met, by_xy, by_parameters = calibrated.sheet.intersect_with_jacobian(xy[own])
-        own = own[met]
-        is_met[own] = True
-        points[own], point_by_xy[own], by_sheet[own] = found[met], by_xy[met], by_parameters[met]
-    by_sensor = np.zeros((n, 3, N_CAMERA + N_SHEET))
-    by_sensor[:, :, :N_CAMERA] = point_by_xy @ xy_by_camera
-    by_sensor[:, :, N_CAMERA:] = by_sheet
-    q, by_point, by_second = TwoViews.of_sensor(sensor).project_right_with_jacobian(points)
-    is_met &= np.isfinite(q).all(axis=1)
+    met = intersect_with_jacobian(points_px, sheet, sensor)
+    views = TwoViews.of_sensor(sensor)
+    q, dq_dpoint, dq_dsecond = views.project_right_with_jacobian(met.points_mm)
     return Projections(
-        sheet, points, q, is_met, point_by_xy @ xy_by_px, by_sensor, by_point, by_second
+        sheet=sheet,
+        points_mm=met.points_mm,
+        q_px=q,
+        is_met=met.is_met & np.isfinite(q).all(axis=1),
+        dpoint_dpx=met.dpoint_dpx,
+        dpoint_dsensor=met.dpoint_dsensor,
+        dq_dpoint=dq_dpoint,
+        dq_dsecond=dq_dsecond,
     )
 
 
@@ -191,11 +174,9 @@ class Crossings:
         """(H,) True where there is a stripe within reach."""
         return np.asarray(self.row >= 0)
 
-    def select(self, chosen: BoolArray | IntArray) -> Crossings:
+    def select(self, rows: BoolArray | IntArray) -> Crossings:
         """Those that a mask or an index names."""
-        return Crossings(
-            self.row[chosen], self.residual_px[chosen], self.sigma_px[chosen], self.normal[chosen]
-        )
+        return replace(self, **{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
 
 def find_crossings(
@@ -203,7 +184,7 @@ def find_crossings(
     normals_px: FloatArray,
     sigma_px: FloatArray,
     right: RightStripes,
-    reach_px: float,
+    reach_px: float = REACH_PX,
 ) -> Crossings:
     """Find the right stripe that runs beside each projected point, and the distance across it.
 
@@ -234,19 +215,25 @@ def find_crossings(
     away = projected.q_px[asked] - right.profile.points_px[found]
     across = np.sum(away * n_right, axis=1)
     along = away[:, 0] * -n_right[:, 1] + away[:, 1] * n_right[:, 0]
-    by_left = projected.q_by_point[asked] @ projected.point_by_px[asked]
+    dq_dleft = projected.dq_dpoint[asked] @ projected.dpoint_dpx[asked]
     tangent = np.stack([-normals_px[asked, 1], normals_px[asked, 0]], axis=1)
-    runs = np.einsum("nij,nj->ni", by_left, tangent)
+    runs = np.einsum("nij,nj->ni", dq_dleft, tangent)
     sine = np.abs(np.sum(runs * n_right, axis=1)) / np.maximum(np.linalg.norm(runs, axis=1), 1e-12)
     good = (np.abs(along) <= ALONG_PX) & (np.abs(across) <= reach_px)
     good &= sine <= SINE_OF_SAME_DIRECTION
-    gain = np.einsum("ni,nij,nj->n", n_right, by_left, normals_px[asked])
+    gain = np.einsum("ni,nij,nj->n", n_right, dq_dleft, normals_px[asked])
     at = asked[good]
     row[at], residual[at], normal[at] = found[good], across[good], n_right[good]
     sigma[at] = np.hypot(gain * sigma_px[asked], right.profile.sigma_px[found])[good]
     return Crossings(row, residual, sigma, normal)
 
 
+FLOOR_PX = 0.06
+"""What is left of the residual's bias after the epipolar offset was found: calibration errors that
+are not smooth, and the stripe's own."""
+DRIFT_PX = 0.4
+"""Standard deviation, before any data, of how far the two cameras have drifted apart since their
+calibration."""
 ROUNDS = 4
 HUBER_SIGMAS = 2.0
 CORRELATION = 3.0
@@ -258,7 +245,7 @@ CERTAIN_SIGMAS = 3.0
 LEAST_SHARE = 0.05
 """A stripe along the epipolar line says nothing about the offset across it."""
 LEAST_OFFSET_PX = 0.1
-"""Offsets below this change no name and hardly a point: no warning."""
+"""Offsets below this change no label and hardly a point: no warning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -283,8 +270,6 @@ class EpipolarOffset:
         Its standard deviation.
     allowed_px
         Standard deviation that the calibration's covariance allows for it.
-    n_samples
-        Samples used.
     """
 
     parameter_step: FloatArray
@@ -293,7 +278,6 @@ class EpipolarOffset:
     offset_px: float
     sigma_px: float
     allowed_px: float
-    n_samples: int
 
     @property
     def is_beyond_calibration(self) -> bool:
@@ -301,25 +285,35 @@ class EpipolarOffset:
         limit = CERTAIN_SIGMAS * float(np.hypot(self.allowed_px, self.sigma_px))
         return abs(self.offset_px) > max(limit, LEAST_OFFSET_PX)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know of it."""
+        if not self.is_beyond_calibration:
+            return ()
+        return (
+            f"the right camera's picture lies {self.offset_px:+.2f} px off the epipolar lines, "
+            f"more than the calibration's standard deviation of {self.allowed_px:.2f} px explains: "
+            "calibrate the two cameras again",
+        )
+
 
 def drift_directions(projected: Projections, sensor: SensorCalibration) -> FloatArray:
     """(H, 2, 3) how the drift's three numbers move the right picture of each point.
 
     The move is across the epipolar line, which is where the point's picture goes with its depth.
     """
-    along = np.einsum("nij,nj->ni", projected.q_by_point, projected.points_mm)
+    along = np.einsum("nij,nj->ni", projected.dq_dpoint, projected.points_mm)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     across *= np.where(across[:, 1] < 0.0, -1.0, 1.0)[:, None]
-    second = sensor.second
-    camera = sensor.camera.camera if second is None else second.camera.camera
+    camera = TwoViews.of_sensor(sensor).right
     size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
     place = (projected.q_px - 0.5 * size) / (HALF_IMAGE * size)
     basis = np.concatenate([np.ones((len(place), 1)), place], axis=1)
     return np.asarray(across[:, :, None] * basis[:, None, :])
 
 
-def residual_derivatives(
+def _residual_jacobian(
     projected: Projections, crossings: Crossings, sensor: SensorCalibration
 ) -> FloatArray:
     """(H, P + 3) of the residuals by steps of the parameters and of the right picture.
@@ -327,34 +321,35 @@ def residual_derivatives(
     The true steps take the residuals to zero: what the calibration's errors made is undone by
     adding them to its parameters, what a drift made by shifting the projected points with it.
     """
-    by_own = np.einsum("ni,nij->nj", crossings.normal, projected.q_by_sensor())
+    dq_dsensor = np.concatenate(
+        [projected.dq_dpoint @ projected.dpoint_dsensor, projected.dq_dsecond], axis=2
+    )
     n = len(projected.sheet)
-    result = np.zeros((n, len(sensor.covariance) + 3))
+    jacobian = np.zeros((n, len(sensor.covariance) + 3))
     columns = np.stack([sensor_columns(sensor, k) for k in range(len(sensor.sheets))])
-    result[np.arange(n)[:, None], columns[projected.sheet]] = by_own
+    jacobian[np.arange(n)[:, None], columns[projected.sheet]] = np.einsum(
+        "ni,nij->nj", crossings.normal, dq_dsensor
+    )
     drift = drift_directions(projected, sensor)
-    result[:, -3:] = np.einsum("ni,nij->nj", crossings.normal, drift)
-    return result
+    jacobian[:, -3:] = np.einsum("ni,nij->nj", crossings.normal, drift)
+    return jacobian
 
 
-def prior_factor(sensor: SensorCalibration, drift_px: float) -> FloatArray:
-    """(P + 3, K) with ``F F'`` the covariance of the calibration and of the drift, before data."""
-    n = len(sensor.covariance)
-    scale = np.sqrt(np.maximum(np.diag(sensor.covariance), 0.0))
-    unit = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(sensor.covariance / np.outer(unit, unit))
-    kept = values > 1e-12 * max(float(values[-1]), 1e-300)
-    factor = np.zeros((n + 3, int(kept.sum()) + 3))
-    factor[:n, :-3] = unit[:, None] * vectors[:, kept] * np.sqrt(values[kept])
-    factor[n:, -3:] = np.diag([drift_px, SLOPE_SHARE * drift_px, SLOPE_SHARE * drift_px])
-    return factor
-
-
-def no_offset(sensor: SensorCalibration, drift_px: float) -> EpipolarOffset:
+def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
     """What is known before any data: nothing has moved, as far as the priors say."""
     n = len(sensor.covariance)
-    prior = prior_factor(sensor, drift_px)
-    return EpipolarOffset(np.zeros(n), np.zeros(3), prior, 0.0, drift_px, 0.0, 0)
+    root = square_root(sensor.covariance, "the sensor's covariance")
+    factor = np.zeros((n + 3, root.shape[1] + 3))
+    factor[:n, :-3] = root
+    factor[n:, -3:] = np.diag([DRIFT_PX, SLOPE_SHARE * DRIFT_PX, SLOPE_SHARE * DRIFT_PX])
+    return EpipolarOffset(
+        parameter_step=np.zeros(n),
+        drift=np.zeros(3),
+        factor=factor,
+        offset_px=0.0,
+        sigma_px=DRIFT_PX,
+        allowed_px=0.0,
+    )
 
 
 def estimate_offset(
@@ -362,9 +357,8 @@ def estimate_offset(
     crossings: Crossings,
     sensor: SensorCalibration,
     prior: EpipolarOffset,
-    floor_px: float,
 ) -> EpipolarOffset:
-    """Most likely errors of the calibration and drift, given the residuals of named samples.
+    """Most likely errors of the calibration and drift, given the residuals of labelled samples.
 
     Robust (Huber's weights) and with the priors' covariance: few samples move little.
 
@@ -376,21 +370,20 @@ def estimate_offset(
         Cameras and sheets.
     prior
         From `no_offset`.
-    floor_px
-        Noise of a residual beside that of the stripes.
     """
     if not len(projected.sheet):
         return prior
-    equations = _Equations.of(projected, crossings, sensor, prior, floor_px=floor_px)
-    information = equations.information()
+    equations = _Equations.of(projected, crossings, sensor, prior)
     step = prior.factor @ equations.state
     n = len(sensor.covariance)
+    offset_px, sigma_px, allowed_px = _mean_offset(equations, crossings, sensor)
     return EpipolarOffset(
-        step[:n],
-        step[n:],
-        prior.factor @ np.linalg.cholesky(np.linalg.inv(information)),
-        *_mean_offset(equations, crossings, sensor),
-        len(projected.sheet),
+        parameter_step=step[:n],
+        drift=step[n:],
+        factor=prior.factor @ np.linalg.cholesky(np.linalg.inv(equations.information())),
+        offset_px=offset_px,
+        sigma_px=sigma_px,
+        allowed_px=allowed_px,
     )
 
 
@@ -398,11 +391,11 @@ def estimate_offset(
 class _Equations:
     """Weighted linear equations of the residuals in whitened errors, and their solution.
 
-    ``by_all`` (H, P + 3) and ``design`` (H, K) are derivatives by the errors and by the whitened
+    ``jacobian`` (H, P + 3) and ``design`` (H, K) are derivatives by the errors and by the whitened
     errors, ``wanted`` (H,) what undoes the residuals.
     """
 
-    by_all: FloatArray
+    jacobian: FloatArray
     design: FloatArray
     wanted: FloatArray
     sigma: FloatArray
@@ -415,23 +408,21 @@ class _Equations:
         crossings: Crossings,
         sensor: SensorCalibration,
         prior: EpipolarOffset,
-        *,
-        floor_px: float,
         is_used: BoolArray | None = None,
     ) -> _Equations:
-        by_all = residual_derivatives(projected, crossings, sensor)
-        design = by_all @ prior.factor
-        sigma = CORRELATION * np.hypot(crossings.sigma_px, floor_px)
+        jacobian = _residual_jacobian(projected, crossings, sensor)
+        design = jacobian @ prior.factor
+        sigma = CORRELATION * np.hypot(crossings.sigma_px, FLOOR_PX)
         wanted = -crossings.residual_px
         used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
-        weight = used
-        state: FloatArray = np.zeros(design.shape[1])
+        found = _Equations(jacobian, design, wanted, sigma, used, np.zeros(design.shape[1]))
         for _ in range(ROUNDS):
-            found = _Equations(by_all, design, wanted, sigma, weight, state)
-            state = np.asarray(np.linalg.solve(found.information(), found.right_side()))
+            weight = found.weight
+            state = np.linalg.solve(found.information(), found.right_side())
             score = np.abs(wanted - design @ state) / sigma * CORRELATION
-            weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
-        return _Equations(by_all, design, wanted, sigma, found.weight, state)
+            next_weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
+            found = replace(found, weight=next_weight, state=np.asarray(state))
+        return replace(found, weight=weight)
 
     def information(self) -> FloatArray:
         """(K, K) with the prior's unit matrix."""
@@ -446,14 +437,13 @@ class _Equations:
 def left_out_scores(
     projected: Projections,
     crossings: Crossings,
-    stretch: IntArray,
+    segment: IntArray,
     is_used: BoolArray,
-    sensor: SensorCalibration,
     *,
+    sensor: SensorCalibration,
     prior: EpipolarOffset,
-    floor_px: float,
 ) -> FloatArray:
-    """How badly each stretch's residuals fit what all the others say of the offset.
+    """How badly each segment's residuals fit what all the others say of the offset.
 
     A stripe that lies on another sheet's right stripe by chance does so with an offset of its own,
     which the calibration's freedom would explain away were it asked about itself.
@@ -462,40 +452,37 @@ def left_out_scores(
     ----------
     projected, crossings
         (H,) as for `estimate_offset`.
-    stretch
-        (H,) number of the stretch of stripe, counted from 0.
+    segment
+        (H,) number of the segment of stripe, counted from 0.
     is_used
-        (H,) False for stretches that are asked but have no say.
-    sensor, prior, floor_px
+        (H,) False for segments that are asked but have no say.
+    sensor, prior
         As for `estimate_offset`.
 
     Returns
     -------
     FloatArray
-        (B,) chi-square of mean, slope and bend of the stretch's residuals, over their count.
+        (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
-    equations = _Equations.of(
-        projected, crossings, sensor, prior, floor_px=floor_px, is_used=is_used
-    )
+    equations = _Equations.of(projected, crossings, sensor, prior, is_used)
     information, right_side = equations.information(), equations.right_side()
-    n_stretches = int(stretch.max()) + 1 if len(stretch) else 0
-    scores = np.zeros(n_stretches)
-    for b in range(n_stretches):
-        own = np.flatnonzero(stretch == b)
-        if not len(own):
+    scores = np.zeros(int(segment.max(initial=-1)) + 1)
+    for b in range(len(scores)):
+        rows = np.flatnonzero(segment == b)
+        if not len(rows):
             continue
-        design, sigma = equations.design[own], equations.sigma[own]
-        scaled = design * (equations.weight[own] / sigma**2)[:, None]
+        design, sigma = equations.design[rows], equations.sigma[rows]
+        scaled = design * (equations.weight[rows] / sigma**2)[:, None]
         others = information - design.T @ scaled
-        state = np.linalg.solve(others, right_side - scaled.T @ equations.wanted[own])
-        place = np.linspace(-1.0, 1.0, len(own))
-        shape = np.stack([np.ones(len(own)), place, place**2], axis=1)[:, : min(len(own), 3)]
+        state = np.linalg.solve(others, right_side - scaled.T @ equations.wanted[rows])
+        place = np.linspace(-1.0, 1.0, len(rows))
+        shape = np.stack([np.ones(len(rows)), place, place**2], axis=1)[:, : min(len(rows), 3)]
         moments = np.linalg.pinv(shape)
         gain = moments @ design
-        missed = moments @ equations.wanted[own] - gain @ state
-        spread = gain @ np.linalg.solve(others, gain.T) + (moments * sigma**2) @ moments.T
-        spread[0, 0] += floor_px**2
-        scores[b] = float(missed @ np.linalg.solve(spread, missed)) / len(missed)
+        missed = moments @ equations.wanted[rows] - gain @ state
+        covariance = gain @ np.linalg.solve(others, gain.T) + (moments * sigma**2) @ moments.T
+        covariance[0, 0] += FLOOR_PX**2
+        scores[b] = float(missed @ np.linalg.solve(covariance, missed)) / len(missed)
     return scores
 
 
@@ -503,24 +490,25 @@ def _mean_offset(
     equations: _Equations, crossings: Crossings, sensor: SensorCalibration
 ) -> tuple[float, float, float]:
     """Weighted mean of the residuals across the epipolar lines, its sigma, and that allowed."""
-    unit = equations.by_all[:, -3]
+    unit = equations.jacobian[:, -3]
     weight = equations.weight / equations.sigma**2
     share = np.where(np.abs(unit) > LEAST_SHARE, unit, 0.0) * weight
     total = float(share @ unit)
     if total <= 0.0:
         return 0.0, float(np.inf), 0.0
     share = share / total
-    by_parameters = share @ equations.by_all[:, :-3]
-    allowed = float(by_parameters @ sensor.covariance @ by_parameters)
+    dmean_dsensor = share @ equations.jacobian[:, :-3]
+    allowed = float(dmean_dsensor @ sensor.covariance @ dmean_dsensor)
     mean = -float(share @ crossings.residual_px)
     return mean, float(np.sqrt(1.0 / total)), float(np.sqrt(max(allowed, 0.0)))
 
 
-def predicted_residuals(
+def residual_and_sigma(
     projected: Projections, crossings: Crossings, sensor: SensorCalibration, offset: EpipolarOffset
 ) -> tuple[FloatArray, FloatArray]:
-    """Residual (H,) that calibration errors and drift explain, and its standard deviation (H,)."""
-    by_all = residual_derivatives(projected, crossings, sensor)
+    """Residual (H,) beyond what calibration errors and drift explain, and its sigma (H,), px."""
+    jacobian = _residual_jacobian(projected, crossings, sensor)
     step = np.concatenate([offset.parameter_step, offset.drift])
-    spread = by_all @ offset.factor
-    return -(by_all @ step), np.sqrt(np.sum(spread**2, axis=1))
+    variance = np.sum((jacobian @ offset.factor) ** 2, axis=1)
+    sigma = np.sqrt(crossings.sigma_px**2 + variance + FLOOR_PX**2)
+    return crossings.residual_px + jacobian @ step, sigma

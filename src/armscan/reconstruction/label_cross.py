@@ -4,20 +4,24 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Points, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
-from armscan.reconstruction.image_memory import SHARPNESS, ImageMemory
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, LabelStatus
-from armscan.reconstruction.stretches import Pieces, cut_pieces
-from armscan.reconstruction.triangulate import intersect_sheets
+from armscan.reconstruction.labels import (
+    PASS_GAP_NS,
+    LabelledInstant,
+    LabelledProfile,
+    PointStatus,
+)
+from armscan.reconstruction.segments import Pieces, cut_pieces
+from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange, intersect_sheets
 from armscan.records.profile import Profile
 
 SPACING_MM = 0.5
@@ -26,13 +30,13 @@ N_NEAR = 32
 REACH_MM = 5.0
 """Nothing is predicted further than this from all that is known."""
 NOISE_MM = 0.04
-"""Stripe, arm and calibration together, between exposures of one stroke."""
+"""Stripe, arm and calibration together, between exposures of one pass."""
 BEND_PER_MM = 0.06
 """Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
 SHARP_MM = 0.3
-"""Vaguer predictions err by the same all along a stretch."""
+"""Vaguer predictions err by the same all along a segment."""
 STUDENT = 3.0
 """Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
 
@@ -67,8 +71,8 @@ class SurfaceMemory:
         """Add the points (N, 3) of an exposure, in the order of their stripes."""
         step = np.linalg.norm(np.diff(points_base_mm, axis=0, prepend=points_base_mm[:1]), axis=1)
         # a jump between stripes counts for one step, so that each stripe's first point is kept
-        way = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
-        kept = points_base_mm[np.diff(way, prepend=-1.0) != 0]
+        arc = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
+        kept = points_base_mm[np.diff(arc, prepend=-1.0) != 0]
         self._kept.append(kept)
         while len(self._kept) > self.n_exposures:
             self._kept.popleft()
@@ -131,6 +135,78 @@ def _continued(
     return offset, np.sqrt(covariance[:, 0, 0] + NOISE_MM**2)
 
 
+REACH_PX = 60.0
+"""A stripe is not looked for further from where it is expected."""
+SIGMA_PX = 5.0
+"""Of the expected place across the stripe; a hand's acceleration and the surface's shape."""
+WINDOW_PX = 600.0
+"""A stripe of which nothing is known may be anywhere over about this width."""
+SHARPNESS = 0.15
+"""What the prediction errs by is nearly the same all along a stripe."""
+STIFFNESS = 20.0
+"""Points' worth of belief that a stripe stands still, so that its motion is always determined."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Stripe:
+    points_px: FloatArray
+    normals_px: FloatArray
+    motion_px: FloatArray
+
+
+@dataclass(slots=True, eq=False)
+class ImageMemory:
+    """The last stripe of each sheet with its motion from the one before."""
+
+    _last: dict[int, _Stripe] = field(default_factory=dict)
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._last.clear()
+
+    def remember(self, points_px: FloatArray, normals_px: FloatArray, sheet: IntArray) -> None:
+        """Take in the named points (N, 2) of an exposure, their normals and sheets (N,)."""
+        for k in np.unique(sheet).tolist():
+            points, normals = points_px[sheet == k], normals_px[sheet == k]
+            self._last[k] = _Stripe(points, normals, self._motion(k, points, normals))
+
+    def log_gain(self, points_px: FloatArray, sheet: int) -> FloatArray:
+        """How well new points (S, 2) continue a sheet's stripe.
+
+        The logarithm (S,) of the density of their place, if they are of the sheet, over that of
+        something new, which may be anywhere: 0 where nothing is expected.
+        """
+        gain = np.zeros(len(points_px))
+        if sheet not in self._last or not len(points_px):
+            return gain
+        last = self._last[sheet]
+        distance, index = _nearest(last, points_px)
+        known = np.flatnonzero(distance < REACH_PX)
+        place = last.points_px[index[known]] + last.motion_px
+        across = np.einsum("ni,ni->n", points_px[known] - place, last.normals_px[index[known]])
+        share = 1.0 + (across / SIGMA_PX) ** 2 / STUDENT
+        peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / SIGMA_PX
+        gain[known] = np.log1p(WINDOW_PX * peak / share**2)
+        return gain
+
+    def _motion(self, sheet: int, points: FloatArray, normals: FloatArray) -> FloatArray:
+        """(2,) motion since the last image: only its part across the stripe can be seen."""
+        if sheet not in self._last:
+            return np.zeros(2)
+        last = self._last[sheet]
+        distance, index = _nearest(last, points)
+        near = distance < REACH_PX
+        n = normals[near]
+        step = np.einsum("ni,ni->n", points[near] - last.points_px[index[near]], n)
+        return np.asarray(np.linalg.solve(n.T @ n + STIFFNESS * np.eye(2), n.T @ step))
+
+
+def _nearest(last: _Stripe, points_px: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Distance (N,) to the nearest point of a stripe that moved on, and its index."""
+    found = cKDTree(last.points_px + last.motion_px).query(points_px)
+    return np.asarray(found[0]), np.asarray(found[1])
+
+
 OUTSIDE = -4.0
 """Log-likelihood of a piece that lies outside the depths of a sheet, over one that is inside."""
 DIRECTION_RAD = np.radians(25.0)
@@ -138,11 +214,11 @@ DIRECTION_RAD = np.radians(25.0)
 ODD_DIRECTION = 0.1
 """Share of stripes that run in any direction: walls and edges."""
 ALIKE_PIECES = 8
-"""Over so many pieces of a stretch, some 5 mm, what misleads one of them misleads all."""
+"""Over so many pieces of a segment, some 5 mm, what misleads one of them misleads all."""
 INDEPENDENT = 0.5
 """Of sharp predictions: neighbouring pieces share some of what they err by."""
 TAKEN = -3.0
-"""Log-likelihood of a piece whose place in the sheet's light is taken by another stretch."""
+"""Log-likelihood of a piece whose place in the sheet's light is taken by another segment."""
 RAY_MM = 1.0
 """Along the sheet, light within this counts as one ray of the laser."""
 
@@ -175,14 +251,14 @@ def hypothesise(
     sensor: SensorCalibration,
     depths: DepthRange,
 ) -> Hypotheses:
-    """Meet the rays of samples (S, 2) with each sheet."""
+    """Intersect the rays of samples (S, 2) with each sheet."""
     points, inside, place = [], [], []
     for k in sheets:
-        met, is_met = intersect_sheets(points_px, np.full(len(points_px), k), sensor)
-        low, high = depths.limits_mm(sensor.sheets[k])
+        of_sheet = np.full(len(points_px), k)
+        met, is_met = intersect_sheets(points_px, of_sheet, sensor)
         sheet = sensor.sheets[k].sheet
         points.append(met)
-        inside.append(is_met & (met[:, 2] >= low) & (met[:, 2] <= high))
+        inside.append(is_met & depths.holds(met, of_sheet, sensor))
         place.append((met - sheet.origin_mm) @ sheet.axes[0])
     return Hypotheses(sheets, np.array(points), np.array(inside).T, np.array(place))
 
@@ -190,24 +266,16 @@ def hypothesise(
 def still_evidence(pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration) -> FloatArray:
     """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
     depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
-    direction = _direction_evidence(pieces, hypotheses.sheets, sensor)
-    return np.asarray(_vote(pieces) * (depth + direction))
+    usual = np.stack([frontal_direction(sensor, k) for k in hypotheses.sheets], axis=1)
+    turn = np.arccos(np.clip(np.abs(pieces.direction @ usual), 0.0, 1.0))
+    likelihood = (1.0 - ODD_DIRECTION) * np.exp(-0.5 * (turn / DIRECTION_RAD) ** 2) + ODD_DIRECTION
+    return np.asarray(_vote(pieces) * (depth + np.log(likelihood)))
 
 
 def _vote(pieces: Pieces) -> FloatArray:
-    """(P, 1) weights by which the pieces of a stretch do not count for more than they know."""
-    count = np.bincount(pieces.stretch)[pieces.stretch]
+    """(P, 1) weights by which the pieces of a segment do not count for more than they know."""
+    count = np.bincount(pieces.segment)[pieces.segment]
     return np.asarray(np.minimum(1.0, 1.0 / count + 1.0 / ALIKE_PIECES)[:, None])
-
-
-def _direction_evidence(
-    pieces: Pieces, sheets: tuple[int, ...], sensor: SensorCalibration
-) -> FloatArray:
-    turn = np.stack(
-        [_angle_between(pieces.direction, frontal_direction(sensor, k)) for k in sheets], axis=1
-    )
-    usual = np.exp(-0.5 * (turn / DIRECTION_RAD) ** 2)
-    return np.asarray(np.log((1.0 - ODD_DIRECTION) * usual + ODD_DIRECTION))
 
 
 def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
@@ -217,11 +285,6 @@ def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
     ends = model.origin_mm + np.array([[-1.0], [1.0]]) * along
     first, last = sensor.camera.camera.project(ends)
     return np.asarray((last - first) / np.linalg.norm(last - first))
-
-
-def _angle_between(direction: FloatArray, line: FloatArray) -> FloatArray:
-    """(P,) angles in 0 to 90 degrees between directions (P, 2) and a line."""
-    return np.asarray(np.arccos(np.clip(np.abs(direction @ line), 0.0, 1.0)))
 
 
 def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -> FloatArray:
@@ -242,7 +305,7 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
 
 
 def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses) -> FloatArray:
-    """(P, H) penalty where another stretch already holds the same rays of a sheet's light.
+    """(P, H) penalty where another segment already holds the same rays of a sheet's light.
 
     A ray of a laser ends on the first thing that it meets, so it is seen once.
 
@@ -254,15 +317,15 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         Of the profile.
     """
     of_sample = pieces.of_sample
-    stretch = pieces.stretch[of_sample]
+    segment = pieces.segment[of_sample]
     penalty = np.zeros(hypotheses.is_inside.shape)
     for h in range(len(hypotheses.sheets)):
         belief = np.where(hypotheses.is_inside[:, h], np.exp(log_posterior[of_sample, h]), 0.0)
         ray = np.floor(hypotheses.place_mm[h] / RAY_MM).astype(np.int64)
         ray -= ray.min(initial=0)
-        table = np.zeros((int(stretch.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
-        np.maximum.at(table, (stretch, ray), belief)
-        penalty[:, h] = TAKEN * _most_of_others(table)[stretch, ray]
+        table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
+        np.maximum.at(table, (segment, ray), belief)
+        penalty[:, h] = TAKEN * _most_of_others(table)[segment, ray]
     return np.asarray(_vote(pieces) * pieces.mean(penalty))
 
 
@@ -276,18 +339,18 @@ def _most_of_others(table: FloatArray) -> FloatArray:
 
 
 SWITCH = 1e-3
-"""Probability that the sheet changes between two pieces of a stretch unnoticed."""
+"""Probability that the sheet changes between two pieces of a segment unnoticed."""
 
 
-def smoothed_posterior(log_likelihood: FloatArray, stretch: IntArray) -> FloatArray:
+def smoothed_posterior(log_likelihood: FloatArray, segment: IntArray) -> FloatArray:
     """Posterior log-probability of each hypothesis for each piece, by forward and backward passes.
 
     Parameters
     ----------
     log_likelihood
         (P, H) of each piece under each hypothesis.
-    stretch
-        (P,) stretch of each piece, not decreasing; stretches are independent.
+    segment
+        (P,) segment of each piece, not decreasing; segments are independent.
 
     Returns
     -------
@@ -301,82 +364,44 @@ def smoothed_posterior(log_likelihood: FloatArray, stretch: IntArray) -> FloatAr
     np.fill_diagonal(step, np.log1p(-SWITCH))
     ahead, behind = log_likelihood.copy(), np.zeros((n, h))
     for p in range(1, n):
-        if stretch[p] == stretch[p - 1]:
-            ahead[p] += _summed(ahead[p - 1][:, None] + step)
+        if segment[p] == segment[p - 1]:
+            ahead[p] += np.logaddexp.reduce(ahead[p - 1][:, None] + step, axis=0)
     for p in range(n - 2, -1, -1):
-        if stretch[p] == stretch[p + 1]:
-            behind[p] = _summed((behind[p + 1] + log_likelihood[p + 1])[:, None] + step)
+        if segment[p] == segment[p + 1]:
+            onward = (behind[p + 1] + log_likelihood[p + 1])[:, None] + step
+            behind[p] = np.logaddexp.reduce(onward, axis=0)
     total = ahead + behind
     return np.asarray(total - np.logaddexp.reduce(total, axis=1, keepdims=True))
 
 
-def _summed(terms: FloatArray) -> FloatArray:
-    return np.asarray(np.logaddexp.reduce(terms, axis=0))
-
-
+MARGIN, REMEMBER_MARGIN = 5.5, 7.0
+"""Least log-odds of a sheet over all others, and of points from which later stripes are predicted:
+with these benchmarks/cross_naming.py finds no wrong label."""
+UNDECIDED_SHARE, LEAST_BETWEEN = 0.2, 4
+"""A larger share of points without a sheet asks for one laser alone, but not before so many
+exposures with all lasers."""
 MOST = 0.5
 """With a larger share undecided, one stripe alone gives no less than all of them together."""
 ROUNDS = 2
-"""Times that the rays held by other stretches are looked up."""
-
-
-@dataclass(frozen=True, slots=True)
-class CrossOptions:
-    """When a name is believed, and when one laser is asked for alone.
-
-    Parameters
-    ----------
-    margin
-        Least log-odds of a name over all others.
-    remember_margin
-        Least log-odds of points from which later stripes are predicted.
-    undecided_share
-        A larger share of points without a name asks for one laser alone.
-    least_between
-        Exposures with all lasers between two single ones.
-    stroke_gap_ns
-        A longer pause begins a new stroke.
-    depths
-        Depths that are possible.
-    """
-
-    margin: float = 5.5
-    remember_margin: float = 7.0
-    undecided_share: float = 0.2
-    least_between: int = 4
-    stroke_gap_ns: int = STROKE_GAP_NS
-    depths: DepthRange = field(default_factory=lambda: DepthRange(0.5))
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.margin <= self.remember_margin:
-            raise OptionError(
-                f"margins of {self.margin} and {self.remember_margin}",
-                remedy="give positive ones, the second not below the first",
-            )
-        if not 0.0 < self.undecided_share <= 1.0 or self.least_between < 0:
-            raise OptionError(
-                f"an undecided share of {self.undecided_share}, at least {self.least_between} "
-                "exposures between single ones",
-                remedy="give a share above 0 and up to 1, and 0 or more exposures",
-            )
+"""Times that the rays held by other segments are looked up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Verdict:
-    """Sheet (N,), log-odds (N,) and fate (N,) of points; undecided ones expected of each sheet."""
+class _Assignment:
+    """Sheet (N,), log-odds (N,), status (N,) of points; undecided ones expected of each sheet."""
 
     sheet: IntArray
     odds: FloatArray
-    fate: IntArray
+    status: IntArray
     undecided: FloatArray
 
 
 class CrossLabeller:
-    """Predicts every stripe from the past of its stroke; a `StripeLabeller`.
+    """Predicts every stripe from the past of its pass; a `StripeLabeller`.
 
-    A stretch of a profile gives other points in space under each sheet. Those of the right sheet
+    A segment of a profile gives other points in space under each sheet. Those of the right sheet
     continue the surface that the last exposures measured; those of a wrong one leave it steeply.
-    The log-likelihoods of a stretch's pieces are joined along it, and the light of a sheet falls
+    The log-likelihoods of a segment's pieces are joined along it, and the light of a sheet falls
     on one thing only. What stays undecided is dropped and counted, and one laser is asked for
     alone. Without the arm's pose each stripe is predicted in the image, from its last place and
     motion.
@@ -385,22 +410,21 @@ class CrossLabeller:
     ----------
     sensor
         Camera and sheets; a source draws the sheets that bear its name.
-    options
-        Defaults if None.
+    depths
+        Depths that are possible.
     """
 
-    def __init__(self, sensor: SensorCalibration, options: CrossOptions | None = None) -> None:
-        self._sensor = sensor
-        self._options = options or CrossOptions()
+    def __init__(self, sensor: SensorCalibration, depths: DepthRange = LABEL_DEPTHS) -> None:
+        self._sensor, self._depths = sensor, depths
         self._source_of = tuple(sheet.name.partition(".")[0] for sheet in sensor.sheets)
         self._sources = tuple(dict.fromkeys(self._source_of))
-        limits = [self._options.depths.limits_mm(sheet) for sheet in sensor.sheets]
+        limits = [depths.limits_mm(sheet) for sheet in sensor.sheets]
         self._surface = SurfaceMemory(depth_span_mm=max(high - low for low, high in limits))
         self._image = ImageMemory()
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past: the next exposure begins a new stroke."""
+        """Forget the past: the next exposure begins a new pass."""
         self._surface.forget()
         self._image.forget()
         self._last_ns: int | None = None
@@ -408,24 +432,25 @@ class CrossLabeller:
         self._since_single = 0
 
     def next_lasers(self) -> tuple[str, ...]:
-        """One laser alone at the start of a stroke and when names are in doubt, else all."""
+        """One laser alone at the start of a pass and when labels are in doubt, else all."""
         return self._next
 
-    def name(
+    def label(
         self,
-        profile: Profile,
-        lasers: tuple[str, ...],
-        base_from_sensor: Pose[Base, Sensor] | None,
-        t_ns: int,
-    ) -> LabelledProfile:
-        """Name the points of the next exposure; see `StripeLabeller`.
+        profiles: Sequence[Profile],
+        lasers: tuple[str, ...] = (),
+        base_from_sensor: Pose[Base, Sensor] | None = None,
+        t_ns: int = 0,
+    ) -> LabelledInstant:
+        """Label the points of the next exposure; see `StripeLabeller`.
 
         Raises
         ------
         InputError
             If the calibration has no sheet of any laser that was on.
         """
-        if self._last_ns is not None and t_ns - self._last_ns > self._options.stroke_gap_ns:
+        (profile,) = profiles
+        if self._last_ns is not None and t_ns - self._last_ns > PASS_GAP_NS:
             self.reset()
         self._last_ns = t_ns
         possible = tuple(
@@ -438,39 +463,45 @@ class CrossLabeller:
                 where=profile.source,
                 remedy="give a calibration of this head",
             )
-        verdict = self._judge(profile, possible, base_from_sensor)
-        self._learn(profile, verdict, base_from_sensor)
-        self._plan(verdict, possible)
-        how = self._how(possible, base_from_sensor is not None)
-        return LabelledProfile(profile, verdict.sheet, verdict.fate, how)
+        found = self._assign(profile, possible, base_from_sensor)
+        self._learn(profile, found, base_from_sensor)
+        self._plan(found, possible)
+        reason = self._reason(possible, base_from_sensor is not None)
+        return LabelledInstant(
+            (
+                LabelledProfile(
+                    profile=profile, sheet=found.sheet, status=found.status, reason=reason
+                ),
+            )
+        )
 
-    def _judge(
+    def _assign(
         self, profile: Profile, possible: tuple[int, ...], pose: Pose[Base, Sensor] | None
-    ) -> _Verdict:
+    ) -> _Assignment:
         n = len(profile)
         pieces = cut_pieces(profile)
-        fate = np.full(n, int(LabelStatus.NOT_ASKED))
+        status = np.full(n, int(PointStatus.FLAGGED))
         sheet, odds = np.full(n, -1), np.full(n, -np.inf)
         undecided = np.zeros(len(self._source_of))
         if not len(pieces):
-            return _Verdict(sheet, odds, fate, undecided)
+            return _Assignment(sheet, odds, status, undecided)
         samples = profile.points_px[pieces.sample]
-        hypotheses = hypothesise(samples, possible, self._sensor, self._options.depths)
+        hypotheses = hypothesise(samples, possible, self._sensor, self._depths)
         posterior = self._posterior(samples, pieces, hypotheses, pose)
         best, margin = _best(posterior)
         inside = pieces.mean(hypotheses.is_inside.astype(np.float64))
-        verdict = np.where(margin >= self._options.margin, LabelStatus.NAMED, LabelStatus.AMBIGUOUS)
+        is_sure = margin >= MARGIN
         is_explained = np.take_along_axis(inside, best[:, None], axis=1)[:, 0] > 0.5
-        verdict[~is_explained] = LabelStatus.UNEXPLAINED
-        asked = pieces.of_point >= 0
-        own = pieces.of_point[asked]
-        fate[asked], odds[asked] = verdict[own], margin[own]
-        sheet[asked] = np.where(
-            verdict[own] == LabelStatus.NAMED, np.array(possible)[best[own]], -1
-        )
-        doubtful = np.where(verdict == LabelStatus.AMBIGUOUS, pieces.size, 0)
-        undecided[list(possible)] = doubtful @ np.exp(posterior)
-        return _Verdict(sheet, odds, fate, undecided)
+        of_piece = np.where(is_sure, PointStatus.MEASURED, PointStatus.AMBIGUOUS)
+        of_piece[~is_explained] = PointStatus.STRAY
+        accepted = pieces.of_point >= 0
+        piece = pieces.of_point[accepted]
+        status[accepted], odds[accepted] = of_piece[piece], margin[piece]
+        assigned = np.where(of_piece == PointStatus.MEASURED, np.array(possible)[best], -1)
+        sheet[accepted] = assigned[piece]
+        in_doubt = np.where(of_piece == PointStatus.AMBIGUOUS, pieces.size, 0)
+        undecided[list(possible)] = in_doubt @ np.exp(posterior)
+        return _Assignment(sheet, odds, status, undecided)
 
     def _posterior(
         self,
@@ -490,39 +521,36 @@ class CrossLabeller:
                 gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
         past = past_evidence(pieces, gain, sharpness)
         evidence = past + still_evidence(pieces, hypotheses, self._sensor)
-        posterior = smoothed_posterior(evidence, pieces.stretch)
+        posterior = smoothed_posterior(evidence, pieces.segment)
         for _ in range(ROUNDS):
             taken = taken_evidence(posterior, pieces, hypotheses)
-            posterior = smoothed_posterior(evidence + taken, pieces.stretch)
+            posterior = smoothed_posterior(evidence + taken, pieces.segment)
         return posterior
 
-    def _learn(self, profile: Profile, verdict: _Verdict, pose: Pose[Base, Sensor] | None) -> None:
-        known = verdict.odds >= self._options.remember_margin
-        known &= verdict.sheet >= 0
-        sheet = verdict.sheet[known]
-        pixels = profile.points_px[known]
+    def _learn(self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None) -> None:
+        known = (found.odds >= REMEMBER_MARGIN) & (found.sheet >= 0)
+        sheet, pixels = found.sheet[known], profile.points_px[known]
         self._image.remember(pixels, profile.normals_px[known], sheet)
-        if pose is None:
-            return
-        points, is_met = intersect_sheets(pixels, sheet, self._sensor)
-        in_sensor: Points[Sensor] = Points(points[is_met])
-        self._surface.remember((pose @ in_sensor).xyz_mm)
+        if pose is not None:
+            points, is_met = intersect_sheets(pixels, sheet, self._sensor)
+            in_sensor: Points[Sensor] = Points(points[is_met])
+            self._surface.remember((pose @ in_sensor).xyz_mm)
 
-    def _plan(self, verdict: _Verdict, possible: tuple[int, ...]) -> None:
+    def _plan(self, found: _Assignment, possible: tuple[int, ...]) -> None:
         """Choose the lasers of the next exposure: all, or the one that most undecided are of."""
         on = {self._source_of[k] for k in possible}
         self._since_single = 0 if len(on) == 1 else self._since_single + 1
         expected = dict.fromkeys(self._sources, 0.0)
-        for source, points in zip(self._source_of, verdict.undecided.tolist(), strict=True):
+        for source, points in zip(self._source_of, found.undecided.tolist(), strict=True):
             expected[source] += points
-        n_asked = int((verdict.fate != int(LabelStatus.NOT_ASKED)).sum())
+        n_asked = int((found.status != PointStatus.FLAGGED).sum())
         n_undecided = sum(expected.values())
-        is_due = self._since_single > self._options.least_between or n_undecided > MOST * n_asked
-        is_in_doubt = n_undecided > self._options.undecided_share * n_asked
+        is_due = self._since_single > LEAST_BETWEEN or n_undecided > MOST * n_asked
+        is_in_doubt = n_undecided > UNDECIDED_SHARE * n_asked
         most = max(self._sources, key=lambda source: expected[source])
         self._next = (most,) if is_in_doubt and is_due else self._sources
 
-    def _how(self, possible: tuple[int, ...], has_pose: bool) -> str:
+    def _reason(self, possible: tuple[int, ...], has_pose: bool) -> str:
         if len(possible) == 1:
             return f"sheet {self._sensor.sheets[possible[0]].name}, the laser that was on"
         if has_pose:

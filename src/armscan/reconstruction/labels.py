@@ -1,30 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The state of each stripe point, the sheet it was given to, and the protocol of labellers."""
+"""What became of each stripe point, the sheet it was given to, and what tells sheets."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from armscan.geometry.arrays import IntArray, frozen_ints
+from armscan.geometry.arrays import ArrayRecord, IntArray, ints
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.records.cloud import PointCloud
+from armscan.reconstruction.epipolar import EpipolarOffset
 from armscan.records.profile import Profile
 
 
 class PointStatus(IntEnum):
-    """What became of a stripe point in a reconstruction."""
+    """What became of a stripe point: of its label first, then of its point in space."""
 
     MEASURED = 0
+    """It has a sheet, and once it is triangulated a point."""
     FLAGGED = 1
-    """Rejected by the stripe extraction; `Profile.flags` says why."""
+    """Rejected by the stripe extraction; `Profile.flags` says why. Its sheet is not asked for."""
     NO_RAY = 2
     """The lens model has no inverse there, or the ray misses the sheet."""
     OUT_OF_DEPTH = 3
     """Meets the sheet outside the depths accepted: those in which it was calibrated, widened."""
     AMBIGUOUS = 4
-    """Several sheets explain it about as well."""
+    """Several sheets explain it about as well: dropped and counted, not guessed."""
     STRAY = 5
     """No sheet explains it: a reflection, or the laser's bright centre."""
     SHARED = 6
@@ -37,10 +39,10 @@ class PointStatus(IntEnum):
     @property
     def label(self) -> str:
         """The words that a report shows."""
-        return _FATE_LABELS[self]
+        return _WORDS[self]
 
 
-_FATE_LABELS = {
+_WORDS = {
     PointStatus.MEASURED: "measured",
     PointStatus.FLAGGED: "flagged by the stripe extraction",
     PointStatus.NO_RAY: "no ray meets the sheet",
@@ -53,165 +55,81 @@ _FATE_LABELS = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredProfile:
-    """What one exposure gave.
+class LabelledProfile(ArrayRecord):
+    """Stripe points of one exposure with the light sheet that drew each.
 
     Parameters
     ----------
     profile
         All N stripe points.
-    fate
-        (N,) `PointStatus` of each.
-    sheet
-        (N,) index of its sheet in ``Reconstruction.cloud.sheet_names``; -1 for none.
-    naming
-        How the sheet was chosen, in words.
-    """
-
-    profile: Profile
-    fate: IntArray
-    sheet: IntArray
-    naming: str
-
-    def __post_init__(self) -> None:
-        n = len(self.profile)
-        object.__setattr__(self, "fate", frozen_ints(self.fate, (n,), "fate"))
-        object.__setattr__(self, "sheet", frozen_ints(self.sheet, (n,), "sheet"))
-
-    def count(self, fate: PointStatus) -> int:
-        """Count of points with this fate."""
-        return int((self.fate == int(fate)).sum())
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Reconstruction:
-    """Measured points and the evidence of each image.
-
-    Parameters
-    ----------
-    cloud
-        Points in the Sensor frame.
-    images
-        One entry an exposure, in the order given; ``cloud.exposure`` points into it.
-    warnings
-        What is weak, in words.
-    """
-
-    cloud: PointCloud
-    images: tuple[MeasuredProfile, ...]
-    warnings: tuple[str, ...] = ()
-
-
-class LabelStatus(IntEnum):
-    """Whether the sheet of a stripe point could be told."""
-
-    NAMED = 0
-    AMBIGUOUS = 1
-    """Several sheets explain it about as well: dropped and counted, not guessed."""
-    UNEXPLAINED = 2
-    """No sheet explains it: a stray reflection, or the laser's bright centre."""
-    NOT_ASKED = 3
-    """Rejected by the stripe extraction; its sheet was not looked for."""
-
-    @property
-    def label(self) -> str:
-        """The words that a report shows."""
-        return _LABELS[self]
-
-
-_LABELS = {
-    LabelStatus.NAMED: "named",
-    LabelStatus.AMBIGUOUS: "on several sheets about as likely",
-    LabelStatus.UNEXPLAINED: "on no sheet: stray light",
-    LabelStatus.NOT_ASKED: "flagged by the stripe extraction",
-}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LabelledProfile:
-    """Stripe points of one exposure with their sheets.
-
-    Parameters
-    ----------
-    profile
-        The stripe points.
     sheet
         (N,) index into the sensor's sheets; -1 for none.
-    fate
-        (N,) `LabelStatus`; ``NAMED`` exactly where ``sheet`` is not -1.
-    how
+    status
+        (N,) `PointStatus` of each.
+    reason
         How the sheets were told, in words.
     """
 
     profile: Profile
-    sheet: IntArray
-    fate: IntArray
-    how: str
+    sheet: IntArray = ints("N")
+    status: IntArray = ints("N")
+    reason: str
 
-    def __post_init__(self) -> None:
-        n = len(self.profile)
-        object.__setattr__(self, "sheet", frozen_ints(self.sheet, (n,), "sheet"))
-        object.__setattr__(self, "fate", frozen_ints(self.fate, (n,), "fate"))
-
-    def count(self, fate: LabelStatus) -> int:
-        """Count of points with this fate."""
-        return int((self.fate == int(fate)).sum())
+    def count(self, status: PointStatus) -> int:
+        """Count of points of this status."""
+        return int((self.status == status).sum())
 
 
-class StereoStatus(IntEnum):
-    """What became of a stripe point of one of two cameras."""
+@dataclass(frozen=True, slots=True, eq=False)
+class LabelledInstant:
+    """What the cameras saw at one instant, labelled.
 
-    UNNAMED = 0
-    """It has no sheet; its `LabelStatus` says why."""
-    FUSED = 1
-    """A left point that the right camera sees too: measured from both images."""
-    ALONE = 2
-    """Only this camera sees it: measured from its image and the sheet."""
-    TAKEN = 3
-    """A right point at or beside the right picture of a fused left point: it is measured there."""
-    OUT_OF_DEPTH = 4
-    """Only this camera sees it, and it lies outside the depths accepted: dropped."""
-    INCONSISTENT = 5
-    """Left and right picture contradict the sheet: dropped, as are the right points beside it."""
-    NO_RAY = 6
-    """The lens model has no inverse there, or the ray misses the sheet."""
+    Parameters
+    ----------
+    profiles
+        One a camera, left first.
+    offset
+        How far the right camera's picture has moved; None for one camera.
+    """
+
+    profiles: tuple[LabelledProfile, ...]
+    offset: EpipolarOffset | None = None
 
 
-STROKE_GAP_NS = 250_000_000
-"""A longer pause between exposures begins a new stroke, of which nothing is known yet."""
+PASS_GAP_NS = 250_000_000
+"""A longer pause between exposures begins a new pass, of which nothing is known yet."""
 
 
 class StripeLabeller(Protocol):
-    """Names the stripes of one camera's exposures in order of time; it remembers the past.
+    """Tells the sheets of stripes, instant by instant in order of time; it may remember the past.
 
     What it returns depends on what it was given since the last `reset` and on nothing else, so
-    that a recording whose rows name their lasers is named again as it was when it was taken.
+    that a recording whose rows name their lasers is labelled again as it was when it was taken.
     """
 
-    def name(
+    def label(
         self,
-        profile: Profile,
-        lasers: tuple[str, ...],
-        base_from_sensor: Pose[Base, Sensor] | None,
-        t_ns: int,
-    ) -> LabelledProfile:
-        """Name the points of the next exposure.
+        profiles: Sequence[Profile],
+        lasers: tuple[str, ...] = (),
+        base_from_sensor: Pose[Base, Sensor] | None = None,
+        t_ns: int = 0,
+    ) -> LabelledInstant:
+        """Label the stripe points of the next instant.
 
         Parameters
         ----------
-        profile
-            Its stripe points.
+        profiles
+            Stripe points of each camera.
         lasers
-            Sources that were on.
+            Sources that were on; empty if unknown.
         base_from_sensor
             Where the sensor was; None if unknown.
         t_ns
-            Mid-exposure time, larger than that of the exposure before.
+            Mid-exposure time, larger than that of the instant before.
         """
 
     def next_lasers(self) -> tuple[str, ...]:
-        """Sources that should be on in the next exposure."""
+        """Sources that should be on in the next exposure; empty for those of the recording."""
 
     def reset(self) -> None:
-        """Forget the past: the next exposure begins a new stroke."""
+        """Forget the past: the next exposure begins a new pass."""

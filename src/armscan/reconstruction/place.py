@@ -9,18 +9,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import (
-    Box,
-    FloatArray,
-    IntArray,
-)
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
-from armscan.geometry.rotations import skew
+from armscan.geometry.shapes import fit_plane
 from armscan.models.calibration import ArmNoise, ScannerCalibration
-from armscan.reconstruction.triangulate import StripePoints, noise_size_mm, sensor_columns
+from armscan.reconstruction.triangulate import StripePoints, sensor_columns, stripe_cloud
 from armscan.records.cloud import PointCloud
-from armscan.records.profile import Profile
+from armscan.records.profile import PointProfile, Profile
+
+DELIVERED = "profile"
+"""Name of the one light sheet of a sensor that delivers points itself."""
+THIRD_DIFFERENCE = np.array([1.0, -3.0, 3.0, -1.0])
+"""Blind to any parabola, so to the course of a profile over four points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,31 +51,16 @@ def place_with_jacobian(
     tool_from_sensor: Pose[Tool, Sensor],
 ) -> BaseJacobian:
     """Map (N, 3) points from Sensor to Base and differentiate (eq. 2.53)."""
-    turned = points_sensor_mm @ tool_from_sensor.rotation.T
-    in_tool = turned + tool_from_sensor.translation_mm
-    by_hand_eye = np.concatenate(
-        [-skew(turned), np.broadcast_to(np.eye(3), (len(turned), 3, 3))], axis=2
-    )
     return BaseJacobian(
-        in_tool @ base_from_tool.rotation.T + base_from_tool.translation_mm,
+        base_from_tool.apply(tool_from_sensor.apply(points_sensor_mm)),
         base_from_tool.rotation @ tool_from_sensor.rotation,
-        base_from_tool.rotation @ by_hand_eye,
+        base_from_tool.rotation @ tool_from_sensor.jacobian(points_sensor_mm),
     )
-
-
-def scan_point_mm(scanner: ScannerCalibration) -> FloatArray | None:
-    """(3,) middle of the working range in Sensor, about which the arm's noise is given.
-
-    The mean of the light sheets' origins; None for a sensor that delivers points itself.
-    """
-    if scanner.sensor is None:
-        return None
-    return np.asarray(np.mean([s.sheet.origin_mm for s in scanner.sensor.sheets], axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BaseTransform:
-    """What placing needs of a scanner, computed once for all exposures.
+    """What carries points to Base with their covariance, computed once for all exposures.
 
     Parameters
     ----------
@@ -82,62 +70,58 @@ class BaseTransform:
         One (Q + 6, K) matrix F a sheet with ``F F'`` the joint covariance of what its points
         depend on (`sensor_columns`) and of the hand-eye; (6, K) where the sensor delivers points.
     scan_point_mm
-        (3,) in Sensor; None to take the mean of each exposure's points.
+        (3,) middle of the working range in Sensor, about which the arm's noise is given: the mean
+        of the light sheets' origins. None to take the mean of each exposure's points, for a sensor
+        that delivers points itself.
     """
 
     scanner: ScannerCalibration
     factors: tuple[FloatArray, ...]
     scan_point_mm: FloatArray | None
 
+    @staticmethod
+    def of(scanner: ScannerCalibration) -> BaseTransform:
+        """Factor the scanner's joint covariance sheet by sheet.
 
-def prepare_placing(scanner: ScannerCalibration) -> BaseTransform:
-    """Factor the scanner's joint covariance sheet by sheet.
+        Raises
+        ------
+        InputError
+            If the covariance is not positive semi-definite.
+        """
+        joint, sensor, name = scanner.covariance, scanner.sensor, "the scanner's covariance"
+        if sensor is None:
+            return BaseTransform(scanner, (square_root(joint, name),), None)
+        hand_eye = np.arange(6) + len(sensor.parameter_names)
+        places = [np.r_[sensor_columns(sensor, k), hand_eye] for k in range(len(sensor.sheets))]
+        factors = tuple(square_root(joint[np.ix_(own, own)], name) for own in places)
+        middle = np.mean([one.sheet.origin_mm for one in sensor.sheets], axis=0)
+        return BaseTransform(scanner, factors, np.asarray(middle))
 
-    Raises
-    ------
-    InputError
-        If the covariance is not positive semi-definite.
-    """
-    joint = scanner.covariance
-    if scanner.sensor is None:
-        return BaseTransform(scanner, (_factor(joint),), None)
-    n = len(scanner.sensor.parameter_names)
-    hand_eye = np.arange(n, n + 6)
-    factors = []
-    for k in range(len(scanner.sensor.sheets)):
-        places = np.concatenate([sensor_columns(scanner.sensor, k), hand_eye])
-        factors.append(_factor(joint[np.ix_(places, places)]))
-    return BaseTransform(scanner, tuple(factors), scan_point_mm(scanner))
-
-
-def _factor(covariance: FloatArray) -> FloatArray:
-    """F with F F' = covariance, in units that make its diagonal one, so that none is lost."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    unit = np.where(scale > 0.0, scale, 1.0)
-    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
-    if len(values) and float(values[0]) < -1e-6 * max(float(values[-1]), 1.0):
-        raise InputError(
-            "the scanner's covariance is not positive semi-definite",
-            remedy="calibrate again: the document was changed or is damaged",
-        )
-    kept = values > 1e-15 * max(float(values[-1]), 0.0)
-    return np.asarray(unit[:, None] * vectors[:, kept] * np.sqrt(values[kept]))
+    @property
+    def sheet_names(self) -> tuple[str, ...]:
+        """Names of the light sheets."""
+        sensor = self.scanner.sensor
+        return (DELIVERED,) if sensor is None else tuple(one.name for one in sensor.sheets)
 
 
 def propagate_to_base(
-    stripe: StripePoints, profile: Profile, base_from_tool: Pose[Base, Tool], placing: BaseTransform
+    stripe: StripePoints,
+    profile: Profile | PointProfile,
+    base_from_tool: Pose[Base, Tool],
+    transform: BaseTransform,
 ) -> PointCloud:
     """Place the points of one exposure in Base.
 
     Parameters
     ----------
     stripe
-        Points in Sensor with what their errors come from.
+        Points in Sensor with what their errors come from; of a sensor that delivers points itself
+        (`delivered_points`) the derivatives by the sensor are (M, 3, 0).
     profile
-        The stripe points that they were triangulated from.
+        The stripe points that they were triangulated from, or the points as delivered.
     base_from_tool
         The arm's pose at that exposure.
-    placing
+    transform
         Of the scanner whose sensor triangulated the points.
 
     Returns
@@ -150,71 +134,59 @@ def propagate_to_base(
     Raises
     ------
     InputError
-        If the scanner has no sensor.
+        If the points were triangulated but the scanner has no camera, or the other way round.
     """
-    scanner = placing.scanner
-    if scanner.sensor is None:
-        raise InputError("this scanner has no camera", remedy="place its profiles instead")
-    placed = place_with_jacobian(
-        stripe.points_mm, base_from_tool, scanner.hand_eye.tool_from_sensor
-    )
+    hand_eye = transform.scanner.hand_eye
+    if isinstance(profile, Profile) == (transform.scanner.sensor is None):
+        fact = "no camera" if transform.scanner.sensor is None else "a camera"
+        raise InputError(f"this scanner has {fact}", remedy="give the scanner of these points")
+    placed = place_with_jacobian(stripe.points_mm, base_from_tool, hand_eye.tool_from_sensor)
     by_sensor = placed.by_sensor_point @ stripe.by_sensor
     by_all = np.concatenate([by_sensor, placed.by_hand_eye], axis=2)
-    covariance = np.zeros((len(stripe.row), 3, 3))
-    for k, factor in enumerate(placing.factors):
-        own = np.flatnonzero(stripe.sheet == k)
-        covariance[own] = _propagated(by_all[own], factor)
-    covariance += _pose_and_noise(placed, stripe.noise_mm, base_from_tool, placing)
-    return PointCloud(
-        frame="Base",
-        points_mm=placed.points_base_mm,
-        covariance_mm2=0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        sigma_noise_mm=noise_size_mm(stripe.noise_mm),
-        sheet=stripe.sheet,
-        sheet_names=tuple(sheet.name for sheet in scanner.sensor.sheets),
-        exposure=np.zeros(len(stripe.row), dtype=np.int64),
-        exposure_sources=(profile.source,),
-        segment=profile.segment[stripe.row],
-        intensity=profile.intensity[stripe.row],
+    covariance = np.zeros((len(stripe), 3, 3))
+    for k, factor in enumerate(transform.factors):
+        of_sheet = np.flatnonzero(stripe.sheet == k)
+        covariance[of_sheet] = _propagated(by_all[of_sheet], factor)
+    if transform.scan_point_mm is None:
+        middle = placed.points_base_mm.mean(axis=0) if len(stripe) else np.zeros(3)
+    else:
+        middle = base_from_tool.apply(hand_eye.tool_from_sensor.apply(transform.scan_point_mm))
+    noise = placed.by_sensor_point @ stripe.noise_mm
+    arm = arm_covariance(placed.points_base_mm, middle, hand_eye.arm_noise)
+    covariance += arm + noise @ noise.transpose(0, 2, 1)
+    return stripe_cloud(
+        "Base",
+        stripe,
+        profile,
+        placed.points_base_mm,
+        covariance,
+        sheet_names=transform.sheet_names,
     )
 
 
-def place_delivered_points(
-    points_sensor_mm: FloatArray,
-    noise_mm: FloatArray,
-    base_from_tool: Pose[Base, Tool],
-    placing: BaseTransform,
-) -> tuple[FloatArray, FloatArray]:
-    """Place points that the sensor itself delivered.
+def delivered_points(profile: PointProfile) -> StripePoints:
+    """Points that a sensor delivered itself; their noise is their own scatter.
 
-    Parameters
-    ----------
-    points_sensor_mm
-        (N, 3).
-    noise_mm
-        (N, 3, J) one standard deviation of each of a point's own noises, as the vector in which it
-        acts.
-    base_from_tool, placing
-        As for `propagate_to_base`.
-
-    Returns
-    -------
-    points_base_mm, covariance_mm2
-        (N, 3) and (N, 3, 3).
-
-    Raises
-    ------
-    InputError
-        If the scanner has a camera: its points depend on the camera's parameters too.
+    It is taken from the third differences of neighbouring points, which neither a line nor a circle
+    touches, and acts across the profile, within its plane; zero for a straight or short profile.
     """
-    if placing.scanner.sensor is not None:
-        raise InputError("this scanner has a camera", remedy="place its stripes instead")
-    placed = place_with_jacobian(
-        points_sensor_mm, base_from_tool, placing.scanner.hand_eye.tool_from_sensor
+    n = len(profile)
+    noise = np.zeros((n, 3, 1))
+    plane = fit_plane(profile.points_mm)
+    if n >= 8 and not isinstance(plane, FitFailure):
+        tangent = np.gradient(profile.points_mm, axis=0)
+        length = np.linalg.norm(tangent, axis=1)
+        across = np.cross(plane.value.normal, tangent / np.maximum(length, 1e-12)[:, None])
+        rough = np.apply_along_axis(np.convolve, 0, profile.points_mm, THIRD_DIFFERENCE, "valid")
+        size = np.abs(np.einsum("ni,ni->n", rough, across[1:-2]))
+        noise[:, :, 0] = across * robust_sigma(size / np.linalg.norm(THIRD_DIFFERENCE))
+    return StripePoints(
+        row=np.arange(n),
+        points_mm=profile.points_mm,
+        noise_mm=noise,
+        by_sensor=np.zeros((n, 3, 0)),
+        sheet=np.zeros(n, dtype=np.int64),
     )
-    covariance = _propagated(placed.by_hand_eye, placing.factors[0])
-    covariance += _pose_and_noise(placed, noise_mm, base_from_tool, placing)
-    return placed.points_base_mm, 0.5 * (covariance + covariance.transpose(0, 2, 1))
 
 
 def arm_covariance(
@@ -237,27 +209,6 @@ def _propagated(jacobian: FloatArray, factor: FloatArray) -> FloatArray:
     return np.asarray(moved @ moved.transpose(0, 2, 1))
 
 
-def _pose_and_noise(
-    placed: BaseJacobian,
-    noise_mm: FloatArray,
-    base_from_tool: Pose[Base, Tool],
-    placing: BaseTransform,
-) -> FloatArray:
-    """(N, 3, 3) of the points' own noise and of the arm."""
-    hand_eye = placing.scanner.hand_eye
-    if placing.scan_point_mm is None:
-        middle = placed.points_base_mm.mean(axis=0) if len(noise_mm) else np.zeros(3)
-    else:
-        in_tool = (
-            hand_eye.tool_from_sensor.rotation @ placing.scan_point_mm
-            + hand_eye.tool_from_sensor.translation_mm
-        )
-        middle = base_from_tool.rotation @ in_tool + base_from_tool.translation_mm
-    noise = placed.by_sensor_point @ noise_mm
-    covariance = arm_covariance(placed.points_base_mm, middle, hand_eye.arm_noise)
-    return np.asarray(covariance + noise @ noise.transpose(0, 2, 1))
-
-
 def merge_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
     """Join clouds of one frame and one list of sheets, in the order given.
 
@@ -269,33 +220,16 @@ def merge_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
     InputError
         If there is no cloud, or if frames, sheets or the presence of normals differ.
     """
-    if not clouds:
-        raise InputError("no clouds to merge")
-    first = clouds[0]
-    for cloud in clouds[1:]:
-        if cloud.frame != first.frame or cloud.sheet_names != first.sheet_names:
-            raise InputError(
-                f"clouds in frames {first.frame} and {cloud.frame} with sheets "
-                f"{', '.join(first.sheet_names)} and {', '.join(cloud.sheet_names)} do not merge"
-            )
-    normals = [cloud.normals for cloud in clouds if cloud.normals is not None]
-    if normals and len(normals) != len(clouds):
+    if clouds and len({cloud.normals is None for cloud in clouds}) > 1:
         raise InputError("clouds with and without normals do not merge")
     starts = np.cumsum([0, *(len(cloud.exposure_sources) for cloud in clouds)])
-    return PointCloud(
-        frame=first.frame,
-        points_mm=np.concatenate([cloud.points_mm for cloud in clouds]),
-        covariance_mm2=np.concatenate([cloud.covariance_mm2 for cloud in clouds]),
-        sigma_noise_mm=np.concatenate([cloud.sigma_noise_mm for cloud in clouds]),
-        sheet=np.concatenate([cloud.sheet for cloud in clouds]),
-        sheet_names=first.sheet_names,
+    return PointCloud.concat(
+        clouds,
         exposure=np.concatenate(
-            [c.exposure + start for c, start in zip(clouds, starts[:-1], strict=True)]
+            [np.zeros(0, np.int64)]
+            + [cloud.exposure + start for cloud, start in zip(clouds, starts, strict=False)]
         ),
         exposure_sources=tuple(source for cloud in clouds for source in cloud.exposure_sources),
-        segment=np.concatenate([cloud.segment for cloud in clouds]),
-        intensity=np.concatenate([cloud.intensity for cloud in clouds]),
-        normals=np.concatenate(normals) if normals else None,
     )
 
 
@@ -309,7 +243,7 @@ def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     """
     if cloud.frame != "Base":
         raise InputError(f"a volume of Base cannot cut a cloud in {cloud.frame}")
-    return cloud.select(np.flatnonzero(box.holds(cloud.points_mm)))
+    return cloud.select(box.holds(cloud.points_mm))
 
 
 NEIGHBOURS = 32
@@ -321,37 +255,14 @@ SPACINGS = 2.5
 SAMPLED, LOOKED_AT = 2000, 64
 """Points whose spacing is measured, and neighbouring cells among which another exposure is sought;
 cells are a quarter of the smallest radius wide."""
-
-
-@dataclass(frozen=True, slots=True)
-class NormalOptions:
-    """What counts as a neighbourhood.
-
-    Parameters
-    ----------
-    radius_mm
-        Points within this distance make a point's tangent plane; None to choose it from the
-        distance between the stripes of different exposures.
-    min_neighbours
-        Fewest cells (a quarter of the radius wide) with points in that neighbourhood.
-    min_width
-        The neighbourhood must be at least this wide across its longest direction, as a standard
-        deviation in parts of the radius: a single stripe has no normal.
-    max_thickness
-        Largest ratio of its standard deviation along the normal to that width: at an edge, or
-        where surfaces lie close to each other, there is no tangent plane.
-    """
-
-    radius_mm: float | None = None
-    min_neighbours: int = 6
-    min_width: float = 0.15
-    max_thickness: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.radius_mm is not None and not 0.0 < self.radius_mm < np.inf:
-            raise OptionError(f"radius of the normals {self.radius_mm} mm", remedy="give some mm")
-        if self.min_neighbours < 3 or not 0.0 < self.min_width < 1.0 or self.max_thickness <= 0.0:
-            raise OptionError("the normals' neighbourhood needs 3 cells, a width and a thickness")
+MIN_NEIGHBOURS = 6
+"""Fewest cells (a quarter of the radius wide) with points in a neighbourhood."""
+MIN_WIDTH = 0.15
+"""A neighbourhood must be at least this wide across its longest direction, as a standard deviation
+in parts of the radius: a single stripe has no normal."""
+MAX_THICKNESS = 0.5
+"""Largest ratio of its standard deviation along the normal to that width: at an edge, or where
+surfaces lie close to each other, there is no tangent plane."""
 
 
 def choose_radius_mm(points_mm: FloatArray, exposure: IntArray) -> float:
@@ -370,22 +281,23 @@ def choose_radius_mm(points_mm: FloatArray, exposure: IntArray) -> float:
         `SPACINGS` times the distance to the next exposure's stripe, taken so that three points in
         four have it; within the limits above.
     """
-    size = SMALLEST_RADIUS_MM / 4.0
     if len(points_mm) == 0:
         return SMALLEST_RADIUS_MM
-    cells, owner = _cells_of_exposures(points_mm, exposure, size)
+    # one mean of the points of each cell and exposure
+    n_exposures = int(exposure.max()) + 1
+    keys = _cell_keys(points_mm, SMALLEST_RADIUS_MM / 4.0) * n_exposures + exposure
+    cells, owner = _cell_means(points_mm, keys), np.unique(keys) % n_exposures
     sample = np.arange(0, len(cells), max(1, len(cells) // SAMPLED))
     count = min(LOOKED_AT, len(cells))
     distance, neighbour = cKDTree(cells).query(cells[sample], k=np.arange(1, count + 1))
     is_other = owner[neighbour] != owner[sample, None]
     spacing = np.where(is_other, distance, np.inf).min(axis=1)
-    spacing = np.minimum(spacing, LARGEST_RADIUS_MM)
-    wanted = SPACINGS * float(np.percentile(spacing, 75))
+    wanted = SPACINGS * float(np.percentile(np.minimum(spacing, LARGEST_RADIUS_MM), 75))
     return float(np.clip(wanted, SMALLEST_RADIUS_MM, LARGEST_RADIUS_MM))
 
 
 def estimate_normals(
-    points_mm: FloatArray, towards_mm: FloatArray, options: NormalOptions | None = None
+    points_mm: FloatArray, towards_mm: FloatArray, radius_mm: float = SMALLEST_RADIUS_MM
 ) -> FloatArray:
     """Fit a tangent plane around every point.
 
@@ -398,32 +310,30 @@ def estimate_normals(
         (N, 3) in one frame.
     towards_mm
         (N, 3) where each point was seen from, in that frame: its normal points to that side.
-    options
-        Defaults if None; without a radius the smallest one is taken (see `choose_radius_mm`).
+    radius_mm
+        Points within this distance make a point's tangent plane (see `choose_radius_mm`).
 
     Returns
     -------
     FloatArray
         (N, 3) unit normals; (0, 0, 0) where there is none: too few neighbours, all of them on one
-        line, or no tangent plane (see `NormalOptions`).
+        line, or no tangent plane.
 
     Raises
     ------
     InputError
         If the shapes differ.
     """
-    options = options or NormalOptions()
     points = np.asarray(points_mm, dtype=np.float64)
     towards = np.asarray(towards_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or towards.shape != points.shape:
         raise InputError(f"points of shape {points.shape} seen from places {towards.shape}")
     if len(points) == 0:
         return np.zeros((0, 3))
-    radius = options.radius_mm or SMALLEST_RADIUS_MM
-    cells = _cell_means(points, _cell_keys(points, radius / 4.0))
-    distance, neighbour = cKDTree(cells).query(points, k=NEIGHBOURS, distance_upper_bound=radius)
-    around = np.where(np.isfinite(distance), np.asarray(neighbour, np.int64), -1)
-    normals = _tangent_normals(points, cells, around, radius, options)
+    cells = _cell_means(points, _cell_keys(points, radius_mm / 4.0))
+    distance, neighbour = cKDTree(cells).query(points, k=NEIGHBOURS, distance_upper_bound=radius_mm)
+    is_near = np.isfinite(distance)
+    normals = _tangent_normals(points, cells[np.where(is_near, neighbour, 0)], is_near, radius_mm)
     side = np.einsum("ni,ni->n", normals, towards - points)
     return np.where(side[:, None] < 0.0, -normals, normals)
 
@@ -442,38 +352,19 @@ def _cell_means(points: FloatArray, keys: IntArray) -> FloatArray:
     return np.stack(sums, axis=1) / np.bincount(member)[:, None]
 
 
-def _cells_of_exposures(
-    points: FloatArray, exposure: IntArray, size_mm: float
-) -> tuple[FloatArray, IntArray]:
-    """(M, 3) means of the points of one cell and one exposure, and (M,) their exposure."""
-    keys = _cell_keys(points, size_mm) * (int(exposure.max()) + 1) + exposure
-    return _cell_means(points, keys), np.unique(keys) % (int(exposure.max()) + 1)
-
-
 def _tangent_normals(
-    points: FloatArray,
-    cells: FloatArray,
-    neighbour: IntArray,
-    radius_mm: float,
-    options: NormalOptions,
+    points: FloatArray, near_mm: FloatArray, is_near: BoolArray, radius_mm: float
 ) -> FloatArray:
-    """(N, 3) direction of least spread of each neighbourhood, zero where it tells nothing.
-
-    ``neighbour`` is (N, K), -1 for none.
-    """
-    weight = (neighbour >= 0).astype(np.float64)
+    """(N, 3) least direction of each neighbourhood (N, K, 3), zero where it tells nothing."""
+    weight = is_near.astype(np.float64)
     count = weight.sum(axis=1)
-    around = cells[np.maximum(neighbour, 0)] - points[:, None]
-    around *= weight[:, :, None]
+    around = (near_mm - points[:, None]) * weight[:, :, None]
     safe = np.maximum(count, 1.0)
     mean = around.sum(axis=1) / safe[:, None]
-    spread = around.transpose(0, 2, 1) @ around / safe[:, None, None]
-    spread -= mean[:, :, None] * mean[:, None, :]
-    values, vectors = np.linalg.eigh(spread)
+    covariance = around.transpose(0, 2, 1) @ around / safe[:, None, None]
+    covariance -= mean[:, :, None] * mean[:, None, :]
+    values, vectors = np.linalg.eigh(covariance)
     thickness, width = np.sqrt(np.maximum(values[:, :2], 0.0)).T
-    is_plane = (
-        (count >= options.min_neighbours)
-        & (width >= options.min_width * radius_mm)
-        & (thickness <= options.max_thickness * width)
-    )
+    is_plane = (count >= MIN_NEIGHBOURS) & (width >= MIN_WIDTH * radius_mm)
+    is_plane &= thickness <= MAX_THICKNESS * width
     return np.where(is_plane[:, None], vectors[:, :, 0], 0.0)

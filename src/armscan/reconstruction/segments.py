@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 
 GAP_PX = 6.0
 """Accepted neighbours farther apart are not linked: a crossing or another line lies between."""
@@ -16,76 +16,73 @@ KINK_POINTS = 8
 """Points on either side from which direction and place at a kink are extrapolated."""
 KINK_RAD = np.radians(20.0)
 JUMP_PX = 0.6
+PIECE_PX, SAMPLE_PX = 24.0, 8.0
+"""Lengths of pieces that are judged by themselves, and between samples on them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Pieces:
-    """Accepted points of a profile with the unbroken piece of each.
+class StripeSegments:
+    """Accepted points of a profile with the unbroken segment of each.
 
     Parameters
     ----------
     row
         (A,) index of each accepted point in the profile.
-    piece
-        (A,) number of its piece, counted from 0 without gaps; a piece lies in one segment.
-    segment
-        (A,) its segment.
+    number
+        (A,) number of its segment, counted from 0 without gaps; it lies in one chain of the profile
+        (`Profile.segment`).
     """
 
     row: IntArray
-    piece: IntArray
-    segment: IntArray
+    number: IntArray
 
 
-def cut_stripes(profile: Profile) -> Pieces:
-    """Cut the segments where they may pass from one line to another.
+def cut_segments(profile: Profile) -> StripeSegments:
+    """Cut the chains of a profile where they may pass from one line to another.
 
-    A chain of points may follow another line beyond a crossing, where points are flagged, and
-    where two lines happen to end at one another, which leaves a kink or a small step.
+    That is where they end; at gaps; where rejected points near another line lie between, because
+    a chain may follow the other line beyond a crossing; and where two lines happen to end at one
+    another, which leaves a kink or a small step.
 
     Parameters
     ----------
     profile
-        Stripe points in the order of their segments.
+        Stripe points in the order of their chains.
     """
     row = np.flatnonzero(profile.is_accepted)
-    points, normals = profile.points_px[row], profile.normals_px[row]
-    segment = profile.segment[row]
     if not len(row):
-        return Pieces(row, row, segment)
-    apart = np.hypot(*np.diff(points, axis=0).T) > GAP_PX
-    is_start = np.concatenate([[True], apart | (np.diff(segment) != 0)])
-    is_start |= _is_kink(points, normals, np.cumsum(is_start))
-    return Pieces(row, np.cumsum(is_start) - 1, segment)
+        return StripeSegments(row, row)
+    points = profile.points_px[row]
+    n_beside = np.cumsum((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)[row]
+    is_cut = np.hypot(*np.diff(points, axis=0).T) > GAP_PX
+    is_cut |= (np.diff(profile.segment[row]) != 0) | (np.diff(n_beside) > 0)
+    is_start = np.concatenate([[True], is_cut])
+    is_start |= _is_kink(points, profile.normals_px[row], np.cumsum(is_start))
+    return StripeSegments(row, np.cumsum(is_start) - 1)
 
 
-def _is_kink(points: FloatArray, normals: FloatArray, piece: IntArray) -> BoolArray:
-    """(A,) True for the first point beyond a kink or a step of its piece."""
+def _is_kink(points: FloatArray, normals: FloatArray, segment: IntArray) -> BoolArray:
+    """(A,) True for the first point beyond a kink or a step of its segment."""
     m, n = KINK_POINTS, len(points)
     found = np.zeros(n, dtype=np.bool_)
     if n < 2 * m:
         return found
     index = np.arange(m, dtype=np.float64)
-    design = np.stack([np.ones(m), index - (m - 0.5)], axis=1)
-    ahead = np.linalg.pinv(design)
+    ahead = np.linalg.pinv(np.stack([np.ones(m), index - (m - 0.5)], axis=1))
     windows = np.lib.stride_tricks.sliding_window_view(points, m, axis=0)
     before, after = windows[: n - 2 * m + 1] @ ahead.T, windows[m:, :, ::-1] @ ahead.T
     middle = slice(m, n - m + 1)
-    inside = piece[: n - 2 * m + 1] == piece[2 * m - 1 :]
+    is_whole = segment[: n - 2 * m + 1] == segment[2 * m - 1 :]
     step = np.abs(np.sum((after[:, :, 0] - before[:, :, 0]) * normals[middle], axis=1))
-    here, there = before[:, :, 1], -after[:, :, 1]
-    cross = here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]
-    turn = np.abs(np.arctan2(cross, np.sum(here * there, axis=1)))
-    size = np.where(inside, np.maximum(turn / KINK_RAD, step / JUMP_PX), 0.0)
-    found[middle] = _peaks(size, m)
+    first, then = before[:, :, 1], -after[:, :, 1]
+    cross = first[:, 0] * then[:, 1] - first[:, 1] * then[:, 0]
+    turn = np.abs(np.arctan2(cross, np.sum(first * then, axis=1)))
+    size = np.where(is_whole, np.maximum(turn / KINK_RAD, step / JUMP_PX), 0.0)
+    # of neighbouring places that exceed the limit, the largest is the kink
+    padded = np.pad(size, m)
+    largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * m + 1).max(axis=1)
+    found[middle] = (size > 1.0) & (size >= largest)
     return found
-
-
-def _peaks(size: FloatArray, reach: int) -> BoolArray:
-    """(M,) True where the size exceeds 1 and no neighbour within reach exceeds it."""
-    padded = np.pad(size, reach)
-    largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).max(axis=1)
-    return np.asarray((size > 1.0) & (size >= largest))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,11 +92,11 @@ class Samples:
     Parameters
     ----------
     at
-        (S,) index into the arrays of `Pieces`.
+        (S,) index into the arrays of `StripeSegments`.
     weight
         (S,) points that a sample stands for, as a part of the usual number.
     nearest
-        (A,) the sample that stands for each accepted point; -1 where its piece has none.
+        (A,) the sample that stands for each accepted point.
     """
 
     at: IntArray
@@ -107,26 +104,93 @@ class Samples:
     nearest: IntArray
 
 
-def take_samples(pieces: Pieces, every: int) -> Samples:
-    """Every so many points of each piece, more densely on short ones.
+def take_samples(segments: StripeSegments, every: int) -> Samples:
+    """Every so many points of each long segment, more densely on short ones."""
+    number, n = segments.number, len(segments.row)
+    if not n:
+        return Samples(segments.row, np.zeros(0), segments.row)
+    start = np.flatnonzero(np.diff(number, prepend=-1))
+    length = np.diff(np.append(start, n))[number]
+    step = np.clip(length // 4, 1, every)
+    place = np.arange(n) - start[number]
+    cell = np.minimum(place // step, np.maximum(length // step - 1, 0))
+    is_first = np.diff(number * (n + 1) + cell, prepend=-1) != 0
+    first = np.flatnonzero(is_first)
+    count = np.diff(np.append(first, n))
+    return Samples(first + count // 2, count / every, np.cumsum(is_first) - 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pieces:
+    """Short pieces of segments, and the points by which these are judged.
 
     Parameters
     ----------
-    pieces
-        Accepted points.
-    every
-        Points between samples of a long piece.
+    of_point
+        (N,) piece of each point of the profile; -1 for points that the extraction rejected.
+    segment
+        (P,) segment of each piece, not decreasing.
+    sample
+        (S,) points that are looked at, about every 8 px; each piece has at least one.
+    of_sample
+        (S,) their pieces, not decreasing.
+    direction
+        (P, 2) unit vectors along the pieces.
     """
-    if not len(pieces.row):
-        return Samples(pieces.row, np.zeros(0), pieces.row)
-    start = np.flatnonzero(np.concatenate([[True], np.diff(pieces.piece) != 0]))
-    length = np.diff(np.append(start, len(pieces.row)))
-    step = np.clip(length // 4, 1, every)[pieces.piece]
-    place = np.arange(len(pieces.row)) - start[pieces.piece]
-    cell = np.minimum(place // step, np.maximum(length[pieces.piece] // step - 1, 0))
-    key = pieces.piece * (len(pieces.row) + 1) + cell
-    is_first = np.concatenate([[True], np.diff(key) != 0])
-    nearest = np.cumsum(is_first) - 1
-    first = np.flatnonzero(is_first)
-    count = np.diff(np.append(first, len(pieces.row)))
-    return Samples(first + count // 2, count / every, nearest)
+
+    of_point: IntArray
+    segment: IntArray
+    sample: IntArray
+    of_sample: IntArray
+    direction: FloatArray
+
+    def __len__(self) -> int:
+        """Count of pieces."""
+        return len(self.segment)
+
+    @property
+    def size(self) -> IntArray:
+        """(P,) count of points."""
+        return np.bincount(self.of_point[self.of_point >= 0], minlength=len(self))
+
+    def mean(self, values: FloatArray) -> FloatArray:
+        """(P, ...) mean over the samples of each piece of values (S, ...)."""
+        count = np.bincount(self.of_sample, minlength=len(self))
+        total = np.zeros((len(self), *values.shape[1:]))
+        np.add.at(total, self.of_sample, values)
+        return np.asarray(total / count.reshape(-1, *([1] * (values.ndim - 1))))
+
+
+def cut_pieces(profile: Profile) -> Pieces:
+    """Cut the segments of a profile every 24 px."""
+    segments = cut_segments(profile)
+    rows, number = segments.row, segments.number
+    of_point = np.full(len(profile), -1)
+    if not len(rows):
+        return Pieces(of_point, rows, rows, rows, np.zeros((0, 2)))
+    points = profile.points_px[rows]
+    step = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    arc_px = np.concatenate([[0.0], np.cumsum(step)])
+    along = arc_px - arc_px[np.flatnonzero(np.diff(number, prepend=-1))][number]
+    piece = _renumbered(number, np.floor(along / PIECE_PX))
+    of_point[rows] = piece
+    sample = np.flatnonzero(np.diff(_renumbered(piece, np.floor(along / SAMPLE_PX)), prepend=-1))
+    starts = np.flatnonzero(np.diff(piece, prepend=-1))
+    return Pieces(of_point, number[starts], rows[sample], piece[sample], _directions(points, piece))
+
+
+def _renumbered(outer: IntArray, inner: FloatArray) -> IntArray:
+    """Number runs of equal (outer, inner) from 0."""
+    is_new = (np.diff(outer) != 0) | (np.diff(inner) != 0)
+    return np.asarray(np.concatenate([[0], np.cumsum(is_new)]))
+
+
+def _directions(points: FloatArray, piece: IntArray) -> FloatArray:
+    """(P, 2) principal direction of the points of each piece."""
+    n = int(piece[-1]) + 1
+    count = np.bincount(piece, minlength=n)
+    middle = np.stack([np.bincount(piece, points[:, k]) for k in range(2)], axis=1) / count[:, None]
+    x, y = (points - middle[piece]).T
+    xx, xy, yy = (np.bincount(piece, v, minlength=n) for v in (x * x, x * y, y * y))
+    angle = 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)

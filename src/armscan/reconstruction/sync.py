@@ -4,22 +4,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.errors import EstimationError, InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats, frozen_ints
+from armscan.errors import EstimationError, InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import slerp
 from armscan.reconstruction.track_faults import TrackFault, check_track
 from armscan.records.cloud import PointCloud
 from armscan.records.recording import NO_TRIGGER, ArmTrack, Clock, ExposureRow
 
-PoseSource = Literal["trigger", "time"]
+PoseSource = Literal["trigger", "time", "given"]
 
 
 class PoseStatus(IntEnum):
@@ -59,72 +59,60 @@ _LABELS = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ExposurePoses:
-    """``base_from_tool`` for each of N exposures.
+class ExposurePoses(RowRecord):
+    """``base_from_tool`` for each of N exposures, those without pose included.
 
     Parameters
     ----------
     rotations, translations_mm
         (N, 3, 3) and (N, 3); unit and zero where there is no pose.
-    fate
+    status
         (N,) `PoseStatus`.
     sample
         (N,) row of the arm's track that gave the pose, or the one before it; -1 for none.
     source
-        Whether poses were found by trigger id or by time.
+        Whether poses were found by trigger id, by time, or given one by one.
     max_gap_ns
-        Widest step between samples that was bridged; 0 by trigger id.
+        Widest step between samples that was bridged; 0 unless by time.
     warnings
         What is weak, in words.
     track_faults
         What the arm's track says against itself.
     """
 
-    rotations: FloatArray
-    translations_mm: FloatArray
-    fate: IntArray
-    sample: IntArray
+    rotations: FloatArray = floats("N", 3, 3)
+    translations_mm: FloatArray = floats("N", 3)
+    status: IntArray = ints("N")
+    sample: IntArray = ints("N")
     source: PoseSource
-    max_gap_ns: int
+    max_gap_ns: int = 0
     warnings: tuple[str, ...] = ()
     track_faults: tuple[TrackFault, ...] = ()
-
-    def __post_init__(self) -> None:
-        n = len(np.atleast_1d(self.fate))
-        for name, shape in (("rotations", (n, 3, 3)), ("translations_mm", (n, 3))):
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), shape, name))
-        for name in ("fate", "sample"):
-            object.__setattr__(self, name, frozen_ints(getattr(self, name), (n,), name))
-
-    def __len__(self) -> int:
-        """Count of exposures, those without pose included."""
-        return len(self.fate)
 
     @property
     def has_pose(self) -> BoolArray:
         """(N,) True where the pose is known."""
-        return np.asarray(self.fate == int(PoseStatus.FOUND))
+        return np.asarray(self.status == PoseStatus.FOUND)
 
-    def count(self, fate: PoseStatus) -> int:
-        """Count of exposures of this fate."""
-        return int((self.fate == int(fate)).sum())
+    def count(self, status: PoseStatus) -> int:
+        """Count of exposures of this status."""
+        return int((self.status == status).sum())
 
     @property
     def missing(self) -> str:
         """How many exposures have no pose, and why; empty if all have one."""
         parts = [
-            f"{self.count(fate)} {fate.label}"
-            for fate in PoseStatus
-            if fate is not PoseStatus.FOUND and self.count(fate)
+            f"{self.count(status)} {status.label}"
+            for status in PoseStatus
+            if status is not PoseStatus.FOUND and self.count(status)
         ]
         return ", ".join(parts)
 
     @property
     def how(self) -> str:
         """How poses were found, in words."""
-        if self.source == "trigger":
-            return "by trigger id"
+        if self.source != "time":
+            return "by trigger id" if self.source == "trigger" else "one for each, in order"
         return f"by time, between samples up to {self.max_gap_ns / 1e6:g} ms apart"
 
     def pose(self, row: int) -> Pose[Base, Tool]:
@@ -135,15 +123,15 @@ class ExposurePoses:
         InputError
             If it has none.
         """
-        fate = PoseStatus(int(self.fate[row]))
-        if fate is not PoseStatus.FOUND:
-            raise InputError(f"exposure {row} has no pose: {fate.label}")
+        status = PoseStatus(int(self.status[row]))
+        if status is not PoseStatus.FOUND:
+            raise InputError(f"exposure {row} has no pose: {status.label}")
         return Pose(self.rotations[row], self.translations_mm[row])
 
 
 GAP_PERIODS = 3
-"""Steps between samples up to this many median periods are bridged, unless the user says more."""
-LARGEST_DEFAULT_GAP_NS = 500_000_000
+"""Steps between samples up to this many median periods are bridged."""
+LARGEST_GAP_NS = 500_000_000
 """And never longer ones: an arm that gives a pose now and then may have gone anywhere between."""
 LISTED_FAULTS = 3
 """Faults of a track that are told one by one."""
@@ -151,30 +139,11 @@ BEND_MM = 0.02
 """Interpolation errors of this size in the tool's place are warned of: an arm's own scatter."""
 
 
-@dataclass(frozen=True, slots=True)
-class SyncOptions:
-    """How exposures and the arm's samples are put together.
-
-    Parameters
-    ----------
-    max_gap_ns
-        Widest step between two samples within which a pose is interpolated. None: three median
-        periods of the track, at most half a second.
-    """
-
-    max_gap_ns: int | None = None
-
-    def __post_init__(self) -> None:
-        if self.max_gap_ns is not None and self.max_gap_ns <= 0:
-            raise OptionError(f"largest gap {self.max_gap_ns} ns", remedy="give more than 0")
-
-
 def exposure_poses(
     rows: Sequence[ExposureRow],
     arm: ArmTrack | None,
     clock: Clock = "shared",
     latency_ns: int = 0,
-    options: SyncOptions | None = None,
 ) -> ExposurePoses:
     """Find ``base_from_tool`` of each exposure; a pose that is not known is never guessed.
 
@@ -194,8 +163,6 @@ def exposure_poses(
         ``shared`` if both bear times of one clock.
     latency_ns
         Added to an exposure's time before the pose is looked up by time.
-    options
-        Defaults if None.
 
     Raises
     ------
@@ -205,7 +172,6 @@ def exposure_poses(
     EstimationError
         If no exposure has a pose.
     """
-    options = options or SyncOptions()
     if arm is None or len(arm) == 0:
         raise InputError(
             "the scan has no samples of the arm", remedy="record the arm's poses in arm.csv"
@@ -214,7 +180,7 @@ def exposure_poses(
     if has_ids and any(row.trigger_id is not None for row in rows):
         poses = _by_trigger(rows, arm, clock, latency_ns)
     elif clock == "shared":
-        poses = poses_by_time(rows, arm, latency_ns, options)
+        poses = poses_by_time(rows, arm, latency_ns)
     else:
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
@@ -246,9 +212,6 @@ def _without_contradicted(
         is_between = times > arm.t_ns[sample]
         is_wrong |= is_between & (check.is_faulty[after] | check.is_broken_step[sample])
     is_wrong &= poses.has_pose
-    fate = np.where(is_wrong, int(PoseStatus.CONTRADICTED), poses.fate)
-    rotations = np.where(is_wrong[:, None, None], np.eye(3), poses.rotations)
-    translations = np.where(is_wrong[:, None], 0.0, poses.translations_mm)
     named = [fault.words for fault in check.faults[:LISTED_FAULTS]]
     if len(check.faults) > LISTED_FAULTS:
         named.append(f"and {len(check.faults) - LISTED_FAULTS} more of this kind")
@@ -260,23 +223,21 @@ def _without_contradicted(
         )
     return replace(
         poses,
-        rotations=rotations,
-        translations_mm=translations,
-        fate=fate,
+        rotations=np.where(is_wrong[:, None, None], np.eye(3), poses.rotations),
+        translations_mm=np.where(is_wrong[:, None], 0.0, poses.translations_mm),
+        status=np.where(is_wrong, PoseStatus.CONTRADICTED, poses.status),
         sample=np.where(is_wrong, -1, poses.sample),
         warnings=tuple(warnings),
         track_faults=check.faults,
     )
 
 
-def largest_gap_ns(arm: ArmTrack, options: SyncOptions) -> int:
+def largest_gap_ns(arm: ArmTrack) -> int:
     """Widest step between samples that is bridged; 0 if the track has one sample only."""
-    if options.max_gap_ns is not None:
-        return options.max_gap_ns
     if len(arm) < 2:
         return 0
     median = float(np.median(np.diff(arm.t_ns)))
-    return int(min(GAP_PERIODS * median, LARGEST_DEFAULT_GAP_NS))
+    return int(min(GAP_PERIODS * median, LARGEST_GAP_NS))
 
 
 def _by_trigger(
@@ -291,26 +252,32 @@ def _by_trigger(
                 remedy="each trigger must have one sample",
             )
         sample_of[int(ids[sample])] = int(sample)
-    fate = np.full(len(rows), int(PoseStatus.NO_TRIGGER))
+    status = np.full(len(rows), int(PoseStatus.NO_TRIGGER))
     found = np.full(len(rows), -1)
     for k, row in enumerate(rows):
         if row.trigger_id is None or row.trigger_id == NO_TRIGGER:
             continue
         found[k] = sample_of.get(row.trigger_id, -1)
-        fate[k] = int(PoseStatus.UNKNOWN_TRIGGER)
+        status[k] = PoseStatus.UNKNOWN_TRIGGER
         if found[k] >= 0:
             is_known = arm.is_known[found[k]]
-            fate[k] = int(PoseStatus.FOUND if is_known else PoseStatus.UNKNOWN_SAMPLE)
-    rotations, translations = _at_samples(arm, found, fate)
-    warnings = _times_apart(rows, arm, found, latency_ns) if clock == "shared" else ()
-    return ExposurePoses(rotations, translations, fate, found, "trigger", 0, warnings)
+            status[k] = PoseStatus.FOUND if is_known else PoseStatus.UNKNOWN_SAMPLE
+    rotations, translations = _at_samples(arm, found, status)
+    return ExposurePoses(
+        rotations=rotations,
+        translations_mm=translations,
+        status=status,
+        sample=found,
+        source="trigger",
+        warnings=_times_apart(rows, arm, found, latency_ns) if clock == "shared" else (),
+    )
 
 
 def _times_apart(
     rows: Sequence[ExposureRow], arm: ArmTrack, found: IntArray, latency_ns: int
 ) -> tuple[str, ...]:
     """Ids and times of one clock must tell the same story; swapped or shifted ids do not."""
-    limit = largest_gap_ns(arm, SyncOptions())
+    limit = largest_gap_ns(arm)
     times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
     apart = np.abs(times - arm.t_ns[found])[found >= 0]
     n_far = int((apart > limit).sum()) if limit else 0
@@ -322,45 +289,45 @@ def _times_apart(
     )
 
 
-def _at_samples(arm: ArmTrack, found: IntArray, fate: IntArray) -> tuple[FloatArray, FloatArray]:
+def _at_samples(arm: ArmTrack, found: IntArray, status: IntArray) -> tuple[FloatArray, FloatArray]:
     rotations, translations = np.tile(np.eye(3), (len(found), 1, 1)), np.zeros((len(found), 3))
-    own = fate == int(PoseStatus.FOUND)
-    rotations[own] = arm.rotations[found[own]]
-    translations[own] = arm.translations_mm[found[own]]
+    has_pose = status == PoseStatus.FOUND
+    rotations[has_pose] = arm.rotations[found[has_pose]]
+    translations[has_pose] = arm.translations_mm[found[has_pose]]
     return rotations, translations
 
 
-def poses_by_time(
-    rows: Sequence[ExposureRow],
-    arm: ArmTrack,
-    latency_ns: int = 0,
-    options: SyncOptions | None = None,
-) -> ExposurePoses:
+def poses_by_time(rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int = 0) -> ExposurePoses:
     """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
-    options = options or SyncOptions()
     times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
-    max_gap = largest_gap_ns(arm, options)
+    max_gap = largest_gap_ns(arm)
     before = np.searchsorted(arm.t_ns, times, side="right") - 1
     after = np.minimum(before + 1, len(arm) - 1)
     start = np.maximum(before, 0)
     is_exact = (before >= 0) & (arm.t_ns[start] == times)
     step = arm.t_ns[after] - arm.t_ns[start]
     is_bridged = arm.is_known[start] & arm.is_known[after] & (step > 0) & (step <= max_gap)
-    fate = np.where(is_bridged, int(PoseStatus.FOUND), int(PoseStatus.GAP))
-    fate[before < 0] = int(PoseStatus.BEFORE_TRACK)
-    fate[times > arm.t_ns[-1]] = int(PoseStatus.AFTER_TRACK)
+    status = np.where(is_bridged, PoseStatus.FOUND, PoseStatus.GAP)
+    status[before < 0] = PoseStatus.BEFORE_TRACK
+    status[times > arm.t_ns[-1]] = PoseStatus.AFTER_TRACK
     at_sample = np.where(arm.is_known[start], PoseStatus.FOUND, PoseStatus.UNKNOWN_SAMPLE)
-    fate[is_exact] = at_sample[is_exact]
-    rotations, translations = _at_samples(arm, start, fate)
-    between = np.flatnonzero((fate == int(PoseStatus.FOUND)) & ~is_exact)
+    status[is_exact] = at_sample[is_exact]
+    rotations, translations = _at_samples(arm, start, status)
+    between = np.flatnonzero((status == PoseStatus.FOUND) & ~is_exact)
     low, high = start[between], after[between]
     fraction = (times[between] - arm.t_ns[low]) / step[between]
     rotations[between] = slerp(arm.rotations[low], arm.rotations[high], fraction)
-    way = arm.translations_mm[high] - arm.translations_mm[low]
-    translations[between] = arm.translations_mm[low] + fraction[:, None] * way
-    sample = np.where(fate == int(PoseStatus.FOUND), start, -1)
-    warnings = _bend_warning(arm, low, fraction)
-    return ExposurePoses(rotations, translations, fate, sample, "time", max_gap, warnings)
+    path = arm.translations_mm[high] - arm.translations_mm[low]
+    translations[between] = arm.translations_mm[low] + fraction[:, None] * path
+    return ExposurePoses(
+        rotations=rotations,
+        translations_mm=translations,
+        status=status,
+        sample=np.where(status == PoseStatus.FOUND, start, -1),
+        source="time",
+        max_gap_ns=max_gap,
+        warnings=_bend_warning(arm, low, fraction),
+    )
 
 
 def _bend_warning(arm: ArmTrack, low: IntArray, fraction: FloatArray) -> tuple[str, ...]:

@@ -7,13 +7,60 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
-from armscan.models.calibration import SHEET_PARAMETER_NAMES, SensorCalibration
-from armscan.records.cloud import PointCloud
-from armscan.records.profile import Profile
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
+from armscan.models.calibration import (
+    SHEET_PARAMETER_NAMES,
+    SensorCalibration,
+    SheetCalibration,
+)
+from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.profile import PointProfile, Profile
 
 N_CAMERA, N_SHEET = 9, len(SHEET_PARAMETER_NAMES)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthRange:
+    """Depths that a reconstruction accepts: the calibrated range of the sheet, or more.
+
+    Parameters
+    ----------
+    margin
+        Part of the calibrated range's width by which it is widened at either end. Between the
+        calibrated range and this limit points are extrapolated: their covariance grows, and a
+        warning counts them.
+    """
+
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.margin >= 0.0:
+            raise OptionError(
+                f"depth margin {self.margin}", remedy="give 0 or more, as a part of the range"
+            )
+
+    def limits_mm(self, sheet: SheetCalibration) -> tuple[float, float]:
+        """Smallest and largest Z accepted."""
+        low, high = sheet.depth_range_mm
+        slack = self.margin * (high - low)
+        return low - slack, high + slack
+
+    def holds(
+        self, points_mm: FloatArray, sheet: IntArray | int, sensor: SensorCalibration
+    ) -> BoolArray:
+        """(..., N) True where points (..., N, 3) are within the depths of their sheets (N,)."""
+        low, high = np.array([self.limits_mm(one) for one in sensor.sheets]).T
+        depth = points_mm[..., 2]
+        return np.asarray((depth >= low[sheet]) & (depth <= high[sheet]))
+
+
+CALIBRATED_DEPTHS = DepthRange(0.0)
+"""Depths that are accepted from one camera unless a person says more (ADR 15)."""
+LABEL_DEPTHS = DepthRange(0.5)
+"""Depths in which a sheet is looked for where several may have drawn a stripe, unless a person says
+otherwise. Two cameras accept them too: the second one sees whether the sheet goes on as it was
+calibrated."""
 
 
 def intersect_sheets(
@@ -41,13 +88,53 @@ def intersect_sheets(
     points = np.zeros((len(points_px), 3))
     is_met = np.zeros(len(points_px), dtype=np.bool_)
     for k, calibrated in enumerate(sensor.sheets):
-        own = is_valid & (sheet_of_point == k)
-        points[own], is_met[own] = calibrated.sheet.intersect(xy[own])
+        of_sheet = is_valid & (sheet_of_point == k)
+        points[of_sheet], is_met[of_sheet] = calibrated.sheet.intersect(xy[of_sheet])
     return points, is_met
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StripePoints:
+class SheetPoints:
+    """Rays of the left camera or the only one, intersected with their sheets.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in the Sensor frame (eq. 4.11); (0, 0, 1) where there is none.
+    is_met
+        (N,) False where the lens model has no inverse or the ray misses the sheet.
+    dpoint_dpx
+        (N, 3, 2) derivative by the pixel.
+    dpoint_dsensor
+        (N, 3, 17) derivative by the camera's 9 parameters and the sheet's 8.
+    """
+
+    points_mm: FloatArray
+    is_met: BoolArray
+    dpoint_dpx: FloatArray
+    dpoint_dsensor: FloatArray
+
+
+def intersect_with_jacobian(
+    points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
+) -> SheetPoints:
+    """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
+    n = len(points_px)
+    xy, has_ray, dxy_dpx, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(points_px)
+    points, is_met = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros(n, dtype=np.bool_)
+    by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, N_CAMERA + N_SHEET))
+    for k, calibrated in enumerate(sensor.sheets):
+        rows = np.flatnonzero(has_ray & (sheet_of_point == k))
+        found, met, dpoint_dxy, dpoint_dsheet = calibrated.sheet.intersect_with_jacobian(xy[rows])
+        rows, dpoint_dxy = rows[met], dpoint_dxy[met]
+        points[rows], is_met[rows] = found[met], True
+        by_px[rows] = dpoint_dxy @ dxy_dpx[rows]
+        by_sensor[rows, :, :N_CAMERA] = dpoint_dxy @ dxy_dcamera[rows]
+        by_sensor[rows, :, N_CAMERA:] = dpoint_dsheet[met]
+    return SheetPoints(points, is_met, by_px, by_sensor)
+
+
+class StripePoints(RowRecord):
     """Points of one exposure in the Sensor frame, with what their errors come from.
 
     Parameters
@@ -59,7 +146,7 @@ class StripePoints:
     noise_mm
         (M, 3, J) one standard deviation of each independent noise: the direction in which it acts
         times its size. One camera has one, the stripe's own noise, which acts within the sheet;
-        a point that both cameras see has one of each camera.
+        a point that both cameras see has one of each camera and one of the sheet's shape.
     by_sensor
         (M, 3, Q) derivative by the parameters that `sensor_columns` names for the point's sheet:
         the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one.
@@ -67,11 +154,11 @@ class StripePoints:
         (M,) index into ``sensor.sheets``.
     """
 
-    row: IntArray
-    points_mm: FloatArray
-    noise_mm: FloatArray
-    by_sensor: FloatArray
-    sheet: IntArray
+    row: IntArray = ints("N")
+    points_mm: FloatArray = floats("N", 3)
+    noise_mm: FloatArray = floats("N", 3, None)
+    by_sensor: FloatArray = floats("N", 3, None)
+    sheet: IntArray = ints("N")
 
 
 def triangulate(
@@ -96,20 +183,40 @@ def cloud_in_sensor(
     """The points of one exposure as a cloud in the Sensor frame."""
     covariance = stripe.noise_mm @ stripe.noise_mm.transpose(0, 2, 1)
     for k in range(len(sensor.sheets)):
-        own = stripe.sheet == k
-        joint = sensor_covariance(sensor, k)
-        covariance[own] += stripe.by_sensor[own] @ joint @ stripe.by_sensor[own].transpose(0, 2, 1)
+        of_sheet = stripe.sheet == k
+        jacobian = stripe.by_sensor[of_sheet]
+        covariance[of_sheet] += (
+            jacobian @ sensor_covariance(sensor, k) @ jacobian.transpose(0, 2, 1)
+        )
+    names = tuple(one.name for one in sensor.sheets)
+    return stripe_cloud("Sensor", stripe, profile, stripe.points_mm, covariance, sheet_names=names)
+
+
+def stripe_cloud(
+    frame: CloudFrame,
+    stripe: StripePoints,
+    profile: Profile | PointProfile,
+    points_mm: FloatArray,
+    covariance_mm2: FloatArray,
+    *,
+    sheet_names: tuple[str, ...],
+) -> PointCloud:
+    """The points of one exposure, given in a frame, as a cloud; the covariance is symmetrised."""
+    if isinstance(profile, Profile):
+        segment, intensity = profile.segment[stripe.row], profile.intensity[stripe.row]
+    else:
+        segment, intensity = np.zeros_like(stripe.row), np.zeros(len(stripe))
     return PointCloud(
-        frame="Sensor",
-        points_mm=stripe.points_mm,
-        covariance_mm2=0.5 * (covariance + covariance.transpose(0, 2, 1)),
+        frame=frame,
+        points_mm=points_mm,
+        covariance_mm2=0.5 * (covariance_mm2 + covariance_mm2.transpose(0, 2, 1)),
         sigma_noise_mm=noise_size_mm(stripe.noise_mm),
         sheet=stripe.sheet,
-        sheet_names=tuple(sheet.name for sheet in sensor.sheets),
-        exposure=np.zeros(len(stripe.row), dtype=np.int64),
+        sheet_names=sheet_names,
+        exposure=np.zeros(len(stripe), dtype=np.int64),
         exposure_sources=(profile.source,),
-        segment=profile.segment[stripe.row],
-        intensity=profile.intensity[stripe.row],
+        segment=segment,
+        intensity=intensity,
     )
 
 
@@ -138,24 +245,20 @@ def triangulate_stripe(
         If ``sheet_of_point`` does not fit the profile or the sheets.
     """
     sheets = _checked_sheets(profile, sheet_of_point, sensor)
-    xy, has_ray, dxy_dq, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(
-        profile.points_px
+    asked = np.flatnonzero(sheets >= 0)
+    met = intersect_with_jacobian(profile.points_px[asked], sheets[asked], sensor)
+    across = np.einsum("nij,nj->ni", met.dpoint_dpx, profile.normals_px[asked])
+    noise = across * profile.sigma_px[asked, None]
+    rest = np.zeros((len(asked), 3, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET))
+    by_sensor = np.concatenate([met.dpoint_dsensor, rest], axis=2)
+    found = StripePoints(
+        row=asked,
+        points_mm=met.points_mm,
+        noise_mm=noise[:, :, None],
+        by_sensor=by_sensor,
+        sheet=sheets[asked],
     )
-    points = np.zeros((len(profile), 3))
-    noise = np.zeros((len(profile), 3))
-    by_sensor = np.zeros((len(profile), 3, len(sensor_columns(sensor, 0))))
-    is_met = np.zeros(len(profile), dtype=np.bool_)
-    for k, calibrated in enumerate(sensor.sheets):
-        own = np.flatnonzero(has_ray & (sheets == k))
-        points[own], is_met[own], dpoint_dxy, dpoint_dsheet = (
-            calibrated.sheet.intersect_with_jacobian(xy[own])
-        )
-        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dq[own], profile.normals_px[own])
-        noise[own] = across * profile.sigma_px[own, None]
-        by_sensor[own, :, :N_CAMERA] = dpoint_dxy @ dxy_dcamera[own]
-        by_sensor[own, :, N_CAMERA : N_CAMERA + N_SHEET] = dpoint_dsheet
-    kept = np.flatnonzero(is_met)
-    return StripePoints(kept, points[kept], noise[kept, :, None], by_sensor[kept], sheets[kept])
+    return found.select(met.is_met)
 
 
 def noise_size_mm(noise_mm: FloatArray) -> FloatArray:
@@ -185,10 +288,8 @@ def sensor_columns(sensor: SensorCalibration, sheet: int) -> IntArray:
 
     The camera's 9 parameters, the sheet's 8, then the 15 of a second camera, if there is one.
     """
-    own, second = sensor.sheet_parameter_slice(sheet), sensor.second_parameter_slice
-    return np.concatenate(
-        [np.arange(N_CAMERA), np.arange(own.start, own.stop), np.arange(second.start, second.stop)]
-    )
+    of_sheet, second = sensor.sheet_parameter_slice(sheet), sensor.second_parameter_slice
+    return np.asarray(np.r_[:N_CAMERA, of_sheet, second])
 
 
 def sensor_covariance(sensor: SensorCalibration, sheet: int) -> FloatArray:

@@ -8,8 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from armscan.models.calibration import Provenance, SensorCalibration
+from armscan.pipeline.measure import Reconstruction
 from armscan.pipeline.scan import ExposureStatus, ScanReconstruction
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus, Reconstruction
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.charts import Bars, histogram_chart
@@ -39,7 +40,7 @@ def cloud_quantities(result: Reconstruction) -> tuple[Quantity, ...]:
     )
 
 
-def _point_quantities(cloud: PointCloud, images: Sequence[MeasuredProfile]) -> tuple[Quantity, ...]:
+def _point_quantities(cloud: PointCloud, images: Sequence[LabelledProfile]) -> tuple[Quantity, ...]:
     n_stripe = sum(len(image.profile) for image in images)
     median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
     low, top = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
@@ -153,14 +154,14 @@ def fate_table(result: Reconstruction) -> Table:
     """What became of the stripe points of each image."""
     fates = _fates(result.images)
     rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.naming)
+        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.reason)
         for image in result.images
     )
     columns = ("image", *(fate.label for fate in fates), "sheet chosen by")
     return Table(columns, rows, "", (len(columns) - 1,))
 
 
-def _fates(images: Sequence[MeasuredProfile]) -> list[PointStatus]:
+def _fates(images: Sequence[LabelledProfile]) -> list[PointStatus]:
     return [fate for fate in PointStatus if any(image.count(fate) for image in images)]
 
 

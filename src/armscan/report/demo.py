@@ -152,7 +152,7 @@ def _instants(scans: Sequence[ScanReconstruction]) -> list[tuple[int, int]]:
         for row, image in zip(scan.image_rows, scan.images, strict=True):
             key = (number, scan.exposures[row].row.t_ns)
             sheets, count = found.get(key, (set(), 0))
-            measured = image.fate == int(PointStatus.MEASURED)
+            measured = image.status == PointStatus.MEASURED
             found[key] = (
                 sheets | set(image.sheet[measured].tolist()),
                 count + int(measured.sum()),
@@ -465,7 +465,7 @@ def _photographs(demo: HeadDemo, photographs: Mapping[str, Exposure]) -> Gallery
         marks, text = [], SCENE_TEXTS[scene]
         for (of_scene, source), image in profiles.items():
             if (of_scene, source) == (scene, exposure.source):
-                measured = image.fate == int(PointStatus.MEASURED)
+                measured = image.status == PointStatus.MEASURED
                 marks = [
                     Marks(image.profile.points_px[measured & (image.sheet == k)], sheet_colour(k))
                     for k in sorted(set(image.sheet[measured].tolist()))

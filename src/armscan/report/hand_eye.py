@@ -17,7 +17,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import euler_from_rotations, rotation_from_vector
 from armscan.geometry.shapes import Plane
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration
-from armscan.reconstruction.labels import MeasuredProfile
+from armscan.reconstruction.labels import LabelledProfile
 from armscan.records.exposure import Exposure
 from armscan.report.charts import (
     DIVERGING,
@@ -226,7 +226,7 @@ def hand_eye_page(
     fit: HandEyeFit,
     scanner: ScannerCalibration,
     stripes: Sequence[PosedStripe],
-    images: Sequence[MeasuredProfile] = (),
+    images: Sequence[LabelledProfile] = (),
     exposures: Mapping[str, Exposure] | None = None,
     *,
     repeats: Sequence[Block] = (),

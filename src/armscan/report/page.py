@@ -171,7 +171,8 @@ def footer(provenance: Provenance) -> str:
 def render_page(page: Page) -> bytes:
     """HTML of a page; nothing in it is loaded from elsewhere."""
     template = _environment().get_template("page.html.j2")
-    return template.render(page=page).encode()
+    # names of files may hold bytes that are no text
+    return template.render(page=page).encode(errors="backslashreplace")
 
 
 @cache

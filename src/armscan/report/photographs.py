@@ -12,7 +12,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import Provenance
-from armscan.reconstruction.labels import MeasuredProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.report.drawing import Marks, photo_markup
@@ -187,7 +187,7 @@ def target_marks(
 
 
 def stripe_gallery(
-    images: Sequence[MeasuredProfile],
+    images: Sequence[LabelledProfile],
     sheet_names: Sequence[str],
     exposures: Mapping[str, Exposure],
 ) -> tuple[Block, ...]:
@@ -204,13 +204,13 @@ def stripe_gallery(
     """
     seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in images)}
     fates = [(FATE_COLOURS[fate], fate.label) for fate in PointStatus if fate in seen]
-    flags = flags_of((image.profile, image.fate) for image in images)
+    flags = flags_of((image.profile, image.status) for image in images)
     shown = evenly_chosen([image for image in images if image.profile.source in exposures])
     pictures = tuple(
         stripe_picture(
             exposures[image.profile.source],
             image.profile,
-            image.fate,
+            image.status,
             image.sheet,
             {int(fate): colour for fate, colour in FATE_COLOURS.items()},
             caption=f"{image.count(PointStatus.MEASURED)} of {len(image.profile)} points measured",

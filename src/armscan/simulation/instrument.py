@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from armscan.devices.sources import Preset
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, floats
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.records.recording import NO_TRIGGER, ArmTrack
@@ -70,7 +70,7 @@ def track_of_sweeps(
         order = np.argsort(both)
         times.append(start + both[order])
         triggers.append(ids[order])
-        joints.append(one.path.joints(both[order] * 1e-9))
+        joints.append(one.joints(both[order] * 1e-9))
     return track_of_readings(
         arm, np.concatenate(times), np.concatenate(triggers), np.concatenate(joints), rng
     )
@@ -106,8 +106,7 @@ class ProbeErrors:
     diameter_mm: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlateProbing:
+class PlateProbing(ArrayRecord):
     """What a program gets; see `armscan.devices.sources.Probing`.
 
     Parameters
@@ -121,12 +120,8 @@ class PlateProbing:
     """
 
     arm: ArmTrack
-    tool_from_probe_mm: FloatArray
+    tool_from_probe_mm: FloatArray = floats(3)
     tip_diameter_mm: float
-
-    def __post_init__(self) -> None:
-        centre = frozen_floats(self.tool_from_probe_mm, (3,), "tool_from_probe_mm")
-        object.__setattr__(self, "tool_from_probe_mm", centre)
 
 
 def probe_plate(

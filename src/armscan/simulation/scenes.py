@@ -216,7 +216,7 @@ def scan_scene(instrument: Instrument, scene: SweptScene, rng: np.random.Generat
         for t_ns in one.exposure_t_ns:
             number += 1
             moment = Moment(now + int(t_ns), f"{number:04d}.png", number)
-            joints = one.path.joints(1e-9 * int(t_ns) + np.array([0.0, -half, half]))
+            joints = one.joints(1e-9 * int(t_ns) + np.array([0.0, -half, half]))
             poses = [arm.true_pose(row) @ head.tool_from_sensor for row in joints]
             shots += instant_shots(head, len(shots), moment, station, light, *poses)
         now += int(one.exposure_t_ns[-1])

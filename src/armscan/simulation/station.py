@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, ImageArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, ImageArray, floats
 from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
 from armscan.simulation.head import Head, MountedCamera, Window
 from armscan.simulation.objects.board_image import render_board
@@ -94,22 +94,18 @@ class ExposureSettings:
     room_light
         Brightness of white that faces up under the room's light, as a part of full scale; None for
         the preset's ambient light.
-    laser_gain
-        Factor on the lasers' light.
     """
 
     window: Window
     lasers: tuple[str, ...] = ()
     room_light: float | None = None
-    laser_gain: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.laser_gain < 0.0 or (self.room_light is not None and self.room_light < 0.0):
+        if self.room_light is not None and self.room_light < 0.0:
             raise InputError("light cannot be negative")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrueStripe:
+class TrueStripe(ArrayRecord):
     """True centre points of one sheet's stripe, about one a column or row.
 
     Parameters
@@ -125,17 +121,10 @@ class TrueStripe:
     """
 
     sheet: str
-    points_px: FloatArray
-    points_sensor_mm: FloatArray
-    points_base_mm: FloatArray
-    thing: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.points_px)
-        shapes = {"points_px": 2, "points_sensor_mm": 3, "points_base_mm": 3}
-        for name, width in shapes.items():
-            object.__setattr__(self, name, frozen_floats(getattr(self, name), (n, width), name))
-        object.__setattr__(self, "thing", frozen_floats(self.thing, (n,), "thing"))
+    points_px: FloatArray = floats("N", 2)
+    points_sensor_mm: FloatArray = floats("N", 3)
+    points_base_mm: FloatArray = floats("N", 3)
+    thing: FloatArray = floats("N")
 
 
 def render_exposure(
@@ -199,7 +188,7 @@ def exposure_light(
         # What is stray is wide or faint: motion over the exposure does not show in it.
         for one, seen in ((source, views), *((one, [views[middle]]) for one in stray)):
             line = band_light(seen, eye.camera, one, region, speckle=imaging.speckle, rng=rng)
-            light += np.float32(settings.laser_gain) * line[inside]
+            light += line[inside]
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
@@ -227,15 +216,14 @@ def true_stripes(
     lasers = _seen_lasers(head, eye, settings.lasers)
     for laser, band in zip(lasers, laser_bands(scene, lens, lasers), strict=True):
         found = find_stripe(scene, lens, laser, band)
-        in_eye: Points[Any] = Points(found.points_mm)
-        in_sensor = found.points_mm if camera == 0 else (sensor_from_eye @ in_eye).xyz_mm
+        in_sensor = found.points_mm if camera == 0 else sensor_from_eye.apply(found.points_mm)
         stripes.append(
             TrueStripe(
-                laser.name,
-                found.points_px + np.array([window.x_px, window.y_px]),
-                in_sensor,
-                (pose @ in_eye).xyz_mm,
-                found.surface,
+                sheet=laser.name,
+                points_px=found.points_px + np.array([window.x_px, window.y_px]),
+                points_sensor_mm=in_sensor,
+                points_base_mm=pose.apply(found.points_mm),
+                thing=found.surface,
             )
         )
     return tuple(stripes)

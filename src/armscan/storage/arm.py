@@ -5,16 +5,13 @@ probe.
 
 from __future__ import annotations
 
-import json
 import math
 import re
-import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from armscan.errors import FileFormatError, InputError
@@ -23,7 +20,8 @@ from armscan.geometry.poses import Pose, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.models.arm import AXIS_PARAMETERS, ArmModel, forward
 from armscan.records.recording import NO_TRIGGER, ArmTrack, PoseForm, Session
-from armscan.storage.files import new_folder, read_bytes
+from armscan.storage.codec import Layout, MismatchError, RecordCodec, parse_toml, toml_bytes
+from armscan.storage.files import new_folder, path_text, read_bytes, told_of
 from armscan.storage.poses import (
     FORM_COLUMNS,
     METRES_REMEDY,
@@ -34,19 +32,14 @@ from armscan.storage.poses import (
     rotations_of_form,
 )
 from armscan.storage.recording_session import SESSION_FILE, session_toml
-from armscan.storage.tables import CsvTable, csv_bytes, number_text
+from armscan.storage.tables import CsvTable, csv_bytes, number_columns
 
 ARM_MODEL_FILE = "arm.toml"
-Triple = tuple[float, float, float]
+AXES_REMEDY = f"write [[axis]] with {', '.join(AXIS_PARAMETERS)} for each joint"
 
 
-class Table(BaseModel):
-    """A table of the file: unknown keys, NaN and wrong types are refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class AxisTable(Table):
+@dataclass(frozen=True, slots=True)
+class _Axis:
     """``[[axis]]``: ``Rz(theta + theta_offset) Tz(offset) Tx(length) Rx(twist)`` (eq. 2.1)."""
 
     theta_offset_rad: float
@@ -57,23 +50,21 @@ class AxisTable(Table):
     joint_max_rad: float | None = None
 
 
-class FlangeTable(Table):
+@dataclass(frozen=True, slots=True, eq=False)
+class _Flange:
     """``[flange]``: Tool in the frame of the last axis."""
 
-    rotation_rows: tuple[Triple, Triple, Triple] = (
-        (1.0, 0.0, 0.0),
-        (0.0, 1.0, 0.0),
-        (0.0, 0.0, 1.0),
-    )
-    translation_mm: Triple = (0.0, 0.0, 0.0)
+    rotation_rows: FloatArray = field(default_factory=lambda: np.eye(3))
+    translation_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
-class ArmTables(Table):
-    """The whole file."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Arm:
+    """The whole of ``arm.toml``."""
 
+    axis: tuple[_Axis, ...]
     name: str = "arm"
-    axis: tuple[AxisTable, ...] = Field(min_length=1)
-    flange: FlangeTable = FlangeTable()
+    flange: _Flange = field(default_factory=_Flange)
 
 
 def read_arm_model(path: Path) -> ArmModel:
@@ -84,61 +75,26 @@ def read_arm_model(path: Path) -> ArmModel:
     FileFormatError
         If the file is missing, no TOML, or does not describe an arm.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n"))
-        text = json.dumps(content, default=str)
-        return _model(ArmTables.model_validate_json(text, strict=True))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileFormatError(
-            f"this is no TOML: {error}",
-            where=str(path),
-            remedy='write lines as name = "my arm", one [[axis]] for each axis',
-        ) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise FileFormatError(
-            f"the arm is not valid at '{key}': {first['msg'].lower()}",
-            where=str(path),
-            remedy=f"write [[axis]] with {', '.join(AXIS_PARAMETERS)} for each joint",
-        ) from error
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
+    where = path_text(path)
+    content = parse_toml(read_bytes(path), where, AXES_REMEDY)
+    with told_of(where, remedy=AXES_REMEDY):
+        try:
+            tables = RecordCodec().read(_Arm, content)
+        except MismatchError as error:
+            raise InputError(f"the arm is not valid: {error}") from error
+        return _arm_model(tables)
 
 
-def arm_model_toml(arm: ArmModel) -> bytes:
-    """Text of ``arm.toml``; reads back as the same numbers."""
-    lines = [f"name = {json.dumps(arm.name, ensure_ascii=False)}"]
-    low, high = arm.joint_limits_rad
-    for k in range(arm.n_axes):
-        lines += ["", "[[axis]]"]
-        lines += [f"{name} = {float(getattr(arm, name)[k])!r}" for name in AXIS_PARAMETERS]
-        if math.isfinite(low[k]):
-            lines.append(f"joint_min_rad = {float(low[k])!r}")
-        if math.isfinite(high[k]):
-            lines.append(f"joint_max_rad = {float(high[k])!r}")
-    lines += [
-        "",
-        "[flange]",
-        f"rotation_rows = {arm.flange.rotation.tolist()!r}",
-        f"translation_mm = {arm.flange.translation_mm.tolist()!r}",
-    ]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _model(tables: ArmTables) -> ArmModel:
-    axes = np.array([[getattr(axis, name) for name in AXIS_PARAMETERS] for axis in tables.axis])
+def _arm_model(tables: _Arm) -> ArmModel:
+    axes = {
+        name: np.array([getattr(axis, name) for axis in tables.axis]) for name in AXIS_PARAMETERS
+    }
     low = [-math.inf if axis.joint_min_rad is None else axis.joint_min_rad for axis in tables.axis]
     high = [math.inf if axis.joint_max_rad is None else axis.joint_max_rad for axis in tables.axis]
-    flange: Pose[Tool, Tool] = Pose(
-        np.array(tables.flange.rotation_rows), np.array(tables.flange.translation_mm)
-    )
+    flange: Pose[Tool, Tool] = Pose(tables.flange.rotation_rows, tables.flange.translation_mm)
     has_limits = bool(np.isfinite([*low, *high]).any())
     return ArmModel(
-        theta_offset_rad=axes[:, 0],
-        offset_mm=axes[:, 1],
-        length_mm=axes[:, 2],
-        twist_rad=axes[:, 3],
+        **axes,
         flange=flange,
         joint_min_rad=np.array(low) if has_limits else None,
         joint_max_rad=np.array(high) if has_limits else None,
@@ -146,8 +102,19 @@ def _model(tables: ArmTables) -> ArmModel:
     )
 
 
+def arm_model_toml(arm: ArmModel) -> bytes:
+    """Text of ``arm.toml``; reads back as the same numbers."""
+    columns = {name: getattr(arm, name).tolist() for name in AXIS_PARAMETERS}
+    low, high = arm.joint_limits_rad
+    columns["joint_min_rad"] = [float(angle) if np.isfinite(angle) else None for angle in low]
+    columns["joint_max_rad"] = [float(angle) if np.isfinite(angle) else None for angle in high]
+    axes = [{name: column[k] for name, column in columns.items()} for k in range(arm.n_axes)]
+    flange = _Flange(arm.flange.rotation, arm.flange.translation_mm)
+    return toml_bytes({"name": arm.name, "axis": axes, "flange": RecordCodec().write(flange)})
+
+
 ARM_FILE = "arm.csv"
-JOINT = re.compile(r"j(\d+)_rad")
+JOINT = re.compile(r"j([0-9]{1,2})_rad")
 WARN_TURNS_RAD = 2.0 * np.pi
 REFUSE_TURNS_RAD = 4.0 * np.pi
 FORMS_AGREE_DEG = 0.02
@@ -258,20 +225,14 @@ def arm_columns(
             [track.translations_mm, pose_numbers(track.rotations, track.is_known, form, rotation)]
         )
         numbers[~track.is_known] = np.nan
-        columns |= _texts((*POSITION, *FORM_COLUMNS[form]), numbers)
+        columns |= number_columns((*POSITION, *FORM_COLUMNS[form]), numbers)
     if track.joints_rad is not None:
         names = tuple(f"j{k}_rad" for k in range(1, track.joints_rad.shape[1] + 1))
-        columns |= _texts(names, track.joints_rad)
+        columns |= number_columns(names, track.joints_rad)
     ids = track.trigger_ids
     if ids is not None and (ids != NO_TRIGGER).any():
         columns["trigger_id"] = tuple("" if k == NO_TRIGGER else str(k) for k in ids)
     return {**columns, **extra}
-
-
-def _texts(names: tuple[str, ...], numbers: FloatArray) -> dict[str, tuple[str, ...]]:
-    return {
-        name: tuple(number_text(value) for value in numbers[:, k]) for k, name in enumerate(names)
-    }
 
 
 def _times(table: CsvTable) -> IntArray:
@@ -479,6 +440,8 @@ def _warnings(track: ArmTrack, where: str) -> list[str]:
 
 
 PROBE_FILE = "probe.toml"
+PROBE_REMEDY = "write centre_tool_mm = [x, y, z] and tip_diameter_mm = 6.0"
+TIP_DIAMETERS_MM = (1e-3, 1000.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -501,15 +464,6 @@ class ProbeTip:
         object.__setattr__(self, "centre_tool_mm", centre)
 
 
-class ProbeKeys(BaseModel):
-    """The whole file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    centre_tool_mm: tuple[float, float, float]
-    tip_diameter_mm: float = Field(gt=0, lt=1000)
-
-
 def read_probe_tip(path: Path) -> ProbeTip:
     """Read ``probe.toml``.
 
@@ -518,32 +472,27 @@ def read_probe_tip(path: Path) -> ProbeTip:
     FileFormatError
         If the file is missing, no TOML, or a key is missing, unknown or wrong.
     """
-    try:
-        content = tomllib.loads(read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n"))
-        keys = ProbeKeys.model_validate_json(json.dumps(content, default=str), strict=True)
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileFormatError(
-            f"this is no TOML: {error}",
-            where=str(path),
-            remedy="write centre_tool_mm = [x, y, z] and tip_diameter_mm = 6.0",
-        ) from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise FileFormatError(
-            f"the probe is not valid at '{key}': {first['msg'].lower()}",
-            where=str(path),
-            remedy="write centre_tool_mm = [x, y, z] and tip_diameter_mm = 6.0",
-        ) from error
-    return ProbeTip(np.array(keys.centre_tool_mm), keys.tip_diameter_mm)
+    where = path_text(path)
+    content = parse_toml(read_bytes(path), where, PROBE_REMEDY)
+    with told_of(where, remedy=PROBE_REMEDY):
+        try:
+            return PROBE_CODEC.read(ProbeTip, content)
+        except MismatchError as error:
+            raise InputError(f"the probe is not valid: {error}") from error
 
 
 def probe_tip_toml(tip: ProbeTip) -> bytes:
     """Text of ``probe.toml``; reads back as the same numbers."""
-    return (
-        f"centre_tool_mm = {tip.centre_tool_mm.tolist()!r}\n"
-        f"tip_diameter_mm = {float(tip.diameter_mm)!r}\n"
-    ).encode()
+    return toml_bytes(PROBE_CODEC.write(tip))
+
+
+PROBE_CODEC = RecordCodec(
+    {
+        ProbeTip: Layout(
+            keys={"diameter_mm": "tip_diameter_mm"}, limits={"diameter_mm": TIP_DIAMETERS_MM}
+        )
+    }
+)
 
 
 def write_probing(

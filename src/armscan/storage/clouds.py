@@ -23,8 +23,9 @@ from armscan.models.camera import CameraModel
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import read_calibration, read_camera_calibration
-from armscan.storage.files import check_outputs, read_bytes, write_files
+from armscan.storage.files import check_outputs, path_text, read_bytes, told_of, write_files
 from armscan.storage.foreign import camera_info_yaml
+from armscan.storage.tables import refuse_beyond_reach
 
 TYPES = {
     "char": "i1",
@@ -46,7 +47,11 @@ TYPES = {
 }
 WRITTEN_TYPES = {"f8": "double", "i4": "int"}
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-HEADER = re.compile(rb"ply\s*\n(.*?)end_header\r?\n", re.DOTALL)
+END_HEADER = re.compile(rb"end_header\r?\n")
+MOST_HEADER_BYTES = 16 * 2**20
+"""A comment for each of a hundred thousand exposures."""
+MOST_PROPERTIES, MOST_DIGITS = 1000, 15
+DAMAGED = "copy the file again; it may be cut or damaged"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,27 +94,22 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
     FileFormatError
         If it is no PLY file, its vertices are lists or not first, or it is cut short.
     """
-    header = HEADER.match(data)
-    if header is None:
+    end = data.find(b"\nend_header", 0, MOST_HEADER_BYTES)
+    start = data.find(b"\n", end + 1) + 1
+    if END_HEADER.fullmatch(data[end + 1 : start]) is None or data[:3] != b"ply":
         raise FileFormatError(
-            "this is not a PLY file with a complete header",
-            where=where,
-            remedy="copy the file again; it may be cut or damaged",
+            "this is not a PLY file with a complete header", where=where, remedy=DAMAGED
         )
-    body = data[header.end() :]
     try:
-        order, count, fields, comments = _header(header[1].decode("latin-1"))
+        order, count, kind, comments = _header(data[:end].decode("latin-1"))
     except (ValueError, KeyError, IndexError) as error:
         raise FileFormatError(
-            "the PLY header is not understood",
-            where=where,
-            remedy="copy the file again; it may be cut or damaged",
+            "the PLY header is not understood", where=where, remedy=DAMAGED
         ) from error
-    if order == "=":
-        table = _ascii_table(body, fields, count, where)
+    if order == "ascii":
+        table = _ascii_table(data[start:], kind, count, where)
     else:
-        kind = np.dtype([(name, order + code) for name, code in fields])
-        table = np.frombuffer(body[: len(body) // kind.itemsize * kind.itemsize], kind)[:count]
+        table = np.frombuffer(data, kind, min(count, (len(data) - start) // kind.itemsize), start)
     if len(table) < count:
         raise FileFormatError(
             f"the PLY file holds {len(table)} of {count} points",
@@ -119,41 +119,39 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
     return PlyVertices(table, comments)
 
 
-def _header(text: str) -> tuple[str, int, list[tuple[str, str]], tuple[str, ...]]:
-    order, count = "", -1
-    element = ""
+def _header(text: str) -> tuple[str, int, np.dtype[Any], tuple[str, ...]]:
+    """Format, count and type of the vertices, and comments; `ValueError` for what is no header."""
+    order, count, element = "", -1, ""
     fields: list[tuple[str, str]] = []
     comments: list[str] = []
-    for line in text.splitlines():
+    for line in text.split("\n"):
         words = line.split()
         if line.startswith("comment "):
-            comments.append(line[8:])
+            comments.append(line[8:].rstrip("\r"))
         elif words[:1] == ["format"]:
-            order = BYTE_ORDERS[words[1]]
+            order = words[1]
         elif words[:1] == ["element"]:
             element = words[1]
             if element == "vertex":
-                count = int(words[2])
+                count = int(words[2][:MOST_DIGITS])
             elif count < 0:
                 raise ValueError("vertices are not the first element")
         elif words[:1] == ["property"] and element == "vertex":
-            fields.append((words[2], TYPES[words[1]]))
-    if not order or count < 0 or not fields:
+            fields.append((words[2], BYTE_ORDERS[order] + TYPES[words[1]]))
+    if count < 0 or not 0 < len(fields) <= MOST_PROPERTIES:
         raise ValueError("the header names no vertices")
-    return order, count, fields, tuple(comments)
+    # a name that occurs twice is a ValueError of numpy
+    return order, count, np.dtype(fields), tuple(comments)
 
 
-def _ascii_table(
-    body: bytes, fields: list[tuple[str, str]], count: int, where: str
-) -> NDArray[Any]:
-    rows = [line.split() for line in body.split(b"\n", count)[:count] if line.strip()]
+def _ascii_table(body: bytes, kind: np.dtype[Any], count: int, where: str) -> NDArray[Any]:
+    most = min(count, len(body))
+    rows = [line.split() for line in body.split(b"\n", most)[:most] if line.strip()]
     try:
-        return np.array([tuple(float(word) for word in row) for row in rows], dtype=fields)
-    except ValueError as error:
+        return np.array([tuple(float(word) for word in row) for row in rows], dtype=kind)
+    except (ValueError, OverflowError) as error:
         raise FileFormatError(
-            "the points of the PLY file are not understood",
-            where=where,
-            remedy="copy the file again; it may be cut or damaged",
+            "the points of the PLY file are not understood", where=where, remedy=DAMAGED
         ) from error
 
 
@@ -234,24 +232,30 @@ def read_ply(path: Path) -> PointCloud:
     FileFormatError
         If the file is cut short, is no PLY, or lacks what armscan writes.
     """
-    vertices = parse_ply(read_bytes(path), str(path))
+    where = path_text(path)
+    return _own_cloud(parse_ply(read_bytes(path), where), where)
+
+
+def _own_cloud(vertices: PlyVertices, where: str) -> PointCloud:
     table = vertices.table
     names = set(table.dtype.names or ())
     needed = {*POINT, *COVARIANCE, *INDICES, "sigma_noise_mm", "intensity"}
     if missing := sorted(needed - names):
         raise FileFormatError(
             f"the PLY file has no {missing[0]}, so it was not written by armscan",
-            where=str(path),
+            where=where,
             remedy="use the cloud that `armscan reconstruct` wrote",
         )
     covariance = np.zeros((len(table), 3, 3))
     for name, (i, j) in COVARIANCE.items():
         covariance[:, i, j] = covariance[:, j, i] = table[name]
     has_normals = names.issuperset(NORMAL)
-    try:
+    points = np.stack([table[name] for name in POINT], axis=1)
+    refuse_beyond_reach(points, where)
+    with told_of(where):
         return PointCloud(
             frame=_frame(vertices),
-            points_mm=np.stack([table[name] for name in POINT], axis=1),
+            points_mm=points,
             covariance_mm2=covariance,
             sigma_noise_mm=table["sigma_noise_mm"],
             sheet=table["sheet"],
@@ -264,8 +268,6 @@ def read_ply(path: Path) -> PointCloud:
             is_simulated=SIMULATED in vertices.comments,
             forced=_names(vertices, FORCED),
         )
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path)) from error
 
 
 def _frame(vertices: PlyVertices) -> CloudFrame:
@@ -281,7 +283,7 @@ def _names(vertices: PlyVertices, word: str) -> tuple[str, ...]:
         if text.startswith(f"{word} "):
             try:
                 names.append(str(json.loads(text.split(" ", 2)[2])))
-            except (IndexError, ValueError) as error:
+            except (IndexError, ValueError, RecursionError) as error:
                 raise InputError(f"the PLY header's comment {text!r} is damaged") from error
     return tuple(names)
 
@@ -305,12 +307,13 @@ def read_cloud(path: Path) -> PointCloud:
     FileFormatError
         If the file is cut short, or holds no points in x, y, z.
     """
-    data = read_bytes(path)
+    data, where = read_bytes(path), path_text(path)
     if data.startswith(b"ply"):
-        table = parse_ply(data, str(path)).table
+        vertices = parse_ply(data, where)
+        table = vertices.table
         names = set(table.dtype.names or ())
         if names.issuperset(COVARIANCE):
-            return read_ply(path)
+            return _own_cloud(vertices, where)
         if missing := sorted(set(POINT) - names):
             raise FileFormatError(
                 f"the PLY file's points have no {missing[0]}",
@@ -420,7 +423,8 @@ def _is_number(word: str) -> bool:
 def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCloud:
     n = len(points_mm)
     zeros = np.zeros(n, dtype=np.int64)
-    try:
+    refuse_beyond_reach(points_mm, path_text(path))
+    with told_of(path_text(path)):
         return PointCloud(
             frame=frame,
             points_mm=points_mm,
@@ -433,8 +437,6 @@ def _bare_cloud(points_mm: FloatArray, frame: CloudFrame, path: Path) -> PointCl
             segment=zeros,
             intensity=np.zeros(n),
         )
-    except InputError as error:
-        raise FileFormatError(error.what, where=str(path), remedy=error.remedy) from error
 
 
 YAML_LOSES = ("covariance", "evidence and provenance")

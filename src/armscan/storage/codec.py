@@ -20,7 +20,7 @@ from typing import Any, Literal, NoReturn, TypeVar, cast, get_args, get_origin, 
 
 import numpy as np
 
-from armscan.errors import FileFormatError, InputError
+from armscan.errors import FileFormatError, InputError, shown
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import CameraRight, Pose
 from armscan.storage.tables import LARGEST_MM
@@ -30,7 +30,7 @@ Tree = Mapping[str, Any]
 
 MOST_BYTES, MOST_VALUES = 64 * 2**20, 1_000_000
 """Of a document. The largest of armscan's has some ten thousand values."""
-MOST_TOML_BYTES = 2**20
+MOST_TOML_BYTES, MOST_TOML_TABLES = 2**18, 1000
 MOST_DIGITS = 40
 """Of a whole number: more than any that is meant."""
 LARGEST, LARGEST_SIZE_PX = 1e15, 100_000
@@ -52,7 +52,8 @@ def json_bytes(value: Any) -> bytes:
     ValueError
         If a float is not finite.
     """
-    return (_encode(value, "") + "\n").encode()
+    # bytes of names that are no text become JSON's own escapes
+    return (_encode(value, "") + "\n").encode(errors="backslashreplace")
 
 
 def _encode(value: Any, indent: str) -> str:
@@ -117,24 +118,47 @@ def parse_json(data: bytes, where: str) -> dict[str, Any]:
     return value
 
 
-def parse_toml(data: bytes, where: str, example: str) -> dict[str, Any]:
-    """Parse a TOML file; ``example`` is a line as they should be, for messages.
+def parse_toml(data: bytes, where: str, remedy: str) -> dict[str, Any]:
+    """Parse a TOML file; ``remedy`` says how lines should be.
 
     Raises
     ------
     FileFormatError
         If it is no TOML, too large or nested too deep.
     """
-    fault = ""
     try:
-        if len(data) <= MOST_TOML_BYTES:
+        n_tables = data.count(b"\n[")
+        if len(data) <= MOST_TOML_BYTES and n_tables <= MOST_TOML_TABLES:
             return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
-        fault = f"{len(data)} bytes"
-    except (UnicodeDecodeError, RecursionError, ValueError) as error:
-        fault = "nested too deep" if isinstance(error, RecursionError) else f"{error!s:.200}"
-    raise FileFormatError(
-        f"this is no TOML: {fault}", where=where, remedy=f"write lines as {example}"
-    )
+        fault = f"it has {len(data)} bytes and {n_tables} tables"
+    except RecursionError:
+        fault = "it is nested too deep"
+    except ValueError as error:
+        fault = shown(str(error), 200)
+    raise FileFormatError(f"this is no TOML: {fault}", where=where, remedy=remedy)
+
+
+def toml_bytes(tree: Tree) -> bytes:
+    """TOML of plain values, tables and lists of tables; keys without a value are left out."""
+    return ("\n".join(_toml_lines(tree)) + "\n").encode()
+
+
+def _toml_lines(tree: Tree, path: str = "") -> Iterator[str]:
+    inner = {key: value for key, value in tree.items() if isinstance(value, dict)}
+    lists = {
+        key: value
+        for key, value in tree.items()
+        if isinstance(value, list) and value and all(isinstance(item, dict) for item in value)
+    }
+    for key, value in tree.items():
+        if key not in inner and key not in lists and value is not None:
+            text = json.dumps(value, allow_nan=False, ensure_ascii=False)
+            yield f"{key} = " + text.replace("\x7f", "\\u007f")
+    for key, table in inner.items():
+        yield from ("", f"[{path}{key}]", *_toml_lines(table, f"{path}{key}."))
+    for key, tables in lists.items():
+        for table in tables:
+            yield from ("", f"[[{path}{key}]]", *_toml_lines(table, f"{path}{key}."))
 
 
 def _refuse_constant(constant: str) -> NoReturn:
@@ -178,7 +202,7 @@ class MismatchError(ValueError):
     """
 
     def __init__(self, key: str, why: str) -> None:
-        super().__init__(f"'{key:.200}' {why}" if key else why)
+        super().__init__(f"'{shown(key, 120)}' {why}" if key else why)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +247,8 @@ class Layout:
         Names of the rows of the field ``covariance`` of a record.
     is_evidence
         Numbers may be unknown: ``null`` in the file, NaN in the program.
-    least
-        Of all numbers.
+    limits
+        Least and most of numbers, in place of those of their names.
     check
         What is wrong with a record that its class allows; empty for nothing.
     """
@@ -239,7 +263,7 @@ class Layout:
     constants: Mapping[str, str] = field(default_factory=dict)
     covariance_names: Callable[[Any], tuple[str, ...]] | None = None
     is_evidence: bool = False
-    least: float = -math.inf
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     check: Callable[[Any], str] | None = None
 
     def may_lack(self, name: str) -> bool:
@@ -337,9 +361,10 @@ class RecordCodec:
         for name in tree:
             if name not in used:
                 near = get_close_matches(name[:60], used, 1)
-                fact = "is not known" + (f"; '{near[0]}' is" if near else "")
+                hint = f"; '{near[0]}' is" if near else ""
                 if self.unknown is None:
-                    raise MismatchError(_join(key, name), fact)
+                    raise MismatchError(_join(key, name), f"is not known{hint}")
+                fact = f"is not known and has no effect{hint}"
                 self.unknown.append(str(MismatchError(_join(key, name), fact)))
         return record
 
@@ -428,17 +453,19 @@ def _scalar(content: Any, slot: _Slot) -> Any:
     hint, key = slot.hint, slot.key
     if get_origin(hint) is Literal:
         if not (isinstance(content, str) and content in get_args(hint)):
-            raise MismatchError(key, f"is not one of {', '.join(map(str, get_args(hint)))}")
+            choices = ", ".join(map(str, get_args(hint)))
+            raise MismatchError(key, f"is {_told(content)}, not one of {choices}")
     elif hint is float:
         if content is None and slot.layout.may_lack(slot.name):
             return math.nan
-        return _number(content, key, slot.name, slot.layout.least)
+        return _number(content, key, slot.layout.limits.get(slot.name))
     elif hint is int:
-        _number(content, key, slot.name, slot.layout.least)
-        if not isinstance(content, int):
-            raise MismatchError(key, "is no whole number")
+        if isinstance(content, float):
+            raise MismatchError(key, f"is {_told(content)}, which is no whole number")
+        _number(content, key, slot.layout.limits.get(slot.name))
     elif type(content) is not hint:
-        raise MismatchError(key, f"is no {'text' if hint is str else 'true or false'}")
+        kind = "text" if hint is str else "true or false"
+        raise MismatchError(key, f"is {_told(content)}, not {kind}")
     return content
 
 
@@ -451,7 +478,7 @@ def numbers(content: Any, key: str) -> FloatArray:
         If it holds anything else, or numbers that are damage by their size.
     """
     for item in _flat(content, key, 3):
-        _number(item, key, key.rpartition(".")[2])
+        _number(item, key)
     try:
         return np.array(content, dtype=np.float64)
     except ValueError as error:
@@ -520,17 +547,30 @@ def symmetric(matrix: FloatArray, key: str) -> FloatArray:
     return matrix
 
 
-def _number(content: Any, key: str, name: str, least: float = -math.inf) -> float:
+def _number(content: Any, key: str, limits: tuple[float, float] | None = None) -> float:
+    """A finite number within limits, by default those of its key's name."""
     if isinstance(content, bool) or not isinstance(content, int | float):
-        raise MismatchError(key, "is no number")
-    most = LARGEST_MM if name.endswith(("_mm", "_px")) else LARGEST
-    if name in ("width_px", "height_px"):
-        most, least = LARGEST_SIZE_PX, 1
-    if not abs(content) <= most:
-        raise MismatchError(key, f"is {float(content):g}, beyond all that is measured")
-    if content < max(least, 0.0 if name.startswith(NOT_NEGATIVE) else -math.inf):
-        raise MismatchError(key, f"is {content}, which is too small")
+        raise MismatchError(key, f"is {_told(content)}, which is no number")
+    least, most = (
+        _limits(key.rstrip(".0123456789").rpartition(".")[2]) if limits is None else limits
+    )
+    if not least <= content <= most:
+        raise MismatchError(key, f"is {content:g}, not within {least:g} and {most:g}")
     return float(content)
+
+
+def _limits(name: str) -> tuple[float, float]:
+    if name in ("width_px", "height_px"):
+        return 1, LARGEST_SIZE_PX
+    most = LARGEST_MM if name.endswith(("_mm", "_px")) else LARGEST
+    return 0.0 if name.startswith(NOT_NEGATIVE) else -most, most
+
+
+def _told(content: Any) -> str:
+    """What stands there, for messages."""
+    if isinstance(content, dict | list):
+        return "a table" if isinstance(content, dict) else "a list"
+    return shown(repr(content), 60)
 
 
 def _read_pose(hint: Any, content: Any, key: str) -> Pose[Any, Any]:

@@ -65,6 +65,7 @@ from armscan.storage.codec import (
 )
 from armscan.storage.files import path_text, read_bytes
 from armscan.storage.foreign import parse_foreign_camera
+from armscan.storage.tables import LARGEST_MM
 from armscan.vision.stripe.image import LaserColour
 
 T = TypeVar("T")
@@ -230,10 +231,6 @@ def _fault_of_colour(sensor: SensorCalibration) -> str:
     return "" if sensor.laser_colour in colours else f"has a laser_colour not of {colours}"
 
 
-def _fault_of_latency(scanner: ScannerCalibration) -> str:
-    return "" if abs(scanner.latency_ns) <= LARGEST_LATENCY_NS else "has a latency of minutes"
-
-
 EVIDENCE = Layout(is_evidence=True)
 LAYOUTS: Mapping[type, Layout] = {
     CameraModel: Layout(
@@ -285,8 +282,9 @@ LAYOUTS: Mapping[type, Layout] = {
         is_evidence=True,
     ),
     HandEyeCalibration: Layout(
+        keys={"dhand_eye_dsensor": "sensor_coupling"},
         codecs={
-            "sensor_coupling": FieldCodec(
+            "dhand_eye_dsensor": FieldCodec(
                 lambda matrix: matrix_tree(
                     matrix, row_names=HAND_EYE_PARAMETER_NAMES, column_names=()
                 ),
@@ -296,14 +294,15 @@ LAYOUTS: Mapping[type, Layout] = {
         covariance_names=lambda _: HAND_EYE_PARAMETER_NAMES,
     ),
     ScannerCalibration: Layout(
-        codecs={"sensor": FieldCodec(_sensor_tree, _sensor_of_tree)}, check=_fault_of_latency
+        codecs={"sensor": FieldCodec(_sensor_tree, _sensor_of_tree)},
+        limits={"latency_ns": (-LARGEST_LATENCY_NS, LARGEST_LATENCY_NS)},
     ),
     Plane: Layout(
         keys={"point_mm": "point_base_mm"},
         spread={"axes": ("along_base", "across_base", "normal_base")},
         check=_fault_of_plane,
     ),
-    ArmNoise: Layout(least=0.0),
+    ArmNoise: Layout(limits=dict.fromkeys(ArmNoise.__dataclass_fields__, (0.0, LARGEST_MM))),
     CameraDiagnostics: EVIDENCE,
     SheetDiagnostics: EVIDENCE,
     SensorDiagnostics: EVIDENCE,
@@ -349,7 +348,7 @@ def scanner_document(calibration: ScannerCalibration, observations: Observations
         If the hand-eye depends on a sensor that is not given.
     """
     tree = CODEC.write(calibration)
-    coupling, sensor = calibration.hand_eye.sensor_coupling, calibration.sensor
+    coupling, sensor = calibration.hand_eye.dhand_eye_dsensor, calibration.sensor
     if coupling is not None:
         if sensor is None:
             raise InputError("the hand-eye depends on a sensor's parameters that have no names")
@@ -532,7 +531,7 @@ def _record(kind: type[T], schema: str, path: Path) -> T:
 
 
 def _check_coupling(scanner: ScannerCalibration, tree: dict[str, Any]) -> None:
-    if scanner.hand_eye.sensor_coupling is None:
+    if scanner.hand_eye.dhand_eye_dsensor is None:
         return
     key, coupling = "hand_eye.sensor_coupling", tree["hand_eye"]["sensor_coupling"]
     names = () if scanner.sensor is None else scanner.sensor.parameter_names
@@ -633,7 +632,7 @@ def new_provenance(
         document_id=str(uuid4()),
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
         armscan_version=version("armscan"),
-        command=tuple(command),
+        command=tuple(path_text(word) for word in command),
         inputs=tuple(fingerprint(path) for path in inputs),
         parent_ids=tuple(parent.document_id for parent in parents),
         options=tuple(entry for group in options for entry in _entries(group)),

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
-from armscan.errors import FileFormatError, OutputError
+from armscan.errors import FileFormatError, InputError, OutputError
 
 try:
     import fcntl
@@ -26,7 +26,8 @@ STALE_SECONDS = 86_400.0
 
 def path_text(path: Path | str) -> str:
     """The path with ``/``; bytes of a name that are not UTF-8 are told as ``\\xef``."""
-    return os.fsencode(Path(path).as_posix()).decode("utf-8", "backslashreplace")
+    text = path.as_posix() if isinstance(path, Path) else path
+    return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
 def read_bytes(path: Path) -> bytes:
@@ -61,6 +62,15 @@ def read_bytes(path: Path) -> bytes:
             "the file is empty (0 bytes)", where=where, remedy="copy the file again"
         )
     return data
+
+
+@contextmanager
+def told_of(where: str, *, remedy: str = "") -> Iterator[None]:
+    """Say of an `InputError` in which file the input stands."""
+    try:
+        yield
+    except InputError as error:
+        raise FileFormatError(error.what, where=where, remedy=remedy or error.remedy) from error
 
 
 def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> None:

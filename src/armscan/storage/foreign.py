@@ -15,6 +15,7 @@ import numpy as np
 from armscan.errors import FileFormatError, InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
+from armscan.storage.codec import LARGEST_SIZE_PX as MOST_PX
 from armscan.storage.codec import is_json, parse_json
 
 MATRIX_KEYS = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
@@ -31,6 +32,13 @@ HEIGHT_KEYS = ("image_height", "image_Height", "height")
 SIZE_KEYS = ("image_size", "imageSize", "img_size")
 RMS_KEYS = ("avg_reprojection_error", "rms", "reprojection_error")
 PLUMB_BOB = ("", "plumb_bob")
+KEYS = (
+    *(MATRIX_KEYS + DISTORTION_KEYS + WIDTH_KEYS + HEIGHT_KEYS + SIZE_KEYS + RMS_KEYS),
+    *("distortion_model", "fisheye_model"),
+)
+"""All that is read of such a file: others may hold the points of all images."""
+INNER = ("data",)
+MOST_ENTRIES = 100
 SKEW_LIMIT = 1e-6
 N_COEFFICIENTS = 5
 
@@ -83,7 +91,7 @@ def _read_tree(data: bytes, where: str) -> Mapping[str, Any]:
     mode = cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     try:
         storage = cv2.FileStorage(_with_yaml_header(data.decode("utf-8")), mode)
-        tree = _plain(storage.root()) if storage.isOpened() else None
+        tree = _plain(storage.root(), KEYS) if storage.isOpened() else None
     except (cv2.error, SystemError, UnicodeDecodeError) as error:
         raise unreadable from error
     if not isinstance(tree, Mapping):
@@ -97,18 +105,16 @@ def _with_yaml_header(text: str) -> str:
     return text if start.startswith(("%YAML", "<?xml", "<opencv")) else f"%YAML:1.0\n---\n{start}"
 
 
-def _plain(node: cv2.FileNode) -> Any:
-    """The content of a node as mappings, lists, numbers and text."""
-    if node.isMap():
-        keys = node.keys()
-        return {key: _plain(node.getNode(key)) for key in keys}
-    if node.isSeq():
-        return [_plain(node.at(index)) for index in range(node.size())]
+def _plain(node: cv2.FileNode, keys: Sequence[str], depth: int = 3) -> Any:
+    """The content of a node as mappings of these keys, lists, numbers and text."""
+    if node.isMap() and depth:
+        there = set(node.keys())
+        return {key: _plain(node.getNode(key), INNER, depth - 1) for key in keys if key in there}
+    if node.isSeq() and depth and node.size() <= MOST_ENTRIES:
+        return [_plain(node.at(index), INNER, depth - 1) for index in range(node.size())]
     if node.isString():
         return node.string()
-    if node.isInt() or node.isReal():
-        return node.real()
-    return None
+    return node.real() if node.isInt() or node.isReal() else None
 
 
 def _first(tree: Mapping[str, Any], keys: Sequence[str]) -> Any:
@@ -120,7 +126,7 @@ def _numbers(value: Any, name: str, where: str) -> FloatArray:
     content = value.get("data") if isinstance(value, Mapping) else value
     try:
         numbers = np.asarray(content, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FileFormatError(
             f"'{name}' is not a matrix of numbers", where=where, remedy="copy the file again"
         ) from error
@@ -194,7 +200,7 @@ def _size(tree: Mapping[str, Any], where: str) -> tuple[int, int]:
     pair = _first(tree, SIZE_KEYS)
     found = pair if pair is not None else [_first(tree, WIDTH_KEYS), _first(tree, HEIGHT_KEYS)]
     is_pair = isinstance(found, Sequence) and len(found) == 2
-    if not is_pair or not all(isinstance(n, int | float) and n >= 1 for n in found):
+    if not is_pair or not all(isinstance(n, int | float) and 1 <= n <= MOST_PX for n in found):
         raise FileFormatError(
             "the file does not say for which image size the camera was calibrated",
             where=where,

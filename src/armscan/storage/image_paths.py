@@ -5,15 +5,15 @@ were rendered.
 
 from __future__ import annotations
 
-import json
 import re
-import tomllib
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
+from armscan.storage.codec import parse_json, parse_toml
+from armscan.storage.files import read_bytes
 
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
 
@@ -93,6 +93,15 @@ def _is_named(name: str, pattern: str) -> bool:
 
 
 def _expand(pattern: str) -> list[Path]:
+    try:
+        return _found(pattern)
+    except OSError as error:
+        raise FileFormatError(
+            f"the path cannot be read ({error.strerror})", where=pattern, remedy="check the path"
+        ) from error
+
+
+def _found(pattern: str) -> list[Path]:
     path = Path(pattern)
     if path.is_dir():
         images = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_SUFFIXES]
@@ -136,15 +145,13 @@ def are_simulated(paths: Iterable[Path]) -> bool:
 
 def _has_mark(path: Path) -> bool:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return parse_json(read_bytes(path), path.name).get("simulated") is True
+    except FileFormatError:
         return False
-    return isinstance(content, dict) and content.get("simulated") is True
 
 
 def _says_simulated(path: Path) -> bool:
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError):
+        return parse_toml(read_bytes(path), path.name, "").get("simulated") is True
+    except FileFormatError:
         return False
-    return content.get("simulated") is True

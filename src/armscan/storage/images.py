@@ -7,6 +7,7 @@ the structure of a file is walked before it is decoded.
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 import zlib
@@ -25,7 +26,7 @@ from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import ImageArray, IntArray
 from armscan.kernels.jpeg_entropy import WHOLE, walk_scan
 from armscan.records.exposure import Exposure
-from armscan.storage.files import read_bytes
+from armscan.storage.files import path_text, read_bytes
 
 Alignment = Literal["low", "high"]
 
@@ -144,6 +145,8 @@ def _heading_defect(marker: int, body: bytes, picture: _Picture, n_bytes: int) -
         picture.components = {
             body[6 + 3 * k]: (body[7 + 3 * k] >> 4, body[7 + 3 * k] & 15) for k in range(n)
         }
+        if defect := _claim_defect(width, height, 8, n):
+            return defect
         if width * height > MOST_PIXELS_A_BYTE * n_bytes:
             return f"claims {width} x {height} px, more than its {n_bytes} bytes can hold"
     elif marker == HUFFMAN:
@@ -224,6 +227,13 @@ TIFF_TYPE_BYTES = {1: 1, 3: 2, 4: 4}
 TIFF_DATA_TAGS = {273: 279, 324: 325}
 """Tags of the offsets of strips and tiles, with the tags of their byte counts."""
 
+TIFF_SIZE_TAGS = {256: "width", 257: "height", 258: "bits", 277: "channels"}
+PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+MOST_PICTURE_BYTES = 400_000_000
+"""Of a decoded picture: 200 million grey pixels of 16 bits. A small file may claim any size."""
+MOST_INFLATION = 1100
+"""Bytes that one byte of a PNG file may become."""
+
 CUT = "copy the file again or leave it out"
 
 
@@ -263,13 +273,28 @@ def check_complete(data: bytes, where: str) -> None:
         return
     try:
         defect = checks[name](data)
-    except (struct.error, IndexError):
+    except (struct.error, IndexError, ValueError, OverflowError):
         defect = "is cut short"
     if defect:
         raise FileFormatError(f"the {name} file {defect}", where=where, remedy=CUT)
 
 
+def _claim_defect(width: int, height: int, bits: int, channels: int = 1) -> str:
+    """What is wrong with the size that a header claims; empty for nothing."""
+    n_bytes = width * height * channels * (2 if bits > 8 else 1)
+    if width < 1 or height < 1:
+        return f"claims {width} x {height} px"
+    if n_bytes > MOST_PICTURE_BYTES:
+        return f"claims {width} x {height} px, {n_bytes} bytes; up to {MOST_PICTURE_BYTES} are read"
+    return ""
+
+
 def _png_defect(data: bytes) -> str:
+    width, height, bits, colour = struct.unpack_from(">IIBB", data, 16)
+    if defect := _claim_defect(width, height, bits, PNG_CHANNELS.get(colour, 1)):
+        return defect
+    if width * height * bits // 8 > MOST_INFLATION * len(data):
+        return f"claims {width} x {height} px, more than its {len(data)} bytes can hold"
     position = len(PNG_SIGNATURE)
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)
@@ -289,6 +314,8 @@ def _bmp_defect(data: bytes) -> str:
     (pixel_offset,) = struct.unpack_from("<I", data, 10)
     width, height = struct.unpack_from("<ii", data, 18)
     bits, compression = struct.unpack_from("<HI", data, 28)
+    if defect := _claim_defect(abs(width), abs(height), 8, 4 if bits > 24 else 3):
+        return defect
     row_bytes = (abs(width) * bits + 31) // 32 * 4
     is_plain = compression in (0, 3)
     return "is cut short" if is_plain and pixel_offset + row_bytes * abs(height) > len(data) else ""
@@ -299,18 +326,22 @@ def _tiff_defect(data: bytes) -> str:
     (directory,) = struct.unpack_from(f"{order}I", data, 4)
     (n_entries,) = struct.unpack_from(f"{order}H", data, directory)
     tags: dict[int, tuple[int, ...]] = {}
+    known = {*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values(), *TIFF_SIZE_TAGS}
     for k in range(n_entries):
         entry = directory + 2 + 12 * k
         tag, kind, count = struct.unpack_from(f"{order}HHI", data, entry)
-        size = TIFF_TYPE_BYTES.get(kind)
-        if size is None or tag not in (*TIFF_DATA_TAGS, *TIFF_DATA_TAGS.values()):
+        n_bytes = TIFF_TYPE_BYTES.get(kind)
+        if n_bytes is None or tag not in known:
             continue
-        if size * count > 4:
+        if n_bytes * count > 4:
             (place,) = struct.unpack_from(f"{order}I", data, entry + 8)
         else:
             place = entry + 8
-        code = {1: "B", 2: "H", 4: "I"}[size]
+        code = {1: "B", 2: "H", 4: "I"}[n_bytes]
         tags[tag] = struct.unpack_from(f"{order}{count}{code}", data, place)
+    size = {name: tags[tag][0] for tag, name in TIFF_SIZE_TAGS.items() if tags.get(tag)}
+    if defect := _claim_defect(**{"width": 0, "height": 0, "bits": 1} | size):
+        return defect
     for offset_tag, count_tag in TIFF_DATA_TAGS.items():
         pairs = zip(tags.get(offset_tag, ()), tags.get(count_tag, ()), strict=False)
         if any(offset + count > len(data) for offset, count in pairs):
@@ -318,7 +349,7 @@ def _tiff_defect(data: bytes) -> str:
     return ""
 
 
-HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d+)" + rb"\s")
+HEADER = re.compile(rb"P([2356])" + 3 * rb"(?:\s|#[^\n]*\n)+(\d{1,6})" + rb"\s")
 
 
 def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
@@ -348,49 +379,41 @@ def decode_netpbm(data: bytes, where: str) -> tuple[ImageArray, int]:
         raise FileFormatError(
             "the PGM header is not understood", where=where, remedy="save the image as PNG"
         )
-    kind = int(header[1])
-    width, height, greatest = (int(header[k]) for k in (2, 3, 4))
-    if not 1 <= greatest <= 65535 or width < 1 or height < 1:
+    kind, width, height, greatest = (int(header[k]) for k in (1, 2, 3, 4))
+    if not 1 <= greatest <= 65535 or _claim_defect(width, height, 16, 3):
         raise FileFormatError(
             f"the PGM header gives {width} x {height} px and a greatest value of {greatest}",
             where=where,
             remedy="save the image as PNG",
         )
     shape = (height, width, 3) if kind in (3, 6) else (height, width)
+    stored, count = np.dtype(">u2" if greatest > 255 else "u1"), math.prod(shape)
     body = data[header.end() :]
-    stored = np.dtype(">u2" if greatest > 255 else "u1")
-    count = int(np.prod(shape))
-    values: NDArray[Any]
     if kind in (2, 3):
         values = _ascii_values(body, where)
     else:
-        values = np.frombuffer(body[: len(body) // stored.itemsize * stored.itemsize], stored)
+        n_stored = min(count, len(body) // stored.itemsize)
+        values = np.frombuffer(body, stored, n_stored)
     if len(values) < count:
         raise FileFormatError(
-            f"the PGM file holds {len(values)} of {count} values",
-            where=where,
-            remedy="copy the file again or leave it out",
+            f"the PGM file holds {len(values)} of {count} values", where=where, remedy=CUT
         )
-    values = values[:count].reshape(shape)
-    image = values.astype(np.uint16) if greatest > 255 else values.astype(np.uint8)
-    return image, greatest.bit_length()
+    image = values[:count].reshape(shape)
+    return _as_image(image.astype(stored.newbyteorder("="))), greatest.bit_length()
 
 
-def _ascii_values(body: bytes, where: str) -> IntArray:
+def _ascii_values(body: bytes, where: str) -> NDArray[Any]:
     words = re.sub(rb"#[^\n]*", b"", body).split()
-    try:
-        values = np.array([int(word) for word in words], dtype=np.int64)
-    except ValueError as error:
+    if not all(word.isdigit() and len(word) <= 5 for word in words):
         raise FileFormatError(
-            "the PGM file holds words that are no numbers",
+            "the PGM file holds words that are no numbers from 0 to 65535",
             where=where,
             remedy="save the image as PNG",
-        ) from error
-    if len(values) and not 0 <= values.min() <= values.max() <= 65535:
+        )
+    values = np.array(list(map(int, words)), dtype=np.int64)
+    if values.max(initial=0) > 65535:
         raise FileFormatError(
-            "the PGM file holds values outside 0 to 65535",
-            where=where,
-            remedy="save the image as PNG",
+            "the PGM file holds values beyond 65535", where=where, remedy="save the image as PNG"
         )
     return values
 
@@ -431,7 +454,7 @@ def read_exposure(
         If pixels exceed the stated bits.
     """
     path = Path(path)
-    name = path.name if source is None else source
+    name = path_text(path.name) if source is None else source
     data = read_bytes(path)
     kind = image_format(data)
     if kind is None:
@@ -493,7 +516,7 @@ def check_same_size(exposures: Sequence[Exposure]) -> None:
 
 def source_names(paths: Sequence[Path]) -> tuple[str, ...]:
     """Names of files for messages: the file name, with folders where file names repeat."""
-    tails = [list(reversed(path.as_posix().split("/"))) for path in paths]
+    tails = [list(reversed(path_text(path).split("/"))) for path in paths]
     names = [tail[0] for tail in tails]
     for depth in range(2, max(map(len, tails), default=0) + 1):
         repeated = {name for name, count in Counter(names).items() if count > 1}

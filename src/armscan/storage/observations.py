@@ -1,38 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a calibration saw, in one ``.npz``: enough to solve again and to draw, without pixels."""
+"""What a calibration saw, in one ``.npz``: enough to solve again and to draw, without pixels.
+
+The records of one kind are one after the other in arrays ``KIND_FIELD``; ``KIND_n_points`` says how
+many rows each has. Numbers, texts and poses have an entry a record.
+"""
 
 from __future__ import annotations
 
 import io
+import math
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
+from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.sheets.result import LaserFit, PlacedBoard, PointUse
 from armscan.errors import FileFormatError, InputError
-from armscan.geometry.arrays import BoolArray
+from armscan.geometry.arrays import BoolArray, IntArray
 from armscan.geometry.poses import Pose
 from armscan.records.profile import Profile, StripeFlag
-from armscan.storage.files import read_bytes
+from armscan.storage.files import path_text, read_bytes
 from armscan.vision.targets.target import TargetView
 
-VIEW_ARRAYS = ("point_index", "points_px", "covariance_px2", "points_board_mm")
-VIEW_SCALARS = ("source", "width_px", "height_px", "is_ambiguous")
 LASERS_APART = "\n"
-PROFILE_ARRAYS = (
-    "points_px",
-    "normals_px",
-    "sigma_px",
-    "width_px",
-    "intensity",
-    "flags",
-    "segment",
+R = TypeVar("R")
+Arrays = Mapping[str, NDArray[Any]]
+
+MOST_BYTES = 512 * 2**20
+"""Of all arrays together; a file of some megabytes may claim any size."""
+MOST_RECORDS = 1_000_000
+NOT_KEPT = {TargetView: ("edges",), PosedStripe: ("by_sensor",)}
+"""Fields that follow from the rest, or that nothing needs again: the derivatives of a stripe's
+points follow from the points, their sheets and the sensor."""
+DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, InputError, OSError, EOFError),
+    *(ValueError, TypeError, KeyError, IndexError, OverflowError, SyntaxError, RecursionError),
+    *(NotImplementedError, RuntimeError, MemoryError),
 )
+"""What the libraries raise for content that is none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,7 +77,7 @@ class StripeContext:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
-    """Target views, and the stripes seen with them.
+    """What images showed.
 
     Parameters
     ----------
@@ -77,21 +89,28 @@ class Observations:
         Hash of the image of each source name.
     contexts
         One entry a profile; empty in files of versions before they were kept.
+    stripes
+        Points of a hand-eye's exposures in the Sensor frame, with the arm's poses and without
+        derivatives.
     """
 
-    views: tuple[TargetView, ...]
-    profiles: tuple[Profile, ...]
-    sha256: Mapping[str, str]
+    views: tuple[TargetView, ...] = ()
+    profiles: tuple[Profile, ...] = ()
+    sha256: Mapping[str, str] = field(default_factory=dict)
     contexts: tuple[StripeContext, ...] = ()
+    stripes: tuple[PosedStripe, ...] = ()
 
 
 def pack_observations(
-    views: Sequence[TargetView],
-    profiles: Sequence[Profile],
-    sha256: Mapping[str, str],
+    views: Sequence[TargetView], profiles: Sequence[Profile], sha256: Mapping[str, str]
 ) -> bytes:
-    """Content of the ``.npz`` file; see `Observations`."""
-    return _packed(_arrays(views, profiles, sha256))
+    """Content of the ``.npz`` file of a camera or a pair; see `Observations`."""
+    return _content(_arrays(views, profiles, sha256))
+
+
+def pack_posed_stripes(stripes: Sequence[PosedStripe], sha256: Mapping[str, str]) -> bytes:
+    """Content of the ``.npz`` file of a hand-eye: points of each exposure and the arm's pose."""
+    return _content(_arrays((), (), sha256) | _packed("stripe", stripes))
 
 
 def pack_board_stripes(fit: LaserFit, sha256: Mapping[str, str]) -> bytes:
@@ -115,7 +134,7 @@ def pack_board_stripes(fit: LaserFit, sha256: Mapping[str, str]) -> bytes:
             raise InputError(f"{board.view.source}: the board's pose in Sensor is not given")
         placed.append(board.placed)
     lasers = [LASERS_APART.join(board.lasers) for board in boards]
-    return _packed(
+    return _content(
         _arrays([board.view for board in boards], profiles, sha256)
         | {
             "board_lasers": np.array(lasers, dtype=np.str_),
@@ -137,23 +156,15 @@ def pack_board_stripes(fit: LaserFit, sha256: Mapping[str, str]) -> bytes:
 def _arrays(
     views: Sequence[TargetView], profiles: Sequence[Profile], sha256: Mapping[str, str]
 ) -> dict[str, NDArray[Any]]:
-    arrays: dict[str, NDArray[Any]] = {
+    return {
         "image_source": np.array(list(sha256), dtype=np.str_),
         "image_sha256": np.array(list(sha256.values()), dtype=np.str_),
+        **_packed("view", views),
+        **_packed("profile", profiles),
     }
-    for name in VIEW_SCALARS:
-        arrays[f"view_{name}"] = np.array([getattr(view, name) for view in views])
-    arrays["view_n_points"] = np.array([len(view) for view in views], dtype=np.int64)
-    for name in VIEW_ARRAYS if views else ():
-        arrays[f"view_{name}"] = np.concatenate([getattr(view, name) for view in views])
-    arrays["profile_source"] = np.array([profile.source for profile in profiles], dtype=np.str_)
-    arrays["profile_n_points"] = np.array([len(profile) for profile in profiles], dtype=np.int64)
-    for name in PROFILE_ARRAYS if profiles else ():
-        arrays[f"profile_{name}"] = np.concatenate([getattr(item, name) for item in profiles])
-    return arrays
 
 
-def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def _content(arrays: Arrays) -> bytes:
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
@@ -165,65 +176,114 @@ def read_observations(path: Path) -> Observations:
     Raises
     ------
     FileFormatError
-        If the file is cut short or is no such file.
+        If the file is cut short, damaged, too large or is no such file.
     """
-    data = read_bytes(path)
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
+        with zipfile.ZipFile(io.BytesIO(read_bytes(path))) as archive:
+            if sum(item.file_size for item in archive.infolist()) > MOST_BYTES:
+                raise ValueError("too large")
+            arrays = {
+                name.removesuffix(".npy"): _array(archive.read(name)) for name in archive.namelist()
+            }
+        hashes = zip(arrays["image_source"], arrays["image_sha256"], strict=True)
         return Observations(
-            views=_views(arrays),
-            profiles=_profiles(arrays),
+            views=_unpacked(TargetView, "view", arrays),
+            profiles=_unpacked(Profile, "profile", arrays),
+            sha256={str(source): str(digest) for source, digest in hashes},
             contexts=_contexts(arrays) if "board_camera" in arrays else (),
-            sha256=dict(
-                zip(arrays["image_source"].tolist(), arrays["image_sha256"].tolist(), strict=True)
-            ),
+            stripes=_unpacked(PosedStripe, "stripe", arrays),
         )
-    except (zipfile.BadZipFile, ValueError, KeyError, IndexError, EOFError, OSError) as error:
+    except DAMAGE as error:
         raise FileFormatError(
             "this is not a complete file of observations",
-            where=str(path),
+            where=path_text(path),
             remedy="copy the file again, or calibrate again",
         ) from error
 
 
-def _pieces(arrays: Mapping[str, NDArray[Any]], prefix: str, name: str) -> list[NDArray[Any]]:
-    ends = np.cumsum(arrays[f"{prefix}_n_points"])
-    return np.split(arrays[f"{prefix}_{name}"], ends[:-1]) if len(ends) else []
+def _array(content: bytes) -> NDArray[Any]:
+    """Array of an ``.npy`` file, once its header claims no more than there is."""
+    stream = io.BytesIO(content)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        raise ValueError("another version of .npy")
+    shape, _, kind = np.lib.format.read_array_header_1_0(stream)
+    if kind.kind not in "biufU" or math.prod(shape) * kind.itemsize > len(content):
+        raise ValueError("an array larger than its file")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
 
 
-def _views(arrays: Mapping[str, NDArray[Any]]) -> tuple[TargetView, ...]:
-    n = len(arrays["view_n_points"])
-    pieces = {name: _pieces(arrays, "view", name) for name in VIEW_ARRAYS if n}
+def _kept(kind: type[Any]) -> dict[str, Any]:
+    """Fields of a record and their types."""
+    hints = get_type_hints(kind)
+    return {
+        item.name: hints[item.name]
+        for item in fields(kind)
+        if item.name not in NOT_KEPT.get(kind, ())
+    }
+
+
+def _packed(word: str, records: Sequence[Any]) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {
+        f"{word}_n_points": np.array([len(record) for record in records], dtype=np.int64),
+        f"{word}_source": np.array([record.source for record in records], dtype=np.str_),
+    }
+    for name, hint in _kept(type(records[0])).items() if records else ():
+        values = [getattr(record, name) for record in records]
+        if (get_origin(hint) or hint) is Pose:
+            arrays[f"{word}_rotation"] = np.array([pose.rotation for pose in values])
+            arrays[f"{word}_translation_mm"] = np.array([pose.translation_mm for pose in values])
+        elif isinstance(values[0], np.ndarray):
+            arrays[f"{word}_{name}"] = np.concatenate(_equally_wide(values))
+        else:
+            arrays[f"{word}_{name}"] = np.array(values)
+    return arrays
+
+
+def _equally_wide(values: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Arrays filled up with zeros to the longest last axis: noises of one camera or two."""
+    widest = max(value.shape[-1] for value in values)
+    if values[0].ndim < 3 or all(value.shape[-1] == widest for value in values):
+        return values
+    return [np.pad(item, [(0, 0), (0, 0), (0, widest - item.shape[-1])]) for item in values]
+
+
+def _counts(word: str, arrays: Arrays) -> IntArray:
+    """Rows of each record of a kind."""
+    counts = arrays.get(f"{word}_n_points", np.zeros(0, dtype=np.int64))
+    if counts.ndim != 1 or len(counts) > MOST_RECORDS or (counts < 0).any():
+        raise ValueError("counts of points that are none")
+    return counts
+
+
+def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
+    counts = _counts(word, arrays)
+    ends = np.cumsum(counts)
+    columns: dict[str, Sequence[Any]] = {}
+    for name, hint in _kept(kind).items() if len(counts) else ():
+        if (get_origin(hint) or hint) is Pose:
+            turns, shifts = arrays[f"{word}_rotation"], arrays[f"{word}_translation_mm"]
+            columns[name] = [Pose(*pair) for pair in zip(turns, shifts, strict=True)]
+            continue
+        array = arrays[f"{word}_{name}"]
+        if np.ndarray in (get_origin(hint), *map(get_origin, get_args(hint))):
+            if len(array) != ends[-1]:
+                raise ValueError(f"{name} has not a row a point")
+            columns[name] = np.split(array, ends[:-1])
+        else:
+            columns[name] = array.tolist()
+    if any(len(column) != len(counts) for column in columns.values()):
+        raise ValueError("records that do not fit each other")
     return tuple(
-        TargetView(
-            source=str(arrays["view_source"][k]),
-            width_px=int(arrays["view_width_px"][k]),
-            height_px=int(arrays["view_height_px"][k]),
-            is_ambiguous=bool(arrays["view_is_ambiguous"][k]),
-            point_index=pieces["point_index"][k],
-            points_px=pieces["points_px"][k],
-            covariance_px2=pieces["covariance_px2"][k],
-            points_board_mm=pieces["points_board_mm"][k],
-        )
-        for k in range(n)
-    )
-
-
-def _profiles(arrays: Mapping[str, NDArray[Any]]) -> tuple[Profile, ...]:
-    n = len(arrays["profile_n_points"])
-    pieces = {name: _pieces(arrays, "profile", name) for name in PROFILE_ARRAYS if n}
-    return tuple(
-        Profile(
-            source=str(arrays["profile_source"][k]),
-            **{name: pieces[name][k] for name in PROFILE_ARRAYS},
-        )
-        for k in range(n)
+        kind(**{name: column[k] for name, column in columns.items()}) for k in range(len(counts))
     )
 
 
 def _contexts(arrays: Mapping[str, NDArray[Any]]) -> tuple[StripeContext, ...]:
-    on_edge = _pieces(arrays, "profile", "on_edge")
+    counts = _counts("profile", arrays)
+    if len(arrays["profile_on_edge"]) != counts.sum():
+        raise ValueError("edges that are not of the points")
+    on_edge = np.split(arrays["profile_on_edge"], np.cumsum(counts)[:-1])
     return tuple(
         StripeContext(
             lasers=tuple(filter(None, str(arrays["board_lasers"][k]).split(LASERS_APART))),

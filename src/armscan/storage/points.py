@@ -13,21 +13,25 @@ from pathlib import Path
 
 import numpy as np
 
-from armscan.errors import FileFormatError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.errors import FileFormatError, OptionError
+from armscan.geometry.arrays import FloatArray
 from armscan.records.points import MarkerSet, ProbedPoints
 from armscan.records.profile import PointProfile
-from armscan.storage.files import read_bytes
+from armscan.storage.files import path_text, read_bytes, told_of
 from armscan.storage.image_paths import expand_paths, natural_key
 from armscan.storage.images import source_names
-from armscan.storage.poses import refuse_beyond_reach
-from armscan.storage.tables import LARGEST_MM, CsvTable, csv_bytes, number_text, parse_csv, read_csv
+from armscan.storage.tables import (
+    COORDINATES,
+    LARGEST_MM,
+    CsvTable,
+    csv_bytes,
+    number_columns,
+    parse_csv,
+    read_csv,
+    refuse_beyond_reach,
+)
 
-COORDINATES = ("x_mm", "y_mm", "z_mm")
 PLANE_NAMES = ("a", "b", "c", "d")
-SMALLEST_EXTENT_MM = 2.0
-"""Points that all lie this near to each other are taken for metres: nothing that small is probed
-to place a scanner, and a plate in metres is not larger."""
 
 
 def read_probed_points(path: Path) -> ProbedPoints:
@@ -42,15 +46,12 @@ def read_probed_points(path: Path) -> ProbedPoints:
     FileFormatError
         If the file is not such a table, holds no point, or is in metres.
     """
-    return _points(parse_csv(read_bytes(path), str(path)))
+    return _probed(read_csv(path))
 
 
 def probed_points_csv(points: ProbedPoints) -> bytes:
     """Text of a table of probed points; reads back as the same numbers."""
-    columns: dict[str, tuple[str, ...]] = {
-        name: tuple(number_text(value) for value in points.points_mm[:, k])
-        for k, name in enumerate(COORDINATES)
-    }
+    columns = number_columns(COORDINATES, points.points_mm)
     if points.features:
         columns["feature"] = points.features
     kind = "tip-centre" if points.are_tip_centres else "surface"
@@ -110,7 +111,7 @@ def read_points_or_plane(path: Path) -> ProbedPoints | FloatArray:
     data = read_bytes(path)
     words = _plane_words(data)
     if words is None:
-        return _points(parse_csv(data, str(path)))
+        return _probed(parse_csv(data, path_text(path)))
     try:
         return parse_plane(words, str(path))
     except OptionError as error:
@@ -129,40 +130,16 @@ def _plane_words(data: bytes) -> str | None:
     return None
 
 
-def _points(table: CsvTable) -> ProbedPoints:
-    _refuse_metres_by_name(table)
-    table.require(COORDINATES)
-    points = table.floats(COORDINATES)
-    if not len(points):
-        raise FileFormatError(
-            "the table holds no point", where=table.where, remedy="probe the surface first"
-        )
-    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
-    if len(points) >= 3 and 0.0 < extent < SMALLEST_EXTENT_MM:
-        raise FileFormatError(
-            f"all {len(points)} points lie within {extent:.3g} mm: these look like metres",
-            where=table.where,
-            remedy="multiply x_mm, y_mm and z_mm by 1000",
-        )
+def _probed(table: CsvTable) -> ProbedPoints:
+    points = table.points("point")
     tip_diameter_mm, is_compensated = _tip(table)
-    try:
+    with told_of(table.where):
         return ProbedPoints(
             points_mm=points,
             tip_diameter_mm=tip_diameter_mm,
             features=table.columns.get("feature", ()),
             source=table.where,
             is_compensated=is_compensated,
-        )
-    except InputError as error:
-        raise FileFormatError(error.what, where=table.where, remedy=error.remedy) from error
-
-
-def _refuse_metres_by_name(table: CsvTable) -> None:
-    if {"x_m", "y_m", "z_m"} <= set(table.columns):
-        raise FileFormatError(
-            "the columns x_m, y_m, z_m are in metres",
-            where=table.where,
-            remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
         )
 
 
@@ -202,10 +179,7 @@ COVARIANCES = ("cov_xx_mm2", "cov_xy_mm2", "cov_xz_mm2", "cov_yy_mm2", "cov_yz_m
 ASSUMED_SIGMA_MM = 0.02
 """Standard deviation an axis of a marker about which a list says nothing: a probed point, or a
 ring's centre measured by two cameras."""
-
-"""Markers that all lie this near to each other are taken for metres."""
 FRAME = "frame ="
-METRES = ("x_m", "y_m", "z_m")
 _UPPER = np.triu_indices(3)
 
 
@@ -239,14 +213,9 @@ def markers_csv(markers: MarkerSet) -> bytes:
     """
     upper = markers.covariance_mm2[:, _UPPER[0], _UPPER[1]]
     columns = {"id": tuple(str(number) for number in markers.ids)}
-    columns |= _texts(COORDINATES, markers.points_mm) | _texts(COVARIANCES, upper)
+    columns |= number_columns(COORDINATES, markers.points_mm)
+    columns |= number_columns(COVARIANCES, upper)
     return csv_bytes(columns, (f"{FRAME} {markers.frame}",))
-
-
-def _texts(names: tuple[str, ...], values: FloatArray) -> dict[str, tuple[str, ...]]:
-    return {
-        name: tuple(number_text(value) for value in values[:, k]) for k, name in enumerate(names)
-    }
 
 
 def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_MM) -> MarkerList:
@@ -271,48 +240,27 @@ def read_marker_list(path: Path, *, frame: str, sigma_mm: float = ASSUMED_SIGMA_
         or a covariance is none.
     """
     table = read_csv(path)
-    if set(METRES) <= set(table.columns):
+    points = table.points("marker")
+    _, first, counts = np.unique(points, axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
         raise FileFormatError(
-            "the columns x_m, y_m, z_m are in metres",
-            where=table.where,
-            remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
+            "two markers have the same place",
+            where=table.place(int(first[np.argmax(counts > 1)])),
+            remedy="list each marker once",
         )
-    table.require(COORDINATES)
-    points = table.floats(COORDINATES)
-    if not len(points):
-        raise FileFormatError(
-            "the table holds no marker", where=table.where, remedy="measure the markers first"
-        )
-    _check_places(table, points)
+    ids = table.ints("id") if "id" in table else np.arange(1, len(table) + 1)
+    table.refuse_repeats("id", ids.tolist())
     has_covariance = any(name in table for name in COVARIANCES)
-    try:
+    frames = [text[len(FRAME) :].strip() for text in table.comments if text.startswith(FRAME)]
+    with told_of(table.where, remedy="correct the table, or measure again"):
         markers = MarkerSet(
-            ids=_ids(table),
+            ids=ids,
             points_mm=points,
             covariance_mm2=_covariance(table, sigma_mm, has_covariance=has_covariance),
-            frame=_frame(table, frame),
-            source=str(path),
+            frame=(*frames, frame)[0],
+            source=path_text(path),
         )
-    except InputError as error:
-        raise FileFormatError(
-            error.what, where=table.where, remedy="correct the table, or measure again"
-        ) from error
     return MarkerList(markers, path, "id" in table, not has_covariance)
-
-
-def _ids(table: CsvTable) -> IntArray:
-    if "id" not in table:
-        return np.arange(1, len(table) + 1)
-    ids = table.ints("id")
-    values, counts = np.unique(ids, return_counts=True)
-    if (counts > 1).any():
-        twice = int(values[np.argmax(counts > 1)])
-        raise FileFormatError(
-            f"the id {twice} occurs {counts.max()} times",
-            where=table.where,
-            remedy="number each marker once",
-        )
-    return ids
 
 
 def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> FloatArray:
@@ -331,28 +279,6 @@ def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> Fl
             remedy="give variances above 0, or leave the six columns out",
         )
     return covariance
-
-
-def _frame(table: CsvTable, frame: str) -> str:
-    named = [text[len(FRAME) :].strip() for text in table.comments if text.startswith(FRAME)]
-    return named[0] if named else frame
-
-
-def _check_places(table: CsvTable, points: FloatArray) -> None:
-    extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
-    if len(points) >= 3 and 0.0 < extent < SMALLEST_EXTENT_MM:
-        raise FileFormatError(
-            f"all {len(points)} markers lie within {extent:.3g} mm: these look like metres",
-            where=table.where,
-            remedy="multiply x_mm, y_mm and z_mm by 1000",
-        )
-    _, first, counts = np.unique(points, axis=0, return_index=True, return_counts=True)
-    if (counts > 1).any():
-        raise FileFormatError(
-            "two markers have the same place",
-            where=table.place(int(first[np.argmax(counts > 1)])),
-            remedy="list each marker once",
-        )
 
 
 PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})

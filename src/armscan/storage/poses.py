@@ -24,7 +24,7 @@ from armscan.geometry.rotations import (
 from armscan.records.recording import PoseForm
 from armscan.storage.codec import parse_json
 from armscan.storage.files import read_bytes
-from armscan.storage.tables import LARGEST_MM
+from armscan.storage.tables import refuse_beyond_reach
 
 POSITION: Final = ("x_mm", "y_mm", "z_mm")
 FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
@@ -136,24 +136,6 @@ METRES_REMEDY = (
     "multiply x, y and z by 1000; if they are millimetres, add 1000 to each x, for Base may lie "
     "anywhere"
 )
-
-
-def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
-    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass.
-
-    Raises
-    ------
-    FileFormatError
-        If one lies beyond `armscan.storage.tables.LARGEST_MM`.
-    """
-    beyond = np.abs(points_mm) > LARGEST_MM
-    if beyond.any():
-        row, column = (int(value) for value in np.argwhere(beyond)[0])
-        raise FileFormatError(
-            f"coordinate {points_mm[row, column]:g} mm (entry {row + 1}) is beyond all reach",
-            where=where,
-            remedy="correct it, or leave the entry out",
-        )
 
 
 def are_within_reach_of_base(translations_mm: FloatArray) -> bool:

@@ -5,17 +5,12 @@
 
 from __future__ import annotations
 
-import json
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import IntArray
@@ -26,59 +21,61 @@ from armscan.records.recording import (
     CameraSetup,
     Clock,
     ExposureRow,
-    PixelAlignment,
-    PixelColour,
     PoseForm,
     Session,
     SessionKind,
 )
-from armscan.storage.files import read_bytes
+from armscan.storage.codec import (
+    LARGEST_SIZE_PX,
+    Layout,
+    MismatchError,
+    RecordCodec,
+    parse_toml,
+    toml_bytes,
+)
+from armscan.storage.files import path_text, read_bytes
 from armscan.storage.tables import CsvTable
 
 SESSION_FILE = "session.toml"
 
 
-class Keys(BaseModel):
-    """Keys of one table: wrong types are refused, unknown keys are kept to be warned of."""
-
-    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
-
-
-class CameraKeys(Keys):
-    """``[[camera]]``."""
-
-    width_px: int | None = Field(None, ge=1)
-    height_px: int | None = Field(None, ge=1)
-    window_x_px: int = Field(SensorWindow().x_px, ge=0)
-    window_y_px: int = Field(SensorWindow().y_px, ge=0)
-    binning: int = Field(SensorWindow().binning, ge=1)
-    bits_used: int = Field(CameraSetup().bits_used, ge=1, le=16)
-    align: PixelAlignment = CameraSetup().align
-    colour: PixelColour = CameraSetup().colour
-
-
-class PoseKeys(Keys):
+@dataclass(frozen=True, slots=True)
+class _PoseKeys:
     """``[pose]``."""
 
     form: PoseForm = Session().pose_form
     rotation: EulerConvention = Session().rotation
 
 
-class TimeKeys(Keys):
+@dataclass(frozen=True, slots=True)
+class _TimeKeys:
     """``[time]``."""
 
     clock: Clock = Session().clock
 
 
-class SessionKeys(Keys):
+@dataclass(frozen=True, slots=True)
+class _SessionKeys:
     """The whole file."""
 
     kind: SessionKind = Session().kind
     head: str | None = None
     simulated: bool = False
-    pose: PoseKeys = PoseKeys()
-    time: TimeKeys = TimeKeys()
-    camera: list[CameraKeys] = Field(default_factory=list)
+    pose: _PoseKeys = _PoseKeys()
+    time: _TimeKeys = _TimeKeys()
+    camera: tuple[CameraSetup, ...] = ()
+
+
+WINDOW_PX = (0, LARGEST_SIZE_PX)
+LAYOUTS: Mapping[type, Layout] = {
+    _SessionKeys: Layout(optional=("simulated",)),
+    CameraSetup: Layout(flat=("window",), limits={"bits_used": (1, 16)}),
+    SensorWindow: Layout(
+        keys={"x_px": "window_x_px", "y_px": "window_y_px"},
+        optional=("binning",),
+        limits={"x_px": WINDOW_PX, "y_px": WINDOW_PX, "binning": (1, 1000)},
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,120 +105,55 @@ def read_session_file(path: Path) -> SessionFile:
     FileFormatError
         If it is no TOML, or a key has a wrong type or value.
     """
-    content = _toml(read_bytes(path), str(path))
+    where = path_text(path)
+    content = parse_toml(read_bytes(path), where, 'write lines as kind = "scan"')
+    unknown: list[str] = []
     try:
-        keys = SessionKeys.model_validate(content)
-    except ValidationError as error:
-        raise _invalid(error, str(path)) from error
+        keys = RecordCodec(LAYOUTS, unknown).read(_SessionKeys, content)
+    except MismatchError as error:
+        remedy = "write it as in the reference of folder recordings"
+        if isinstance(content.get("camera"), dict):
+            remedy = "write [[camera]] with two brackets, once a camera"
+        raise FileFormatError(str(error), where=where, remedy=remedy) from error
     session = Session(
         kind=keys.kind,
-        cameras=tuple(_setup(camera) for camera in keys.camera),
+        cameras=keys.camera,
         clock=keys.time.clock,
         pose_form=keys.pose.form,
         rotation=keys.pose.rotation,
         head=keys.head,
         is_simulated=keys.simulated,
     )
-    return SessionFile(session, frozenset(_stated(keys)), tuple(_unknown(keys, path.name)))
+    odd = tuple(f"{path.name}: the key {fact}" for fact in unknown)
+    return SessionFile(session, frozenset(_stated(content)), odd)
 
 
 def session_toml(session: Session) -> bytes:
     """Text of ``session.toml`` with every key; reads back as the same session."""
-    lines = [f"# assumed: {' '.join(fact.split())}" for fact in session.assumed]
-    lines.append(f"kind = {_quoted(session.kind)}")
-    if session.head is not None:
-        lines.append(f"head = {_quoted(session.head)}")
-    if session.is_simulated:
-        lines.append("simulated = true")
-    lines += ["", "[pose]", f"form = {_quoted(session.pose_form)}"]
-    lines.append(f"rotation = {_quoted(session.rotation)}")
-    lines += ["", "[time]", f"clock = {_quoted(session.clock)}"]
-    for camera in session.cameras:
-        lines += ["", "[[camera]]"]
-        if camera.width_px is not None:
-            lines.append(f"width_px = {camera.width_px}")
-        if camera.height_px is not None:
-            lines.append(f"height_px = {camera.height_px}")
-        lines += [
-            f"window_x_px = {camera.window.x_px}",
-            f"window_y_px = {camera.window.y_px}",
-            *([f"binning = {camera.window.binning}"] if camera.window.binning > 1 else []),
-            f"bits_used = {camera.bits_used}",
-            f"align = {_quoted(camera.align)}",
-            f"colour = {_quoted(camera.colour)}",
-        ]
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _toml(data: bytes, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(data.decode("utf-8-sig").replace("\r\n", "\n"))
-    except UnicodeDecodeError as error:
-        raise FileFormatError(
-            "this is not UTF-8 text", where=where, remedy="save it as UTF-8"
-        ) from error
-    except tomllib.TOMLDecodeError as error:
-        raise FileFormatError(
-            f"this is no TOML: {error}", where=where, remedy='write lines as kind = "scan"'
-        ) from error
-
-
-def _setup(keys: CameraKeys) -> CameraSetup:
-    return CameraSetup(
-        width_px=keys.width_px,
-        height_px=keys.height_px,
-        window=SensorWindow(keys.window_x_px, keys.window_y_px, keys.binning),
-        bits_used=keys.bits_used,
-        align=keys.align,
-        colour=keys.colour,
+    keys = _SessionKeys(
+        kind=session.kind,
+        head=session.head,
+        simulated=session.is_simulated,
+        pose=_PoseKeys(session.pose_form, session.rotation),
+        time=_TimeKeys(session.clock),
+        camera=session.cameras,
     )
+    assumed = "".join(f"# assumed: {' '.join(fact.split())}\n" for fact in session.assumed)
+    return assumed.encode() + toml_bytes(RecordCodec(LAYOUTS).write(keys))
 
 
-def _invalid(error: ValidationError, where: str) -> FileFormatError:
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    hint = "write it as in the reference of folder recordings"
-    if key == "camera":
-        hint = "write [[camera]] with two brackets, once a camera"
-    return FileFormatError(
-        f"'{key}' is {first['input']!r}: {first['msg'].lower()}", where=where, remedy=hint
-    )
-
-
-def _stated(keys: Keys, prefix: str = "") -> Iterator[str]:
-    """Names of all keys that the file holds, tables' keys with the table's name before."""
-    for name in keys.model_fields_set:
-        value = getattr(keys, name)
-        yield prefix + name
-        if isinstance(value, Keys):
-            yield from _stated(value, f"{prefix}{name}.")
-        elif isinstance(value, list):
-            # a list that nobody knows may hold anything
-            for k, item in enumerate(value):
-                if isinstance(item, Keys):
-                    yield from _stated(item, f"{prefix}{name}.{k}.")
-
-
-def _unknown(keys: Keys, file: str, prefix: str = "") -> Iterator[str]:
-    """A sentence for each key that is not known, with the nearest name that is."""
-    known = type(keys).model_fields
-    for name in keys.model_extra or {}:
-        near = get_close_matches(name, known, 1)
-        hint = f"; '{near[0]}' is" if near else ""
-        yield f"{file}: the key '{prefix}{name}' is not known and has no effect{hint}"
-    for name in known:
-        value = getattr(keys, name)
-        items = value if isinstance(value, list) else [value]
-        for item in items:
-            if isinstance(item, Keys):
-                yield from _unknown(item, file, f"{prefix}{name}.")
-
-
-def _quoted(text: str) -> str:
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+def _stated(content: Mapping[str, Any]) -> Iterator[str]:
+    """Names of the keys that the file holds, those of tables with the table's name before."""
+    for name, value in content.items():
+        yield name
+        tables = value if isinstance(value, list) else [value]
+        for k, table in enumerate(tables):
+            place = f"{name}.{k}" if isinstance(value, list) else name
+            yield from (f"{place}.{key}" for key in table) if isinstance(table, dict) else ()
 
 
 EXPOSURES_FILE = "exposures.csv"
+MOST_CAMERAS = 100
 REQUIRED = ("index", "t_ns", "camera", "file", "lasers")
 OPTIONAL = ("trigger_id", "view")
 DRIVE = re.compile(r"[A-Za-z]:")
@@ -310,7 +242,7 @@ def _check(rows: Sequence[ExposureRow], table: CsvTable) -> None:
     seen: dict[tuple[str, int, int], int] = {}
     for k, row in enumerate(rows):
         where = table.place(k)
-        if row.camera < 0:
+        if not 0 <= row.camera < MOST_CAMERAS:
             raise FileFormatError(
                 f"camera {row.camera}", where=where, remedy="count cameras from 0"
             )

@@ -7,22 +7,32 @@ import csv
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from armscan.errors import FileFormatError, InputError
+from armscan.errors import FileFormatError, InputError, shown
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.storage.files import read_bytes
+from armscan.storage.files import path_text, read_bytes
 
 INT64 = np.iinfo(np.int64)
 WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+")
 NAN = re.compile(r"[-+]?nan", re.IGNORECASE)
 DECIMAL = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
+COORDINATES = ("x_mm", "y_mm", "z_mm")
+SMALLEST_EXTENT_MM = 2.0
+"""Points that all lie this near to each other are taken for metres: nothing that small is probed
+to place a scanner or carries markers, and a plate in metres is not larger."""
+MOST_COLUMNS, MOST_CELLS = 500, 20_000_000
+"""No table of armscan has more; some gigabytes of memory hold so many cells."""
+MOST_QUOTED = 60
+"""Characters of a cell in a message."""
 
 LARGEST_MM, LARGEST = 1e7, 1e12
 """Lengths beyond ten kilometres, and any numbers beyond this, are slips that overflow later."""
@@ -64,8 +74,50 @@ class CsvTable:
         """File and line of a row, for messages."""
         return f"{self.where}, line {self.lines[row]}"
 
-    def require(self, names: Sequence[str]) -> None:
-        """Raise if a column is missing.
+    def refuse_repeats(self, name: str, values: Sequence[Any]) -> None:
+        """Raise if a value of a column occurs twice.
+
+        Raises
+        ------
+        FileFormatError
+            Naming both lines.
+        """
+        first: dict[Any, int] = {}
+        for row, value in enumerate(values):
+            if first.setdefault(value, row) != row:
+                raise FileFormatError(
+                    f"{name} {value} appears again (first in line {self.lines[first[value]]})",
+                    where=self.place(row),
+                    remedy="give each line its own",
+                )
+
+    def points(self, noun: str) -> FloatArray:
+        """Coordinates (N, 3) in mm, at least one row.
+
+        Raises
+        ------
+        FileFormatError
+            If columns or rows are missing, a cell is no number, or the points are in metres.
+        """
+        if {"x_m", "y_m", "z_m"} <= set(self.columns):
+            raise FileFormatError(
+                "the columns x_m, y_m, z_m are in metres",
+                where=self.where,
+                remedy="multiply them by 1000 and name them x_mm, y_mm, z_mm",
+            )
+        self.require(COORDINATES, noun)
+        points = self.floats(COORDINATES)
+        extent = float(np.linalg.norm(points.max(axis=0) - points.min(axis=0)))
+        if len(points) >= 3 and 0.0 < extent < SMALLEST_EXTENT_MM:
+            raise FileFormatError(
+                f"all {len(points)} {noun}s lie within {extent:.3g} mm: these look like metres",
+                where=self.where,
+                remedy="multiply x_mm, y_mm and z_mm by 1000",
+            )
+        return points
+
+    def require(self, names: Sequence[str], noun: str = "") -> None:
+        """Raise if a column is missing, or rows are; ``noun`` is a row's, where one is needed.
 
         Raises
         ------
@@ -73,13 +125,18 @@ class CsvTable:
             Naming the columns that are missing, and those that there are.
         """
         missing = [name for name in names if name not in self.columns]
+        if not missing and noun and not len(self):
+            raise FileFormatError(
+                f"the table holds no {noun}", where=self.where, remedy=f"write one line a {noun}"
+            )
         if not missing:
             return
-        other = [name for name in self.columns if name not in names]
+        other = [name for name in self.columns if name not in names and len(name) < MOST_QUOTED]
         near = {name: get_close_matches(name, other, 1, 0.4) for name in missing}
         hints = [f"'{found[0]}' may be '{name}'" for name, found in near.items() if found]
+        there = shown(", ".join(self.columns), 300)
         raise FileFormatError(
-            f"no column is called {', '.join(missing)} (there are: {', '.join(self.columns)})",
+            f"no column is called {', '.join(missing)} (there are: {there})",
             where=self.where,
             remedy=f"write the header {','.join(names)}"
             + (f"; {', '.join(hints)}" if hints else ""),
@@ -110,7 +167,7 @@ class CsvTable:
             value = _number(cell)
             if not (math.isfinite(value) or (may_lack and math.isnan(value))):
                 raise FileFormatError(
-                    f"'{cell}' in column {name} is no number",
+                    f"'{shown(cell, MOST_QUOTED)}' in column {name} is no number",
                     where=self.place(row),
                     remedy="write it as -12.5 or 1.25e-3"
                     + (", or leave it empty where it is not known" if may_lack else ""),
@@ -148,14 +205,14 @@ class CsvTable:
             return missing
         if not WHOLE_NUMBER.fullmatch(cell):
             raise FileFormatError(
-                f"'{cell}' in column {name} is no whole number",
+                f"'{shown(cell, MOST_QUOTED)}' in column {name} is no whole number",
                 where=self.place(row),
                 remedy="write all digits, without point or exponent",
             )
-        value = int(cell)
+        value = int(cell[:MOST_QUOTED])
         if not INT64.min <= value <= INT64.max:
             raise FileFormatError(
-                f"{value} in column {name} needs more than 64 bits",
+                f"{shown(cell, MOST_QUOTED)} in column {name} needs more than 64 bits",
                 where=self.place(row),
                 remedy="write fewer digits; times are whole nanoseconds",
             )
@@ -171,7 +228,7 @@ def read_csv(path: Path) -> CsvTable:
         If the file is missing, empty, not UTF-8, has no header, a column twice, or a row of
         another length than the header.
     """
-    return parse_csv(read_bytes(path), str(path))
+    return parse_csv(read_bytes(path), path_text(path))
 
 
 def parse_csv(data: bytes, where: str) -> CsvTable:
@@ -222,6 +279,11 @@ def csv_bytes(columns: Mapping[str, Sequence[str]], comments: Sequence[str] = ()
     return buffer.getvalue().encode()
 
 
+def number_columns(names: Sequence[str], values: FloatArray) -> dict[str, tuple[str, ...]]:
+    """Columns of text of an array (N, len(names)); reads back as the same numbers."""
+    return {name: tuple(map(number_text, values[:, k])) for k, name in enumerate(names)}
+
+
 def number_text(value: float) -> str:
     """Shortest text that reads back as the same number; empty for NaN."""
     return "" if math.isnan(value) else repr(float(value))
@@ -269,9 +331,17 @@ def _checked_header(header: list[str], where: str) -> list[str]:
             where=where,
             remedy="write a header with the names of the columns",
         )
-    repeated = sorted({name for name in header if header.count(name) > 1})
+    if len(header) > MOST_COLUMNS:
+        raise FileFormatError(
+            f"the header has {len(header)} columns",
+            where=where,
+            remedy=f"write at most {MOST_COLUMNS} columns, one line a row",
+        )
+    repeated = [name for name, count in Counter(header).items() if count > 1]
     if repeated or "" in header:
-        fact = f"more than one column is called {repeated[0]}" if repeated else "a name is missing"
+        fact = "a name is missing"
+        if repeated:
+            fact = f"more than one column is called {shown(repeated[0], MOST_QUOTED)}"
         raise FileFormatError(f"{fact} in the header", where=where, remedy="name each column once")
     return header
 
@@ -302,3 +372,21 @@ def _wrong_length(
         where=f"{where}, line {number}",
         remedy=remedy,
     )
+
+
+def refuse_beyond_reach(points_mm: FloatArray, where: str) -> None:
+    """Raise for coordinates (N, 3) that no instrument reaches; gaps of NaN pass.
+
+    Raises
+    ------
+    FileFormatError
+        If one lies beyond `LARGEST_MM`.
+    """
+    beyond = np.abs(points_mm) > LARGEST_MM
+    if beyond.any():
+        row, column = (int(value) for value in np.argwhere(beyond)[0])
+        raise FileFormatError(
+            f"coordinate {points_mm[row, column]:g} mm (entry {row + 1}) is beyond all reach",
+            where=where,
+            remedy="correct it, or leave the entry out",
+        )

@@ -19,12 +19,14 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import (
     CircleSection,
+    PlateReference,
     PosedStripe,
     check_diameter,
     find_sections,
 )
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import levenberg_marquardt
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.rotations import vector_from_rotation
 
@@ -111,8 +113,98 @@ def objective(
     return total
 
 
+def minimise_objective(
+    plane_base: FloatArray,
+    poses: list[Pose[Base, Tool]],
+    points_mm: list[FloatArray],
+    start: Pose[Tool, Sensor],
+) -> tuple[Pose[Tool, Sensor], float] | FitFailure:
+    """Minimise F of eq. 2.76 over the six parameters of eqs. 2.69 and 2.70; arguments as there.
+
+    Every point counts alike and the plate is exact: pose errors, the plate's flatness and the
+    probed plane's uncertainty, which are common to many points, have no place in it.
+
+    Returns
+    -------
+    tool_from_sensor, rms_mm
+        Where F is least, and the root mean square distance of the points from the plate there.
+    """
+    planes = [plane_in_tool(plane_base, pose) for pose in poses]
+    normals = np.repeat([plane[:3] for plane in planes], [len(p) for p in points_mm], axis=0)
+    offsets = np.repeat([plane[3] for plane in planes], [len(p) for p in points_mm])
+    points = np.concatenate(points_mm)
+
+    def linearise(pose: Pose[Tool, Sensor]) -> tuple[FloatArray, FloatArray]:
+        turned = pose.rotate(points)
+        misclosure = np.einsum("ni,ni->n", turned + pose.translation_mm, normals) + offsets
+        return misclosure, np.hstack([np.cross(turned, normals), normals])
+
+    found = levenberg_marquardt(start, linearise, lambda pose, step: pose.retract(step))
+    if found is None or found.system.covariance is None:
+        return FitFailure(
+            "the postures do not determine the minimum of eq. 2.76",
+            "turn the tool more, about two or three axes",
+        )
+    return found.state, float(np.sqrt(found.chi2 / len(points)))
+
+
 SAME_ROTATION_DEG = 0.1
 """Postures that turn by less against each other count as moved without turning."""
+
+
+class PrintedHandEye(ArrayRecord):
+    """A hand-eye by the printed equations, to set beside ours; it has no covariance.
+
+    Parameters
+    ----------
+    tool_from_sensor
+        The hand-eye.
+    rms_mm
+        Root mean square of what its own equations leave.
+    equations
+        Which those are.
+    """
+
+    tool_from_sensor: Pose[Tool, Sensor]
+    rms_mm: float
+    equations: str
+
+
+def as_printed(
+    stripes: Sequence[PosedStripe],
+    reference: PlateReference | float,
+    start: Pose[Tool, Sensor],
+) -> PrintedHandEye | FitFailure:
+    """The hand-eye of the same stripes by the printed equations.
+
+    Parameters
+    ----------
+    stripes
+        One entry an exposure.
+    reference
+        The plate in Base, or the diameter of a sphere in mm.
+    start
+        Where the minimum of eq. 2.76 is looked for; the two steps on a sphere need none.
+    """
+    if not isinstance(reference, PlateReference):
+        two = calibrate_in_two_steps(stripes, reference)
+        if isinstance(two, FitFailure):
+            return two
+        rms_mm = float(np.sqrt(np.mean(two.centre_misfit_mm**2)))
+        return PrintedHandEye(
+            tool_from_sensor=two.tool_from_sensor, rms_mm=rms_mm, equations="eqs. 2.45 to 2.52"
+        )
+    found = minimise_objective(
+        reference.plane.coefficients,
+        [stripe.base_from_tool for stripe in stripes],
+        [stripe.points_mm for stripe in stripes],
+        start,
+    )
+    if isinstance(found, FitFailure):
+        return found
+    return PrintedHandEye(tool_from_sensor=found[0], rms_mm=found[1], equations="eq. 2.76")
+
+
 RANK_RATIO = 1e-3
 """A direction that is weaker than the strongest by more is taken as missing."""
 

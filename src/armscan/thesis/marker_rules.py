@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from armscan.errors import InputError
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.alignments import LabelledMarkers, label_markers, paired_count
@@ -73,6 +73,25 @@ class LineCode:
         """Its cross ratio."""
         a, b, c, d = self.positions_mm
         return cross_ratio(a, b, c, d)
+
+
+def parse_code(text: str) -> LineCode:
+    """Read ``NAME=A,B,C,D``: a code and the places of its four points along their line, mm.
+
+    Raises
+    ------
+    OptionError
+        If it is not of that form, or the places do not increase.
+    """
+    name, _, places = text.partition("=")
+    try:
+        return LineCode(name.strip(), tuple(float(place) for place in places.split(",")))
+    except (ValueError, InputError) as error:
+        raise OptionError(
+            f"'{text}' is no code",
+            where="--code",
+            remedy="write NAME=0,10,25,45: four places along the line, increasing",
+        ) from error
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.calibration import SensorCalibration
-from armscan.reconstruction.labels import LabelledProfile, LabelStatus
+from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus
 from armscan.records.profile import Profile
 
 
@@ -112,29 +113,31 @@ class RowLabeller:
         """What the schedule says."""
         return self._options.schedule.lasers(self._exposure)
 
-    def name(
+    def label(
         self,
-        profile: Profile,
-        lasers: tuple[str, ...],
-        base_from_sensor: Pose[Base, Sensor] | None,
-        t_ns: int,
-    ) -> LabelledProfile:
-        """Name the points of the next exposure; see `StripeLabeller`. Pose, time do not matter."""
+        profiles: Sequence[Profile],
+        lasers: tuple[str, ...] = (),
+        base_from_sensor: Pose[Base, Sensor] | None = None,
+        t_ns: int = 0,
+    ) -> LabelledInstant:
+        """Label the points of the next exposure; pose and time do not matter."""
         self._exposure += 1
+        (profile,) = profiles
         is_asked = profile.is_accepted
         sheet = np.full(len(profile), -1)
-        fate = np.where(is_asked, int(LabelStatus.UNEXPLAINED), int(LabelStatus.NOT_ASKED))
+        status = np.where(is_asked, PointStatus.STRAY, PointStatus.FLAGGED)
         if len(lasers) == 1 and lasers[0] in self._names:
             sheet[is_asked] = self._names.index(lasers[0])
             self._rows[lasers[0]] = profile.points_px[is_asked]
-            how = f"sheet {lasers[0]}, the laser that was on"
+            reason = f"sheet {lasers[0]}, the laser that was on"
         else:
             known = [name for name in self._names if name in self._rows]
             if known:
                 sheet[is_asked] = self._compared(profile.points_px[is_asked], known)
-            how = f"rows of earlier exposures, within {self._options.threshold_px:g} px"
-        fate[sheet >= 0] = int(LabelStatus.NAMED)
-        return LabelledProfile(profile, sheet, fate, how)
+            reason = f"rows of earlier exposures, within {self._options.threshold_px:g} px"
+        status[sheet >= 0] = PointStatus.MEASURED
+        labelled = LabelledProfile(profile=profile, sheet=sheet, status=status, reason=reason)
+        return LabelledInstant((labelled,))
 
     def _compared(self, points_px: FloatArray, known: list[str]) -> IntArray:
         """(N,) sheet of the smallest difference of rows, -1 where none is within T."""

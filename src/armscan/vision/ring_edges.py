@@ -30,7 +30,7 @@ _MAX_MISFIT_SHARE, _MAX_MISFIT_PX = 0.02, 0.2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rims:
+class MeasuredRims:
     """N measured rims.
 
     ``ellipses``: The fits. ``centres_px``: (N, 2) centres of the ellipses. ``half_px``: (N, 2) half
@@ -53,7 +53,7 @@ class Rims:
 
 def measure_rims(
     grey: RawGrey, blobs: Blobs, gaps_px: FloatArray, min_contrast_levels: float
-) -> Rims:
+) -> MeasuredRims:
     """Measure the outlines of blobs.
 
     ``grey``: (H, W) raw levels. ``blobs``: N blobs. ``gaps_px``: (N,) distance to the nearest other
@@ -79,7 +79,7 @@ def measure_rims(
     safe = ellipses.circles_where(~is_edge, blobs.centres_px)
     half, directions = safe.axes()
     is_edge &= _is_near(safe, half, blobs)
-    return Rims(safe, safe.centres()[0], half, directions, contrast, is_edge)
+    return MeasuredRims(safe, safe.centres()[0], half, directions, contrast, is_edge)
 
 
 def _misfit(ellipses: Ellipses, points_px: FloatArray, sigma_px: FloatArray) -> FloatArray:
@@ -142,6 +142,6 @@ def common_centres(outer: Ellipses, inner: Ellipses) -> tuple[FloatArray, FloatA
     covariance = np.zeros((len(rows), 10, 10))
     covariance[:, :5, :5] = outer.covariance
     covariance[:, 5:, 5:] = inner.covariance
-    spread = derivative @ covariance @ derivative.transpose(0, 2, 1)
+    own_covariance = derivative @ covariance @ derivative.transpose(0, 2, 1)
     centres = origin + unit[:, None] * vector[:, :2]
-    return centres, spread * (unit**2)[:, None, None], np.asarray(mismatch)
+    return centres, own_covariance * (unit**2)[:, None, None], np.asarray(mismatch)

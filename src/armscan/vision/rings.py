@@ -20,15 +20,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.exposure import Exposure
 from armscan.records.points import RingImages
-from armscan.vision.ring_edges import Rims, common_centres, measure_rims, nearest_gaps_px
+from armscan.vision.ring_edges import MeasuredRims, common_centres, measure_rims, nearest_gaps_px
 from armscan.vision.targets.circle_lattice import Blobs, find_blobs
 from armscan.vision.targets.grey import grey_channels, to_grey8
 
-THESIS_PERIMETER_PX = (200.0, 350.0)
-"""Limits of eq. 4.19 as the thesis sets them."""
 THESIS_MAX_ROUNDNESS = 1.7
 """Limit of eq. 4.21: a tilt of 54 degrees by the convention of `armscan.vision.rings`."""
 
@@ -43,7 +41,7 @@ class RingOptions:
     ----------
     min_perimeter_px, max_perimeter_px
         Limits of the outer rim's circumference, as if the ring were not tilted (eq. 4.19);
-        `perimeter_limits` derives them from a marker's size.
+        `perimeter_limits` derives them from a marker's size; the thesis has 200 to 350.
     max_roundness
         Largest C of eq. 4.20 (eq. 4.21).
     disc
@@ -212,7 +210,7 @@ def detect_rings(exposure: Exposure, options: RingOptions | None = None) -> Ring
     nested[pairs[0]] = nested[pairs[1]] = True
     rims = measure_rims(
         grey,
-        blobs.subset(nested),
+        blobs.select(nested),
         nearest_gaps_px(blobs, pairs)[nested],
         options.min_contrast * exposure.full_scale,
     )
@@ -220,7 +218,9 @@ def detect_rings(exposure: Exposure, options: RingOptions | None = None) -> Ring
     return _filtered(exposure, rims, outer, inner, options)
 
 
-def _chosen(rims: Rims, cluster: IntArray, options: RingOptions) -> tuple[IntArray, IntArray]:
+def _chosen(
+    rims: MeasuredRims, cluster: IntArray, options: RingOptions
+) -> tuple[IntArray, IntArray]:
     """Rows of the outermost and innermost rim of each cluster that has both."""
     towards_disc = rims.contrast_levels if options.disc == "light" else -rims.contrast_levels
     rows = []
@@ -239,13 +239,13 @@ def _chosen(rims: Rims, cluster: IntArray, options: RingOptions) -> tuple[IntArr
 
 
 def _filtered(
-    exposure: Exposure, rims: Rims, outer: IntArray, inner: IntArray, options: RingOptions
+    exposure: Exposure, rims: MeasuredRims, outer: IntArray, inner: IntArray, options: RingOptions
 ) -> RingDetection:
     window = exposure.window
     half = rims.half_px * window.binning
     size, shape = perimeters_px(half[outer]), roundness(half[outer])
     centres, covariance, mismatch = common_centres(
-        rims.ellipses.subset(outer), rims.ellipses.subset(inner)
+        rims.ellipses.select(outer), rims.ellipses.select(inner)
     )
     shift = np.hypot(*(rims.centres_px[outer] - rims.centres_px[inner]).T)
     fails = np.stack(
@@ -267,18 +267,10 @@ def _filtered(
         outer_half_px=half[outer][kept],
         inner_half_px=half[inner][kept],
         direction_rad=np.arctan2(long[:, 1], long[:, 0])[kept],
-        contrast=_contrast(rims, inner, exposure)[kept],
+        contrast=-rims.contrast_levels[inner][kept] / exposure.full_scale,
         perimeter_px=size[kept],
         roundness=shape[kept],
     )
-    return RingDetection(rings, centres[~kept], _reasons(fails, kept))
-
-
-def _contrast(rims: Rims, inner: IntArray, exposure: Exposure) -> FloatArray:
-    """Level of the disc minus that of the ring, as a fraction of full scale."""
-    return np.asarray(-rims.contrast_levels[inner] / exposure.full_scale)
-
-
-def _reasons(fails: BoolArray, kept: BoolArray) -> tuple[str, ...]:
-    first = fails.argmax(axis=0)[~kept]
-    return tuple(_REASONS[k] for k in first)
+    return RingDetection(
+        rings, centres[~kept], tuple(_REASONS[k] for k in fails.argmax(axis=0)[~kept])
+    )

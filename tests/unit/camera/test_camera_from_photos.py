@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Real photographs; skipped where the data folder is absent."""
 
-import os
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -14,14 +11,13 @@ from armscan.pipeline.progress import ProgressEvent
 from armscan.records.exposure import Exposure
 from armscan.storage.images import read_exposure
 from armscan.vision.targets.target import Chessboard, CircleGrid
-
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
+from rigs.photographs import DATA
 
 
 def photos(pattern: str) -> list[Exposure]:
     paths = sorted(DATA.glob(pattern))
     if not paths:
-        pytest.skip(f"no photographs {pattern} in the data folder (set ARMSCAN_DATA)")
+        pytest.skip("no real photographs: set ARMSCAN_DATA")
     return [read_exposure(path) for path in paths]
 
 

@@ -9,7 +9,7 @@ import scipy.optimize
 from scipy.stats import norm
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.least_squares import (
     HUBER_LIMIT,
     MAD_TO_SIGMA,
@@ -17,7 +17,6 @@ from armscan.geometry.least_squares import (
     huber_weights,
     levenberg_marquardt,
     minimise,
-    reject_outliers,
     robust_sigma,
     square_root,
 )
@@ -159,16 +158,3 @@ def test_robust_constants_are_those_of_the_normal_distribution() -> None:
     variance = inside - 2.0 * HUBER_LIMIT * norm.pdf(HUBER_LIMIT) + clipped
     np.testing.assert_allclose(inside**2 / variance, 0.95, atol=1e-3)
     np.testing.assert_allclose(huber_weights(np.array([-0.5, 1.345, -2.69])), [1.0, 1.0, 0.5])
-
-
-def test_outliers_are_rejected_until_nothing_changes() -> None:
-    values = np.concatenate([np.random.default_rng(RNG_SEED).normal(0.0, 1.0, 50), [30.0, -40.0]])
-    eligible = np.arange(52) > 0
-
-    def fit(used: BoolArray) -> FloatArray:
-        return np.asarray(values - values[used].mean())
-
-    used = reject_outliers(fit, eligible, sigmas=6.0)
-    assert used.sum() == 49
-    assert not used[0]
-    assert not used[50:].any()

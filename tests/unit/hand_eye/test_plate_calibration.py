@@ -137,7 +137,7 @@ def test_the_coupling_is_what_a_changed_sensor_does() -> None:
         for s in stripes
     ]
     fit = _fitted(by_shift, plate)
-    coupling = fit.calibration.sensor_coupling
+    coupling = fit.calibration.dhand_eye_dsensor
     assert coupling is not None
     for k, step in enumerate(1e-3 * np.eye(3)):
         moved = _fitted([replace(s, points_mm=s.points_mm + step) for s in stripes], plate)

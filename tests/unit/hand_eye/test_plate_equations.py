@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.observations import (
@@ -14,10 +15,12 @@ from armscan.calibration.hand_eye.observations import (
 )
 from armscan.calibration.hand_eye.surface import HandEyeState, PlateSurface, place
 from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Points, Pose, Tool
 from armscan.thesis.hand_eye import (
     design_rows,
     hand_eye_unknowns,
+    minimise_objective,
     objective,
     plane_in_tool,
     rotation_from_angles,
@@ -117,3 +120,27 @@ def test_a_shifted_plane_is_the_plane_of_the_residuals() -> None:
     np.testing.assert_allclose(
         plane.distance_mm(placed.points_base_mm), placed.residual_mm, atol=2e-6
     )
+
+
+def test_the_minimum_of_the_objective_is_found_from_afar() -> None:
+    """Eq. 2.76: exact points give the truth; noisy ones a value that no step lowers."""
+    rig = PlateRig(good_postures(8, np.random.default_rng(3)), SILENT)
+    far = TOOL_FROM_SENSOR.retract(np.array([0.1, -0.2, 0.15, 8.0, -5.0, 6.0]))
+    for noisy in (rig, PlateRig(rig.postures)):
+        stripes, _ = noisy.draw(3)
+        poses = [stripe.base_from_tool for stripe in stripes]
+        points = [stripe.points_mm for stripe in stripes]
+        found = minimise_objective(PLANE, poses, points, far)
+        assert not isinstance(found, FitFailure)
+        pose, rms_mm = found
+        least = objective(PLANE, poses, points, pose)
+        assert rms_mm**2 * sum(map(len, points)) == pytest.approx(least, rel=1e-6, abs=1e-9)
+        if noisy is rig:
+            np.testing.assert_allclose(
+                pose.translation_mm, TOOL_FROM_SENSOR.translation_mm, atol=1e-5
+            )
+            continue
+        for k in range(6):
+            for way in (-1.0, 1.0):
+                beside = pose.retract(way * 1e-4 * np.eye(6)[k] * (1.0 if k < 3 else 100.0))
+                assert objective(PLANE, poses, points, beside) > least

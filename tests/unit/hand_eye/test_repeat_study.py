@@ -82,7 +82,7 @@ def test_sound_predictions_are_found_sound_and_bad_ones_named() -> None:
         return HandEyeCalibration(
             tool_from_sensor=moved,
             covariance=stated,
-            sensor_coupling=None,
+            dhand_eye_dsensor=None,
             arm_noise=ArmNoise(position_mm=0.01, rotation_rad=1e-5),
             rms_mm=0.01,
             n_postures=12,
@@ -117,7 +117,7 @@ def test_one_sensors_error_that_moves_the_repeats_apart_is_predicted() -> None:
             HandEyeCalibration(
                 tool_from_sensor=moved,
                 covariance=1e-16 * np.eye(6),
-                sensor_coupling=coupling,
+                dhand_eye_dsensor=coupling,
                 arm_noise=ArmNoise(position_mm=0.01, rotation_rad=1e-5),
                 rms_mm=0.01,
                 n_postures=12,

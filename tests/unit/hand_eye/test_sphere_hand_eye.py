@@ -152,7 +152,7 @@ def test_the_sensors_error_counts_once() -> None:
             for stripe in rig.stripes(poses, generator)
         ]
         fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK, sensor_covariance=known))
-        coupling = fit.calibration.sensor_coupling
+        coupling = fit.calibration.dhand_eye_dsensor
         assert coupling is not None
         total = fit.calibration.covariance + coupling @ known @ coupling.T
         squares.append(float(error_of(fit) @ np.linalg.solve(total, error_of(fit))))
@@ -200,7 +200,7 @@ def test_an_error_of_the_sensor_moves_the_hand_eye_against_it() -> None:
     shifts = np.broadcast_to(np.eye(3), (rig.n_points, 3, 3))
     stripes = [replace(stripe, dpoint_dsensor=shifts) for stripe in stripes]
     fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK))
-    coupling = fit.calibration.sensor_coupling
+    coupling = fit.calibration.dhand_eye_dsensor
     assert coupling is not None
     np.testing.assert_allclose(coupling[:3], 0.0, atol=1e-6)
     np.testing.assert_allclose(coupling[3:], -HAND_EYE.rotation, atol=1e-4)

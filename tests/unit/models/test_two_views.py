@@ -247,7 +247,7 @@ def test_points_follow_the_parameters(number: int) -> None:
     expected = (found(nudged(VIEWS, number, step)) - found(nudged(VIEWS, number, -step))) / (
         2.0 * step
     )
-    derivative = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE).by_parameters
+    derivative = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE).dpoint_dparameters
     assert np.abs(derivative[:, :, number] - expected).max() < 1e-4 * np.abs(expected).max()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lasers chosen while a scan is taken: what is asked for is exposed, strokes stay apart."""
+"""Lasers chosen while a scan is taken: what is asked for is exposed, passes stay apart."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from armscan.pipeline.adaptive_scan import (
     ChosenLasers,
     TakenPass,
     scan_adaptively,
-    strokes,
-    take_stroke,
+    scan_passes,
+    take_pass,
 )
-from armscan.reconstruction.labels import STROKE_GAP_NS, LabelledProfile, LabelStatus
+from armscan.reconstruction.labels import (
+    PASS_GAP_NS,
+    LabelledInstant,
+    LabelledProfile,
+    PointStatus,
+)
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, ExposureRow, Session
@@ -67,7 +72,7 @@ class DarkScan:
 
     def expose(self, row: int, lasers: tuple[str, ...]) -> Exposure:
         self.asked.append((row, lasers))
-        image = np.full((40, 60), 4, np.uint8)
+        image = np.full((1536, 2048), 4, np.uint8)
         return Exposure(image, f"{row}.png", lasers=lasers, t_ns=self.rows[row].t_ns)
 
     def true_stripes(self, row: int) -> Sequence[TrueStripe]:
@@ -81,20 +86,23 @@ class Counting:
     told: list[tuple[tuple[str, ...], bool, int]] = field(default_factory=list)
     n_since_reset: int = 0
 
-    def name(
+    def label(
         self,
-        profile: Profile,
-        lasers: tuple[str, ...],
-        base_from_sensor: Pose[Base, Sensor] | None,
-        t_ns: int,
-    ) -> LabelledProfile:
+        profiles: Sequence[Profile],
+        lasers: tuple[str, ...] = (),
+        base_from_sensor: Pose[Base, Sensor] | None = None,
+        t_ns: int = 0,
+    ) -> LabelledInstant:
+        (profile,) = profiles
         self.n_since_reset += 1
         self.told.append((lasers, base_from_sensor is not None, t_ns))
         if base_from_sensor is not None:
             expected = BASE_FROM_TOOL @ TOOL_FROM_SENSOR
             assert np.allclose(base_from_sensor.matrix, expected.matrix)
         n = len(profile)
-        return LabelledProfile(profile, np.full(n, -1), np.full(n, int(LabelStatus.AMBIGUOUS)), "")
+        status = np.full(n, int(PointStatus.AMBIGUOUS))
+        labelled = LabelledProfile(profile=profile, sheet=np.full(n, -1), status=status, reason="")
+        return LabelledInstant((labelled,))
 
     def next_lasers(self) -> tuple[str, ...]:
         return ("A",) if self.n_since_reset == 0 else BOTH
@@ -106,34 +114,32 @@ class Counting:
 EXPECTED = (("A",), BOTH, BOTH, BOTH, ("A",), BOTH, BOTH)
 
 
-def test_strokes_end_at_pauses() -> None:
-    assert strokes(rows()) == (range(4), range(4, 7))
-    assert strokes(rows(), gap_ns=TICK_NS - 1) == tuple(range(k, k + 1) for k in range(7))
-    gap = [replace(row, t_ns=k * STROKE_GAP_NS) for k, row in enumerate(rows())]
-    assert strokes(gap) == (range(7),)
+def test_passes_end_at_pauses() -> None:
+    assert scan_passes(rows()) == (range(4), range(4, 7))
+    assert scan_passes(rows(), gap_ns=TICK_NS - 1) == tuple(range(k, k + 1) for k in range(7))
+    gap = [replace(row, t_ns=k * PASS_GAP_NS) for k, row in enumerate(rows())]
+    assert scan_passes(gap) == (range(7),)
     with pytest.raises(InputError, match="order of time"):
-        strokes(rows()[::-1])
+        scan_passes(rows()[::-1])
 
 
 def test_what_the_namer_asks_for_is_exposed_and_named() -> None:
     scan, namer = DarkScan(), Counting()
     kept: list[int] = []
-    chosen, taken = scan_adaptively(
-        scan, scanner(), namer, keep=lambda row, exposure: kept.append(row)
-    )
+    chosen = scan_adaptively(scan, scanner(), namer, keep=lambda row, exposure: kept.append(row))
     assert tuple(on for _, on in scan.asked) == EXPECTED
     assert [t_ns for *_, t_ns in namer.told] == TIMES_NS
     # the arm's pose of row 2 is not known: the namer is told so, nothing is made up
     assert [has_pose for _, has_pose, _ in namer.told] == [k != 2 for k in range(7)]
     assert chosen.lasers == EXPECTED
-    assert [stroke.lasers for stroke in taken] == [EXPECTED[:4], EXPECTED[4:]]
     assert kept == list(range(7))
 
 
-def test_strokes_can_be_taken_in_any_order() -> None:
+def test_passes_can_be_taken_in_any_order() -> None:
     scan = DarkScan()
-    taken = [take_stroke(scan, r, Counting(), lambda row: None) for r in strokes(scan.rows)[::-1]]
-    assert ChosenLasers.of_strokes(scan, taken).lasers == EXPECTED
+    taken = [take_pass(scan, r, Counting(), scanner()) for r in scan_passes(scan.rows)[::-1]]
+    assert [one.lasers for one in taken] == [EXPECTED[4:], EXPECTED[:4]]
+    assert ChosenLasers.of_passes(scan, taken).lasers == EXPECTED
 
 
 def test_the_rows_of_the_result_name_their_lasers_and_are_exposed_so() -> None:
@@ -149,10 +155,10 @@ def test_the_rows_of_the_result_name_their_lasers_and_are_exposed_so() -> None:
     assert chosen.name == "dark"
 
 
-def test_missing_strokes_and_rows_are_refused() -> None:
+def test_missing_passes_and_rows_are_refused() -> None:
     scan = DarkScan()
     with pytest.raises(InputError, match="lasers of 1 exposures for 7 rows"):
         ChosenLasers(scan, (BOTH,))
-    part = TakenPass((0, 1), (BOTH, BOTH), ())
+    part = TakenPass((0, 1), (BOTH, BOTH))
     with pytest.raises(InputError, match="2 of 7"):
-        ChosenLasers.of_strokes(scan, [part])
+        ChosenLasers.of_passes(scan, [part])

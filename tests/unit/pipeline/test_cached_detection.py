@@ -138,7 +138,7 @@ def test_other_options_and_other_code_are_other_entries(monkeypatch: pytest.Monk
     }
     monkeypatch.setattr(detection_cache, "code_version", lambda: "newer")
     keys.add(detection_key("target", exposure, (GRID,)))
-    assert len(keys) == 6
+    assert len(keys) == 5
 
 
 def test_the_code_version_follows_the_detectors_sources(

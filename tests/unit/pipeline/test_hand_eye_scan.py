@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.devices.sources import ScanSource
-from armscan.errors import EstimationError, InputError, OptionError
+from armscan.errors import EstimationError, InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.models.calibration import (
     CameraCalibration,
@@ -20,12 +22,7 @@ from armscan.models.calibration import (
 )
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.pipeline.hand_eye import (
-    HandEyeRun,
-    HandEyeScanOptions,
-    _left_out,
-    calibrate_hand_eye_from_scan,
-)
+from armscan.pipeline.hand_eye import ObservedStripes, _left_out, observe_stripes
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from rigs.plate_rig import SHEET, SILENT, TOOL_FROM_SENSOR, PlateRig, Surface, good_postures
@@ -157,11 +154,26 @@ class DrawnScan:
         return f"posture {k // self.repeats}"
 
 
-def _run(source: ScanSource, options: HandEyeScanOptions | None = None) -> HandEyeRun:
+@dataclass(frozen=True)
+class Run:
+    """What was seen, and the hand-eye of it."""
+
+    seen: ObservedStripes
+    fit: HandEyeFit
+
+
+def _fit(
+    source: ScanSource, sensor: SensorCalibration, **limits: int
+) -> tuple[ObservedStripes, HandEyeFit | FitFailure]:
     _, plate = RIG.draw(0)
-    run = calibrate_hand_eye_from_scan(source, _sensor(), plate, options)
-    assert isinstance(run, HandEyeRun)
-    return run
+    seen = observe_stripes(source, sensor, **limits)
+    return seen, calibrate_on_plate(seen.stripes, plate, sensor_covariance=sensor.covariance)
+
+
+def _run(source: ScanSource, **limits: int) -> Run:
+    seen, fit = _fit(source, _sensor(), **limits)
+    assert isinstance(fit, HandEyeFit)
+    return Run(seen, fit)
 
 
 def test_images_and_poses_give_the_hand_eye() -> None:
@@ -173,16 +185,16 @@ def test_images_and_poses_give_the_hand_eye() -> None:
     assert np.abs(error[:3]).max() < limit_mm / 33.0
     assert run.fit.calibration.n_postures == 8
     assert run.fit.calibration.n_exposures == 16
-    coupling = run.fit.calibration.sensor_coupling
+    coupling = run.fit.calibration.dhand_eye_dsensor
     assert coupling is not None and coupling.shape == (6, 17)
-    assert len(run.images) == len(run.stripes) == 16
-    assert run.warnings == ()
+    assert len(run.seen.images) == len(run.seen.stripes) == 16
+    assert run.seen.warnings == ()
 
 
 def test_without_views_exposures_at_one_place_are_one_posture() -> None:
     run = _run(DrawnScan(repeats=2, views=False))
     assert run.fit.calibration.n_postures == 8
-    assert any("count as one posture" in warning for warning in run.warnings)
+    assert any("count as one posture" in warning for warning in run.seen.warnings)
 
 
 def test_a_moving_scan_has_a_posture_an_exposure() -> None:
@@ -192,25 +204,22 @@ def test_a_moving_scan_has_a_posture_an_exposure() -> None:
 
 def test_an_exposure_without_pose_is_named_and_left_out() -> None:
     run = _run(DrawnScan(is_first_known=False))
-    assert run.not_used == (("image0", "the arm gave no pose for it"),)
+    assert run.seen.not_used == (("image0", "the arm gave no pose for it"),)
     assert run.fit.calibration.n_postures == 7
 
 
 def test_a_long_scan_is_thinned_evenly_and_says_so() -> None:
-    run = _run(DrawnScan(repeats=2), HandEyeScanOptions(max_exposures=8))
-    assert len(run.stripes) == 8
-    assert any("8 of 16 exposures" in warning for warning in run.warnings)
-    with pytest.raises(OptionError):
-        HandEyeScanOptions(max_exposures=2)
+    run = _run(DrawnScan(repeats=2), max_exposures=8)
+    assert len(run.seen.stripes) == 8
+    assert any("8 of 16 exposures" in warning for warning in run.seen.warnings)
 
 
 def test_a_scan_without_arm_or_without_stripes_says_so() -> None:
-    _, plate = RIG.draw(0)
     with pytest.raises(InputError, match="no samples of the arm"):
-        calibrate_hand_eye_from_scan(DrawnScan(has_arm=False), _sensor(), plate)
+        observe_stripes(DrawnScan(has_arm=False), _sensor())
     behind = replace(_sensor().sheets[0], depth_range_mm=(1000.0, 1010.0))
     sensor = replace(_sensor(), sheets=(behind,))
-    failure = calibrate_hand_eye_from_scan(DrawnScan(), sensor, plate)
+    _, failure = _fit(DrawnScan(), sensor)
     assert isinstance(failure, FitFailure)
     assert "0 postures" in failure.reason
 
@@ -229,13 +238,12 @@ class TornScan(DrawnScan):
 
 def test_an_unreadable_image_is_named_and_left_out() -> None:
     run = _run(TornScan(torn=(2,)))
-    assert [name for name, _ in run.not_used] == ["image2"]
-    assert "not an image" in run.not_used[0][1]
-    assert any("1 exposures were not used: image2 (" in warning for warning in run.warnings)
+    assert [name for name, _ in run.seen.not_used] == ["image2"]
+    assert "not an image" in run.seen.not_used[0][1]
+    assert any("1 exposures were not used: image2 (" in warning for warning in run.seen.warnings)
     assert run.fit.calibration.n_postures == 7
-    _, plate = RIG.draw(0)
     with pytest.raises(EstimationError, match=r"could be read: .*not an image"):
-        calibrate_hand_eye_from_scan(TornScan(torn=tuple(range(8))), _sensor(), plate)
+        observe_stripes(TornScan(torn=tuple(range(8))), _sensor())
 
 
 @dataclass(frozen=True)
@@ -260,7 +268,7 @@ class BackgroundScan(DrawnScan):
 def test_the_background_of_a_view_is_read_once() -> None:
     scan = BackgroundScan(repeats=3)
     run = _run(scan)
-    assert len(run.stripes) == 16
+    assert len(run.seen.stripes) == 16
     assert sorted(scan.read) == list(range(24))
 
 
@@ -274,9 +282,8 @@ class TwoCameraScan(DrawnScan):
 
 
 def test_two_cameras_are_not_mixed() -> None:
-    _, plate = RIG.draw(0)
     with pytest.raises(InputError, match="exposures of cameras 0, 1"):
-        calibrate_hand_eye_from_scan(TwoCameraScan(), _sensor(), plate)
+        observe_stripes(TwoCameraScan(), _sensor())
 
 
 def test_exposures_that_were_not_used_are_counted_beyond_those_named() -> None:

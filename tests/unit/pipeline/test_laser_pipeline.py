@@ -12,11 +12,10 @@ from armscan.models.calibration import CameraCalibration, SensorCalibration, She
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.pipeline.laser import BOARDS_STAGE, STRIPES_STAGE, calibrate_sheets_from_pairs
-from armscan.pipeline.measure import MeasureOptions
+from armscan.pipeline.measure import MeasureOptions, reconstruct
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.reconstruct import reconstruct
-from armscan.reconstruction.label_single import DepthRange
 from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.target import Chessboard
 from rigs.sheet_rig import PROVENANCE

@@ -11,7 +11,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.jobs.reconstruct import StillPaths, read_stills
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.hand_eye import HandEyeScanOptions, observe_stripes
+from armscan.pipeline.hand_eye import observe_stripes
 from armscan.pipeline.instants import PARTNER_MISSING, SAME_TIME_NS, ScanInstants, group_instants
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
 from armscan.records.recording import ExposureRow
@@ -88,12 +88,12 @@ def test_lone_rows_are_told_from_complete_instants() -> None:
 def test_a_scan_goes_on_without_a_lost_frame(
     device: ScannerCalibration, seen_as: SeenAs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armscan.pipeline.scan.see", seen_as)
+    monkeypatch.setattr("armscan.pipeline.measure.extract_profile", seen_as)
     result = measure_scan(
-        two_camera_scan(3, lost=LOST, late_ns=1), device, ScanOptions(normals=None)
+        two_camera_scan(3, lost=LOST, late_ns=1), device, ScanOptions(has_normals=False)
     )
     placed, alone = ExposureStatus.PLACED, ExposureStatus.NO_PARTNER
-    assert [e.fate for e in result.exposures] == [placed, placed, alone, placed, placed]
+    assert [e.status for e in result.exposures] == [placed, placed, alone, placed, placed]
     assert result.exposures[2].reason == PARTNER_MISSING
     assert result.image_rows == (0, 1, 3, 4)
     assert set(result.cloud.exposure.tolist()) >= {0, 2}
@@ -107,13 +107,13 @@ def test_a_pose_that_only_the_partner_lacks_is_said_to_be_its(
     device: ScannerCalibration, seen_as: SeenAs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The right image of the last instant lies just after the arm's last sample."""
-    monkeypatch.setattr("armscan.pipeline.scan.see", seen_as)
+    monkeypatch.setattr("armscan.pipeline.measure.extract_profile", seen_as)
     scan = two_camera_scan(3, late_ns=1)
     assert scan.arm is not None
     moved = PERIOD_NS // 2
     late = [replace(row, t_ns=row.t_ns + moved) for row in scan.rows[4:]]
     result = measure_scan(
-        replace(scan, rows=(*scan.rows[:4], *late)), device, ScanOptions(normals=None)
+        replace(scan, rows=(*scan.rows[:4], *late)), device, ScanOptions(has_normals=False)
     )
     assert late[0].t_ns == scan.arm.t_ns[-1] < late[1].t_ns
     assert result.exposures[4].reason == "the other camera's image has none"
@@ -122,9 +122,9 @@ def test_a_pose_that_only_the_partner_lacks_is_said_to_be_its(
 def test_a_hand_eye_scan_names_the_image_without_partner(
     device: ScannerCalibration, seen_as: SeenAs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("armscan.pipeline.hand_eye.see", seen_as)
+    monkeypatch.setattr("armscan.pipeline.measure.extract_profile", seen_as)
     assert device.sensor is not None
-    found = observe_stripes(two_camera_scan(3, lost=LOST), device.sensor, HandEyeScanOptions())
+    found = observe_stripes(two_camera_scan(3, lost=LOST), device.sensor)
     assert found.not_used == (("images/1l.png", PARTNER_MISSING),)
     assert {item.source for item in found.stripes} >= {"images/0l.png", "images/2l.png"}
     assert any(PARTNER_MISSING in text for text in found.warnings)
@@ -151,7 +151,7 @@ def test_no_complete_instant_is_refused_in_words(
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
         measure_scan(scan, device)
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
-        observe_stripes(scan, device.sensor, HandEyeScanOptions())
+        observe_stripes(scan, device.sensor)
     with pytest.raises(InputError, match="no instant has the images of all 2 cameras"):
         read_stills(stills_of(scan, tmp_path / "scan"), ImageOptions(), 2)
 

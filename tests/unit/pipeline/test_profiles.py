@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from armscan.calibration.hand_eye.calibrate import calibrate_on_sphere
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
-from armscan.pipeline.profiles import calibrate_hand_eye_from_profiles, posed_stripes_from_profiles
+from armscan.pipeline.hand_eye import posed_stripes_from_profiles
 from armscan.records.profile import PointProfile
 
 SEED = 2
@@ -58,7 +59,7 @@ def scan(n: int) -> tuple[list[PointProfile], list[Pose[Base, Tool]]]:
 
 def test_floor_and_spikes_do_not_disturb_the_hand_eye() -> None:
     profiles, poses = scan(10)
-    fit = calibrate_hand_eye_from_profiles(profiles, poses, 2.0 * RADIUS_MM)
+    fit = calibrate_on_sphere(posed_stripes_from_profiles(profiles, poses), 2.0 * RADIUS_MM)
     assert isinstance(fit, HandEyeFit), fit
     assert fit.calibration.rms_mm < 1.2 * NOISE_MM
     error = fit.calibration.tool_from_sensor.translation_mm - TOOL_FROM_SENSOR.translation_mm

@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.errors import EstimationError, InputError, OptionError
+from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline import measure
+from armscan.pipeline import scan as scan_module
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
-from armscan.reconstruction.place import NormalOptions
 from rigs.scan_fake import (
     PERIOD_NS,
     FakeScan,
@@ -56,15 +57,16 @@ def test_the_plane_comes_back_in_base(device: ScannerCalibration) -> None:
     assert [event.done for event in events] == [0, 1, 2, 3, 4, 5, 6]
 
 
-def test_threads_and_volume_change_nothing_but_speed_and_extent(
-    device: ScannerCalibration,
+def test_reading_ahead_and_volume_change_nothing_but_speed_and_extent(
+    device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    one = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None))
-    two = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, threads=2))
+    one = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
+    monkeypatch.setattr(measure, "LOOK_AHEAD", 2)
+    two = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
     assert one.cloud.normals is None
     box = Box(np.array([-100.0, -100.0, -1.0]), np.array([100.0, 2.6, 1.0]))
-    cut = measure_scan(as_source(fake_scan()), device, ScanOptions(normals=None, volume=box))
+    cut = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False, volume=box))
     inside = box.holds(one.cloud.points_mm)
     np.testing.assert_array_equal(cut.cloud.points_mm, one.cloud.points_mm[inside])
     assert sum(e.n_outside_volume for e in cut.exposures) == int((~inside).sum()) > 0
@@ -82,7 +84,7 @@ def test_what_is_missing_is_counted_and_named(device: ScannerCalibration) -> Non
     result = measure_scan(
         as_source(replace(late, arm=replace(scan.arm, is_known=known), broken=(2,))), device
     )
-    fates = [exposure.fate for exposure in result.exposures]
+    fates = [exposure.status for exposure in result.exposures]
     placed, unreadable, no_pose = (
         ExposureStatus.PLACED,
         ExposureStatus.UNREADABLE,
@@ -111,24 +113,24 @@ def test_exposures_are_not_read_for_nothing(device: ScannerCalibration) -> None:
         {},
     ]
     shown = with_rows(scan, changes)
-    result = measure_scan(as_source(shown), device, ScanOptions(normals=None))
+    result = measure_scan(as_source(shown), device, ScanOptions(has_normals=False))
     assert sorted(shown.reads) == [0, 1, 2, 4]
-    assert [e.fate for e in result.exposures].count(ExposureStatus.LASER_OFF) == 2
+    assert [e.status for e in result.exposures].count(ExposureStatus.LASER_OFF) == 2
     assert result.image_rows == (1, 2, 4)
 
 
 def test_without_names_of_lasers_all_are_taken_as_lit(device: ScannerCalibration) -> None:
     scan = with_rows(fake_scan(3), [{"lasers": ()}] * 3)
-    result = measure_scan(as_source(scan), device, ScanOptions(normals=None))
+    result = measure_scan(as_source(scan), device, ScanOptions(has_normals=False))
     assert len(result.images) == 3
     assert any("no exposure names its lasers" in warning for warning in result.warnings)
 
 
 def test_latency_shifts_the_points_along_the_sweep() -> None:
     """1 mm a period: a quarter of a period late is 0.25 mm."""
-    on_time = measure_scan(as_source(fake_scan(4)), scanner(), ScanOptions(normals=None)).cloud
+    on_time = measure_scan(as_source(fake_scan(4)), scanner(), ScanOptions(has_normals=False)).cloud
     late = measure_scan(
-        as_source(fake_scan(4)), scanner(PERIOD_NS // 4), ScanOptions(normals=None)
+        as_source(fake_scan(4)), scanner(PERIOD_NS // 4), ScanOptions(has_normals=False)
     ).cloud
     np.testing.assert_allclose(
         late.points_mm - on_time.points_mm, np.tile([0, 0.25, 0], (len(late), 1)), atol=1e-9
@@ -146,7 +148,7 @@ def test_a_wrong_hand_eye_does_not_lie_flat(device: ScannerCalibration) -> None:
             @ device.hand_eye.tool_from_sensor,
         ),
     )
-    cloud = measure_scan(as_source(fake_scan(3)), wrong, ScanOptions(normals=None)).cloud
+    cloud = measure_scan(as_source(fake_scan(3)), wrong, ScanOptions(has_normals=False)).cloud
     assert np.abs(cloud.points_mm[:, 2]).max() > 0.1
 
 
@@ -155,7 +157,7 @@ def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> 
     with pytest.raises(InputError, match="no samples of the arm"):
         measure_scan(as_source(replace(scan, arm=None)), device)
     with pytest.raises(InputError, match="no camera"):
-        coupled = replace(device.hand_eye, sensor_coupling=None)
+        coupled = replace(device.hand_eye, dhand_eye_dsensor=None)
         measure_scan(as_source(scan), replace(device, sensor=None, hand_eye=coupled))
     with pytest.raises(EstimationError, match=r"could be measured: images/0\.png: the image"):
         measure_scan(as_source(replace(scan, broken=(0, 1, 2))), device)
@@ -164,8 +166,6 @@ def test_what_gives_no_cloud_is_refused_in_words(device: ScannerCalibration) -> 
         measure_scan(as_source(scan), device, ScanOptions(volume=away))
     with pytest.raises(InputError, match="cameras 0, 1"):
         measure_scan(as_source(with_rows(scan, [{}, {"camera": 1}, {}])), device)
-    with pytest.raises(OptionError, match="threads"):
-        ScanOptions(threads=0)
 
 
 def test_ctrl_c_stops_the_scan(device: ScannerCalibration) -> None:
@@ -181,9 +181,11 @@ def test_ctrl_c_stops_the_scan(device: ScannerCalibration) -> None:
     assert scan.reads == [0, 1]
 
 
-def test_a_few_points_without_normal_are_normal(device: ScannerCalibration) -> None:
-    narrow = ScanOptions(normals=NormalOptions(radius_mm=0.6))
-    result = measure_scan(as_source(fake_scan(3)), device, narrow)
+def test_a_few_points_without_normal_are_normal(
+    device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan_module, "choose_radius_mm", lambda *_: 0.6)
+    result = measure_scan(as_source(fake_scan(3)), device)
     assert any("have no normal: within 0.6 mm" in warning for warning in result.warnings)
 
 
@@ -192,7 +194,7 @@ def test_a_laser_without_sheet_is_told_of(device: ScannerCalibration) -> None:
     scan = with_rows(fake_scan(), [{"lasers": ("B",)}] * 6)
 
     def told(head: ScannerCalibration, sheet: str = "") -> bool:
-        options = ScanOptions(measure=MeasureOptions(sheet=sheet), normals=None)
+        options = ScanOptions(measure=MeasureOptions(sheet=sheet), has_normals=False)
         texts = measure_scan(as_source(scan), head, options).warnings
         return any("laser B" in text and "A" in text for text in texts)
 

@@ -21,7 +21,7 @@ from armscan.jobs import simulate as simulate_job_simulate
 from armscan.jobs.simulate import SimulateRequest, run_simulation
 from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene, truth_path
 from armscan.storage import files
 from armscan.storage.arm import read_probe_tip
@@ -178,5 +178,5 @@ def test_views_of_two_cameras_stay_together() -> None:
         replace(row, camera=k % 2, t_ns=1000 * (k // 2), view=None)
         for k, row in enumerate(whole.rows)
     )
-    kept = FewerViews(replace(whole, rows=rows), 2).rows
+    kept = fewer_views(replace(whole, rows=rows), 2).rows
     assert [(row.t_ns, row.camera) for row in kept] == [(0, 0), (0, 1), (2000, 0), (2000, 1)]

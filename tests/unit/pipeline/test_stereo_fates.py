@@ -10,18 +10,17 @@ import pytest
 
 from armscan.errors import OptionError
 from armscan.models.calibration import SensorCalibration
-from armscan.pipeline.measure import LitProfile, MeasureOptions
-from armscan.pipeline.reconstruct import ByTwoCameras, measurer_for
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.label_stereo import StereoLabelOptions
-from armscan.reconstruction.labels import LabelStatus, PointStatus, StereoStatus
-from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
+from armscan.pipeline.measure import MeasureOptions, labeller_for
+from armscan.reconstruction import points
+from armscan.reconstruction.label_stereo import StereoLabeller
+from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.points import MeasuredProfile, measure_points
+from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange
 from armscan.records.profile import Profile
 from rigs.stereo_scenes import Noise, draw_surfaces, expose
 from rigs.two_camera_scan import small_head
 
-STRICT = StereoLabelOptions(consistency_sigmas=1.0)
-"""Drops many a pair that noise alone explains."""
+Pair = tuple[MeasuredProfile, ...]
 
 
 @pytest.fixture(scope="module")
@@ -36,75 +35,70 @@ def profiles() -> tuple[Profile, Profile]:
     return left.profile, right.profile
 
 
-def shallow(sensor: SensorCalibration, found: StereoMeasurement) -> SensorCalibration:
+def measured(
+    profiles: tuple[Profile, Profile],
+    sensor: SensorCalibration,
+    depths: DepthRange | None = None,
+) -> Pair:
+    options = MeasureOptions(depths=depths)
+    labels = labeller_for(sensor, options).label(profiles)
+    return measure_points(labels, sensor, options.accepted_depths(sensor))
+
+
+def shallow(sensor: SensorCalibration, found: Pair) -> SensorCalibration:
     """The sensor, calibrated to the middle of the depths of what one camera sees alone."""
-    alone = found.right_points.points_mm[:, 2]
+    alone = found[1].points.points_mm[:, 2]
     limits = (float(np.median(alone)), float(alone.max()) + 50.0)
     sheets = tuple(replace(sheet, depth_range_mm=limits) for sheet in sensor.sheets)
     return replace(sensor, sheets=sheets)
 
 
-def n_of(fate: np.ndarray, wanted: StereoStatus) -> int:
-    return int((fate == int(wanted)).sum())
-
-
-def check(found: StereoMeasurement) -> None:
-    """Fates are those of the points and of the counts."""
-    left, right, counts = found.left_fate, found.right_fate, found.counts
-    for fate, points, named in (
-        (left, found.left_points, found.left),
-        (right, found.right_points, found.right),
-    ):
-        measured = np.isin(fate, (int(StereoStatus.FUSED), int(StereoStatus.ALONE)))
-        np.testing.assert_array_equal(np.flatnonzero(measured), points.row)
-        np.testing.assert_array_equal(fate == int(StereoStatus.UNNAMED), named.sheet == -1)
-    assert n_of(left, StereoStatus.FUSED) == counts.n_fused
-    assert n_of(left, StereoStatus.ALONE) == counts.n_left_alone
-    assert n_of(right, StereoStatus.ALONE) == counts.n_right_alone
-    assert n_of(left, StereoStatus.INCONSISTENT) == counts.n_inconsistent
-    assert counts.n_out_of_depth == sum(n_of(f, StereoStatus.OUT_OF_DEPTH) for f in (left, right))
+def check(found: Pair) -> None:
+    """States are those of the points; a right point is shared where the left one is fused."""
+    for one in found:
+        is_measured = one.labelled.status == PointStatus.MEASURED
+        np.testing.assert_array_equal(np.flatnonzero(is_measured), one.points.row)
+        unlabelled = (PointStatus.FLAGGED, PointStatus.AMBIGUOUS, PointStatus.STRAY)
+        np.testing.assert_array_equal(
+            np.isin(one.labelled.status, unlabelled), one.labelled.sheet == -1
+        )
+    assert found[0].labelled.count(PointStatus.SHARED) == 0
 
 
 def test_dropped_pairs_are_inconsistent_in_both_images(
-    sensor: SensorCalibration, profiles: tuple[Profile, Profile]
+    sensor: SensorCalibration,
+    profiles: tuple[Profile, Profile],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    kind = measure_stereo(*profiles, sensor)
-    strict = measure_stereo(*profiles, sensor, STRICT)
+    kind = measured(profiles, sensor)
+    monkeypatch.setattr(points, "CONSISTENCY_SIGMAS", 1.0)
+    strict = measured(profiles, sensor)
     for found in (kind, strict):
         check(found)
-    assert strict.counts.n_inconsistent > 100
-    gone = n_of(strict.right_fate, StereoStatus.INCONSISTENT)
+    assert strict[0].labelled.count(PointStatus.INCONSISTENT) > 100
+    gone = strict[1].labelled.count(PointStatus.INCONSISTENT)
     assert gone > 0
-    # a right point is taken, or falls with its left one: never both, never neither
-    assert gone + n_of(strict.right_fate, StereoStatus.TAKEN) == n_of(
-        kind.right_fate, StereoStatus.TAKEN
-    ) + n_of(kind.right_fate, StereoStatus.INCONSISTENT)
-    left, right = ByTwoCameras(sensor, STRICT).measure([LitProfile(p) for p in profiles])
-    assert left.image.count(PointStatus.INCONSISTENT) == strict.counts.n_inconsistent
-    assert right.image.count(PointStatus.INCONSISTENT) == gone
-    assert right.image.count(PointStatus.SHARED) == n_of(strict.right_fate, StereoStatus.TAKEN)
-    assert left.image.count(PointStatus.AMBIGUOUS) == strict.left.count(LabelStatus.AMBIGUOUS)
+    # a right point is shared, or falls with its left one: never both, never neither
+    assert gone + strict[1].labelled.count(PointStatus.SHARED) == sum(
+        kind[1].labelled.count(status) for status in (PointStatus.SHARED, PointStatus.INCONSISTENT)
+    )
 
 
 def test_a_margin_that_was_given_counts_and_what_lies_beyond_is_out_of_depth(
     sensor: SensorCalibration, profiles: tuple[Profile, Profile]
 ) -> None:
-    narrow = shallow(sensor, measure_stereo(*profiles, sensor))
-    seen = [LitProfile(profile) for profile in profiles]
-    given = MeasureOptions(depths=DepthRange(0.0))
-    left, right = measurer_for(narrow, given).measure(seen)
-    found = measure_stereo(*profiles, narrow, StereoLabelOptions(depths=DepthRange(0.0)))
-    check(found)
-    n_out = [one.image.count(PointStatus.OUT_OF_DEPTH) for one in (left, right)]
-    assert sum(n_out) == found.counts.n_out_of_depth > 0
-    np.testing.assert_array_equal(left.points.points_mm, found.left_points.points_mm)
-    usual = measurer_for(narrow, MeasureOptions()).measure(seen)
-    own = measure_stereo(*profiles, narrow)
-    for one, points in zip(usual, (own.left_points, own.right_points), strict=True):
-        np.testing.assert_array_equal(one.points.points_mm, points.points_mm)
-    assert len(own.left_points.row) > len(found.left_points.row)
+    narrow = shallow(sensor, measured(profiles, sensor))
+    given = measured(profiles, narrow, DepthRange(0.0))
+    check(given)
+    assert sum(one.labelled.count(PointStatus.OUT_OF_DEPTH) for one in given) > 0
+    usual = measured(profiles, narrow)
+    told = measured(profiles, narrow, LABEL_DEPTHS)
+    for one, other in zip(usual, told, strict=True):
+        np.testing.assert_array_equal(one.points.points_mm, other.points.points_mm)
+    assert len(usual[0].points) > len(given[0].points)
 
 
 def test_a_chosen_sheet_is_refused_for_two_cameras(sensor: SensorCalibration) -> None:
+    assert isinstance(labeller_for(sensor, MeasureOptions()), StereoLabeller)
     with pytest.raises(OptionError, match="two cameras tell each stripe's sheet"):
-        measurer_for(sensor, MeasureOptions(sheet="A.1"))
+        labeller_for(sensor, MeasureOptions(sheet="A.1"))

@@ -12,7 +12,7 @@ from armscan.errors import EstimationError, OptionError
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.pipeline.truth import hand_eye_errors, true_names
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
@@ -57,20 +57,20 @@ def scan_of(views: list[str | None]) -> Rows:
 
 
 def test_exposures_of_a_view_stay_together_and_the_ends_are_kept() -> None:
-    few = FewerViews(scan_of(["a", "a", "b", "b", "c", "c", "d", "d", "e", "e"]), 3)
+    few = fewer_views(scan_of(["a", "a", "b", "b", "c", "c", "d", "d", "e", "e"]), 3)
     assert [row.view for row in few.rows] == ["a", "a", "c", "c", "e", "e"]
     assert [few.exposure(k).source for k in range(6)] == [row.source for row in few.rows]
 
 
 def test_exposures_without_view_are_views_of_their_own() -> None:
-    few = FewerViews(scan_of([None] * 7), 4)
+    few = fewer_views(scan_of([None] * 7), 4)
     assert [row.index for row in few.rows] == [0, 2, 4, 6]
-    assert len(FewerViews(scan_of([None] * 3), 9).rows) == 3
+    assert len(fewer_views(scan_of([None] * 3), 9).rows) == 3
 
 
 def test_no_view_at_all_is_refused() -> None:
     with pytest.raises(OptionError, match="keep at least one"):
-        FewerViews(scan_of([None]), 0)
+        fewer_views(scan_of([None]), 0)
 
 
 def test_a_sheet_without_true_points_at_its_depths_is_told() -> None:

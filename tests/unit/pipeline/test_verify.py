@@ -18,8 +18,8 @@ from armscan.models.camera import CameraModel
 from armscan.pipeline.scan import ScanOptions, ScanReconstruction, measure_scan
 from armscan.pipeline.truth import distance_by_calibration
 from armscan.pipeline.verify import Measured, VerifyOptions, verify_on_plate
-from armscan.reconstruction.labels import MeasuredProfile
-from armscan.reconstruction.place import merge_clouds, prepare_placing, propagate_to_base
+from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
 from armscan.reconstruction.sync import ExposurePoses
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
 from rigs import placing_rig as rig
@@ -33,18 +33,20 @@ POSES = (rig.BASE_FROM_TOOL, OTHER_POSE)
 
 
 def two_exposures(scanner: ScannerCalibration) -> ScanReconstruction:
-    placing, profile = prepare_placing(scanner), rig.profile_at(PLACES_PX)
+    placing, profile = BaseTransform.of(scanner), rig.profile_at(PLACES_PX)
     assert scanner.sensor is not None
     stripe = triangulate_stripe(profile, SHEET_OF, scanner.sensor)
     cloud = merge_clouds([propagate_to_base(stripe, profile, pose, placing) for pose in POSES])
-    image = MeasuredProfile(profile, np.zeros(3, dtype=np.int64), SHEET_OF, "")
+    image = LabelledProfile(
+        profile=profile, sheet=SHEET_OF, status=np.zeros(3, dtype=np.int64), reason=""
+    )
     poses = ExposurePoses(
-        np.stack([pose.rotation for pose in POSES]),
-        np.stack([pose.translation_mm for pose in POSES]),
-        np.zeros(2, dtype=np.int64),
-        np.arange(2),
-        "time",
-        0,
+        rotations=np.stack([pose.rotation for pose in POSES]),
+        translations_mm=np.stack([pose.translation_mm for pose in POSES]),
+        status=np.zeros(2, dtype=np.int64),
+        sample=np.arange(2),
+        source="time",
+        max_gap_ns=0,
     )
     return ScanReconstruction(cloud, (image, image), (0, 1), (), poses)
 
@@ -82,7 +84,7 @@ def test_points_that_are_missing_are_noticed() -> None:
     scanner = rig.scanner()
     scan = two_exposures(scanner)
     other = np.full(3, 1, dtype=np.int64)
-    cut = replace(scan, images=(replace(scan.images[0], fate=other), scan.images[1]))
+    cut = replace(scan, images=(replace(scan.images[0], status=other), scan.images[1]))
     with pytest.raises(EstimationError, match="cut off"):
         distance_by_calibration(cut, scanner, np.ones((6, 3)))
 
@@ -114,7 +116,7 @@ def test_a_head_that_has_moved_on_a_plate(
 ) -> None:
     scanner = scanner_with(np.array(shift_mm))
     source = scan_fake.as_source(scan_fake.fake_scan(12, 2.0))
-    scan = measure_scan(source, scanner, ScanOptions(normals=None, threads=1))
+    scan = measure_scan(source, scanner, ScanOptions(has_normals=False))
     found = verify_on_plate(Measured(scan.cloud, scan, scanner), PLATE)
     assert found.verdict == verdict
     place, correction, *_ = found.checks

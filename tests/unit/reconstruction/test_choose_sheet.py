@@ -8,7 +8,9 @@ from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.label_single import DepthRange, choose_sheets
+from armscan.reconstruction.label_single import SingleLabeller
+from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
 from rigs.sheet_rig import PROVENANCE, make_profile
 
@@ -72,6 +74,18 @@ def stripes(*x_over_z: float) -> Profile:
     return make_profile("object.png", parts, 0.1)
 
 
+def labelled(
+    profile: Profile,
+    sensor: SensorCalibration,
+    depths: DepthRange,
+    *,
+    sheet_name: str = "",
+    lasers: tuple[str, ...] = (),
+) -> LabelledProfile:
+    (found,) = SingleLabeller(sensor, depths, sheet_name).label([profile], lasers).profiles
+    return found
+
+
 FAR = -60.0 / 360.0
 """Left meets this column at z = 257 (outside), right at z = 360 (outside)."""
 NEAR = 0.25
@@ -79,15 +93,15 @@ NEAR = 0.25
 
 
 def test_the_users_word_comes_first() -> None:
-    choice = choose_sheets(stripes(0.0), two_sheets(), DepthRange(), sheet_name="right")
+    choice = labelled(stripes(0.0), two_sheets(), DepthRange(), sheet_name="right")
     assert set(choice.sheet.tolist()) == {1}
-    assert "as asked" in choice.how
+    assert "as asked" in choice.reason
     with pytest.raises(OptionError, match="left, right"):
-        choose_sheets(stripes(0.0), two_sheets(), DepthRange(), sheet_name="middle")
+        labelled(stripes(0.0), two_sheets(), DepthRange(), sheet_name="middle")
 
 
 def test_the_only_laser_that_was_on() -> None:
-    choice = choose_sheets(stripes(0.0), two_sheets(), DepthRange(), lasers=("left",))
+    choice = labelled(stripes(0.0), two_sheets(), DepthRange(), lasers=("left",))
     assert set(choice.sheet.tolist()) == {0}
 
 
@@ -109,17 +123,17 @@ def test_depth_names_a_stripe_that_one_sheet_alone_puts_in_range() -> None:
         covariance=sensor.covariance,
         provenance=PROVENANCE,
     )
-    choice = choose_sheets(stripes(0.13), sensor, DepthRange(0.0))
+    choice = labelled(stripes(0.13), sensor, DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {1}
-    assert "right" in choice.how
+    assert "right" in choice.reason
 
 
 def test_the_words_tell_the_calibrated_depths_from_those_accepted() -> None:
     """At x/z = -0.25: left z = 240, 40 mm before its range, and right z = 400, 80 mm behind."""
-    choice = choose_sheets(stripes(-0.25), two_sheets(), DepthRange(1.5))
+    choice = labelled(stripes(-0.25), two_sheets(), DepthRange(1.5))
     assert set(choice.sheet.tolist()) == {0}
-    assert "left (calibrated Z 280 to 320 mm, accepted 220 to 380 mm)" in choice.how
-    assert "within reach" in choice.how
+    assert "left (calibrated Z 280 to 320 mm, accepted 220 to 380 mm)" in choice.reason
+    assert "within reach" in choice.reason
 
 
 def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
@@ -140,10 +154,10 @@ def test_the_calibrated_depths_decide_before_the_widened_ones() -> None:
         covariance=sensor.covariance,
         provenance=PROVENANCE,
     )
-    choice = choose_sheets(stripes(0.05), sensor, DepthRange(3.0))
+    choice = labelled(stripes(0.05), sensor, DepthRange(3.0))
     assert set(choice.sheet.tolist()) == {0}
-    assert "within its calibrated depths: left" in choice.how
-    assert "within reach" not in choice.how
+    assert "within its calibrated depths: left" in choice.reason
+    assert "within reach" not in choice.reason
 
 
 def test_only_segments_outside_all_calibrated_depths_ask_the_widened_ones() -> None:
@@ -164,21 +178,21 @@ def test_only_segments_outside_all_calibrated_depths_ask_the_widened_ones() -> N
         covariance=sensor.covariance,
         provenance=PROVENANCE,
     )
-    choice = choose_sheets(stripes(0.05, -0.25), sensor, DepthRange(1.5))
+    choice = labelled(stripes(0.05, -0.25), sensor, DepthRange(1.5))
     assert set(choice.sheet.tolist()) == {0}
-    assert choice.how.count("left") == 2
-    assert "within reach" in choice.how
+    assert choice.reason.count("left") == 2
+    assert "within reach" in choice.reason
 
 
 def test_a_stripe_that_both_sheets_put_in_range_is_not_guessed() -> None:
     with pytest.raises(EstimationError, match="--sheet"):
-        choose_sheets(stripes(0.0), two_sheets(), DepthRange())
+        labelled(stripes(0.0), two_sheets(), DepthRange())
 
 
 def test_a_stripe_in_no_range_gets_no_sheet() -> None:
-    choice = choose_sheets(stripes(FAR, NEAR), two_sheets(), DepthRange(0.0))
+    choice = labelled(stripes(FAR, NEAR), two_sheets(), DepthRange(0.0))
     assert set(choice.sheet.tolist()) == {-1}
-    assert choice.how.startswith("no sheet")
+    assert choice.reason.startswith("no sheet")
 
 
 def test_flagged_points_do_not_vote() -> None:
@@ -194,7 +208,7 @@ def test_flagged_points_do_not_vote() -> None:
         flags=flags,
         segment=profile.segment,
     )
-    choice = choose_sheets(flagged, two_sheets(), DepthRange())
+    choice = labelled(flagged, two_sheets(), DepthRange())
     assert set(choice.sheet.tolist()) == {-1}
 
 

@@ -17,8 +17,8 @@ from armscan.reconstruction.label_cross import (
     still_evidence,
     taken_evidence,
 )
-from armscan.reconstruction.label_single import DepthRange
-from armscan.reconstruction.stretches import Pieces, cut_pieces
+from armscan.reconstruction.segments import Pieces, cut_pieces
+from armscan.reconstruction.triangulate import DepthRange
 from rigs.cross_rig import PLANES, camera, light_sheet, sensor
 from rigs.sheet_rig import make_profile
 
@@ -88,11 +88,11 @@ def test_light_that_falls_on_one_thing_does_not_fall_on_another() -> None:
     pieces, samples = pieces_of(*apart)
     found = hypothesise(samples, (0, 1), SENSOR, DepthRange(0.2))
     believed = np.log(np.full((len(pieces), 2), 0.5))
-    believed[pieces.stretch == 0] = np.log([1.0 - 1e-9, 1e-9])
-    believed[pieces.stretch == 1] = np.log([1e-9, 1.0 - 1e-9])
+    believed[pieces.segment == 0] = np.log([1.0 - 1e-9, 1e-9])
+    believed[pieces.segment == 1] = np.log([1e-9, 1.0 - 1e-9])
     penalty = taken_evidence(believed, pieces, found)[:, 0]
-    total = [penalty[pieces.stretch == k].sum() for k in range(3)]
-    votes = 1.0 + (pieces.stretch == 1).sum() / ALIKE_PIECES
+    total = [penalty[pieces.segment == k].sum() for k in range(3)]
+    votes = 1.0 + (pieces.segment == 1).sum() / ALIKE_PIECES
     assert total[1] == pytest.approx(TAKEN * votes, rel=0.2)
     assert total[0] == pytest.approx(0.0, abs=1e-6)
     assert total[2] == pytest.approx(0.0, abs=1e-6)

@@ -39,7 +39,14 @@ def poses(places_mm: FloatArray) -> ExposurePoses:
     n = len(places_mm)
     zeros = np.zeros(n, dtype=np.int64)
     turns = np.broadcast_to(np.eye(3), (n, 3, 3))
-    return ExposurePoses(turns, places_mm, zeros, np.arange(n), "trigger", 0)
+    return ExposurePoses(
+        rotations=turns,
+        translations_mm=places_mm,
+        status=zeros,
+        sample=np.arange(n),
+        source="trigger",
+        max_gap_ns=0,
+    )
 
 
 STILL = poses(np.zeros((3, 3)))

@@ -4,7 +4,7 @@
 import numpy as np
 
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.label_single import is_without_ray
+from armscan.reconstruction.points import is_without_ray
 
 SHEET = LightSheet(
     origin_mm=np.array([0.0, 0.0, 300.0]),

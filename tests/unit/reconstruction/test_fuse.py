@@ -13,13 +13,8 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
-from armscan.reconstruction.stereo_points import (
-    FusedPoints,
-    fuse_points,
-    misfit_mm,
-    triangulate_right,
-)
-from armscan.reconstruction.triangulate import sensor_columns, sensor_covariance
+from armscan.reconstruction.points import fuse_points, misfit_mm, triangulate_right
+from armscan.reconstruction.triangulate import StripePoints, sensor_columns, sensor_covariance
 from rigs.sheet_rig import make_profile
 from rigs.stereo_head import StereoHead
 
@@ -54,7 +49,7 @@ def fused(
     right_px: FloatArray,
     *,
     right_sigma_px: float = SIGMA_PX,
-) -> FusedPoints:
+) -> StripePoints:
     _, normals, _ = pixels()
     right_normals = np.tile([np.sqrt(0.5), np.sqrt(0.5)], (len(left_px), 1))
     right = RightStripes.of(make_profile("right", [(right_px, right_normals)], right_sigma_px))
@@ -63,11 +58,11 @@ def fused(
     beside = find_crossings(there, normals, np.full(n, SIGMA_PX), right, 30.0)
     assert (beside.row == np.arange(n)).all()
     return fuse_points(
+        np.arange(n),
         there,
         beside,
         normals,
-        np.full(n, SIGMA_PX),
-        np.full(n, right_sigma_px),
+        np.column_stack([np.full(n, SIGMA_PX), np.full(n, right_sigma_px)]),
         sensor=sensor,
         shift_px=np.zeros(n),
     )
@@ -107,7 +102,7 @@ def test_noises_are_the_moves_by_one_sigma_of_each_stripe() -> None:
         assert (min(same, turned) if column == 2 else same) < 0.01 * size
 
 
-def predicted(found: FusedPoints, sensor: SensorCalibration) -> FloatArray:
+def predicted(found: StripePoints, sensor: SensorCalibration) -> FloatArray:
     noise = found.noise_mm @ found.noise_mm.transpose(0, 2, 1)
     joint = sensor_covariance(sensor, SHEET)
     return np.asarray(noise + found.by_sensor @ joint @ found.by_sensor.transpose(0, 2, 1))

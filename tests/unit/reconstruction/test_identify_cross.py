@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from armscan.errors import InputError, OptionError
-from armscan.reconstruction.label_cross import CrossLabeller, CrossOptions
+from armscan.errors import InputError
+from armscan.geometry.poses import Base, Pose, Sensor
+from armscan.reconstruction import label_cross
+from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import (
-    STROKE_GAP_NS,
+    PASS_GAP_NS,
     LabelledProfile,
-    LabelStatus,
+    PointStatus,
     StripeLabeller,
 )
 from armscan.thesis.row_rule import RowLabeller
@@ -36,16 +38,23 @@ class Outcome:
             int(((n.sheet >= 0) & (e.true_sheet >= 0) & (n.sheet != e.true_sheet)).sum())
             for e, n in zip(self.taken, self.named, strict=True)
         )
-        return wrong / max(sum(n.count(LabelStatus.NAMED) for n in self.named), 1)
+        return wrong / max(sum(n.count(PointStatus.MEASURED) for n in self.named), 1)
 
     @property
     def named_share(self) -> float:
         asked = sum(int(e.profile.is_accepted.sum()) for e in self.taken)
-        return sum(n.count(LabelStatus.NAMED) for n in self.named) / asked
+        return sum(n.count(PointStatus.MEASURED) for n in self.named) / asked
 
     @property
     def singles(self) -> int:
         return sum(len(e.lasers) == 1 for e in self.taken)
+
+
+def label(
+    namer: StripeLabeller, exposure: CrossExposure, pose: Pose[Base, Sensor] | None, t_ns: int
+) -> LabelledProfile:
+    (found,) = namer.label([exposure.profile], exposure.lasers, pose, t_ns).profiles
+    return found
 
 
 def take(stroke: CrossStroke, namer: StripeLabeller, has_arm: bool = True) -> Outcome:
@@ -53,7 +62,7 @@ def take(stroke: CrossStroke, namer: StripeLabeller, has_arm: bool = True) -> Ou
     for k in range(stroke.n_exposures):
         exposure = stroke.expose(k, namer.next_lasers())
         pose = exposure.base_from_sensor if has_arm else None
-        named.append(namer.name(exposure.profile, exposure.lasers, pose, exposure.t_ns))
+        named.append(label(namer, exposure, pose, exposure.t_ns))
         taken.append(exposure)
     return Outcome(taken, named)
 
@@ -82,8 +91,8 @@ def test_where_surfaces_bend_the_thesis_rule_names_less(strokes: dict[str, Cross
     ours = take(stroke, CrossLabeller(stroke.sensor))
     thesis = take(stroke, RowLabeller(stroke.sensor))
     both = [n for e, n in zip(thesis.taken, thesis.named, strict=True) if e.lasers == BOTH]
-    asked = sum(int((n.fate != int(LabelStatus.NOT_ASKED)).sum()) for n in both)
-    assert sum(n.count(LabelStatus.UNEXPLAINED) for n in both) > 0.1 * asked
+    asked = sum(int((n.status != int(PointStatus.FLAGGED)).sum()) for n in both)
+    assert sum(n.count(PointStatus.STRAY) for n in both) > 0.1 * asked
     per_exposure = [
         np.mean([len(set(n.sheet[n.sheet >= 0].tolist())) for n in found.named])
         for found in (ours, thesis)
@@ -112,8 +121,8 @@ def test_rejected_points_are_not_asked(strokes: dict[str, CrossStroke]) -> None:
     stroke = strokes["plate"]
     for exposure, named in zip(*_columns(take(stroke, CrossLabeller(stroke.sensor))), strict=True):
         rejected = ~exposure.profile.is_accepted
-        assert (named.fate[rejected] == int(LabelStatus.NOT_ASKED)).all()
-        assert ((named.sheet >= 0) == (named.fate == int(LabelStatus.NAMED))).all()
+        assert (named.status[rejected] == int(PointStatus.FLAGGED)).all()
+        assert ((named.sheet >= 0) == (named.status == int(PointStatus.MEASURED))).all()
 
 
 def _columns(found: Outcome) -> tuple[list[CrossExposure], list[LabelledProfile]]:
@@ -125,12 +134,14 @@ def test_a_recorded_stroke_is_named_again_as_it_was(strokes: dict[str, CrossStro
     namer = CrossLabeller(stroke.sensor)
     first = take(stroke, namer)
     later = [
-        namer.name(e.profile, e.lasers, e.base_from_sensor, e.t_ns + 10 * STROKE_GAP_NS)
+        namer.label([e.profile], e.lasers, e.base_from_sensor, e.t_ns + 10 * PASS_GAP_NS).profiles[
+            0
+        ]
         for e in first.taken
     ]
     for before, after in zip(first.named, later, strict=True):
         assert np.array_equal(before.sheet, after.sheet)
-        assert np.array_equal(before.fate, after.fate)
+        assert np.array_equal(before.status, after.status)
 
 
 def test_after_a_pause_nothing_is_known_and_both_stripes_are_in_doubt(
@@ -141,21 +152,23 @@ def test_after_a_pause_nothing_is_known_and_both_stripes_are_in_doubt(
     take(stroke, namer)
     again = stroke.expose(8, BOTH)
     at_once = stroke.t_ns(N_EXPOSURES - 1) + TICK_NS
-    known = namer.name(again.profile, BOTH, again.base_from_sensor, at_once)
-    late = at_once + STROKE_GAP_NS + 1
-    forgotten = namer.name(again.profile, BOTH, again.base_from_sensor, late)
-    assert known.count(LabelStatus.NAMED) > forgotten.count(LabelStatus.NAMED)
-    assert known.count(LabelStatus.AMBIGUOUS) == 0
+    known = namer.label([again.profile], BOTH, again.base_from_sensor, at_once).profiles[0]
+    late = at_once + PASS_GAP_NS + 1
+    forgotten = namer.label([again.profile], BOTH, again.base_from_sensor, late).profiles[0]
+    assert known.count(PointStatus.MEASURED) > forgotten.count(PointStatus.MEASURED)
+    assert known.count(PointStatus.AMBIGUOUS) == 0
 
 
 def test_a_stroke_that_begins_with_both_asks_for_one_laser_and_then_knows(
-    strokes: dict[str, CrossStroke],
+    strokes: dict[str, CrossStroke], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stroke = strokes["waves"]
-    namer = CrossLabeller(stroke.sensor, CrossOptions(margin=50.0, remember_margin=50.0))
+    monkeypatch.setattr(label_cross, "MARGIN", 50.0)
+    monkeypatch.setattr(label_cross, "REMEMBER_MARGIN", 50.0)
+    namer = CrossLabeller(stroke.sensor)
     first = stroke.expose(4, BOTH)
-    named = namer.name(first.profile, BOTH, first.base_from_sensor, first.t_ns)
-    assert named.count(LabelStatus.NAMED) == 0
+    named = namer.label([first.profile], BOTH, first.base_from_sensor, first.t_ns).profiles[0]
+    assert named.count(PointStatus.MEASURED) == 0
     asked = namer.next_lasers()
     assert len(asked) == 1
     n_true = [int((first.true_sheet == k).sum()) for k in (0, 1)]
@@ -170,9 +183,9 @@ def test_without_the_arm_stripes_are_predicted_in_the_image(
     found = take(stroke, CrossLabeller(stroke.sensor), has_arm=False)
     assert found.wrong_share < 0.001
     assert found.named_share > 0.95
-    assert "without the arm's pose" in found.named[-1].how
+    assert "without the arm's pose" in found.named[-1].reason
     with_arm = take(stroke, CrossLabeller(stroke.sensor))
-    assert "continues the surface" in with_arm.named[-1].how
+    assert "continues the surface" in with_arm.named[-1].reason
 
 
 def test_a_stripe_that_vanishes_for_a_while_is_found_again(
@@ -187,7 +200,7 @@ def test_a_stripe_that_vanishes_for_a_while_is_found_again(
         is_hidden = 6 <= k < 10
         seen = exposure.true_sheet == 0 if is_hidden else exposure.true_sheet >= 0
         profile = exposure.profile.select(seen)
-        named = namer.name(profile, lasers, exposure.base_from_sensor, exposure.t_ns)
+        named = namer.label([profile], lasers, exposure.base_from_sensor, exposure.t_ns).profiles[0]
         is_named = named.sheet >= 0
         assert np.array_equal(named.sheet[is_named], exposure.true_sheet[seen][is_named])
         if k > 2:
@@ -206,7 +219,7 @@ def test_a_dark_exposure_and_one_without_stripes_are_survived() -> None:
     stroke = CrossStroke("plate", 1, THESIS, N_EXPOSURES)
     namer = CrossLabeller(stroke.sensor)
     empty = stroke.expose(0, ())
-    named = namer.name(empty.profile, BOTH, empty.base_from_sensor, empty.t_ns)
+    named = namer.label([empty.profile], BOTH, empty.base_from_sensor, empty.t_ns).profiles[0]
     assert len(named.sheet) == 0
     assert namer.next_lasers() == BOTH
     found = take(stroke, namer)
@@ -217,11 +230,4 @@ def test_a_laser_of_another_head_is_refused() -> None:
     stroke = CrossStroke("plate", 1, THESIS, 1)
     profile = stroke.expose(0, BOTH).profile
     with pytest.raises(InputError, match="laser that was on is C, the calibration has A, B"):
-        CrossLabeller(stroke.sensor).name(profile, ("C",), None, 0)
-
-
-def test_wrong_options_are_refused() -> None:
-    with pytest.raises(OptionError, match="margins"):
-        CrossOptions(margin=8.0, remember_margin=7.0)
-    with pytest.raises(OptionError, match="undecided share"):
-        CrossOptions(undecided_share=0.0)
+        CrossLabeller(stroke.sensor).label([profile], ("C",), None, 0).profiles[0]

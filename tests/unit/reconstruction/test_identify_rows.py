@@ -8,7 +8,7 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.reconstruction.labels import LabelStatus
+from armscan.reconstruction.labels import PointStatus
 from armscan.records.profile import Profile
 from armscan.thesis.row_rule import LaserSchedule, RowLabeller, RowOptions, row_differences
 from rigs.cross_rig import sensor
@@ -25,8 +25,8 @@ def rows(points: list[tuple[float, float]]) -> Profile:
 def taught() -> RowLabeller:
     """After exposure N with A at row 100 and N + 1 with B at row 125, in columns 10 to 13."""
     namer = RowLabeller(sensor())
-    namer.name(rows([(x, 100.0) for x in range(10, 14)]), ("A",), None, 0)
-    namer.name(rows([(x, 125.0) for x in range(10, 14)]), ("B",), None, 1)
+    namer.label([rows([(x, 100.0) for x in range(10, 14)])], ("A",), None, 0).profiles[0]
+    namer.label([rows([(x, 125.0) for x in range(10, 14)])], ("B",), None, 1).profiles[0]
     return namer
 
 
@@ -35,22 +35,22 @@ def taught() -> RowLabeller:
     [(100.0, A), (110.0, A), (110.1, -1), (89.9, -1), (115.0, B), (134.9, B), (135.1, -1)],
 )
 def test_threshold_of_equations_3_6_and_3_7(row: float, sheet: int) -> None:
-    named = taught().name(rows([(10.0, row), (11.0, row)]), ("A", "B"), None, 2)
+    named = taught().label([rows([(10.0, row), (11.0, row)])], ("A", "B"), None, 2).profiles[0]
     assert named.sheet.tolist() == [sheet, sheet]
-    expected = LabelStatus.NAMED if sheet >= 0 else LabelStatus.UNEXPLAINED
-    assert (named.fate == int(expected)).all()
+    expected = PointStatus.MEASURED if sheet >= 0 else PointStatus.STRAY
+    assert (named.status == int(expected)).all()
 
 
 def test_where_both_hold_the_smallest_difference_wins() -> None:
     namer = RowLabeller(sensor(), RowOptions(threshold_px=20.0))
-    namer.name(rows([(10.0, 100.0), (11.0, 100.0)]), ("A",), None, 0)
-    namer.name(rows([(10.0, 125.0), (11.0, 125.0)]), ("B",), None, 1)
-    named = namer.name(rows([(10.0, 112.0), (11.0, 113.0)]), ("A", "B"), None, 2)
+    namer.label([rows([(10.0, 100.0), (11.0, 100.0)])], ("A",), None, 0).profiles[0]
+    namer.label([rows([(10.0, 125.0), (11.0, 125.0)])], ("B",), None, 1).profiles[0]
+    named = namer.label([rows([(10.0, 112.0), (11.0, 113.0)])], ("A", "B"), None, 2).profiles[0]
     assert named.sheet.tolist() == [A, B]
 
 
 def test_a_column_in_which_nothing_was_seen_has_no_name() -> None:
-    named = taught().name(rows([(14.4, 100.0), (13.4, 100.0)]), ("A", "B"), None, 2)
+    named = taught().label([rows([(14.4, 100.0), (13.4, 100.0)])], ("A", "B"), None, 2).profiles[0]
     assert named.sheet.tolist() == [-1, A]
 
 
@@ -66,24 +66,24 @@ def test_schedule_of_figure_3_2() -> None:
     asked = []
     for k in range(6):
         asked.append(namer.next_lasers())
-        namer.name(rows([(1.0, 1.0), (2.0, 1.0)]), asked[-1], None, k)
+        namer.label([rows([(1.0, 1.0), (2.0, 1.0)])], asked[-1], None, k).profiles[0]
     assert asked == 2 * [("A",), ("B",), ("A", "B")]
     assert sum(len(on) for on in asked) / len(asked) == pytest.approx(4.0 / 3.0)
 
 
 def test_single_exposures_are_named_by_their_laser_and_renew_its_rows() -> None:
     namer = taught()
-    named = namer.name(rows([(10.0, 150.0), (11.0, 150.0)]), ("A",), None, 2)
+    named = namer.label([rows([(10.0, 150.0), (11.0, 150.0)])], ("A",), None, 2).profiles[0]
     assert named.sheet.tolist() == [A, A]
-    both = namer.name(rows([(10.0, 152.0), (11.0, 100.0)]), ("A", "B"), None, 3)
+    both = namer.label([rows([(10.0, 152.0), (11.0, 100.0)])], ("A", "B"), None, 3).profiles[0]
     assert both.sheet.tolist() == [A, -1]
 
 
 def test_without_earlier_exposures_nothing_is_named() -> None:
     namer = taught()
     namer.reset()
-    named = namer.name(rows([(10.0, 100.0), (11.0, 100.0)]), ("A", "B"), None, 2)
-    assert named.count(LabelStatus.UNEXPLAINED) == 2
+    named = namer.label([rows([(10.0, 100.0), (11.0, 100.0)])], ("A", "B"), None, 2).profiles[0]
+    assert named.count(PointStatus.STRAY) == 2
 
 
 def test_wrong_options_are_refused() -> None:

@@ -32,9 +32,9 @@ def stripes() -> tuple[FloatArray, FloatArray, IntArray]:
 def test_neighbours_on_a_nearer_thing_do_not_hide_the_floor() -> None:
     points, depth, number = stripes()
     planes = fit_planes(points, depth, number)
-    assert set(planes.stretch.tolist()) == set(range(6))
+    assert set(planes.segment.tolist()) == set(range(6))
     on_floor = np.isin(number, (0, 1, 4, 5))
-    of_floor = np.isin(planes.stretch, (0, 1, 4, 5))
+    of_floor = np.isin(planes.segment, (0, 1, 4, 5))
     off, sigma = depths_off(points[on_floor], depth[on_floor], planes)
     own = off[:, of_floor]
     assert np.abs(own).max() < 0.3

@@ -6,12 +6,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction.place import (
     LARGEST_RADIUS_MM,
     SMALLEST_RADIUS_MM,
-    NormalOptions,
     choose_radius_mm,
     estimate_normals,
 )
@@ -60,12 +59,11 @@ def test_a_ball_seen_from_two_sides() -> None:
 
 
 def test_where_there_is_no_tangent_plane_the_normal_is_zero() -> None:
-    options = NormalOptions()
     line = np.column_stack([np.arange(0.0, 10.0, 0.02), np.zeros(500), np.zeros(500)])
     few = np.array([[100.0, 0.0, 0.0], [100.5, 1.0, 0.0], [101.0, 0.3, 0.0]])
     blob = 200.0 + np.random.default_rng(2).normal(0.0, 0.7, (400, 3))
     points = np.concatenate([line, few, blob])
-    normals = estimate_normals(points, points + np.array([0.0, 0.0, 140.0]), options)
+    normals = estimate_normals(points, points + np.array([0.0, 0.0, 140.0]))
     assert not normals[:503].any()
     lengths = np.linalg.norm(normals, axis=1)
     assert np.isfinite(normals).all()
@@ -78,7 +76,7 @@ def test_lines_of_a_quick_sweep_need_a_wider_radius() -> None:
     points = np.column_stack([flat, np.zeros(len(flat))])
     seen = np.tile([0.0, 0.0, 140.0], (len(points), 1))
     assert not estimate_normals(points, seen).any()
-    wide = estimate_normals(points, seen, NormalOptions(radius_mm=6.0))
+    wide = estimate_normals(points, seen, 6.0)
     np.testing.assert_allclose(wide, np.tile([0.0, 0.0, 1.0], (len(points), 1)), atol=1e-9)
 
 
@@ -99,5 +97,3 @@ def test_no_points_and_wrong_shapes() -> None:
     assert estimate_normals(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0, 3)
     with pytest.raises(InputError, match="shape"):
         estimate_normals(np.zeros((2, 3)), np.zeros((1, 3)))
-    with pytest.raises(OptionError, match="radius"):
-        NormalOptions(radius_mm=0.0)

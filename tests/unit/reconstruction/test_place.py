@@ -15,14 +15,14 @@ from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
+    BaseTransform,
     arm_covariance,
-    place_delivered_points,
+    delivered_points,
     place_with_jacobian,
-    prepare_placing,
     propagate_to_base,
-    scan_point_mm,
 )
 from armscan.reconstruction.triangulate import intersect_sheets, triangulate_stripe
+from armscan.records.profile import PointProfile
 from rigs import placing_rig as rig
 from rigs.sheet_rig import thesis_rig
 
@@ -89,7 +89,7 @@ def covariance_by_differences() -> FloatArray:
 
 def test_covariance_term_by_term_on_two_sheets() -> None:
     """Each point takes the camera, its own sheet and the hand-eye, with the coupling's sign."""
-    placing = prepare_placing(rig.scanner())
+    placing = BaseTransform.of(rig.scanner())
     assert placing.scanner.sensor is not None
     profile = rig.profile_at(PLACES_PX)
     stripe = triangulate_stripe(profile, SHEET_OF, placing.scanner.sensor)
@@ -110,7 +110,7 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
     np.testing.assert_allclose(cloud.covariance_mm2 / size, expected / size, atol=1e-5)
     loud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
     middle = (
-        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(scan_point_mm(placing.scanner)[None]))
+        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(placing.scan_point_mm[None]))
     ).xyz_mm[0]
     np.testing.assert_allclose(
         loud.covariance_mm2 - cloud.covariance_mm2,
@@ -128,7 +128,7 @@ def test_covariance_is_that_of_repeats() -> None:
     """
     scanner = rig.scanner()
     assert scanner.sensor is not None
-    placing = prepare_placing(scanner)
+    placing = BaseTransform.of(scanner)
     camera, pair = thesis_rig().camera, rig.sheets()
     place, sheet = PLACES_PX[:1], SHEET_OF[:1]
     profile = rig.profile_at(place)
@@ -136,7 +136,7 @@ def test_covariance_is_that_of_repeats() -> None:
         triangulate_stripe(profile, sheet, scanner.sensor), profile, rig.BASE_FROM_TOOL, placing
     )
     middle = (
-        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(scan_point_mm(scanner)[None]))
+        rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(placing.scan_point_mm[None]))
     ).xyz_mm[0]
     rng = np.random.default_rng(12)
     position = np.hypot(rig.ARM_NOISE.position_mm, rig.ARM_NOISE.exposure_position_mm)
@@ -174,11 +174,14 @@ def test_the_arm_errs_least_at_the_scan_point() -> None:
 
 def test_points_that_a_sensor_delivered() -> None:
     """Without camera the hand-eye's covariance is all; the scan point is the points' middle."""
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None)
-    placing = prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None)
+    placing = BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
     points = np.array([[0.0, -10.0, 100.0], [0.0, 10.0, 110.0]])
     noise = np.array([[0.0, 0.0, 0.02], [0.0, 0.01, 0.0]])[:, :, None]
-    placed, covariance = place_delivered_points(points, noise, rig.BASE_FROM_TOOL, placing)
+    profile = PointProfile(source="profile", points_mm=points)
+    stripe = replace(delivered_points(profile), noise_mm=noise)
+    cloud = propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
+    placed, covariance = cloud.points_mm, cloud.covariance_mm2
     by = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
     expected = by.by_hand_eye @ hand_eye.covariance @ by.by_hand_eye.transpose(0, 2, 1)
     expected += arm_covariance(placed, placed.mean(axis=0), rig.ARM_NOISE)
@@ -186,7 +189,7 @@ def test_points_that_a_sensor_delivered() -> None:
     expected += turned[:, :, None] * turned[:, None, :]
     np.testing.assert_allclose(covariance, expected, atol=1e-12)
     with pytest.raises(InputError, match="camera"):
-        place_delivered_points(points, noise, rig.BASE_FROM_TOOL, prepare_placing(rig.scanner()))
+        propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, BaseTransform.of(rig.scanner()))
 
 
 def test_combinations_known_a_thousand_times_better_are_kept() -> None:
@@ -194,8 +197,8 @@ def test_combinations_known_a_thousand_times_better_are_kept() -> None:
     mixing = np.linalg.qr(np.random.default_rng(3).normal(size=(6, 6)))[0]
     units = np.array([1e-4, 1e-4, 1e-4, 0.02, 0.02, 0.02])
     tight = mixing @ np.diag(np.geomspace(1e-8, 1.0, 6)) @ mixing.T * np.outer(units, units)
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=tight)
-    (factor,) = prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye)).factors
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None, covariance=tight)
+    (factor,) = BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye)).factors
     combination = mixing[:, 0] / units
     variance = float(((combination @ factor) ** 2).sum())
     assert variance == pytest.approx(1e-8, rel=1e-3)
@@ -203,9 +206,9 @@ def test_combinations_known_a_thousand_times_better_are_kept() -> None:
 
 def test_a_covariance_that_is_none_is_refused() -> None:
     broken = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0])
-    hand_eye = replace(rig.scanner().hand_eye, sensor_coupling=None, covariance=broken)
+    hand_eye = replace(rig.scanner().hand_eye, dhand_eye_dsensor=None, covariance=broken)
     with pytest.raises(InputError, match="positive semi-definite"):
-        prepare_placing(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
+        BaseTransform.of(replace(rig.scanner(), sensor=None, hand_eye=hand_eye))
 
 
 def test_volume() -> None:

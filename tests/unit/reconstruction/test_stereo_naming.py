@@ -3,16 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
 import pytest
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import InputError
 from armscan.geometry.arrays import IntArray
-from armscan.reconstruction.label_stereo import StereoLabelOptions, log_ratio
-from armscan.reconstruction.labels import LabelStatus
-from armscan.reconstruction.stereo_points import StereoMeasurement, measure_stereo
+from armscan.models.calibration import SensorCalibration
+from armscan.reconstruction.epipolar import EpipolarOffset
+from armscan.reconstruction.label_stereo import StereoLabeller, log_ratio
+from armscan.reconstruction.labels import LabelledInstant, PointStatus
+from armscan.reconstruction.points import MeasuredProfile, measure_points
 from armscan.reconstruction.triangulate import sensor_covariance
 from armscan.records.profile import Profile
 from rigs.placing_rig import scanner
@@ -30,14 +33,34 @@ def head() -> StereoHead:
     return StereoHead.thesis()
 
 
+@dataclass(frozen=True)
+class Found:
+    """Labels of one instant and the points of each camera."""
+
+    labels: LabelledInstant
+    measured: tuple[MeasuredProfile, ...]
+
+    @property
+    def offset(self) -> EpipolarOffset:
+        assert self.labels.offset is not None
+        return self.labels.offset
+
+    def n_labelled(self) -> int:
+        return sum(one.count(PointStatus.MEASURED) for one in self.labels.profiles)
+
+
+def measure(sensor: SensorCalibration, left: Profile, right: Profile) -> Found:
+    labeller = StereoLabeller(sensor)
+    labels = labeller.label([left, right])
+    return Found(labels, measure_points(labels, sensor, labeller.depths))
+
+
 @cache
-def measured(
-    kind: str, seed: int, noise: Noise = QUIET
-) -> tuple[StereoMeasurement, SeenProfile, SeenProfile]:
+def measured(kind: str, seed: int, noise: Noise = QUIET) -> tuple[Found, SeenProfile, SeenProfile]:
     rng = np.random.default_rng([seed, KINDS.index(kind)])
     sensor = head().drawn_calibration(rng)
     left, right = expose(head(), draw_surfaces(kind, rng), noise, rng)
-    return measure_stereo(left.profile, right.profile, sensor), left, right
+    return measure(sensor, left.profile, right.profile), left, right
 
 
 def n_wrong(sheet: IntArray, truth: SeenProfile) -> int:
@@ -51,9 +74,10 @@ def test_shared_points_get_their_sheets_and_hardly_any_a_wrong_one(kind: str) ->
         found, left, right = measured(kind, seed)
         both = left.is_shared & left.profile.is_accepted
         shared += int(both.sum())
-        right_names += int((both & (found.left.sheet == left.sheet)).sum())
-        wrong += n_wrong(found.left.sheet, left) + n_wrong(found.right.sheet, right)
-        named += found.left.count(LabelStatus.NAMED) + found.right.count(LabelStatus.NAMED)
+        in_left, in_right = found.labels.profiles
+        right_names += int((both & (in_left.sheet == left.sheet)).sum())
+        wrong += n_wrong(in_left.sheet, left) + n_wrong(in_right.sheet, right)
+        named += found.n_labelled()
     assert right_names >= LEAST_NAMED * shared
     assert wrong <= MOST_WRONG * named
 
@@ -62,27 +86,29 @@ def test_stray_lines_get_no_name() -> None:
     found, left, _ = measured("plate", 3, Noise(0.15, 12))
     stray = (left.sheet == -1) & left.profile.is_accepted
     assert stray.sum() > 300
-    assert (found.left.sheet[stray] == -1).mean() > 0.98
+    sheet = found.labels.profiles[0].sheet
+    assert (sheet[stray] == -1).mean() > 0.98
     both = left.is_shared & left.profile.is_accepted
-    assert (found.left.sheet[both] == left.sheet[both]).mean() > 0.9
+    assert (sheet[both] == left.sheet[both]).mean() > 0.9
 
 
 def test_a_drift_beyond_the_calibration_is_found_with_its_sign_and_warned_of() -> None:
     still, _, _ = measured("waves", 0)
     moved, left, _ = measured("waves", 0, Noise(shift_px=(0.0, DRIFT_PX)))
-    difference = moved.epipolar_offset_px - still.epipolar_offset_px
+    difference = moved.offset.offset_px - still.offset.offset_px
     # the epipolar lines are some degrees off the rows
     assert difference == pytest.approx(DRIFT_PX, abs=0.1)
-    assert not still.warnings
-    assert "calibrate the two cameras again" in moved.warnings[0]
-    assert n_wrong(moved.left.sheet, left) == 0
+    assert not still.measured[0].warnings
+    assert "calibrate the two cameras again" in moved.measured[0].warnings[0]
+    assert n_wrong(moved.labels.profiles[0].sheet, left) == 0
 
 
 def test_points_of_a_plate_err_as_they_say() -> None:
     found, left, right = measured("plate", 1)
     sensor_rng = np.random.default_rng([1, 0])
     sensor = head().drawn_calibration(sensor_rng)
-    for points, truth in ((found.left_points, left), (found.right_points, right)):
+    for one, truth in zip(found.measured, (left, right), strict=True):
+        points = one.points
         own = points.sheet == truth.sheet[points.row]
         error = points.points_mm - truth.points_mm[points.row]
         normal = _plane_normal(truth.points_mm)
@@ -104,42 +130,33 @@ def _plane_normal(points: np.ndarray) -> np.ndarray:
 
 def test_each_point_is_counted_once() -> None:
     found, left, right = measured("steps", 1)
-    counts = found.counts
-    assert counts.n_fused == int(found.is_fused.sum())
-    assert counts.n_fused + counts.n_left_alone == len(found.left_points.row)
-    assert counts.n_right_alone == len(found.right_points.row)
-    assert len(np.unique(found.left_points.row)) == len(found.left_points.row)
-    named = found.left.sheet[found.left_points.row]
-    assert (named == found.left_points.sheet).all()
-    total = sum(found.left.count(fate) for fate in LabelStatus)
-    assert total == len(left.profile)
-    assert len(found.right.sheet) == len(right.profile)
+    for one, seen in zip(found.measured, (left, right), strict=True):
+        status, row = one.labelled.status, one.points.row
+        assert len(status) == len(seen.profile)
+        np.testing.assert_array_equal(np.flatnonzero(status == PointStatus.MEASURED), row)
+        assert (one.labelled.sheet[row] == one.points.sheet).all()
+    shared = found.measured[1].labelled.status == PointStatus.SHARED
+    is_fused = found.measured[0].points.noise_mm[:, :, 1].any(axis=1)
+    assert shared.sum() > 0.5 * is_fused.sum() > 0
+    assert not (found.measured[0].labelled.status == PointStatus.SHARED).any()
 
 
 def test_no_stripes_give_no_points() -> None:
     none = Profile.empty(source="none")
     _, left, _ = measured("plate", 0)
     for pair in ((none, none), (left.profile, none), (none, left.profile)):
-        found = measure_stereo(*pair, head().calibration())
-        assert len(found.left_points.row) == 0
-        assert len(found.right_points.row) == 0
+        found = measure(head().calibration(), *pair)
+        assert [len(one.points) for one in found.measured] == [0, 0]
 
 
 def test_one_camera_is_refused() -> None:
     sensor = scanner().sensor
     assert sensor is not None
     with pytest.raises(InputError, match="one camera"):
-        measure_stereo(Profile.empty(source="a"), Profile.empty(source="b"), sensor)
-
-
-def test_options_out_of_range_are_refused() -> None:
-    with pytest.raises(OptionError, match="runner_up"):
-        StereoLabelOptions(runner_up=1.5)
-    with pytest.raises(OptionError, match="reach_px"):
-        StereoLabelOptions(reach_px=0.0)
+        measure(sensor, Profile.empty(source="a"), Profile.empty(source="b"))
 
 
 def test_log_ratio_is_that_of_a_seen_gaussian_against_an_even_spread() -> None:
-    ratio = log_ratio(np.array([0.0, 50.0]), np.array([0.1, 0.1]), 80.0, 0.75)
+    ratio = log_ratio(np.array([0.0, 50.0]), np.array([0.1, 0.1]), 80.0)
     peak = 1.0 / (0.1 * np.sqrt(2.0 * np.pi))
     assert ratio == pytest.approx([np.log(0.25 + 0.75 * 80.0 * peak), np.log(0.25)])

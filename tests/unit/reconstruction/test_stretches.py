@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray, IntArray
-from armscan.reconstruction.stretches import PIECE_PX, SAMPLE_PX, Pieces, cut_pieces
+from armscan.reconstruction.segments import PIECE_PX, SAMPLE_PX, Pieces, cut_pieces
 from armscan.records.profile import Profile, StripeFlag
 
 
@@ -15,11 +15,13 @@ def profile_of(
     points: FloatArray, flags: IntArray | None = None, segment: IntArray | None = None
 ) -> Profile:
     n = len(points)
+    tangent = np.gradient(points, axis=0)
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     zero = np.zeros(n, np.int64)
     return Profile(
         source="made by hand",
         points_px=points,
-        normals_px=np.tile([0.0, 1.0], (n, 1)),
+        normals_px=normal / np.linalg.norm(normal, axis=1, keepdims=True),
         sigma_px=np.full(n, 0.1),
         width_px=np.full(n, 3.0),
         intensity=np.full(n, 100.0),
@@ -33,14 +35,14 @@ def line(n: int, angle_deg: float = 50.0, start: tuple[float, float] = (100.0, 8
     return np.asarray(start) + 1.4 * np.arange(n)[:, None] * [np.cos(angle), np.sin(angle)]
 
 
-def stretches(pieces: Pieces) -> int:
-    return int(pieces.stretch.max()) + 1
+def segments(pieces: Pieces) -> int:
+    return int(pieces.segment.max()) + 1
 
 
 def test_a_straight_chain_is_one_stretch_of_equal_pieces() -> None:
     pieces = cut_pieces(profile_of(line(200)))
     length = 1.4 * 199
-    assert stretches(pieces) == 1
+    assert segments(pieces) == 1
     assert len(pieces) == int(length // PIECE_PX) + 1
     assert len(pieces.sample) == int(length // SAMPLE_PX) + 1
     assert pieces.size.sum() == 200
@@ -50,9 +52,9 @@ def test_a_straight_chain_is_one_stretch_of_equal_pieces() -> None:
 
 def test_other_chains_and_gaps_are_cut() -> None:
     points = line(120)
-    assert stretches(cut_pieces(profile_of(points, segment=np.repeat([0, 1], 60)))) == 2
+    assert segments(cut_pieces(profile_of(points, segment=np.repeat([0, 1], 60)))) == 2
     gap = np.delete(points, np.arange(50, 55), axis=0)
-    assert stretches(cut_pieces(profile_of(gap))) == 2
+    assert segments(cut_pieces(profile_of(gap))) == 2
 
 
 def test_only_rejections_near_another_line_cut_a_chain() -> None:
@@ -61,7 +63,7 @@ def test_only_rejections_near_another_line_cut_a_chain() -> None:
         flags = np.zeros(120, np.int64)
         flags[60] = int(flag)
         pieces = cut_pieces(profile_of(points, flags))
-        assert stretches(pieces) == expected
+        assert segments(pieces) == expected
         assert pieces.of_point[60] == -1
 
 
@@ -69,15 +71,15 @@ def test_a_chain_that_turns_onto_the_other_line_is_cut_at_the_corner() -> None:
     first = line(60, -50.0)
     second = line(60, 55.0, (float(first[-1, 0]), float(first[-1, 1])))[1:]
     pieces = cut_pieces(profile_of(np.concatenate([first, second])))
-    assert stretches(pieces) == 2
-    last_of_first = np.flatnonzero(pieces.stretch[pieces.of_point] == 0).max()
+    assert segments(pieces) == 2
+    last_of_first = np.flatnonzero(pieces.segment[pieces.of_point] == 0).max()
     assert abs(last_of_first - 59) <= 2
 
 
 def test_bends_of_surfaces_are_no_corners() -> None:
     angle = np.arange(0.0, 2.0, 1.4 / 60.0)
     circle = 300.0 + 60.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert stretches(cut_pieces(profile_of(circle))) == 1
+    assert segments(cut_pieces(profile_of(circle))) == 1
 
 
 def test_means_are_taken_over_the_samples_of_each_piece() -> None:

@@ -151,6 +151,6 @@ def test_exposures_at_faulty_samples_get_no_pose_and_a_word() -> None:
     ]
     poses = exposure_poses(rows, track)
     wrong, found = PoseStatus.CONTRADICTED, PoseStatus.FOUND
-    assert poses.fate.tolist() == [found, wrong, wrong, found]
+    assert poses.status.tolist() == [found, wrong, wrong, found]
     assert len(poses.track_faults) == 1
     assert any("off the track" in text for text in poses.warnings)

@@ -10,7 +10,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.kernels.chains import best_states
-from armscan.reconstruction.segments import cut_stripes, take_samples
+from armscan.reconstruction.segments import cut_segments, take_samples
 from armscan.records.profile import Profile
 from rigs.sheet_rig import make_profile
 
@@ -30,36 +30,36 @@ def course(bend: FloatArray) -> FloatArray:
 def test_a_straight_and_a_round_line_stay_whole() -> None:
     x = np.arange(200.0)
     for bend in (0.3 * x, 120.0 - np.sqrt(130.0**2 - (x - 100.0) ** 2)):
-        assert cut_stripes(line(course(bend))).piece.max() == 0
+        assert cut_segments(line(course(bend))).number.max() == 0
 
 
 @pytest.mark.parametrize("jump", [1.2, -2.0])
 def test_a_step_cuts_where_it_is(jump: float) -> None:
-    pieces = cut_stripes(line(course(np.where(np.arange(200.0) < 90, 0.0, jump))))
-    assert pieces.piece.max() == 1
-    assert abs(int((pieces.piece == 0).sum()) - 90) <= 2
+    pieces = cut_segments(line(course(np.where(np.arange(200.0) < 90, 0.0, jump))))
+    assert pieces.number.max() == 1
+    assert abs(int((pieces.number == 0).sum()) - 90) <= 2
 
 
 def test_a_kink_cuts_where_it_is() -> None:
     x = np.arange(200.0)
-    pieces = cut_stripes(line(course(np.where(x < 90, 0.0, 0.6 * (x - 90)))))
-    assert pieces.piece.max() == 1
-    assert abs(int((pieces.piece == 0).sum()) - 90) <= 2
+    pieces = cut_segments(line(course(np.where(x < 90, 0.0, 0.6 * (x - 90)))))
+    assert pieces.number.max() == 1
+    assert abs(int((pieces.number == 0).sum()) - 90) <= 2
 
 
 def test_a_gap_cuts() -> None:
     whole = line(course(np.zeros(100)))
-    pieces = cut_stripes(whole.select(np.abs(np.arange(100) - 50) > 5))
-    assert pieces.piece.max() == 1
+    pieces = cut_segments(whole.select(np.abs(np.arange(100) - 50) > 5))
+    assert pieces.number.max() == 1
 
 
 def test_samples_stand_for_every_point_of_their_own_piece() -> None:
     whole = line(course(np.zeros(100)))
-    pieces = cut_stripes(whole.select(np.abs(np.arange(100) - 92) > 3))
+    pieces = cut_segments(whole.select(np.abs(np.arange(100) - 92) > 3))
     samples = take_samples(pieces, 6)
-    assert (pieces.piece[samples.at[samples.nearest]] == pieces.piece).all()
+    assert (pieces.number[samples.at[samples.nearest]] == pieces.number).all()
     assert samples.weight.sum() == pytest.approx(len(pieces.row) / 6)
-    assert (pieces.piece[samples.at] == 1).sum() >= 4
+    assert (pieces.number[samples.at] == 1).sum() >= 4
 
 
 def test_best_states_equal_those_of_a_search_over_all_sequences() -> None:

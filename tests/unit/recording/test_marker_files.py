@@ -70,7 +70,7 @@ def test_probed_points_are_a_list_too(tmp_path: Path) -> None:
         (f"{HEAD}\n0.1,0.2,0.3\n0.2,0.2,0.3\n0.1,0.4,0.3\n", "these look like metres"),
         (f"{HEAD}\n", "holds no marker"),
         ("", "the file is empty"),
-        (f"id,{HEAD}\n4,1,2,3\n4,100,2,3\n", "the id 4 occurs 2 times"),
+        (f"id,{HEAD}\n4,1,2,3\n4,100,2,3\n", "line 3: id 4 appears again"),
         (f"id,{HEAD}\na,1,2,3\n", "'a' in column id is no whole number"),
         (f"{HEAD}\n1,2,3\n50,2,3\n1,2,3\n", "line 2: two markers have the same place"),
         (f"{HEAD},cov_xx_mm2\n1,2,3,0.1\n", "no column is called cov_xy_mm2"),

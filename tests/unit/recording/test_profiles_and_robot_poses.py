@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +11,8 @@ import pytest
 from armscan.errors import FileFormatError
 from armscan.storage.points import read_profiles
 from armscan.storage.poses import read_robot_poses
+from rigs.photographs import DATA, needs
 
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).parents[4] / "shared" / "data"))
 YAML = "%YAML:1.0\n---\nscan_line: [ 1.5e+00, 0., .Nan, 2.,\n    0., -3.5, 4., 0., -6. ]\n"
 
 
@@ -112,7 +111,7 @@ def test_bad_pose_tables_are_refused(tmp_path: Path, text: str, said: str) -> No
     assert said in str(caught.value)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the reference data are not here (ARMSCAN_DATA)")
+@needs("sphere_profiles", "plate_profiles")
 @pytest.mark.parametrize(
     ("folder", "table", "count"),
     [("sphere_profiles", "RobPoses.rob", 15), ("plate_profiles", "rob2board.txt", 12)],

@@ -139,7 +139,7 @@ def test_unknown_keys_are_warned_of_with_the_nearest_name(tmp_path: Path) -> Non
     assert len(warnings) == 3
     assert any("'lab' is not known" in text for text in warnings)
     assert any("'pose.rotations' is not known" in t and "'rotation' is" in t for t in warnings)
-    assert any("'camera.bit_used' is not known" in t and "'bits_used' is" in t for t in warnings)
+    assert any("'camera.0.bit_used' is not known" in t and "'bits_used' is" in t for t in warnings)
 
 
 def test_unknown_lists_and_tables_of_tables_are_warned_of_too(tmp_path: Path) -> None:

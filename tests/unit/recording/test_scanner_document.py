@@ -45,7 +45,8 @@ def test_round_trip_is_exact(tmp_path: Path, has_sensor: bool) -> None:
 def test_what_is_not_known_stays_unknown(tmp_path: Path) -> None:
     known = scanner_calibration()
     bare = replace(
-        known, hand_eye=replace(known.hand_eye, plate=None, diagnostics=None, sensor_coupling=None)
+        known,
+        hand_eye=replace(known.hand_eye, plate=None, diagnostics=None, dhand_eye_dsensor=None),
     )
     path = tmp_path / "scanner.json"
     path.write_bytes(scanner_document(bare))
@@ -58,7 +59,7 @@ def test_released_schema_is_still_read() -> None:
 
 def test_a_coupling_needs_the_names_of_a_sensor() -> None:
     known = scanner_calibration(has_sensor=False)
-    coupled = replace(known, hand_eye=replace(known.hand_eye, sensor_coupling=np.ones((6, 25))))
+    coupled = replace(known, hand_eye=replace(known.hand_eye, dhand_eye_dsensor=np.ones((6, 25))))
     with pytest.raises(InputError, match="no names"):
         scanner_document(coupled)
 

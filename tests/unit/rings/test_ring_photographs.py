@@ -3,20 +3,14 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from armscan.storage.images import read_exposures
 from armscan.vision.rings import RingDetection, detect_rings
+from rigs.photographs import DATA, needs
 
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
 FOLDER = DATA / "ring_markers"
-pytestmark = pytest.mark.skipif(
-    not FOLDER.is_dir(), reason="the photographs of rings are not here (ARMSCAN_DATA)"
-)
+pytestmark = needs("ring_markers")
 
 
 def found_in(name: str) -> RingDetection:

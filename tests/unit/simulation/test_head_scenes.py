@@ -12,7 +12,7 @@ import pytest
 
 from armscan.devices.sources import TwinScene
 from armscan.geometry.poses import Points, Sensor
-from armscan.pipeline.scan_part import FewerViews
+from armscan.pipeline.scan_part import fewer_views
 from armscan.simulation.arm.arm import reach
 from armscan.simulation.arm.hand import CAMERA_CLOCK_NS, HeadOrientation, aim_point_mm, sensor_over
 from armscan.simulation.arm.passes import SweptScene, scan_passes
@@ -328,10 +328,10 @@ def test_places_of_markers_overlap_and_are_named():
 
 def test_two_cameras_are_recorded_and_read_back(tmp_path):
     ball = scan_of("thesis-multi", "ball")
-    two = FewerViews(ball, 2)
+    two = fewer_views(ball, 2)
     assert [row.camera for row in two.rows] == [0, 1, 0, 1]
     assert two.rows[0].t_ns == two.rows[1].t_ns < two.rows[2].t_ns
-    some = FewerViews(ball, 1)
+    some = fewer_views(ball, 1)
     write_recording(tmp_path / "ball", some)
     back = read_recording(tmp_path / "ball")
     assert back.session.cameras == some.session.cameras

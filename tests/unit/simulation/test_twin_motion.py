@@ -41,11 +41,11 @@ def test_a_stroke_has_a_persons_speed_and_ends_where_it_should():
     assert (done.exposure_t_ns % CAMERA_CLOCK_NS == 0).all()
     assert (np.diff(done.exposure_t_ns) > 0).all()
     times = np.arange(0.0, 1e-9 * done.exposure_t_ns[-1], 0.01)
-    way = _middle_of_stripe(done.path.joints(times))
+    way = _middle_of_stripe(done.joints(times))
     speed = np.linalg.norm(np.diff(way, axis=0), axis=1) / 0.01
     assert speed.min() > 18.0 and speed.max() < 82.0
     assert speed.std() > 2.0
-    first, last = _middle_of_stripe(done.path.joints(1e-9 * done.exposure_t_ns[[0, -1]]))
+    first, last = _middle_of_stripe(done.joints(1e-9 * done.exposure_t_ns[[0, -1]]))
     strays = 4.0 * np.hypot(hand.aside_mm, hand.depth_mm)
     assert np.linalg.norm(first - stroke.start_mm) < strays
     assert np.linalg.norm(last - stroke.end_mm) < strays
@@ -61,7 +61,7 @@ def test_a_steady_hand_follows_the_line_at_even_speed():
     times = np.linspace(0.0, 1.5, 31)
     wanted = start + np.outer(40.0 * times, here.rotation[:, 0])
     # Between knots the joints are cubic: the line is kept to micrometres.
-    np.testing.assert_allclose(_middle_of_stripe(done.path.joints(times)), wanted, atol=0.005)
+    np.testing.assert_allclose(_middle_of_stripe(done.joints(times)), wanted, atol=0.005)
 
 
 def test_a_stroke_too_short_for_its_images_is_refused():

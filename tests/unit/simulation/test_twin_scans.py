@@ -57,7 +57,7 @@ def test_every_scene_lists_its_exposures_without_rendering(scene: TwinScene):
     assert (scan.arm is None) == (scene in ("camera", "laser"))
     setup = scan.session.cameras[0]
     is_calibration = scene in ("camera", "laser", "hand-eye")
-    is_full = is_calibration or scene in ("markers", "markers-moved")
+    is_full = is_calibration or scene in ("markers", "markers-moved", "still-part")
     assert (setup.width_px, setup.height_px) == ((3072, 2048) if is_full else (2658, 800))
     assert scan.session.kind == ("calibration" if is_calibration else "scan")
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import cv2
@@ -13,8 +12,8 @@ import pytest
 
 from armscan.cli.run import main
 from armscan.storage.documents import read_stereo_calibration
+from rigs.photographs import DATA
 
-DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[4] / "shared/data"))
 PAIRS = DATA / "stereo_chessboard"
 TARGET = ["--target", "chessboard:9x6:25"]
 SMALL = ["--distortion", "k1k2"]
@@ -24,7 +23,7 @@ SMALL = ["--distortion", "k1k2"]
 def sides(pattern: str = "0*") -> list[str]:
     """Patterns of the left and of the right images."""
     if not list(PAIRS.glob("left*.jpg")):
-        pytest.skip("no pairs stereo_chessboard in the data folder (set ARMSCAN_DATA)")
+        pytest.skip("no real photographs: set ARMSCAN_DATA")
     return [str(PAIRS / f"{side}{pattern}.jpg") for side in ("left", "right")]
 
 

@@ -68,7 +68,6 @@ def test_background_of_another_size_is_refused() -> None:
         {"laser_colour": "infrared"},
         {"line_sigma_px": 0.1},
         {"threshold": -1.0},
-        {"shortest_px": float("nan")},
         {"smoothing_px": -2.0},
     ],
 )

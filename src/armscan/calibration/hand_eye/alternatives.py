@@ -309,27 +309,15 @@ def _offset_and_tilt(plane: FloatArray, by_surface: FloatArray) -> tuple[float, 
     return float(middle @ plane), float(np.degrees(np.arctan(np.hypot(plane[0], plane[1]))))
 
 
-@dataclass(frozen=True, slots=True)
-class FreePlane:
-    """A plane solved along with the hand-eye.
+def find_free_plane(problem: Problem, plate: PlateSurface) -> tuple[float, float, float] | None:
+    """Solve hand-eye and plane together; None where the postures do not determine both.
 
-    Parameters
-    ----------
-    offset_mm
-        Its place on the probed plane's normal, where the stripes lie.
-    tilt_deg
-        Angle between the two planes.
-    typical_mm
-        Median over postures of their distance from it.
+    Returns
+    -------
+    offset_mm, tilt_deg, typical_mm
+        Place of that plane on the probed one's normal, where the stripes lie; angle between them;
+        median over postures of their distance from it.
     """
-
-    offset_mm: float
-    tilt_deg: float
-    typical_mm: float
-
-
-def find_free_plane(problem: Problem, plate: PlateSurface) -> FreePlane | None:
-    """Solve hand-eye and plane together; None where the postures do not determine both."""
     observations = problem.observations
     start = linear_hand_eye(observations, plate.plane, is_offset_free=True)
     if start is None:
@@ -341,7 +329,7 @@ def find_free_plane(problem: Problem, plate: PlateSurface) -> FreePlane | None:
     placed = problem.place(found.state)
     offset_mm, tilt_deg = _offset_and_tilt(found.state.surface, placed.by_surface)
     typical = float(np.nanmedian(posture_rms(observations, placed.residual_mm)))
-    return FreePlane(offset_mm, tilt_deg, typical)
+    return offset_mm, tilt_deg, typical
 
 
 def offset_in_words(offset_mm: float, tilt_deg: float, plate: PlateReference) -> str:
@@ -362,48 +350,34 @@ def offset_in_words(offset_mm: float, tilt_deg: float, plate: PlateReference) ->
     return words
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Mirrored:
-    words: str
-    remedy: str
-    observations: CondensedObservations
-
-
 def find_mirror(
     problem: Problem, plate: PlateSurface, start: Start, smaller: float = SMALLER
 ) -> FitFailure | None:
     """Refuse data that are much likelier if something was mirrored; None if nothing was.
 
+    Mirrored data must leave less than ``smaller`` times what the data as given leave.
+
     A reflection in a flat light sheet leaves the sheet's points where they are, so that mirrored
     data of one perfectly flat sheet fit as well as right ones: nothing but a drawing of the head
     can tell. The bow of real sheets and a second sheet tell them apart, by a misfit of some tenths
     of a millimetre that passes for scatter of a bad arm. So mirrored readings are always tried.
-
-    Parameters
-    ----------
-    problem, plate
-        Data, reference and noise model.
-    start
-        The best hand-eye for the data as they are; its wrong postures take no part.
-    smaller
-        Part of what the data as given leave that mirrored data must not exceed.
     """
     few = thinned(problem.without(start.is_wrong).observations)
     given = _likelihood(replace(problem, observations=few), start.tool_from_sensor)
     if given is None:
         return None
-    best: tuple[float, float, _Mirrored] | None = None
-    for mirrored in _all_mirrored(few, plate):
-        pose = find_start(mirrored.observations, plate).tool_from_sensor
-        found = _likelihood(replace(problem, observations=mirrored.observations), pose)
+    best: tuple[float, float, str, str] | None = None
+    for words, remedy, mirrored in _all_mirrored(few, plate):
+        pose = find_start(mirrored, plate).tool_from_sensor
+        found = _likelihood(replace(problem, observations=mirrored), pose)
         if found is not None and (best is None or found[0] > best[0]):
-            best = (*found, mirrored)
+            best = (*found, words, remedy)
     if best is None or best[0] < given[0] + LIKELIER or best[1] > smaller * given[1]:
         return None
     return FitFailure(
         f"mirrored data: the stripes of the typical posture lie {given[1]:.3f} mm from the plate, "
-        f"and {best[1]:.3f} mm {best[2].words}",
-        best[2].remedy,
+        f"and {best[1]:.3f} mm {best[2]}",
+        best[3],
     )
 
 
@@ -416,11 +390,14 @@ def _likelihood(problem: Problem, pose: Pose[Tool, Sensor]) -> tuple[float, floa
     return fit.linear.log_likelihood, typical
 
 
-def _all_mirrored(given: CondensedObservations, plate: PlateSurface) -> Iterator[_Mirrored]:
+def _all_mirrored(
+    given: CondensedObservations, plate: PlateSurface
+) -> Iterator[tuple[str, str, CondensedObservations]]:
+    """Words, remedy and data of everything that may have been mirrored."""
     for axis, name in enumerate("xyz"):
         mirror = np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
         rotations, translations = mirror @ given.rotations @ mirror, given.translations_mm @ mirror
-        yield _Mirrored(
+        yield (
             f"if the poses were left-handed, {name} pointing the other way (the plate was not)",
             f"give the poses in a right-handed frame: turn the sign of {name} and of the two "
             "rotations that it changes, or read them by the convention of the arm's maker",
@@ -428,7 +405,7 @@ def _all_mirrored(given: CondensedObservations, plate: PlateSurface) -> Iterator
         )
     # The sensor's points in a mirror: what left-handed poses and plate come to.
     mirror, by_sensor = np.diag([-1.0, 1.0, 1.0]), given.dpoint_dsensor
-    yield _Mirrored(
+    yield (
         "if poses and plate were left-handed (an axis of Base and Tool points the other way), or "
         "the sensor's points",
         "give poses, probed points and the sensor's points in right-handed frames",
@@ -441,7 +418,7 @@ def _all_mirrored(given: CondensedObservations, plate: PlateSurface) -> Iterator
     )
     if float(given.points_mm[:, 2].min()) > 0.0:
         for axis, name in ((0, "left and right"), (1, "top and bottom")):
-            yield _Mirrored(
+            yield (
                 f"if {name} of the images were exchanged",
                 "turn off the camera's mirroring (reverse X or Y), and record calibration and "
                 "scan with the same setting",
@@ -502,16 +479,8 @@ def find_reading(
 ) -> FitFailure | None:
     """Refuse in favour of another way to read the poses, if the stripes agree with one.
 
-    Convention, direction, unit and order are tried.
-
-    Parameters
-    ----------
-    given, plate
-        The data as read.
-    fact, typical_mm
-        What is wrong as they are read, and what they leave.
-    most_mm
-        What the reading may leave at most.
+    Convention, direction, unit and order are tried. ``fact`` says what is wrong as they are read,
+    and that leaves ``typical_mm``; the other reading may leave ``most_mm``.
     """
     few = three_a_stripe(given)
     for words, remedy, rotations, translations in _readings(few):

@@ -116,7 +116,7 @@ def calibrate_on_plate(
     sensor_covariance
         (P, P) of the sensor's parameters, in the order of the stripes' ``dpoint_dsensor``: its
         errors bend all stripes alike, and are not taken for something that moved. The hand-eye
-        returned, and its covariance, are for the sensor as it is; ``sensor_coupling`` carries its
+        returned, and its covariance, are for the sensor as it is; ``dhand_eye_dsensor`` carries its
         errors on. None takes it as exact.
 
     Returns

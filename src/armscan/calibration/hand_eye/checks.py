@@ -215,18 +215,19 @@ def explain_misfit(problem: Problem, plate: PlateSurface, start: Start) -> FitFa
     if refusal is not None:
         return refusal
     free = find_free_plane(problem, plate)
-    is_plate = free is not None and free.typical_mm < FREE_PLANE_SHARE * typical_mm
+    is_plate = free is not None and free[2] < FREE_PLANE_SHARE * typical_mm
     if free is not None and is_plate:
-        if abs(free.offset_mm) > GROSS_OFFSET_MM or free.tilt_deg > GROSS_TILT_DEG:
-            most_mm = min(free.typical_mm, limit_mm)
+        offset_mm, tilt_deg, free_mm = free
+        if abs(offset_mm) > GROSS_OFFSET_MM or tilt_deg > GROSS_TILT_DEG:
+            most_mm = min(free_mm, limit_mm)
             misread = find_reading(observations, plate, fact, typical_mm, most_mm=most_mm)
             if misread is not None:
                 return misread
-            is_plate = free.typical_mm <= limit_mm
+            is_plate = free_mm <= limit_mm
         if is_plate:
-            where = offset_in_words(free.offset_mm, free.tilt_deg, plate.reference)
+            where = offset_in_words(offset_mm, tilt_deg, plate.reference)
             return FitFailure(
-                f"{fact}; with the plate's plane left free it is {free.typical_mm:.3f} mm, and the "
+                f"{fact}; with the plate's plane left free it is {free_mm:.3f} mm, and the "
                 f"plane then lies {where}",
                 PROBE_AGAIN,
             )
@@ -269,18 +270,10 @@ def _split(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedFit:
-    """A solution, what is weak about it, and what is added to its covariance for that.
+    """A solution in which the sensor may err within its covariance, and what is weak about it.
 
-    Parameters
-    ----------
-    fit
-        In which the sensor may err within its covariance.
-    warnings
-        In words.
-    widening
-        (6, 6) added to the hand-eye's covariance for what contradicts it a little.
-    plane_check
-        What the stripes alone say of the plate.
+    ``widening`` (6, 6) is added to the hand-eye's covariance for what contradicts it a little;
+    ``plane_check`` is what the stripes alone say of the plate.
     """
 
     fit: HandEyeSolution
@@ -449,14 +442,8 @@ def influence_warnings(
 ) -> tuple[str, ...]:
     """Name the postures without which the hand-eye would move further than its sigma allows.
 
-    Parameters
-    ----------
-    postures
-        Names.
-    left_out
-        What changes without each posture, by its number.
-    covariance
-        (6, 6) of the hand-eye, in the order of the changes' first six.
+    ``left_out`` is what changes without each posture, by its number in ``postures``; ``covariance``
+    (6, 6) or more is that of the hand-eye, in the order of the changes.
     """
     sigma = np.sqrt(np.diag(covariance)[:N_HAND_EYE])
     moves = {

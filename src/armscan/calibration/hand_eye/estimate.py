@@ -63,12 +63,7 @@ LEAST_FOR_WEIGHTS = 4
 class Problem:
     """Data, reference and noise model of one estimate.
 
-    Parameters
-    ----------
-    observations, surface, options
-        What is to be solved.
-    weights
-        (n postures,) at most 1: below it, the posture's pose is trusted less. None for all 1.
+    ``weights`` (n postures,) are at most 1: below it, a posture's pose is trusted less.
     """
 
     observations: CondensedObservations
@@ -206,16 +201,8 @@ def minimise_distances(
 ) -> Minimum[HandEyeState, DenseSystem] | None:
     """Minimise ``e' C^-1 e`` over the unknowns; None where the covariance is not definite.
 
-    Parameters
-    ----------
-    problem
-        Data and reference.
-    start
-        Where to begin.
-    covariance
-        (M, M) of the residuals e, eq. 2.74.
-    columns
-        Which entries of a step are solved for; those of the problem if None.
+    ``covariance`` (M, M) is that of the residuals e of eq. 2.74; ``columns`` are the entries of a
+    step that are solved for, those of the problem if None.
     """
     try:
         whiten = Whitening(covariance)
@@ -245,16 +232,8 @@ def estimate(
 ) -> HandEyeSolution | None:
     """Solve, and estimate the scatter, in turn; None where the data leave unknowns open.
 
-    Parameters
-    ----------
-    problem
-        Data, reference and noise model.
-    start
-        Close to the solution.
-    sigmas
-        Standard deviations to begin with; typical ones if None.
-    hold_noise
-        Keep these standard deviations.
+    It begins close to the solution, with ``sigmas`` (C,), typical ones if None, and keeps them with
+    ``hold_noise``.
     """
     state = start
     rounds, settled = NOISE_ROUNDS[problem.surface.method]
@@ -479,12 +458,7 @@ def conditioning_at(
 ) -> Conditioning:
     """Rank and condition of the hand-eye at a state, other unknowns eliminated; of any rank.
 
-    Parameters
-    ----------
-    problem, state
-        Where.
-    sigmas
-        Standard deviations of the causes of scatter; those to begin with if None.
+    ``sigmas`` (C,) are those of the causes of scatter; those to begin with if None.
 
     Raises
     ------

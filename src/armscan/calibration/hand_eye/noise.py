@@ -69,21 +69,10 @@ MAX_LOG = 7.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseComponent:
-    """One cause of scatter.
+    """One cause of scatter: ``arm``, ``exposure``, each with its ``rotation``, ``flatness``, ...
 
-    Parameters
-    ----------
-    name
-        ``arm``, ``arm rotation``, ``exposure``, ``exposure rotation``, ``flatness``,
-        ``sheet shape``, ``form`` or ``stripe``.
-    covariance
-        (M, M) of the residuals when ``sigma`` is 1.
-    sigma
-        Given, or typical where it is to be estimated.
-    is_estimated
-        True if the data decide.
-    log_width
-        Standard deviation of the logarithm of ``sigma`` before the data were seen.
+    ``covariance`` (M, M) is that of the residuals when ``sigma`` is 1. ``sigma`` is given, or
+    typical where it is estimated; ``log_width`` is the standard deviation of its logarithm then.
     """
 
     name: str
@@ -102,14 +91,7 @@ def noise_components(
 ) -> tuple[NoiseComponent, ...]:
     """Build the causes of scatter at the given placing.
 
-    Parameters
-    ----------
-    observations, surface, placed
-        Data, reference, and where they lie.
-    options
-        Standard deviations given, or None for those to be estimated.
-    weights
-        (n postures,) at most 1: below it, the posture's pose is trusted less. None for all 1.
+    ``weights`` (n postures,) are at most 1: below it, a posture's pose is trusted less.
     """
     by_pose = placed.dresidual_dpose
     shift, turn = by_pose[:, :3] @ by_pose[:, :3].T, by_pose[:, 3:] @ by_pose[:, 3:].T
@@ -300,14 +282,9 @@ def solve_linear(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseEstimate:
-    """Standard deviations of the causes of scatter.
+    """Standard deviations (C,) of the causes of scatter, and covariance (C, C) of their logarithms.
 
-    Parameters
-    ----------
-    sigmas
-        (C,) of each component, given ones included.
-    log_covariance
-        (C, C) of their logarithms; zero for given ones.
+    Given ones are included, with a covariance of zero.
     """
 
     sigmas: FloatArray
@@ -321,18 +298,10 @@ def estimate_noise(
     known: FloatArray,
     start: FloatArray | None = None,
 ) -> NoiseEstimate:
-    """Maximise the restricted likelihood by scoring.
+    """Maximise the restricted likelihood of residuals (M,) with Jacobian (M, K) by scoring.
 
-    Parameters
-    ----------
-    residual, jacobian
-        (M,) and (M, K) at the minimum.
-    components
-        Causes of scatter.
-    known
-        (M, M) covariance that is added and not estimated: of probed plane and sensor.
-    start
-        (C,) standard deviations to begin with; those of the components if None.
+    ``known`` (M, M) is added to the covariance and not estimated: of probed plane and sensor.
+    ``start`` (C,) are the standard deviations to begin with; those of the components if None.
     """
     typical = np.array([component.sigma for component in components])
     free = np.flatnonzero([c.is_estimated for c in components]).astype(np.int64)

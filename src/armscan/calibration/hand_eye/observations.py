@@ -28,8 +28,6 @@ from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.shapes import Plane, fit_circle, fit_plane
 
-FLATNESS_LENGTH_MM = 30.0
-"""Length over which a plate's flatness error stays alike; need not be exact."""
 OUTLIER_SIGMAS = 5.0
 """Points further than this many robust sigmas from their line or circle are left out."""
 MIN_POINTS = 20
@@ -72,7 +70,7 @@ class HandEyeOptions:
     plate_flatness_mm
         Standard deviation of the plate's smooth flatness error.
     flatness_length_mm
-        Distance over which that error is alike.
+        Length over which it stays alike; need not be exact.
     sheet_shape_mm
         Standard deviation of the light sheets' own shape, beyond what their parameters describe.
     stripe_noise_factor
@@ -97,7 +95,7 @@ class HandEyeOptions:
     exposure_position_mm: float | None = None
     exposure_rotation_rad: float | None = None
     plate_flatness_mm: float | None = None
-    flatness_length_mm: float = FLATNESS_LENGTH_MM
+    flatness_length_mm: float = 30.0
     sheet_shape_mm: float | None = None
     stripe_noise_factor: float | None = None
     solve_plate: bool = False
@@ -113,7 +111,7 @@ class HandEyeOptions:
             self._check(name, 0.0, math.inf, "give 0 or more, or leave it out to have it estimated")
         for name in ("arm_rotation_rad", "exposure_rotation_rad"):
             self._check(name, 0.0, 0.1, "0 or more, below 0.1 rad: give rad, not degrees")
-        self._check("flatness_length_mm", 1e-6, math.inf, "give a positive length")
+        self._check("flatness_length_mm", 1.0, 1000.0, "give 1 to 1000 mm")
         self._check("per_stripe", 4, 100, "give 4 to 100")
         self._check("posture_sigmas", 1.5, math.inf, "give at least 1.5")
         self._check("max_rms_mm", 1e-6, 1000.0, "give a positive length")
@@ -226,7 +224,7 @@ def check_diameter(diameter_mm: float) -> None:
     if not 1.0 <= diameter_mm <= 1000.0:
         raise OptionError(
             f"a sphere of {diameter_mm} mm diameter",
-            where="hand-eye options",
+            where="sphere hand-eye options",
             remedy="give the diameter in mm, 1 to 1000",
         )
 

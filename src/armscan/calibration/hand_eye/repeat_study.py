@@ -93,7 +93,7 @@ def study_repeats(
     """
     poses = [one.tool_from_sensor for one in calibrations]
     covariances = [one.covariance for one in calibrations]
-    follow = [one.sensor_coupling for one in calibrations if one.sensor_coupling is not None]
+    follow = [one.dhand_eye_dsensor for one in calibrations if one.dhand_eye_dsensor is not None]
     n = len(calibrations)
     if sensor_covariance is not None and len(follow) == n > 1:
         apart = np.array(follow) - np.mean(follow, axis=0)

@@ -166,7 +166,7 @@ def hand_eye_calibration(
     return HandEyeCalibration(
         tool_from_sensor=held.state.tool_from_sensor,
         covariance=covariance[:N_HAND_EYE, :N_HAND_EYE] + checked.widening,
-        sensor_coupling=dhand_eye_dsensor(held),
+        dhand_eye_dsensor=dhand_eye_dsensor(held),
         arm_noise=arm_noise(components, held.noise.sigmas),
         rms_mm=float(np.sqrt((distances**2).mean())),
         n_postures=len(postures),

@@ -211,18 +211,9 @@ def turn_between_rad(one: Pose[Tool, Sensor], other: Pose[Tool, Sensor]) -> floa
 class Start:
     """Where the estimate on a plate begins.
 
-    Parameters
-    ----------
-    tool_from_sensor
-        The start.
-    linear
-        The linear solution, where it exists.
-    rms_mm
-        (n postures,) distance of each posture's points from the plate; NaN where it has none.
-    is_wrong
-        (n postures,) True for postures that the others contradict.
-    alternatives
-        Other minima that leave little more, least first.
+    Beside the start: the linear solution, where it exists; (n postures,) distance of each posture's
+    points from the plate, NaN where it has none, and whether the others contradict it; other minima
+    that leave little more, least first.
     """
 
     tool_from_sensor: Pose[Tool, Sensor]

@@ -7,8 +7,8 @@ the estimator is the same (`armscan.calibration.hand_eye.estimate`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -25,66 +25,18 @@ from armscan.models.calibration import HandEyeMethod
 N_HAND_EYE = 6
 
 
-class ReferenceSurface(Protocol):
-    """A surface in Base, described by K parameters that may be solved along."""
-
-    @property
-    def method(self) -> HandEyeMethod:
-        """Name of the calibration on it."""
-        ...
-
-    @property
-    def start(self) -> FloatArray:
-        """(K,) parameters as given."""
-        ...
-
-    @property
-    def per_stripe(self) -> int:
-        """Observations that a stripe is condensed to."""
-        ...
-
-    def distance(
-        self, points_mm: FloatArray, parameters: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Signed distance (..., N) of points (..., N, 3) for parameters (..., K).
-
-        With its gradient (..., N, 3) and its derivative (..., N, K) by the parameters.
-        """
-        ...
-
-    def scan_points(
-        self,
-        observations: CondensedObservations,
-        points_base_mm: FloatArray,
-        tool_from_sensor: Pose[Tool, Sensor],
-    ) -> FloatArray:
-        """(N, 3) about which an error of the arm's pose turns each placed point."""
-        ...
-
-    def free_parameters(self, options: HandEyeOptions) -> tuple[int, ...]:
-        """Which of the K parameters are solved along."""
-        ...
-
-    def prior(self, options: HandEyeOptions) -> FloatArray | None:
-        """(K, K) covariance of parameters that are held; None where they are exact or solved."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class PlateSurface:
     """A flat plate: two tilts (rad) and an offset (mm) from the probed plane.
 
-    These are `armscan.geometry.shapes.PLANE_PARAMETERS`.
+    These are its K = 3 parameters, `armscan.geometry.shapes.PLANE_PARAMETERS`; ``start`` is what
+    they are as given. A stripe is condensed to ``per_stripe`` observations.
     """
 
     reference: PlateReference
     method: HandEyeMethod = "plate"
     per_stripe: int = 12
-
-    @property
-    def start(self) -> FloatArray:
-        """(3,) zeros: the probed plane."""
-        return np.zeros(3)
+    start: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def plane(self) -> Plane:
@@ -94,7 +46,10 @@ class PlateSurface:
     def distance(
         self, points_mm: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As of `ReferenceSurface`; the distance is the misclosure of eq. 2.74."""
+        """Signed distance (..., N) of points (..., N, 3) for parameters (..., K): eq. 2.74.
+
+        With its gradient (..., N, 3) and its derivative (..., N, K) by the parameters.
+        """
         local = (points_mm - self.plane.point_mm) @ self.plane.axes.T
         tilt_1, tilt_2, offset = (parameters[..., k, None] for k in range(3))
         scale = np.sqrt(1.0 + tilt_1**2 + tilt_2**2)
@@ -120,17 +75,20 @@ class PlateSurface:
         points_base_mm: FloatArray,
         tool_from_sensor: Pose[Tool, Sensor],
     ) -> FloatArray:
-        """The middle of the sensor's working range, where each exposure has it."""
+        """(N, 3) about which an error of the arm's pose turns each placed point.
+
+        The middle of the sensor's working range, where each exposure has it.
+        """
         stripe = observations.of_points(observations.stripe)
         middle = tool_from_sensor.apply(observations.points_mm.mean(axis=0))
         return (observations.rotations @ middle + observations.translations_mm)[stripe]
 
     def free_parameters(self, options: HandEyeOptions) -> tuple[int, ...]:
-        """All three, or none."""
+        """Which of the parameters are solved along: all or none."""
         return (0, 1, 2) if options.solve_plate else ()
 
     def prior(self, options: HandEyeOptions) -> FloatArray | None:
-        """(3, 3) of the probed plane."""
+        """(K, K) covariance of parameters that are held; None where they are exact or solved."""
         return None if options.solve_plate else self.reference.covariance
 
     def plane_at(self, parameters: FloatArray) -> Plane:
@@ -146,7 +104,10 @@ class PlateSurface:
 
 @dataclass(frozen=True, eq=False)
 class SphereSurface:
-    """A sphere: centre in Base (mm) and radius (mm), of which the centre is always solved."""
+    """A sphere: centre in Base (mm) and radius (mm), K = 4, of which the centre is always solved.
+
+    Its members are those of `PlateSurface`.
+    """
 
     radius_mm: float
     method: HandEyeMethod = "sphere"
@@ -160,7 +121,7 @@ class SphereSurface:
     def distance(
         self, points_mm: FloatArray, parameters: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As of `ReferenceSurface`, positive outside."""
+        """As of `PlateSurface`, positive outside."""
         towards = points_mm - parameters[..., None, :3]
         length = np.linalg.norm(towards, axis=-1)
         normals = towards / np.maximum(length, 1e-12)[..., None]
@@ -187,6 +148,10 @@ class SphereSurface:
     def prior(self, options: HandEyeOptions) -> FloatArray | None:
         """None: the radius is exact where it is held."""
         return None
+
+
+ReferenceSurface: TypeAlias = PlateSurface | SphereSurface
+"""What the points should lie on; the estimator knows no difference but these members."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,7 +193,7 @@ class Placed:
         (M, 6 + K + 1) its derivative by a step of `HandEyeState.retract`.
     dresidual_dpose
         (M, 6) its derivative by a shift of the arm's pose in Base, and by its turn about
-        `ReferenceSurface.scan_points`.
+        `PlateSurface.scan_points`.
     """
 
     points_base_mm: FloatArray

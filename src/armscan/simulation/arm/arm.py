@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.errors import EstimationError
-from armscan.geometry.arrays import FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, FloatArray, floats, frozen_floats
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import skew, vector_from_rotation
 
@@ -225,8 +225,7 @@ class ArmErrors:
     shift_mm: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuringArm:
+class MeasuringArm(ArrayRecord, kw_only=False):
     """The true arm, the controller's arm and the encoders between them.
 
     Parameters
@@ -242,11 +241,7 @@ class MeasuringArm:
     true: ScrewArm
     nominal: ScrewArm
     white_rad: float
-    waves_rad: FloatArray
-
-    def __post_init__(self) -> None:
-        waves = frozen_floats(self.waves_rad, (N_JOINTS, 4), "waves_rad")
-        object.__setattr__(self, "waves_rad", waves)
+    waves_rad: FloatArray = floats(N_JOINTS, 4)
 
     @staticmethod
     def build(errors: ArmErrors, rng: np.random.Generator) -> MeasuringArm:

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the head is held and moved: orientation over a surface, poses, the path of a hand with
-tremor, and scan passes.
-"""
+"""How a person holds and leads the head: orientations over a face, scan passes, tremor."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
-from armscan.geometry.poses import Base, Pose, Sensor, Tool
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, floats, ints
+from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.arm.arm import COMFORTABLE_RAD, N_JOINTS, ScrewArm, reach
 from armscan.simulation.head import Head, sheet_middle_mm
@@ -184,48 +181,6 @@ _FREQUENCIES_HZ = (0.4, 0.9, 1.7)
 _SHARES = (0.6, 0.3, 0.1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandPath:
-    """Joint angles over time, cubic between knots.
-
-    Parameters
-    ----------
-    t_s
-        (N,) increasing times of the knots, N >= 2.
-    joints_rad
-        (N, 7) true joint angles there.
-    """
-
-    t_s: FloatArray
-    joints_rad: FloatArray
-
-    def __post_init__(self) -> None:
-        times = frozen_floats(self.t_s, (None,), "t_s")
-        joints = frozen_floats(self.joints_rad, (len(times), N_JOINTS), "joints_rad")
-        object.__setattr__(self, "t_s", times)
-        object.__setattr__(self, "joints_rad", joints)
-
-    @staticmethod
-    def through(
-        arm: ScrewArm,
-        tool_from_sensor: Pose[Tool, Sensor],
-        t_s: FloatArray,
-        poses: Sequence[Pose[Base, Sensor]],
-    ) -> HandPath:
-        """Path of a true arm whose sensor passes poses at times (N,), each reached exactly."""
-        sensor_from_tool = tool_from_sensor.inverse()
-        joints = COMFORTABLE_RAD
-        knots = []
-        for pose in poses:
-            joints = reach(arm, pose @ sensor_from_tool, joints)
-            knots.append(joints)
-        return HandPath(t_s, np.array(knots))
-
-    def joints(self, t_s: FloatArray) -> FloatArray:
-        """True joint angles (N, 7) at times (N,) within the knots."""
-        return np.asarray(CubicSpline(self.t_s, self.joints_rad, axis=0)(t_s))
-
-
 @dataclass(frozen=True, slots=True)
 class HandTremor:
     """How far a hand strays; each a standard deviation over time.
@@ -248,28 +203,15 @@ class HandTremor:
     speed: float = 0.25
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sway:
-    """A smooth random function of time: a few slow waves with random phases.
+def sway(rng: np.random.Generator, t_s: FloatArray) -> FloatArray:
+    """(N,) smooth random values at times (N,), of about unit standard deviation over time.
 
-    Parameters
-    ----------
-    phases_rad
-        (3,) phases of the waves.
+    A few slow waves with random phases.
     """
-
-    phases_rad: FloatArray
-
-    @staticmethod
-    def draw(rng: np.random.Generator) -> Sway:
-        """Draw the phases."""
-        return Sway(rng.uniform(0.0, 2.0 * np.pi, len(_FREQUENCIES_HZ)))
-
-    def __call__(self, t_s: FloatArray) -> FloatArray:
-        """(N,) values of about unit standard deviation at times (N,)."""
-        angle = 2.0 * np.pi * np.outer(t_s, _FREQUENCIES_HZ) + self.phases_rad
-        scale = np.sqrt(2.0 / np.sum(np.square(_SHARES)))
-        return np.asarray(scale * np.sin(angle) @ np.array(_SHARES))
+    phases_rad = rng.uniform(0.0, 2.0 * np.pi, len(_FREQUENCIES_HZ))
+    angle = 2.0 * np.pi * np.outer(t_s, _FREQUENCIES_HZ) + phases_rad
+    scale = np.sqrt(2.0 / np.sum(np.square(_SHARES)))
+    return np.asarray(scale * np.sin(angle) @ np.array(_SHARES))
 
 
 CAMERA_CLOCK_NS = 12_500_000
@@ -337,21 +279,25 @@ class ScanPass:
         return float(np.linalg.norm(self.end_mm - self.start_mm))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """What the person did.
+class Trajectory(ArrayRecord):
+    """What the person did: joint angles over time, cubic between knots.
 
     Parameters
     ----------
-    path
-        True joint angles, from a little before the first exposure to a little after the last;
-        times in s from the start of the stroke.
+    t_s, joints_rad
+        (N,) times of the knots from the start of the pass, from a little before its first exposure
+        to a little after its last, and (N, 7) true joint angles there.
     exposure_t_ns
-        (N,) mid-exposure times, ns from the start of the stroke.
+        (M,) mid-exposure times, ns from the start of the pass.
     """
 
-    path: HandPath
-    exposure_t_ns: IntArray
+    t_s: FloatArray = floats("N")
+    joints_rad: FloatArray = floats("N", N_JOINTS)
+    exposure_t_ns: IntArray = ints("M")
+
+    def joints(self, t_s: FloatArray) -> FloatArray:
+        """True joint angles (N, 7) at times (N,) within the knots."""
+        return np.asarray(CubicSpline(self.t_s, self.joints_rad, axis=0)(t_s))
 
 
 def sweep(
@@ -376,10 +322,15 @@ def sweep(
         ticks = _even_ticks(stroke.n_exposures, duration)
     knots = np.arange(-_MARGIN_S, duration + _MARGIN_S + _KNOT_S, _KNOT_S)
     sizes = (hand.tilt_deg, hand.tilt_deg, hand.tilt_deg, hand.depth_mm, hand.aside_mm)
-    stray = np.stack([size * Sway.draw(rng)(knots) for size in sizes], axis=1)
+    stray = np.stack([size * sway(rng, knots) for size in sizes], axis=1)
     poses = _poses(stroke, head, np.interp(knots, times, way), stray)
-    path = HandPath.through(arm, head.tool_from_sensor, knots, poses)
-    return Trajectory(path, CAMERA_CLOCK_NS * ticks)
+    sensor_from_tool = head.tool_from_sensor.inverse()
+    joints = [COMFORTABLE_RAD]
+    for pose in poses:
+        joints.append(reach(arm, pose @ sensor_from_tool, joints[-1]))
+    return Trajectory(
+        t_s=knots, joints_rad=np.array(joints[1:]), exposure_t_ns=CAMERA_CLOCK_NS * ticks
+    )
 
 
 def _even_ticks(n_exposures: int, duration_s: float) -> IntArray:
@@ -401,7 +352,7 @@ def _progress(
     burst_s = 1e-9 * CAMERA_CLOCK_NS * stroke.n_exposures if pace.is_burst else 0.0
     longest = max(stroke.length_mm / pace.slowest_mm_s, burst_s) + 4.0 * _MARGIN_S
     times = np.arange(-2.0 * _MARGIN_S, longest, _FINE_S)
-    wanted = stroke.speed_mm_s * (1.0 + hand.speed * Sway.draw(rng)(times))
+    wanted = stroke.speed_mm_s * (1.0 + hand.speed * sway(rng, times))
     speed = np.clip(wanted, pace.slowest_mm_s, pace.fastest_mm_s)
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * _FINE_S)])
     return times, way - np.interp(0.0, times, way)

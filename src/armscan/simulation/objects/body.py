@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.poses import Part, Pose, Sensor
+from armscan.simulation.optics.scene import OneColour
 
 LIMB_COLUMNS = 12
 MAX_STEPS = 2000
@@ -202,7 +203,7 @@ class MetaballLimb:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Body:
+class Body(OneColour):
     """Limbs joined in order, standing somewhere in the scene.
 
     Parameters
@@ -263,10 +264,6 @@ class Body:
             gradient += beside[:, None] * corner
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))
 
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), np.shape(points_mm))
-
     def _in_part(self, points_mm: FloatArray) -> FloatArray:
         pose = self.sensor_from_part
         return np.ascontiguousarray((points_mm - pose.translation_mm) @ pose.rotation)
@@ -287,55 +284,3 @@ def free_form_part() -> Body:
     """Return the part in its own frame."""
     here: Pose[Any, Any] = Pose(np.eye(3), np.zeros(3))
     return Body(_LIMBS, here)
-
-
-_FOOT = (
-    MetaballLimb((0, -62, 0), (0, -61, 0), 70.0, 70.0),
-    MetaballLimb((0, 10, 0), (0, 40, 0), 15.0, 9.0, 6.0),
-    MetaballLimb((0, 34, 0), (0, 35, 0), 13.5, 13.5, 1.5),
-)
-_CHEST = (
-    MetaballLimb((0, 55, 3), (0, 76, 0), 16.0, 22.0, 8.0),
-    MetaballLimb((-33, 80, -4), (33, 80, -4), 15.0, 15.0, 20.0),
-    MetaballLimb((-30, 82, -3), (0, 96, -4), 13.0, 13.0, 12.0),
-    MetaballLimb((30, 82, -3), (0, 96, -4), 13.0, 13.0, 12.0),
-    MetaballLimb((-15, 71, 15), (-12, 72, 15), 9.5, 9.5, 14.0),
-    MetaballLimb((15, 71, 15), (12, 72, 15), 9.5, 9.5, 14.0),
-    MetaballLimb((-27, 96, 3), (-4, 91, 13), 2.6, 2.6, 6.0),
-    MetaballLimb((27, 96, 3), (4, 91, 13), 2.6, 2.6, 6.0),
-)
-_HEAD = (
-    MetaballLimb((0, 90, -5), (0, 122, -1), 13.0, 11.5, 10.0),
-    MetaballLimb((0, 147, -6), (0, 145, 0), 22.5, 21.0, 6.0),
-    MetaballLimb((0, 138, 5), (0, 124, 8), 17.0, 11.5, 10.0),
-    MetaballLimb((-3, 117.5, 15.5), (3, 117.5, 15.5), 5.2, 5.2, 8.0),
-    MetaballLimb((-12, 144.5, 15.5), (-3, 145, 19), 2.8, 3.0, 5.0),
-    MetaballLimb((12, 144.5, 15.5), (3, 145, 19), 2.8, 3.0, 5.0),
-    MetaballLimb((-11, 139, 22), (-7.5, 139, 23.5), 3.2, 3.6, 4.5, is_hollow=True),
-    MetaballLimb((11, 139, 22), (7.5, 139, 23.5), 3.2, 3.6, 4.5, is_hollow=True),
-    MetaballLimb((-9.6, 139.3, 16.4), (-8.2, 139.3, 16.8), 4.0, 4.0, 0.6),
-    MetaballLimb((9.6, 139.3, 16.4), (8.2, 139.3, 16.8), 4.0, 4.0, 0.6),
-    MetaballLimb((-12, 142, 18), (-5.5, 142, 19.5), 1.3, 1.3, 1.5),
-    MetaballLimb((12, 142, 18), (5.5, 142, 19.5), 1.3, 1.3, 1.5),
-    MetaballLimb((0, 143, 20), (0, 131.5, 25.5), 1.9, 2.7, 3.5),
-    MetaballLimb((-3.2, 130.5, 22.5), (3.2, 130.5, 22.5), 1.9, 1.9, 1.5),
-    MetaballLimb((-4.5, 125.6, 18.8), (0, 125.2, 20.4), 1.2, 1.7, 1.6),
-    MetaballLimb((4.5, 125.6, 18.8), (0, 125.2, 20.4), 1.2, 1.7, 1.6),
-    MetaballLimb((-3.6, 123, 18.6), (3.6, 123, 18.6), 1.9, 1.9, 1.2),
-    MetaballLimb((-21.5, 143, -3), (-20, 133.5, -1), 3.2, 2.2, 2.0),
-    MetaballLimb((21.5, 143, -3), (20, 133.5, -1), 3.2, 2.2, 2.0),
-)
-_HAIR = (
-    MetaballLimb((0, 152, -6), (0, 151, -8), 22.5, 22.5, 0.5),
-    MetaballLimb((-20, 150, 4), (-9, 161, 12), 3.6, 4.0, 2.0),
-    MetaballLimb((-9, 161, 12), (4, 162, 13), 4.0, 4.0, 2.0),
-    MetaballLimb((4, 162, 13), (20, 150, 4), 4.0, 3.6, 2.0),
-    MetaballLimb((-16, 160, 3), (0, 169, 5), 3.8, 4.0, 2.0),
-    MetaballLimb((0, 169, 5), (16, 160, 3), 4.0, 3.8, 2.0),
-    MetaballLimb((0, 150, -30), (0, 146, -32), 10.0, 9.0, 4.0),
-)
-
-
-def bust(sensor_from_part: Pose[Sensor, Part]) -> Body:
-    """Return the bust standing at a pose."""
-    return Body(_FOOT + _CHEST + _HEAD + _HAIR, sensor_from_part)

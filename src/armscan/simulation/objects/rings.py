@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats
 from armscan.geometry.poses import Base, Pose
 from armscan.simulation.optics.camera import RenderCamera, blur_image
 from armscan.simulation.optics.render import camera_rays
@@ -29,8 +29,7 @@ _OFF_FACE_MM = 0.5
 """A point farther from the marker's plane is on another face."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RingMarker:
+class RingMarker(ArrayRecord, kw_only=False):
     """One marker.
 
     Parameters
@@ -43,16 +42,15 @@ class RingMarker:
         Albedo of the two tones.
     """
 
-    centre_mm: FloatArray
-    normal: FloatArray
+    centre_mm: FloatArray = floats(3)
+    normal: FloatArray = floats(3)
     disc_mm: float = DISC_DIAMETER_MM
     ring_mm: float = RING_DIAMETER_MM
     light: float = _LIGHT
     dark: float = _DARK
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "centre_mm", frozen_floats(self.centre_mm, (3,), "centre_mm"))
-        object.__setattr__(self, "normal", frozen_floats(self.normal, (3,), "normal"))
+        super().__post_init__()
         if not 0.0 < self.disc_mm < self.ring_mm:
             raise InputError(f"a disc of {self.disc_mm} mm in a ring of {self.ring_mm} mm")
 

@@ -11,7 +11,7 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, frozen_floats
 from armscan.geometry.poses import Pose
-from armscan.simulation.optics.scene import MISS, Surface
+from armscan.simulation.optics.scene import MISS, OneColour, Surface
 
 GREY = (0.7, 0.7, 0.7)
 
@@ -59,7 +59,7 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box:
+class Box(OneColour):
     """A block with sharp edges that stands on z = 0 of its frame, its footprint centred on z.
 
     Parameters
@@ -103,10 +103,6 @@ class Box:
         normals[rows, face] = np.where(centred[rows, face] < 0.0, -1.0, 1.0)
         return normals
 
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
-
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
         """As for `Solid`."""
         beyond = np.abs(self._from_centre(points_mm)) - 0.5 * self.size_mm
@@ -117,13 +113,29 @@ class Box:
         return np.asarray(points_mm - np.array([0.0, 0.0, 0.5 * self.size_mm[2]]))
 
 
+class HeightField(OneColour):
+    """A face given by its height over x and y."""
+
+    __slots__ = ()
+
+    def slopes(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(N,) derivatives of the height along x and y."""
+        raise NotImplementedError
+
+    def normals(self, points_mm: FloatArray) -> FloatArray:
+        """As for `Surface`."""
+        slope_x, slope_y = self.slopes(points_mm[:, 0], points_mm[:, 1])
+        normals = np.stack([-slope_x, -slope_y, np.ones(len(slope_x))], axis=1)
+        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+
+
 N_WAVES = 7
 """Half waves over each side of a plate: on 200 mm the shortest is 29 mm long."""
 _GRID = 61
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FlatPlate:
+class FlatPlate(HeightField):
     """A rectangle in x and y of its frame, seen from +z; z = 0 is the best plane through it.
 
     Parameters
@@ -212,16 +224,6 @@ class FlatPlate:
         result[inside] = distance[inside] + height / along[inside]
         return result
 
-    def normals(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        slope_x, slope_y = self.slopes(points_mm[:, 0], points_mm[:, 1])
-        normals = np.stack([-slope_x, -slope_y, np.ones(len(slope_x))], axis=1)
-        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
-
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
         """As for `Solid`, over the face and next to it."""
         return np.asarray(points_mm[:, 2] - self.height_mm(points_mm[:, 0], points_mm[:, 1]))
@@ -296,7 +298,7 @@ class Wave:
 
 
 @dataclass(frozen=True, slots=True)
-class WavyPlate:
+class WavyPlate(HeightField):
     """A rectangle in x and y of its frame whose height is a sum of sines, seen from +z.
 
     Parameters
@@ -368,16 +370,6 @@ class WavyPlate:
         inside[walking] = False
         result[falls[inside]] = distance[inside]
         return result
-
-    def normals(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        slope_x, slope_y = self.slopes(points_mm[:, 0], points_mm[:, 1])
-        normals = np.stack([-slope_x, -slope_y, np.ones(len(slope_x))], axis=1)
-        return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
 
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
         """As for `Solid`, over the face; true to first order close to it."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from armscan.devices.sources import Preset
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, floats
 from armscan.simulation.optics.camera import STEP_TOLERANCE, Detector, RenderCamera
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.scene import Hits, Scene
@@ -24,8 +24,7 @@ SAME_SURFACE_MM = 3.0
 """Neighbouring pixels that differ more in distance lie on two sides of a silhouette."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StripeTruth:
+class StripeTruth(ArrayRecord):
     """True centre points of one laser's stripe, one a row (or a column, if it lies flat).
 
     Parameters
@@ -41,15 +40,9 @@ class StripeTruth:
     """
 
     laser: str
-    points_px: FloatArray
-    points_mm: FloatArray
-    surface: FloatArray
-
-    def __post_init__(self) -> None:
-        n = len(self.points_px)
-        object.__setattr__(self, "points_px", frozen_floats(self.points_px, (n, 2), "points_px"))
-        object.__setattr__(self, "points_mm", frozen_floats(self.points_mm, (n, 3), "points_mm"))
-        object.__setattr__(self, "surface", frozen_floats(self.surface, (n,), "surface"))
+    points_px: FloatArray = floats("N", 2)
+    points_mm: FloatArray = floats("N", 3)
+    surface: FloatArray = floats("N")
 
 
 def camera_rays(
@@ -115,7 +108,10 @@ def _refine(
     is_lit = scene.laser_light(laser, hits) > 0.0
     pixels = 0.5 * (low + high)
     return StripeTruth(
-        laser.name, pixels[is_lit], hits.points_mm[is_lit], hits.surface[is_lit].astype(np.float64)
+        laser=laser.name,
+        points_px=pixels[is_lit],
+        points_mm=hits.points_mm[is_lit],
+        surface=hits.surface[is_lit].astype(np.float64),
     )
 
 

@@ -34,8 +34,19 @@ class Surface(Protocol):
         """(N, 3) part of red, green and blue light that is reflected at points (N, 3)."""
 
 
+class OneColour:
+    """What reflects all over alike: ``colour`` is its (3,) albedo."""
+
+    __slots__ = ()
+    colour: tuple[float, float, float]
+
+    def albedo(self, points_mm: FloatArray) -> FloatArray:
+        """As for `Surface`."""
+        return np.broadcast_to(np.asarray(self.colour), np.shape(points_mm))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Floor:
+class Floor(OneColour):
     """An endless plane of one colour.
 
     Parameters
@@ -68,13 +79,9 @@ class Floor:
         """As for `Surface`."""
         return np.broadcast_to(self.normal, points_mm.shape)
 
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sphere:
+class Sphere(OneColour):
     """A ball of one colour: centre (3,) and radius in mm."""
 
     centre_mm: FloatArray
@@ -103,10 +110,6 @@ class Sphere:
         """(N,) signed distance of points (N, 3) from the surface; positive outside."""
         away = np.linalg.norm(points_mm - self.centre_mm, axis=1)
         return np.asarray(away - self.radius_mm)
-
-    def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """As for `Surface`."""
-        return np.broadcast_to(np.asarray(self.colour), points_mm.shape)
 
 
 _TEXTURE_CELLS = 1024

@@ -37,7 +37,7 @@ from armscan.vision.stripe.ridge import (
     measure_level,
     trace_ridges,
 )
-from armscan.vision.stripe.smooth import Course, curvature, scatter, smooth
+from armscan.vision.stripe.smooth import Polyline, curvature, scatter, smooth
 from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
@@ -155,7 +155,7 @@ def to_profile(
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])
-    course = straighten(Course(points, normals, sigma, stretch, usable), fits)
+    course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning
@@ -181,7 +181,7 @@ def fitted_centres(fits: ProfileFits) -> tuple[FloatArray, FloatArray, FloatArra
     return points, table[:, 2:4].copy(), np.maximum(sigma, LEAST_SIGMA_PX)
 
 
-def straighten(course: Course, fits: ProfileFits) -> Course:
+def straighten(course: Polyline, fits: ProfileFits) -> Polyline:
     """Take out the bias of a column or row that cuts a bent line at a slant.
 
     With curvature k, and n and t the components of the normal and the tangent along the column, a
@@ -192,9 +192,9 @@ def straighten(course: Course, fits: ProfileFits) -> Course:
     rows = np.arange(len(table))
     along = 1 - table[:, 5].astype(np.int64)
     n = course.normals[rows, along]
-    spread = fits.values[:, SIGMA]
+    sigma_along = fits.values[:, SIGMA]
     bend = curvature(course)
-    cubic = bend * (1.0 - n * n) * spread / (2.0 * n)
+    cubic = bend * (1.0 - n * n) * sigma_along / (2.0 * n)
     corrected = course.points.copy()
-    corrected[rows, along] -= fits.values[:, BEND_GAIN] * spread * cubic
+    corrected[rows, along] -= fits.values[:, BEND_GAIN] * sigma_along * cubic
     return replace(course, points=corrected)

@@ -198,12 +198,13 @@ def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
     slant = min(float(np.median(seen.sine[chosen])), STEEPEST_SINE)
     last = (reach + BLUR_PX) * slant / np.sqrt(1.0 - slant**2)
     width = float(np.median(seen.width[chosen]))
-    spread = max(
-        _spread(seen.width[chosen]) / np.sqrt(2 * HALF + 1), _spread(seen.mean_width[chosen])
+    scatter = max(
+        _robust_std(seen.width[chosen]) / np.sqrt(2 * HALF + 1),
+        _robust_std(seen.mean_width[chosen]),
     )
-    narrow = width - max(LEAST_SHRINKING * width, SCATTERS * spread)
+    narrow = width - max(LEAST_SHRINKING * width, SCATTERS * scatter)
     lean = np.abs(seen.lean[inwards] - np.median(seen.lean[chosen]))
-    leaning = SKEW_SCORE * max(1.0, _spread(seen.lean[chosen]))
+    leaning = SKEW_SCORE * max(1.0, _robust_std(seen.lean[chosen]))
     is_cut = (seen.mean_width[inwards] < narrow) | (lean > leaning)
     for at in arc[is_cut & (arc < farthest)]:
         if at - last > GAP_SIGMAS * sigma_px + REACH_PX:
@@ -212,6 +213,6 @@ def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
     return int(np.searchsorted(arc, last))
 
 
-def _spread(values: FloatArray) -> float:
+def _robust_std(values: FloatArray) -> float:
     """Standard deviation of most of the values."""
     return robust_sigma(values - np.median(values))

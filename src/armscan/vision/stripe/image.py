@@ -119,9 +119,9 @@ def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage
         if use.sum() < 16:
             break
         middle = x[use].mean()
-        spread = float(((x[use] - middle) ** 2).sum())
-        if spread > use.sum():
-            slope = float(((x[use] - middle) * y[use]).sum()) / spread
+        squares = float(((x[use] - middle) ** 2).sum())
+        if squares > use.sum():
+            slope = float(((x[use] - middle) * y[use]).sum()) / squares
             gain = float(np.clip(slope, *GAIN_LIMITS))
         offset = float(np.median(y[use] - gain * x[use]))
         rest = np.abs(y - gain * x - offset)

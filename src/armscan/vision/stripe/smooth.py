@@ -40,7 +40,7 @@ RESIDUAL_WIDENING = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Course:
+class Polyline:
     """Centres in the order of their chains.
 
     ``points``, ``normals``: (N, 2) image pixels and unit normals. ``sigma``: (N,) standard
@@ -58,7 +58,7 @@ class Course:
         """Count of points."""
         return len(self.points)
 
-    def run(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
+    def fit_parabolas(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
         """Result (N, 8) of the smoothing kernel with these half windows."""
         result = np.zeros((len(self), RESULT_COLUMNS))
         smooth_chains(
@@ -96,7 +96,7 @@ def windows(largest_px: float) -> FloatArray:
     return np.geomspace(min(SMALLEST_WINDOW_PX, largest_px), largest_px, steps + 1)
 
 
-def smooth(course: Course, largest_px: float) -> SmoothedCentres:
+def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     """Smooth centres along their chains and give each its standard deviation.
 
     The noise of neighbours is measured from the residuals, not assumed: its size corrects the
@@ -105,15 +105,16 @@ def smooth(course: Course, largest_px: float) -> SmoothedCentres:
     ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
-    rough = course.run(half, np.ones(len(half)))
+    rough = course.fit_parabolas(half, np.ones(len(half)))
     score = np.abs(rough[:, PREDICTED]) / np.hypot(rough[:, PREDICTED_SIGMA], course.sigma)
-    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * _scale(score))
+    scale = max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
+    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
     course = replace(course, is_used=course.is_used & ~is_outlier)
     correlation = noise_correlation(course, half[-1])
     course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
     if largest_px <= 0.0:
         return SmoothedCentres(course.points, course.normals, course.sigma, is_outlier)
-    result = course.run(half, np.array([_inflation(correlation, h) for h in half]))
+    result = course.fit_parabolas(half, np.array([_inflation(correlation, h) for h in half]))
     used, normals = course.is_used, course.normals
     shift = np.where(used, result[:, SHIFT], 0.0)
     slope = np.where(used, result[:, SLOPE], 0.0)
@@ -127,20 +128,15 @@ def smooth(course: Course, largest_px: float) -> SmoothedCentres:
     )
 
 
-def curvature(course: Course) -> FloatArray:
+def curvature(course: Polyline) -> FloatArray:
     """Curvature (N,) of the chains in 1/px, positive where they bend towards their normals.
 
     Shrunk towards zero by its own noise, so that straight lines are not disturbed.
     """
-    result = course.run(BEND_WINDOWS_PX, np.ones(len(BEND_WINDOWS_PX)))
+    result = course.fit_parabolas(BEND_WINDOWS_PX, np.ones(len(BEND_WINDOWS_PX)))
     square = result[:, BEND] ** 2
     noise = result[:, BEND_SIGMA] ** 2
     return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
-
-
-def _scale(score: FloatArray) -> float:
-    """Typical size of scores that should have unit variance; at least 1."""
-    return max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
 
 
 def _weights(half: int) -> FloatArray:
@@ -162,7 +158,7 @@ def _inflation(correlation: FloatArray, half_px: float) -> float:
 def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
     """Standard deviation of the points across a smooth course of their own, in px."""
     n = len(points)
-    course = Course(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
+    course = Polyline(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
     for half in SCATTER_HALVES:
         residual = _filter_residuals(course, half)
         if np.isfinite(residual).sum() >= LEAST_PAIRS:
@@ -171,7 +167,7 @@ def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
     return UNKNOWN_SCATTER_PX
 
 
-def noise_correlation(course: Course, half_px: float) -> FloatArray:
+def noise_correlation(course: Polyline, half_px: float) -> FloatArray:
     """Covariance (LAGS,) of normalised raw centres at distances 0, 1, ... along the chain.
 
     Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
@@ -192,15 +188,15 @@ def noise_correlation(course: Course, half_px: float) -> FloatArray:
         return white
     kernel = -_weights(half)
     kernel[half] += 1.0
-    spread = np.correlate(kernel, kernel, "full")
-    middle = len(spread) // 2
+    autocorrelation = np.correlate(kernel, kernel, "full")
+    middle = len(autocorrelation) // 2
     mixture = np.zeros((LAGS, LAGS))
     for lag in range(LAGS):
         for m in range(LAGS):
             for signed in {m, -m}:
                 at = middle + lag - signed
-                if 0 <= at < len(spread):
-                    mixture[lag, m] += spread[at]
+                if 0 <= at < len(autocorrelation):
+                    mixture[lag, m] += autocorrelation[at]
     scale = max(measured[0] / mixture[0, 0], 0.05)
     surplus = measured[1:] - scale * mixture[1:, 0]
     limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
@@ -223,7 +219,7 @@ def _lag_products(residual: FloatArray, chain: IntArray) -> FloatArray | None:
     return measured
 
 
-def _filter_residuals(course: Course, half: int) -> FloatArray:
+def _filter_residuals(course: Polyline, half: int) -> FloatArray:
     """Residuals over sigma from a uniform quadratic over 2 half + 1 places; NaN near ends."""
     points, normals, chain = course.points, course.normals, course.chain
     n = len(points)

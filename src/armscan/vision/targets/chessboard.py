@@ -370,7 +370,9 @@ def _numbered(
         for extent in extents(small, crossings, lattice):
             if n_tried == _MAX_TRIED:
                 break
-            choices = _dark_first(small, numberings(extent, target.columns, target.rows))
+            choices = numberings(extent, target.columns, target.rows)
+            # the origin has a dark outer square, unless none has
+            choices = [n for n in choices if _darkness(small, n) > 0.0] or choices
             is_known = is_sure(choices, is_square=target.columns == target.rows)
             if not is_known:
                 seen.append(extent)
@@ -389,12 +391,6 @@ def _search_image(grey: RawGrey) -> tuple[Grey32, float]:
     size = (round(image.shape[1] / factor), round(image.shape[0] / factor))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, dtype=np.float32), image.shape[1] / size[0]
-
-
-def _dark_first(grey: Grey32, choices: Sequence[NumberedCorners]) -> list[NumberedCorners]:
-    """Those numberings whose origin has a dark outer square; all if none has."""
-    dark = [numbered for numbered in choices if _darkness(grey, numbered) > 0.0]
-    return dark if dark else list(choices)
 
 
 def _darkness(grey: Grey32, numbered: NumberedCorners) -> float:

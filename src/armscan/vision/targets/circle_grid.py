@@ -189,7 +189,7 @@ def _candidates(grey: RawGrey, exposure: Exposure, target: CircleGrid) -> list[_
     blobs = find_blobs(to_grey8(grey, exposure.full_scale))
     found = []
     for is_light in (False, True):
-        alike = blobs.subset(blobs.is_light == is_light)
+        alike = blobs.select(blobs.is_light == is_light)
         for lattice in grow_lattices(alike):
             grid = number_grid(lattice, alike.centres_px, target, MIN_CIRCLES_FRACTION)
             size = lattice_size(lattice, target.is_asymmetric)

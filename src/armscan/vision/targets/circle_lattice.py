@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats
 from armscan.vision.targets.grey import MIN_CONTRAST, Grey8
 from armscan.vision.targets.target import CircleGrid, rightness
 
@@ -35,26 +35,17 @@ _NOISE_SIGMAS = 5.0
 _PARENT = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Blobs:
+class Blobs(RowRecord):
     """Ellipse-shaped blobs.
 
-    ``centres_px``: (N, 2) centres, image pixels. ``shapes_px2``: (N, 2, 2) matrices S with ``d'
-    S^-1 d = 1`` on the rim, ``d`` from the centre. ``is_light``: (N,) True for a light blob on a
-    dark ground.
+    ``centres_px``: (N, 2) centres, image pixels. ``shapes_px2``: (N, 2, 2) matrices S with
+    ``d' S^-1 d = 1`` on the rim, ``d`` from the centre. ``is_light``: (N,) True for a light blob on
+    a dark ground.
     """
 
-    centres_px: FloatArray
-    shapes_px2: FloatArray
-    is_light: BoolArray
-
-    def __len__(self) -> int:
-        """Count of blobs."""
-        return len(self.centres_px)
-
-    def subset(self, chosen: BoolArray) -> Blobs:
-        """Return the chosen blobs."""
-        return Blobs(self.centres_px[chosen], self.shapes_px2[chosen], self.is_light[chosen])
+    centres_px: FloatArray = floats("N", 2)
+    shapes_px2: FloatArray = floats("N", 2, 2)
+    is_light: BoolArray = bools("N")
 
 
 def find_blobs(
@@ -93,7 +84,7 @@ def find_blobs(
     table = table[np.argsort(table[:, 5], kind="stable")]
     table = table[_first_of_each(table, same_log_area)]
     shapes = table[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
-    return Blobs(table[:, :2].copy(), shapes, table[:, 6] > 0.5)
+    return Blobs(centres_px=table[:, :2], shapes_px2=shapes, is_light=table[:, 6] > 0.5)
 
 
 def _links(hierarchy: object) -> IntArray:
@@ -199,8 +190,8 @@ class _Grower:
         """Blobs nearest to the middle of all blobs first: the middle has most neighbours."""
         middle = np.median(self._centres, axis=0)
         order = np.argsort(((self._centres - middle) ** 2).sum(axis=1), kind="stable")
-        spread = np.unique(np.linspace(0, self._count - 1, _MAX_SEEDS).astype(np.int64))
-        return [int(k) for k in order[spread]]
+        chosen = np.unique(np.linspace(0, self._count - 1, _MAX_SEEDS).astype(np.int64))
+        return [int(k) for k in order[chosen]]
 
     def grow(self, seed: int) -> Lattice:
         """Lattice from a seed, breadth first; each cell hands its basis to its neighbours."""

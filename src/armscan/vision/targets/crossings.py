@@ -14,13 +14,12 @@ reflection, a finger) are bridged by a homography of the cells around them.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
 from armscan.vision.targets.grey import Grey32
 
 _BLUR_PX = 1.2
@@ -36,8 +35,7 @@ _LEVELS = (1.0, 2.0, 4.0)
 """Reductions of the image in which crossings are looked for: the coarse ones are for blur."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Crossings:
+class Crossings(RowRecord):
     """Crossings of two edges.
 
     ``points_px``: (N, 2) places, image pixels, to about half a pixel. ``rising_rad``,
@@ -46,14 +44,10 @@ class Crossings:
     ``contrast``: (N,) difference in level between light and dark sectors.
     """
 
-    points_px: FloatArray
-    rising_rad: FloatArray
-    falling_rad: FloatArray
-    contrast: FloatArray
-
-    def __len__(self) -> int:
-        """Count of crossings."""
-        return len(self.points_px)
+    points_px: FloatArray = floats("N", 2)
+    rising_rad: FloatArray = floats("N")
+    falling_rad: FloatArray = floats("N")
+    contrast: FloatArray = floats("N")
 
 
 def find_crossings(grey: Grey32, min_contrast: float) -> Crossings:
@@ -69,7 +63,8 @@ def find_crossings(grey: Grey32, min_contrast: float) -> Crossings:
         found.append(np.column_stack([rows, np.full(len(rows), level)]))
     table = np.concatenate(found)
     table = table[_first_of_each(table)]
-    return Crossings(table[:, :2].copy(), table[:, 2], table[:, 3], table[:, 4])
+    u_v, (rising, falling, contrast) = table[:, :2], table[:, 2:5].T
+    return Crossings(points_px=u_v, rising_rad=rising, falling_rad=falling, contrast=contrast)
 
 
 def _crossings_in(grey: Grey32, min_contrast: float) -> FloatArray:
@@ -338,18 +333,13 @@ def _regular(crossings: Crossings, lattice: Lattice) -> Lattice:
         (cells[others] - cells[:, None, :]).astype(np.float64), points[others]
     )
     missed = np.hypot(*(predicted - points).T)
-    step = _step_px(points, others)
+    step = np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1)
     is_regular = ~(missed > _POSITION_TOLERANCE * step)
     return {
         (int(a), int(b)): int(k)
         for (a, b), k, keep in zip(cells, index, is_regular, strict=True)
         if keep
     }
-
-
-def _step_px(points: FloatArray, others: IntArray) -> FloatArray:
-    """Way (N,) to the nearest other point."""
-    return np.asarray(np.linalg.norm(points[others] - points[:, None, :], axis=-1).min(axis=1))
 
 
 def _extended(crossings: Crossings, lattice: Lattice) -> Lattice:

@@ -8,11 +8,11 @@ this cannot fail for an ellipse, because the origin lies inside it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
 from armscan.vision.targets.grey import RawGrey
 
 _STEPS = 12
@@ -23,8 +23,7 @@ for _k, (_i, _j) in enumerate(_TERMS):
 _TERM_MATRICES.setflags(write=False)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Ellipses:
+class Ellipses(RowRecord):
     """N fitted ellipses.
 
     ``origin_px``: (N, 2) origin of each ellipse's own coordinates. ``scale_px``: (N,) unit of each
@@ -34,12 +33,12 @@ class Ellipses:
     ``degrees_of_freedom``: (N,) edge points minus 5.
     """
 
-    origin_px: FloatArray
-    scale_px: FloatArray
-    terms: FloatArray
-    covariance: FloatArray
-    chi2: FloatArray
-    degrees_of_freedom: FloatArray
+    origin_px: FloatArray = floats("N", 2, nan=True, infinite=True)
+    scale_px: FloatArray = floats("N", nan=True, infinite=True)
+    terms: FloatArray = floats("N", 5, nan=True, infinite=True)
+    covariance: FloatArray = floats("N", 5, 5, nan=True, infinite=True)
+    chi2: FloatArray = floats("N", nan=True, infinite=True)
+    degrees_of_freedom: FloatArray = floats("N")
 
     @property
     def matrices(self) -> FloatArray:
@@ -114,20 +113,20 @@ class Ellipses:
     def circles(origin_px: FloatArray) -> Ellipses:
         """Circles of radius 1 px around (N, 2) places: stand-ins for what was not fitted."""
         n = len(origin_px)
-        terms = np.tile([1.0, 0.0, 1.0, 0.0, 0.0], (n, 1))
-        covariance = np.tile(np.eye(5), (n, 1, 1))
-        return Ellipses(origin_px, np.ones(n), terms, covariance, np.zeros(n), np.zeros(n))
-
-    def subset(self, rows: IntArray) -> Ellipses:
-        """Return the ellipses of some rows, in that order."""
-        return Ellipses(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Ellipses(
+            origin_px=origin_px,
+            scale_px=np.ones(n),
+            terms=np.tile([1.0, 0.0, 1.0, 0.0, 0.0], (n, 1)),
+            covariance=np.tile(np.eye(5), (n, 1, 1)),
+            chi2=np.zeros(n),
+            degrees_of_freedom=np.zeros(n),
+        )
 
     def replaced(self, rows: IntArray, others: Ellipses) -> Ellipses:
         """Return a copy in which some rows hold others."""
-        arrays = [getattr(self, field.name).copy() for field in fields(self)]
-        for array, field in zip(arrays, fields(self), strict=True):
-            array[rows] = getattr(others, field.name)
-        return Ellipses(*arrays)
+        order = np.arange(len(self))
+        order[rows] = len(self) + np.arange(len(rows))
+        return Ellipses.concat([self, others]).select(order)
 
     def circles_where(self, replaced: BoolArray, origin_px: FloatArray) -> Ellipses:
         """Return a copy with unit circles at (N, 2) origins where a fit is to be replaced."""
@@ -171,7 +170,14 @@ def fit_ellipses(points_px: FloatArray, weights_per_px2: FloatArray) -> Ellipses
     distance, jacobian = _sampson(own, terms)
     normal = (jacobian * weights[:, :, None]).transpose(0, 2, 1) @ jacobian
     chi2 = (weights * distance**2).sum(axis=1)
-    return Ellipses(origin, scale, terms, _inverse(normal), chi2, has_weight.sum(axis=1) - 5.0)
+    return Ellipses(
+        origin_px=origin,
+        scale_px=scale,
+        terms=terms,
+        covariance=_inverse(normal),
+        chi2=chi2,
+        degrees_of_freedom=has_weight.sum(axis=1) - 5.0,
+    )
 
 
 def _algebraic(own: FloatArray, has_weight: BoolArray) -> FloatArray:

@@ -69,8 +69,8 @@ def fit_saddles(
     covariance = inverse[:, :2, :2]
     contrast = np.abs(parameters[:, 6])
     moved = np.hypot(*(parameters[:, :2] - (corners_px - origin)).T)
-    spread = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
-    is_good = (moved < 0.6 * radius) & (spread < 0.25 * radius) & np.isfinite(spread)
+    sigma_px = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+    is_good = (moved < 0.6 * radius) & (sigma_px < 0.25 * radius) & np.isfinite(sigma_px)
     is_good &= parameters[:, 4] < radius
     turned = np.abs(np.arcsin(np.sin(parameters[:, 2:4] - start[:, 2:4]))).max(axis=1)
     is_good &= turned < np.maximum(_MAX_TURN_RAD, MAX_RESIDUAL_RATIO * np.median(turned))

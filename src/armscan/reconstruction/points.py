@@ -1,0 +1,490 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Labelled stripes to points: on their sheet, or fused from both cameras; what is dropped and why.
+
+One light sheet draws one line: each ray of the laser lights one point, the first that it meets.
+Where a line runs on unbroken, all rays around there are spent on it. What else is bright in the
+sheet's part of the image then is a reflection, an edge that a compressed photograph made, or light
+of another source, however well it meets the sheet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.rotations import skew
+from armscan.models.calibration import SensorCalibration
+from armscan.models.light_sheet import LightSheet
+from armscan.reconstruction.epipolar import (
+    Crossings,
+    EpipolarOffset,
+    Projections,
+    RightStripes,
+    drift_directions,
+    find_crossings,
+    project_on_sheets,
+    residual_and_sigma,
+)
+from armscan.reconstruction.labels import LabelledInstant, LabelledProfile, PointStatus
+from armscan.reconstruction.triangulate import (
+    N_CAMERA,
+    N_SHEET,
+    DepthRange,
+    StripePoints,
+    sensor_columns,
+    sensor_covariance,
+    triangulate_stripe,
+)
+from armscan.records.profile import Profile
+
+LARGEST_SLANT = 0.6
+"""Tangent of the angle at which a ray may run to the sheet's depth axis: line lenses spread light
+by up to 60 degrees. Where the sheet knows its rays, they are followed and half of it is enough."""
+NEEDED = 0.5
+"""A segment is left without rays if fewer than this part of its own width is free around it."""
+STEP_SPACINGS = 3.0
+"""Rays are told apart by so many of the spacings between neighbouring points."""
+CONSISTENCY_SIGMAS = 5.0
+"""Points whose left and right picture disagree by more are dropped."""
+MISFIT_SHARE = 0.3
+"""Part of a sheet's residual from its calibration that is its own shape, not the stripes' noise."""
+BESIDE_ROWS = 3
+"""Where the right picture is larger, not every right point has a left one: this many between."""
+N_OBSERVED = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredProfile:
+    """What one exposure gave.
+
+    Parameters
+    ----------
+    labelled
+        Its stripe points, the sheet of each and what became of it.
+    points
+        The measured ones in the Sensor frame.
+    warnings
+        What is weak, in words.
+    """
+
+    labelled: LabelledProfile
+    points: StripePoints
+    warnings: tuple[str, ...] = ()
+
+
+def measure_points(
+    labelled: LabelledInstant, sensor: SensorCalibration, depths: DepthRange
+) -> tuple[MeasuredProfile, ...]:
+    """The points of one instant, camera by camera; those beyond the accepted depths are dropped.
+
+    Of points that both cameras see, the left profile carries the fused one; in the right profile
+    they are marked as shared, so that no point counts twice.
+    """
+    if labelled.offset is None:
+        return tuple(_on_sheets(one, sensor, depths) for one in labelled.profiles)
+    left, right = labelled.profiles
+    return measure_stereo(left, right, labelled.offset, sensor, depths)
+
+
+def points_again(labelled: LabelledProfile, sensor: SensorCalibration) -> StripePoints:
+    """The measured points of a profile of one camera, from the states that it was given."""
+    is_measured = labelled.status == PointStatus.MEASURED
+    return triangulate_stripe(labelled.profile, np.where(is_measured, labelled.sheet, -1), sensor)
+
+
+def _on_sheets(
+    labelled: LabelledProfile, sensor: SensorCalibration, depths: DepthRange
+) -> MeasuredProfile:
+    """Points of one camera on their sheets (eq. 2.20)."""
+    profile, found = labelled.profile, points_again(labelled, sensor)
+    status = np.where(labelled.status == PointStatus.MEASURED, PointStatus.NO_RAY, labelled.status)
+    is_inside = depths.holds(found.points_mm, found.sheet, sensor)
+    status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
+    found = found.select(is_inside)
+    for k, calibrated in enumerate(sensor.sheets):
+        of_sheet = np.flatnonzero(found.sheet == k)
+        row = found.row[of_sheet]
+        is_lost = is_without_ray(
+            found.points_mm[of_sheet],
+            profile.intensity[row],
+            profile.segment[row],
+            calibrated.sheet,
+        )
+        status[row[is_lost]] = PointStatus.NO_LASER_RAY
+    kept = found.select(status[found.row] == PointStatus.MEASURED)
+    return MeasuredProfile(replace(labelled, status=status), kept)
+
+
+def is_without_ray(
+    points_mm: FloatArray, intensity: FloatArray, segment: IntArray, sheet: LightSheet
+) -> BoolArray:
+    """(N,) True for the points of segments for which brighter ones left no ray of the laser.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) on the sheet, Sensor frame.
+    intensity
+        (N,) peak grey level above the background.
+    segment
+        (N,) number of each point's connected segment.
+    sheet
+        The light sheet.
+    """
+    lost = np.zeros(len(points_mm), dtype=np.bool_)
+    if len(np.unique(segment)) < 2:
+        return lost
+    ray, depth = _rays(points_mm, sheet)
+    slant = LARGEST_SLANT * (0.5 if np.any(sheet.fan != 0.0) else 1.0)
+    apart_mm = np.abs(np.diff(ray))[np.diff(segment) == 0]
+    step = STEP_SPACINGS * max(float(np.median(apart_mm)) if len(apart_mm) else 0.0, 1e-6)
+    bins = np.floor((ray - ray.min()) / step).astype(np.int64)
+    first_depth = np.full(int(bins.max()) + 1, np.nan)
+    number = np.unique(segment, return_inverse=True)[1]
+    strength = np.bincount(number, np.maximum(intensity, 0.0))
+    for k in np.argsort(-strength):
+        rows = np.flatnonzero(number == k)
+        first, last = int(bins[rows].min()), int(bins[rows].max())
+        spent = np.isfinite(first_depth)
+        apart = 0.0
+        if spent.any():
+            nearest = np.interp(bins[rows], np.flatnonzero(spent), first_depth[spent])
+            apart = float(np.abs(depth[rows] - nearest).max())
+        reach = int(np.ceil(slant * apart / step))
+        start, stop = first - reach, last + reach + 1
+        within = np.arange(max(start, 0), min(stop, len(spent)))
+        if stop - start - int(spent[within].sum()) < NEEDED * (last - first + 1):
+            lost[rows] = True
+            continue
+        covered = np.arange(first, last + 1)
+        order = np.argsort(bins[rows])
+        first_depth[covered] = np.interp(covered, bins[rows][order], depth[rows][order])
+    return lost
+
+
+def _rays(points_mm: FloatArray, sheet: LightSheet) -> tuple[FloatArray, FloatArray]:
+    """Where the laser's ray of each point crosses the sheet's middle, and its depth, in mm."""
+    local = (points_mm - sheet.origin_mm) @ sheet.axes[:2].T / sheet.scale_mm
+    u, v = local[:, 0], local[:, 1]
+    lean, spread = sheet.fan
+    u0 = (u - lean * v) / np.maximum(1.0 + spread * v, 0.2)
+    return np.asarray(u0 * sheet.scale_mm), np.asarray(v * sheet.scale_mm)
+
+
+def measure_stereo(
+    left: LabelledProfile,
+    right: LabelledProfile,
+    offset: EpipolarOffset,
+    sensor: SensorCalibration,
+    depths: DepthRange,
+) -> tuple[MeasuredProfile, MeasuredProfile]:
+    """Points of two cameras: fused where both see them, else of one camera on its sheet.
+
+    The noises of each point are those of the left stripe, of the right stripe and of the sheet's
+    shape; zero where a camera has no part in it.
+
+    Raises
+    ------
+    InputError
+        If the sensor has one camera.
+    """
+    row = np.flatnonzero(left.sheet >= 0)
+    profile = left.profile
+    projected = project_on_sheets(profile.points_px[row], left.sheet[row], sensor)
+    row, projected = row[projected.is_met], projected.select(projected.is_met)
+    crossings = find_crossings(
+        projected, profile.normals_px[row], profile.sigma_px[row], RightStripes.of(right.profile)
+    )
+    other = np.where(crossings.is_found, right.sheet[crossings.row], -1)
+    is_pair = crossings.is_found & ((other == projected.sheet) | (other == -1))
+    residual, sigma = residual_and_sigma(projected, crossings, sensor, offset)
+    is_fused = is_pair & (np.abs(residual) <= CONSISTENCY_SIGMAS * sigma)
+    is_inside = depths.holds(projected.points_mm, projected.sheet, sensor)
+    is_alone = ~is_pair & is_inside
+    left_status = np.where(left.sheet >= 0, PointStatus.NO_RAY, left.status)
+    left_status[row] = np.where(is_pair, PointStatus.INCONSISTENT, PointStatus.OUT_OF_DEPTH)
+    left_status[row[is_fused | is_alone]] = PointStatus.MEASURED
+    seen = projected.select(is_fused), crossings.select(is_fused)
+    both = _fused(row[is_fused], *seen, profile, right.profile, sensor=sensor, offset=offset)
+    single = _left_alone(row[is_alone], projected.select(is_alone), profile, sensor)
+    right_points, right_status = _right_alone(
+        right, crossings.row[is_pair], crossings.row[is_fused], sensor, depths
+    )
+    return (
+        MeasuredProfile(
+            replace(left, status=left_status), _in_order(both, single), offset.warnings
+        ),
+        MeasuredProfile(replace(right, status=right_status), right_points),
+    )
+
+
+def _right_alone(
+    right: LabelledProfile,
+    paired: IntArray,
+    fused: IntArray,
+    sensor: SensorCalibration,
+    depths: DepthRange,
+) -> tuple[StripePoints, IntArray]:
+    """Points that the left camera does not see, and the status (N,) of all right points.
+
+    ``paired`` and ``fused`` are rows beside which left points fell, and those of them that agreed.
+    """
+    is_labelled = right.sheet >= 0
+    is_beside = _beside(paired, right.profile)
+    found = triangulate_right(
+        right.profile, np.flatnonzero(is_labelled & ~is_beside), right.sheet, sensor
+    )
+    is_inside = depths.holds(found.points_mm, found.sheet, sensor)
+    status = np.where(is_labelled, PointStatus.NO_RAY, right.status)
+    status[is_labelled & is_beside] = PointStatus.INCONSISTENT
+    status[is_labelled & _beside(fused, right.profile)] = PointStatus.SHARED
+    status[found.row] = np.where(is_inside, PointStatus.MEASURED, PointStatus.OUT_OF_DEPTH)
+    return found.select(is_inside), status
+
+
+def _beside(rows: IntArray, right: Profile) -> BoolArray:
+    """(N,) right points that a left point fell beside, with those between them."""
+    is_beside = np.zeros(len(right), dtype=np.bool_)
+    for step in range(-BESIDE_ROWS, BESIDE_ROWS + 1):
+        near = np.clip(rows + step, 0, len(right) - 1)
+        is_beside[near[right.segment[near] == right.segment[rows]]] = True
+    return is_beside
+
+
+def _in_order(both: StripePoints, single: StripePoints) -> StripePoints:
+    """Both kinds in the order of the profile."""
+    joined = StripePoints.concat([both, single])
+    return joined.select(np.argsort(joined.row, kind="stable"))
+
+
+def misfit_mm(sensor: SensorCalibration, sheet: int) -> float:
+    """Standard deviation of a sheet's true surface about its model."""
+    return MISFIT_SHARE * sensor.sheets[sheet].rms_mm
+
+
+def _fused(
+    row: IntArray,
+    projected: Projections,
+    crossings: Crossings,
+    left: Profile,
+    right: Profile,
+    *,
+    sensor: SensorCalibration,
+    offset: EpipolarOffset,
+) -> StripePoints:
+    """Points that both cameras see."""
+    shift = np.zeros(len(row))
+    if offset.is_beyond_calibration:
+        moved = drift_directions(projected, sensor) @ offset.drift
+        shift = -np.sum(crossings.normal * moved, axis=1)
+    sigma = np.stack([left.sigma_px[row], right.sigma_px[crossings.row]], axis=1)
+    return fuse_points(
+        row, projected, crossings, left.normals_px[row], sigma, sensor=sensor, shift_px=shift
+    )
+
+
+def fuse_points(
+    row: IntArray,
+    projected: Projections,
+    crossings: Crossings,
+    normals_px: FloatArray,
+    sigma_px: FloatArray,
+    *,
+    sensor: SensorCalibration,
+    shift_px: FloatArray,
+) -> StripePoints:
+    """Weigh left stripe, right stripe and sheet against each other (eqs. 4.7, 4.11, 4.17).
+
+    A point has three unknowns. Its place along the left stripe is a choice of where to sample, so
+    it keeps its left pixel along the stripe. Three distances remain for the other two: across the
+    left stripe, across the right stripe, and from the sheet. They are weighed by the inverse of
+    their joint covariance: noise of both stripes, the sheet's own shape, and the calibration,
+    which all three share. With the sheet alone (weight of the right stripe zero) this is eq. 4.11;
+    with the sheet's weight zero it is the direct triangulation of eq. 4.7.
+
+    Parameters
+    ----------
+    row
+        (M,) rows of the left profile.
+    projected
+        (M,) these points on their sheets.
+    crossings
+        (M,) the right stripes beside them; all found.
+    normals_px
+        (M, 2) across the left stripe.
+    sigma_px
+        (M, 2) of the left stripe's point and of the right stripe's.
+    sensor
+        Both cameras and all sheets, with their joint covariance.
+    shift_px
+        (M,) known part of the residuals, to be taken off: of a camera that has moved.
+
+    Returns
+    -------
+    StripePoints
+        The noises are those of the left stripe, of the right stripe, and of the sheet's own shape.
+    """
+    n = len(projected.sheet)
+    ddistance_dpoint, ddistance_dsensor = _observations(projected, crossings, normals_px, sensor)
+    misfit = np.array([misfit_mm(sensor, k) for k in range(len(sensor.sheets))])
+    noise = np.column_stack([sigma_px, np.maximum(misfit[projected.sheet], 1e-6)])
+    covariance = np.zeros((n, N_OBSERVED, N_OBSERVED))
+    for k in np.unique(projected.sheet):
+        of_sheet = np.flatnonzero(projected.sheet == k)
+        j = ddistance_dsensor[of_sheet, 1:]
+        covariance[of_sheet] = (j @ sensor_covariance(sensor, int(k))) @ j.transpose(0, 2, 1)
+    covariance[:, np.arange(N_OBSERVED), np.arange(N_OBSERVED)] += noise**2
+    gain = _gain(ddistance_dpoint, covariance)
+    missed = np.zeros((n, 1 + N_OBSERVED))
+    missed[:, 2] = crossings.residual_px - shift_px
+    points = projected.points_mm - np.einsum("nij,nj->ni", gain, missed)
+    return StripePoints(
+        row=row,
+        points_mm=points,
+        noise_mm=gain[:, :, 1:] * noise[:, None, :],
+        by_sensor=-gain @ ddistance_dsensor,
+        sheet=projected.sheet,
+    )
+
+
+def _observations(
+    projected: Projections,
+    crossings: Crossings,
+    normals_px: FloatArray,
+    sensor: SensorCalibration,
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of four distances by the point (M, 4, 3) and by the sensor (M, 4, 32).
+
+    The first is along the left stripe, then across the left stripe, across the right stripe, and
+    from the sheet.
+    """
+    points = projected.points_mm
+    second = N_CAMERA + N_SHEET
+    by_point = np.zeros((len(points), 4, 3))
+    by_sensor = np.zeros((len(points), 4, second + projected.dq_dsecond.shape[2]))
+    _, dq_dpoint, dq_dcamera = sensor.camera.camera.project_with_jacobian(points)
+    tangents = np.stack([-normals_px[:, 1], normals_px[:, 0]], axis=1)
+    axes = np.stack([tangents, normals_px], axis=1)
+    by_point[:, :2], by_sensor[:, :2, :N_CAMERA] = axes @ dq_dpoint, axes @ dq_dcamera
+    across = crossings.normal[:, None, :]
+    by_point[:, 2] = (across @ projected.dq_dpoint)[:, 0]
+    by_sensor[:, 2, second:] = (across @ projected.dq_dsecond)[:, 0]
+    for k in np.unique(projected.sheet):
+        of_sheet = np.flatnonzero(projected.sheet == k)
+        sheet = sensor.sheets[k].sheet
+        _, gradient, dheight_dsheet = sheet.height_with_jacobian(points[of_sheet])
+        by_point[of_sheet, 3] = gradient
+        by_sensor[of_sheet, 3, N_CAMERA:second] = dheight_dsheet
+    return by_point, by_sensor
+
+
+def _gain(by_point: FloatArray, covariance: FloatArray) -> FloatArray:
+    """(M, 3, 4) least-squares change of the point by each of the four distances.
+
+    The first distance is kept at zero exactly; the others are weighed.
+    """
+    along, rest = by_point[:, 0], by_point[:, 1:]
+    first = along / np.sum(along**2, axis=1, keepdims=True)
+    second = np.cross(along, by_point[:, 1])
+    second /= np.linalg.norm(second, axis=1, keepdims=True)
+    third = np.cross(along, second)
+    third /= np.linalg.norm(third, axis=1, keepdims=True)
+    free = np.stack([second, third], axis=2)
+    design = rest @ free
+    weighed = np.linalg.solve(covariance, design).transpose(0, 2, 1)
+    solve = free @ np.linalg.solve(weighed @ design, weighed)
+    # moving along the stripe changes the other distances too, which the solution takes back
+    place = first - np.einsum("nij,njk,nk->ni", solve, rest, first)
+    return np.concatenate([place[:, :, None], solve], axis=2)
+
+
+def _left_alone(
+    row: IntArray, projected: Projections, left: Profile, sensor: SensorCalibration
+) -> StripePoints:
+    """Points on their sheet by the left camera alone (eq. 4.11)."""
+    noise = np.zeros((len(row), 3, N_OBSERVED))
+    across = np.einsum("nij,nj->ni", projected.dpoint_dpx, left.normals_px[row])
+    noise[:, :, 0] = across * left.sigma_px[row, None]
+    for k in np.unique(projected.sheet):
+        of_sheet = projected.sheet == k
+        points = projected.points_mm[of_sheet]
+        _, gradient, _ = sensor.sheets[k].sheet.height_with_jacobian(points)
+        # the move along the ray by one standard deviation of the sheet's own shape
+        along = np.sum(gradient * points, axis=1)
+        noise[of_sheet, :, 2] = points / along[:, None] * misfit_mm(sensor, int(k))
+    second = np.zeros((len(row), 3, projected.dq_dsecond.shape[2]))
+    by_sensor = np.concatenate([projected.dpoint_dsensor, second], axis=2)
+    return StripePoints(
+        row=row,
+        points_mm=projected.points_mm,
+        noise_mm=noise,
+        by_sensor=by_sensor,
+        sheet=projected.sheet,
+    )
+
+
+def triangulate_right(
+    profile: Profile, row: IntArray, sheet: IntArray, sensor: SensorCalibration
+) -> StripePoints:
+    """Intersect the right camera's rays with their sheets (eq. 4.11 in the right camera).
+
+    Parameters
+    ----------
+    profile
+        Stripe points of the right camera.
+    row
+        (M,) those to intersect; points whose ray does not meet the sheet are left out.
+    sheet
+        (N,) index into the sensor's sheets of every point of the profile.
+    sensor
+        Both cameras and all sheets.
+
+    Returns
+    -------
+    StripePoints
+        In the Sensor frame. The noises are those of a left stripe (zero), of the right stripe, and
+        of the sheet's own shape.
+
+    Raises
+    ------
+    InputError
+        If the sensor has one camera.
+    """
+    if sensor.second is None:
+        raise InputError("the sensor has one camera")
+    pose, camera = sensor.second.right_from_sensor, sensor.second.camera.camera
+    turn = pose.rotation.T
+    xy, has_ray, dxy_dpx, dxy_dcamera = camera.undistort_with_jacobian(profile.points_px[row])
+    n = len(row)
+    points, noise = np.zeros((n, 3)), np.zeros((n, 3, N_OBSERVED))
+    by_sensor = np.zeros((n, 3, len(sensor_columns(sensor, 0))))
+    is_met = np.zeros(n, dtype=np.bool_)
+    second = N_CAMERA + N_SHEET
+    for k, calibrated in enumerate(sensor.sheets):
+        at = np.flatnonzero(has_ray & (sheet[row] == k))
+        if not len(at):
+            continue
+        in_right = calibrated.sheet.in_frame(pose.rotation, pose.translation_mm)
+        found, met, dpoint_dxy, dpoint_dsheet = in_right.intersect_with_jacobian(xy[at])
+        at, found, dpoint_dxy = at[met], found[met], dpoint_dxy[met]
+        is_met[at] = True
+        from_centre = found - pose.translation_mm
+        points[at] = from_centre @ turn.T
+        _, gradient, _ = calibrated.sheet.height_with_jacobian(points[at])
+        ray = found @ turn.T
+        along = np.sum(gradient * ray, axis=1)
+        across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dpx[at], profile.normals_px[row[at]])
+        noise[at, :, 1] = (across @ turn.T) * profile.sigma_px[row[at], None]
+        noise[at, :, 2] = ray / along[:, None] * misfit_mm(sensor, k)
+        by_sensor[at, :, N_CAMERA:second] = turn @ dpoint_dsheet[met]
+        by_sensor[at, :, second : second + N_CAMERA] = turn @ (dpoint_dxy @ dxy_dcamera[at])
+        moved = np.concatenate([turn @ skew(from_centre), np.tile(-turn, (len(at), 1, 1))], axis=2)
+        # a moved camera slides the point along its ray back onto the sheet
+        slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
+        by_sensor[at, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
+    return StripePoints(
+        row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=sheet[row]
+    ).select(is_met)

@@ -47,6 +47,7 @@ Distortion = Annotated[
 
 
 def camera(
+    context: typer.Context,
     *,
     images: Annotated[
         list[str] | None,
@@ -117,10 +118,7 @@ def camera(
         )
         return
     if target is None:
-        raise OptionError(
-            "--target is not given",
-            remedy="give --target, or --from camera.json to solve it again",
-        )
+        context.fail("Missing option '--target'.")
     options = given(CameraOptions, **changed)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(

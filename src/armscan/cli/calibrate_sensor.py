@@ -118,6 +118,7 @@ EulerAngles = Annotated[
 
 
 def laser(
+    context: typer.Context,
     *,
     camera: Annotated[
         Path | None,
@@ -193,10 +194,7 @@ def laser(
         )
         return
     if camera is None or target is None:
-        raise OptionError(
-            f"{'--camera' if camera is None else '--target'} is not given",
-            remedy="give --camera and --target, or --from sensor.json to solve it again",
-        )
+        context.fail(f"Missing option '{'--camera' if camera is None else '--target'}'.")
     images = SheetImages(tuple(on or ()), tuple(off or ()), scan, tuple(leave_out or ()))
     options = LaserOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),

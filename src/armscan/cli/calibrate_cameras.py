@@ -37,6 +37,21 @@ STEREO_EXAMPLE = (
     "\b\nTake 10 to 20 pairs at rest, both images at one instant; the board is tilted by 20 to 45\n"
     "degrees to all sides and reaches the corners of both images. Lists pair in their order."
 )
+Photographs = Annotated[
+    list[str] | None,
+    typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
+]
+AgainFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--from", help="Solve camera.json again from its own observations; no target, images."
+    ),
+]
+TargetScan = Annotated[Path | None, typer.Option(help="Recording of the target instead of images.")]
+NotUsed = Annotated[
+    list[str] | None,
+    typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
+]
 Distortion = Annotated[
     str | None,
     typer.Option(
@@ -49,25 +64,12 @@ Distortion = Annotated[
 def camera(
     context: typer.Context,
     *,
-    images: Annotated[
-        list[str] | None,
-        typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
-    ] = None,
+    images: Photographs = None,
     target: OptionalTarget = None,
-    again: Annotated[
-        Path | None,
-        typer.Option(
-            "--from", help="Solve camera.json again from its own observations; no target, images."
-        ),
-    ] = None,
+    again: AgainFile = None,
     output: Document = Path("camera.json"),
-    scan: Annotated[
-        Path | None, typer.Option(help="Recording of the target instead of images.")
-    ] = None,
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
-    ] = None,
+    scan: TargetScan = None,
+    leave_out: NotUsed = None,
     auto_leave_out: Annotated[
         bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
     ] = False,

@@ -72,15 +72,14 @@ Cache = Annotated[
 Document = Annotated[
     Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
 ]
-Target = Annotated[
-    str,
-    typer.Option(
-        "--target",
-        show_default=False,
-        help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
-        "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
-    ),
-]
+TARGET = typer.Option(
+    "--target",
+    show_default=False,
+    help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
+    "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
+)
+Target = Annotated[str, TARGET]
+OptionalTarget = Annotated[str | None, TARGET]
 BitsUsed = Annotated[
     int | None,
     typer.Option("--bits-used", help="Significant bits of 16-bit images, such as 10 or 12."),

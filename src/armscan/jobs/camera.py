@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from armscan.calibration.cameras.calibrate import calibrate_camera as solve_camera
 from armscan.calibration.cameras.result import CameraOptions, reasons_to_refuse
-from armscan.errors import OptionError
+from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job
+from armscan.jobs.job import Job, solved
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.pipeline.cameras import (
     CameraRun,
@@ -32,14 +34,19 @@ from armscan.report.quantity import (
 )
 from armscan.storage.documents import (
     camera_document,
+    observations_of,
+    read_camera_calibration,
+    recorded_options,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
-from armscan.storage.observations import pack_observations
+from armscan.storage.observations import pack_observations, read_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.thesis.ellipse import with_printed_centres
 from armscan.vision.targets.target import (
+    Charuco,
+    Chessboard,
     CircleGrid,
     Target,
     describe_target,
@@ -156,6 +163,64 @@ def _beside_thesis(
         "rms_px": printed.fit.rms_px,
         "parameters": printed.fit.camera.parameters.tolist(),
     }
+
+
+def calibrate_camera_from_file(
+    job: Job, camera_file: Path, changes: Mapping[str, Any] | None = None
+) -> Summary:
+    """Solve the camera of a document again from the observations beside it, and write it anew.
+
+    Parameters
+    ----------
+    job
+        Where to write the document ``NAME.json``.
+    camera_file
+        ``camera.json`` with its file of observations.
+    changes
+        Fields of `CameraOptions` that are not to be as the document records them.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable or keeps too little, or the observations do not determine the
+        camera.
+    """
+    places = job.places(".json", beside=(".npz", ".html"))
+    observations_file = observations_of(camera_file)
+    before, found = read_camera_calibration(camera_file), read_observations(observations_file)
+    options = CameraOptions(
+        **{**recorded_options(before.provenance, CameraOptions), **(changes or {})}
+    )
+    sources = [view.source for view in found.views]
+    options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
+    kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid)
+    recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
+    targets = [kind(**values) for kind, values in recorded.items() if values]
+    if not targets:
+        raise FileFormatError(
+            "the document does not say of which target its views are",
+            where=str(camera_file),
+            remedy="calibrate again from the images",
+        )
+    target = targets[0]
+    fit = solved(solve_camera(found.views, options), camera_file)
+    nonsense = reasons_to_refuse(fit)
+    provenance = job.provenance(
+        (camera_file, observations_file),
+        (target, fit.options),
+        parents=(before.provenance,),
+        warnings=fit.warnings,
+        forced=nonsense,
+    )
+    inputs = tuple(Path(item.path) for item in before.provenance.inputs)
+    read = _Images((), inputs, are_simulated(inputs))
+    page = camera_page(fit, (), {}, provenance, is_simulated=read.is_simulated)
+    job.refuse_nonsense(page, nonsense)
+    observations = pack_observations([view.view for view in fit.views], (), found.sha256)
+    document = camera_document(camera_calibration(fit, provenance), (places[1].name, observations))
+    written = job.write(dict(zip(places, (document, observations, page), strict=True)))
+    summary = _camera_summary(CameraRun(fit, (), 0), target, read, written)
+    return replace(summary, forced=nonsense)
 
 
 def _camera_images(

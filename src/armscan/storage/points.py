@@ -554,12 +554,13 @@ def read_profiles(paths: Sequence[Path | str]) -> tuple[PointProfile, ...]:
     FileFormatError
         If a file is missing, cut, no such profile, or holds no point.
     """
-    files = [file for path in paths for file in _files(Path(path))]
+    files = [file for path in paths for file in profile_files(Path(path))]
     names = source_names(files)
     return tuple(_read(file, name) for file, name in zip(files, names, strict=True))
 
 
-def _files(path: Path) -> list[Path]:
+def profile_files(path: Path) -> list[Path]:
+    """Profiles of a file, a pattern or a folder, in natural order."""
     if not path.is_dir():
         return list(expand_paths([path]))
     found = [

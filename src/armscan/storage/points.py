@@ -28,7 +28,7 @@ from armscan.records.points import MarkerSet, ProbedPoints
 from armscan.records.profile import PointProfile
 from armscan.records.recording import PoseForm
 from armscan.storage.codec import parse_json
-from armscan.storage.files import path_text, read_bytes, told_of
+from armscan.storage.files import is_folder, path_text, read_bytes, told_of
 from armscan.storage.image_paths import expand_paths, natural_key
 from armscan.storage.images import source_names
 from armscan.storage.tables import (
@@ -532,7 +532,7 @@ def _covariance(table: CsvTable, sigma_mm: float, *, has_covariance: bool) -> Fl
 
 
 PROFILE_SUFFIXES = frozenset({".yml", ".yaml", ".csv", ".txt"})
-SCAN_LINE = re.compile(r"^\s*scan_line\s*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
+SCAN_LINE = re.compile(r"^[ \t]*scan_line[ \t]*:\s*\[([^\]]*)(\]?)", re.MULTILINE)
 YAML_WORDS = {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}
 
 
@@ -561,7 +561,7 @@ def read_profiles(paths: Sequence[Path | str]) -> tuple[PointProfile, ...]:
 
 def profile_files(path: Path) -> list[Path]:
     """Profiles of a file, a pattern or a folder, in natural order."""
-    if not path.is_dir():
+    if not is_folder(path):
         return list(expand_paths([path]))
     found = [
         item

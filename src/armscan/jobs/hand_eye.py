@@ -51,8 +51,8 @@ from armscan.storage.points import (
     profile_files,
     read_points_or_plane,
     read_profiles,
+    read_robot_poses,
 )
-from armscan.storage.points import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed

@@ -13,7 +13,6 @@ import pytest
 from armscan.cli.run import main
 from armscan.storage.clouds import read_ply
 from armscan.storage.documents import read_camera_calibration, read_sensor_calibration
-from armscan.storage.observations import read_observations
 from rigs.drawn_bench import FOCAL, HEIGHT, OBJECT_PLACE, SHEET, SHEET_D_MM, TARGET, WIDTH, Bench
 
 SIGMAS = 4.0
@@ -62,39 +61,35 @@ def test_points_lie_on_the_object(
     assert np.all(np.abs(off_plane) < SIGMAS * sigma)
 
 
-def test_observations_let_the_camera_be_solved_again(calibrated: Bench) -> None:
-    from armscan.calibration.cameras.calibrate import calibrate_camera
-    from armscan.calibration.cameras.result import CameraOptions
+@pytest.mark.parametrize("command", ["camera", "laser"])
+def test_a_document_is_solved_again_from_its_own_files(
+    calibrated: Bench, tmp_path: Path, command: str
+) -> None:
+    document = calibrated.camera if command == "camera" else calibrated.sensor
+    again = tmp_path / "again.json"
+    assert main(["calibrate", command, "--from", str(document), "-o", str(again)]) == 0
+    before, after = (json.loads(path.read_text("utf-8")) for path in (document, again))
+    assert after["provenance"]["parent_ids"] == [before["provenance"]["document_id"]]
+    for content in (before, after):
+        for key in ("provenance", "observations", "sha256"):
+            del content[key]
+    assert after == before
+    npz = document.with_suffix(".npz").read_bytes()
+    assert again.with_suffix(".npz").read_bytes() == npz
 
-    found = read_observations(calibrated.camera.with_suffix(".npz"))
-    again = calibrate_camera(found.views, CameraOptions(distortion="none"))
-    assert again
-    np.testing.assert_allclose(
-        again.camera.parameters,
-        read_camera_calibration(calibrated.camera).camera.parameters,
-        atol=1e-9,
-        rtol=1e-12,
-    )
 
-
-def test_observations_let_the_sheet_be_solved_again(calibrated: Bench) -> None:
-    from armscan.calibration.cameras.board_pose import estimate_board_pose
-    from armscan.calibration.sheets.calibrate import calibrate_sheets
-    from armscan.calibration.sheets.result import BoardStripes
-
-    found = read_observations(calibrated.sensor.with_suffix(".npz"))
-    document = read_sensor_calibration(calibrated.sensor)
-    boards = []
-    for view, profile in zip(found.views, found.profiles, strict=True):
-        pose = estimate_board_pose(view, document.camera.camera)
-        assert pose
-        boards.append(BoardStripes(profile, view, pose))
-    again = calibrate_sheets(boards, document.camera)
-    assert again
-    np.testing.assert_allclose(
-        again.sheets[0].sheet.plane, document.sheets[0].sheet.plane, atol=1e-9, rtol=1e-9
-    )
-    np.testing.assert_allclose(again.covariance, document.covariance, atol=1e-15, rtol=1e-6)
+def test_a_document_without_its_own_observations_is_not_solved_again(
+    calibrated: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    moved = tmp_path / calibrated.sensor.name
+    moved.write_bytes(calibrated.sensor.read_bytes())
+    words = ["calibrate", "laser", "--from", str(moved), "-o", str(tmp_path / "again.json")]
+    assert main(words) == 2
+    moved.with_suffix(".npz").write_bytes(calibrated.camera.with_suffix(".npz").read_bytes())
+    assert main(words) == 2
+    assert "not the observations" in capsys.readouterr().err
+    assert main([*words, "--target", "chessboard:7x5:10"]) == 2
+    assert not (tmp_path / "again.json").exists()
 
 
 @pytest.mark.parametrize("name", ["camera.html", "sensor.html"])

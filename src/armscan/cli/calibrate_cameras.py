@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -18,6 +18,9 @@ from armscan.cli.options import (
     Document,
     Force,
     ForceBad,
+    Method,
+    MethodOption,
+    OptionalTarget,
     Target,
     given,
     run,
@@ -36,6 +39,21 @@ STEREO_EXAMPLE = (
     "\b\nTake 10 to 20 pairs at rest, both images at one instant; the board is tilted by 20 to 45\n"
     "degrees to all sides and reaches the corners of both images. Lists pair in their order."
 )
+Photographs = Annotated[
+    list[str] | None,
+    typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
+]
+AgainFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--from", help="Solve camera.json again from its own observations; no target, images."
+    ),
+]
+TargetScan = Annotated[Path | None, typer.Option(help="Recording of the target instead of images.")]
+NotUsed = Annotated[
+    list[str] | None,
+    typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
+]
 Distortion = Annotated[
     str | None,
     typer.Option(
@@ -46,20 +64,14 @@ Distortion = Annotated[
 
 
 def camera(
+    context: typer.Context,
     *,
-    images: Annotated[
-        list[str] | None,
-        typer.Argument(help="Image files, folders, or quoted patterns.", show_default=False),
-    ] = None,
-    target: Target,
+    images: Photographs = None,
+    target: OptionalTarget = None,
+    again: AgainFile = None,
     output: Document = Path("camera.json"),
-    scan: Annotated[
-        Path | None, typer.Option(help="Recording of the target instead of images.")
-    ] = None,
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(help="Image not to use, by name or quoted pattern; repeat for more."),
-    ] = None,
+    scan: TargetScan = None,
+    leave_out: NotUsed = None,
     auto_leave_out: Annotated[
         bool, typer.Option("--auto-leave-out", help="Leave out views that do not fit.")
     ] = False,
@@ -70,6 +82,7 @@ def camera(
     board_warp: Annotated[
         bool, typer.Option("--board-warp", help="Also solve a bow of the board.")
     ] = False,
+    method: MethodOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
     force: Force = False,
@@ -80,25 +93,48 @@ def camera(
     """Calibrate a camera from photographs of a flat target."""
     from armscan.calibration.cameras.result import CameraOptions
     from armscan.errors import OptionError
-    from armscan.jobs.camera import calibrate_camera
+    from armscan.jobs.camera import calibrate_camera, calibrate_camera_from_file
     from armscan.storage.images import ImageOptions
 
     held = set(fix or ())
     if unknown := sorted(held - {"aspect", "centre"}):
         raise OptionError(f"--fix {unknown[0]} is not known", remedy="choose aspect or centre")
-    options = given(
-        CameraOptions,
-        distortion=distortion,
-        is_aspect_fixed="aspect" in held,
-        is_principal_point_fixed="centre" in held,
-        solve_warp=board_warp,
-        leave_out=tuple(leave_out or ()),
-        leave_out_misfits=auto_leave_out,
-    )
+    changed: dict[str, Any] = {
+        "distortion": distortion,
+        "is_aspect_fixed": "aspect" in held or None,
+        "is_principal_point_fixed": "centre" in held or None,
+        "solve_warp": board_warp or None,
+        "leave_out": tuple(leave_out) if leave_out else None,
+        "leave_out_misfits": auto_leave_out or None,
+    }
+    if again is not None:
+        if images or scan or target:
+            raise OptionError(
+                "--from takes target and views from the document's own files",
+                remedy="leave out --target and the images",
+            )
+        changes = {key: value for key, value in changed.items() if value is not None}
+        run(
+            lambda job: calibrate_camera_from_file(job, again, changes),
+            as_json=as_json,
+            output=output,
+            force=force,
+            force_bad=force_bad,
+        )
+        return
+    if target is None:
+        context.fail("Missing option '--target'.")
+    options = given(CameraOptions, **changed)
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: calibrate_camera(
-            job, target, images or (), scan=scan, options=options, image_options=pixels
+            job,
+            target,
+            images or (),
+            scan=scan,
+            options=options,
+            image_options=pixels,
+            is_beside_thesis=method is Method.THESIS,
         ),
         as_json=as_json,
         output=output,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,14 +17,15 @@ from armscan.cli.options import (
     Cache,
     DefaultOf,
     Document,
+    EulerAngles,
     Force,
     ForceBad,
     LaserColourOption,
     Method,
     MethodOption,
+    OptionalTarget,
     Side,
     StripeMethodOption,
-    Target,
     given,
     run,
 )
@@ -46,6 +47,27 @@ HAND_EYE_EXAMPLE = (
     "\b\nLay the plate down, probe it, and take 12 or more postures at rest: tilted by 30 to 45\n"
     "degrees in several directions, nearer and farther."
 )
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        help="Camera calibration, also of OpenCV or ROS; stereo.json for two cameras.",
+        show_default=False,
+    ),
+]
+AgainFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        help="Solve sensor.json again from its own observations; no camera, target, images.",
+    ),
+]
+LitImages = Annotated[
+    list[str] | None,
+    typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
+]
+DarkImages = Annotated[
+    list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
+]
 LaserScan = Annotated[
     Path | None,
     typer.Option(help="Recording of the board instead of images; paired by its views."),
@@ -108,32 +130,16 @@ PoseTable = Annotated[
     Path | None,
     typer.Option(help="Table of the robot's poses, one a profile.", show_default=False),
 ]
-EulerAngles = Annotated[
-    str | None,
-    typer.Option(
-        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
-        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
-    ),
-]
 
 
 def laser(
+    context: typer.Context,
     *,
-    camera: Annotated[
-        Path,
-        typer.Option(
-            help="Camera calibration, also of OpenCV or ROS; stereo.json for two cameras.",
-            show_default=False,
-        ),
-    ],
-    target: Target,
-    on: Annotated[
-        list[str] | None,
-        typer.Option(help="Images with the laser on: files, folder or quoted pattern; repeatable."),
-    ] = None,
-    off: Annotated[
-        list[str] | None, typer.Option(help="The same placements without laser; repeatable.")
-    ] = None,
+    camera: CameraFile = None,
+    target: OptionalTarget = None,
+    again: AgainFile = None,
+    on: LitImages = None,
+    off: DarkImages = None,
     scan: LaserScan = None,
     output: Document = Path("sensor.json"),
     sheets: Sheets = None,
@@ -154,21 +160,43 @@ def laser(
 ) -> None:
     """Calibrate light sheets from images of laser lines on a flat target."""
     from armscan.calibration.sheets.result import SheetOptions
-    from armscan.jobs.sheets import SheetImages, calibrate_sheets
+    from armscan.errors import OptionError
+    from armscan.jobs.sheets import (
+        SheetImages,
+        calibrate_sheets,
+        calibrate_sheets_from_file,
+    )
     from armscan.pipeline.laser import LaserOptions
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 
+    changed: dict[str, Any] = {
+        "margin_mm": margin_mm,
+        "n_sheets": sheets,
+        "sheet_names": tuple(name) if name else None,
+        "is_bow_allowed": False if plane_only else None,
+    }
+    if again is not None:
+        if camera or target or on or off or scan or leave_out:
+            raise OptionError(
+                "--from takes cameras and stripes from the document's own files",
+                remedy="leave out --camera, --target and the images",
+            )
+        changes = {key: value for key, value in changed.items() if value is not None}
+        run(
+            lambda job: calibrate_sheets_from_file(job, again, changes),
+            as_json=as_json,
+            output=output,
+            force=force,
+            force_bad=force_bad,
+        )
+        return
+    if camera is None or target is None:
+        context.fail(f"Missing option '{'--camera' if camera is None else '--target'}'.")
     images = SheetImages(tuple(on or ()), tuple(off or ()), scan, tuple(leave_out or ()))
     options = LaserOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
-        sheets=given(
-            SheetOptions,
-            margin_mm=margin_mm,
-            n_sheets=sheets,
-            sheet_names=tuple(name or ()),
-            is_bow_allowed=not plane_only,
-        ),
+        sheets=given(SheetOptions, **changed),
     )
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
@@ -210,7 +238,7 @@ def hand_eye(
         float | None,
         typer.Option(help="Scatter of the plate's surface; left out, estimated."),
     ] = None,
-    method: MethodOption = Method.ARMSCAN,
+    method: MethodOption = None,
     output: Document = Path("scanner.json"),
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,

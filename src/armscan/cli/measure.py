@@ -15,8 +15,11 @@ from armscan.cli.options import (
     BitsAlign,
     BitsUsed,
     DefaultOf,
+    EulerAngles,
     Force,
     LaserColourOption,
+    Method,
+    MethodOption,
     StripeMethodOption,
     given,
     progress_bar,
@@ -36,7 +39,8 @@ RECONSTRUCT_EXAMPLE = (
     "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
     "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
     "      --sheet A -o cloud.ply\n"
-    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply"
+    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
+    "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
 TWIN = "armscan.pipeline.simulate:SimulateOptions."
 
@@ -172,6 +176,25 @@ def simulate(
     show(summary, as_json=as_json)
 
 
+DepthMargin = Annotated[
+    float | None,
+    typer.Option(
+        help="Widen the calibrated depth range by this part of its width at either end; "
+        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
+        "extrapolated.",
+        show_default=False,
+    ),
+]
+ProfilePoses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
+        "that delivers points.",
+        show_default=False,
+    ),
+]
+
+
 def reconstruct(
     *,
     images: Annotated[
@@ -202,22 +225,17 @@ def reconstruct(
         list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
     ] = None,
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
-    depth_margin: Annotated[
-        float | None,
-        typer.Option(
-            help="Widen the calibrated depth range by this part of its width at either end; "
-            "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
-            "extrapolated.",
-            show_default=False,
-        ),
-    ] = None,
+    depth_margin: DepthMargin = None,
     volume: Annotated[
         str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
     ] = "",
     arm: ArmFile = None,
+    poses: ProfilePoses = None,
+    euler: EulerAngles = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
     ] = Path("cloud.ply"),
+    method: MethodOption = None,
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
     bits_used: BitsUsed = None,
@@ -226,7 +244,7 @@ def reconstruct(
     as_json: AsJson = False,
 ) -> None:
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
-    from armscan.jobs.reconstruct import StillPaths
+    from armscan.jobs.reconstruct import PoseTable, StillPaths
     from armscan.jobs.reconstruct import reconstruct as reconstruct_points
     from armscan.pipeline.measure import MeasureOptions
     from armscan.reconstruction.triangulate import DepthRange
@@ -236,15 +254,24 @@ def reconstruct(
     paths = StillPaths(
         tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
     )
+    table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
         depths=None if depth_margin is None else DepthRange(depth_margin),
         sheet=sheet,
+        is_by_thesis=method is Method.THESIS,
     )
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: reconstruct_points(
-            job, sensor, paths, volume=volume, arm=arm, options=options, image_options=pixels
+            job,
+            sensor,
+            paths,
+            volume=volume,
+            arm=arm,
+            poses=table,
+            options=options,
+            image_options=pixels,
         ),
         as_json=as_json,
         output=output,

@@ -72,15 +72,14 @@ Cache = Annotated[
 Document = Annotated[
     Path, typer.Option("-o", "--output", help="Document to write; a page goes beside it.")
 ]
-Target = Annotated[
-    str,
-    typer.Option(
-        "--target",
-        show_default=False,
-        help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
-        "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
-    ),
-]
+TARGET = typer.Option(
+    "--target",
+    show_default=False,
+    help="circle-grid:11x9:3.75, asymmetric-circle-grid:4x11:5, chessboard:11x6:13 (inner "
+    "corners, mm) or charuco:10x7:4:3:DICT_4X4_50.",
+)
+Target = Annotated[str, TARGET]
+OptionalTarget = Annotated[str | None, TARGET]
 BitsUsed = Annotated[
     int | None,
     typer.Option("--bits-used", help="Significant bits of 16-bit images, such as 10 or 12."),
@@ -96,14 +95,13 @@ BitsAlign = Annotated[
 
 
 class Method(StrEnum):
-    """Whose way a result is found."""
+    """Whose way a result is found beside armscan's own."""
 
-    ARMSCAN = "armscan"
     THESIS = "thesis"
 
 
 MethodOption = Annotated[
-    Method,
+    Method | None,
     typer.Option("--method", help="thesis: as the thesis prints it, to set it beside armscan's."),
 ]
 StripeMethodOption = Annotated[
@@ -112,6 +110,13 @@ StripeMethodOption = Annotated[
         "--stripe-method",
         help="fit, or the thesis's threshold, centroid, template, hessian.",
         show_default=DefaultOf(STRIPES + "method"),
+    ),
+]
+EulerAngles = Annotated[
+    str | None,
+    typer.Option(
+        help="Angles in --poses: intrinsic-xyz, extrinsic-xyz (FANUC), intrinsic-zxz.",
+        show_default=DefaultOf("armscan.jobs.hand_eye:StripeSource.euler"),
     ),
 ]
 LaserColourOption = Annotated[

@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+from armscan.calibration.cameras.calibrate import calibrate_camera as solve_camera
 from armscan.calibration.cameras.result import CameraOptions, reasons_to_refuse
-from armscan.errors import OptionError
+from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job
+from armscan.jobs.job import Job, solved
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.pipeline.cameras import (
     CameraRun,
     calibrate_camera_from_found,
+    calibrate_camera_from_views,
 )
 from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.targets import find_targets
@@ -31,13 +34,25 @@ from armscan.report.quantity import (
 )
 from armscan.storage.documents import (
     camera_document,
+    observations_of,
+    read_camera_calibration,
+    recorded_options,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
-from armscan.storage.observations import pack_observations
+from armscan.storage.observations import pack_observations, read_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
+from armscan.thesis.ellipse import with_printed_centres
+from armscan.vision.targets.target import (
+    Charuco,
+    Chessboard,
+    CircleGrid,
+    Target,
+    describe_target,
+    format_target,
+    parse_target,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +74,7 @@ def calibrate_camera(
     scan: Path | None = None,
     options: CameraOptions | None = None,
     image_options: ImageOptions | None = None,
+    is_beside_thesis: bool = False,
 ) -> Summary:
     """Read, calibrate, write ``camera.json``, ``.npz`` and ``.html``, and say what came out.
 
@@ -74,6 +90,8 @@ def calibrate_camera(
         Folder recording of the target, instead of images.
     options, image_options
         Of the calibration, and how pixels are read.
+    is_beside_thesis
+        Tell what the printed way to find circle centres gives of the same images.
 
     Raises
     ------
@@ -83,6 +101,12 @@ def calibrate_camera(
     """
     options, image_options = options or CameraOptions(), image_options or ImageOptions()
     plate = parse_target(target)
+    if is_beside_thesis and not isinstance(plate, CircleGrid):
+        raise OptionError(
+            "the printed centres are those of circles",
+            where="--method thesis",
+            remedy="take a circle grid, or leave it out",
+        )
     places = job.places(".json", beside=(".npz", ".html"))
     read = _camera_images(images, scan, image_options)
     check_same_size(read.exposures)
@@ -115,6 +139,87 @@ def calibrate_camera(
     document = camera_document(calibration, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = _camera_summary(run, plate, read, written)
+    if is_beside_thesis:
+        views = [with_printed_centres(view, by_source[view.source]) for view in found.views]
+        table, data = _beside_thesis(calibrate_camera_from_views(views, options), run)
+        extra = {**summary.extra, "thesis": data}
+        summary = replace(summary, tables=(*summary.tables, table), extra=extra)
+    return replace(summary, forced=nonsense)
+
+
+def _beside_thesis(
+    printed: CameraRun | FitFailure, ours: CameraRun
+) -> tuple[Table, dict[str, object]]:
+    """The camera from the printed circle centres beside ours, for people and for programs."""
+    columns = ("As the thesis prints it (eqs. 2.22 to 2.27)", "", "ours")
+    if isinstance(printed, FitFailure):
+        return Table(columns, (("not found", printed.reason, ""),)), {"failure": printed.reason}
+    rows = [("rms, px", significant(printed.fit.rms_px), significant(ours.fit.rms_px))]
+    values = zip(
+        PARAMETER_NAMES, printed.fit.camera.parameters, ours.fit.camera.parameters, strict=True
+    )
+    rows += [(name, f"{there:.6g}", f"{here:.6g}") for name, there, here in values]
+    return Table(columns, tuple(rows), "", (1, 2)), {
+        "rms_px": printed.fit.rms_px,
+        "parameters": printed.fit.camera.parameters.tolist(),
+    }
+
+
+def calibrate_camera_from_file(
+    job: Job, camera_file: Path, changes: Mapping[str, Any] | None = None
+) -> Summary:
+    """Solve the camera of a document again from the observations beside it, and write it anew.
+
+    Parameters
+    ----------
+    job
+        Where to write the document ``NAME.json``.
+    camera_file
+        ``camera.json`` with its file of observations.
+    changes
+        Fields of `CameraOptions` that are not to be as the document records them.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable or keeps too little, or the observations do not determine the
+        camera.
+    """
+    places = job.places(".json", beside=(".npz", ".html"))
+    observations_file = observations_of(camera_file)
+    before, found = read_camera_calibration(camera_file), read_observations(observations_file)
+    options = CameraOptions(
+        **{**recorded_options(before.provenance, CameraOptions), **(changes or {})}
+    )
+    sources = [view.source for view in found.views]
+    options = replace(options, leave_out=named_by(options.leave_out, sources, "--leave-out"))
+    kinds: tuple[type[Target], ...] = (Chessboard, Charuco, CircleGrid)
+    recorded = {kind: recorded_options(before.provenance, kind) for kind in kinds}
+    targets = [kind(**values) for kind, values in recorded.items() if values]
+    if not targets:
+        raise FileFormatError(
+            "the document does not say of which target its views are",
+            where=str(camera_file),
+            remedy="calibrate again from the images",
+        )
+    target = targets[0]
+    fit = solved(solve_camera(found.views, options), camera_file)
+    nonsense = reasons_to_refuse(fit)
+    provenance = job.provenance(
+        (camera_file, observations_file),
+        (target, fit.options),
+        parents=(before.provenance,),
+        warnings=fit.warnings,
+        forced=nonsense,
+    )
+    inputs = tuple(Path(item.path) for item in before.provenance.inputs)
+    read = _Images((), inputs, are_simulated(inputs))
+    page = camera_page(fit, (), {}, provenance, is_simulated=read.is_simulated)
+    job.refuse_nonsense(page, nonsense)
+    observations = pack_observations([view.view for view in fit.views], (), found.sha256)
+    document = camera_document(camera_calibration(fit, provenance), (places[1].name, observations))
+    written = job.write(dict(zip(places, (document, observations, page), strict=True)))
+    summary = _camera_summary(CameraRun(fit, (), 0), target, read, written)
     return replace(summary, forced=nonsense)
 
 

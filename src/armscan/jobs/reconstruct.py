@@ -12,12 +12,18 @@ import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box
+from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.job import Job
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
 from armscan.pipeline.measure import reconstruct as reconstruct_images
-from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.pipeline.scan import (
+    ScanOptions,
+    ScanReconstruction,
+    measure_scan,
+    place_profiles,
+)
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
@@ -41,6 +47,7 @@ from armscan.storage.documents import (
 )
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
+from armscan.storage.points import profile_files, read_profiles, read_robot_poses
 from armscan.storage.recording import FolderRecording, is_recording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
@@ -64,6 +71,25 @@ class StillPaths:
     background: tuple[str, ...] = ()
     right: tuple[str, ...] = ()
     right_background: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PoseTable:
+    """A robot's poses, one a profile of a sensor that delivers points.
+
+    Parameters
+    ----------
+    path
+        The table.
+    euler
+        Which angles it holds.
+    """
+
+    path: Path
+    euler: EulerConvention = "extrinsic-xyz"
+
+    def __post_init__(self) -> None:
+        check_convention(self.euler)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,10 +132,13 @@ def reconstruct(
     *,
     volume: str = "",
     arm: Path | None = None,
+    poses: PoseTable | None = None,
     options: MeasureOptions | None = None,
     image_options: ImageOptions | None = None,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
+
+    With a table of poses the files are profiles that a sensor delivered, to be placed in Base.
 
     Parameters
     ----------
@@ -123,6 +152,8 @@ def reconstruct(
         Part of Base to measure in a recording, ``xmin,xmax,ymin,ymax,zmin,zmax``; empty for all.
     arm
         ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
+    poses
+        Of profiles; None for images.
     options, image_options
         Of stripes, depths and sheet, and how pixels are read.
 
@@ -133,6 +164,9 @@ def reconstruct(
         nothing was measured; nothing is written then.
     """
     options, image_options = options or MeasureOptions(), image_options or ImageOptions()
+    box = Box.parse(volume, "--volume") if volume else None
+    if poses is not None:
+        return _delivered(job, calibration, paths.images, poses, box)
     folders = [Path(name) for name in paths.images if Path(name).is_dir()]
     recordings = [folder for folder in folders if is_recording(folder)]
     if recordings and not (paths.background or paths.right):
@@ -145,7 +179,6 @@ def reconstruct(
                 remedy="name one recording at a time",
             )
         _check_own_images(paths)
-        box = Box.parse(volume, "--volume") if volume else None
         return _scan(job, calibration, recordings[0], arm, ScanOptions(measure=options, volume=box))
     for option, value in (("--volume", volume), ("--arm", arm)):
         if value:
@@ -224,7 +257,7 @@ def _sensor(path: Path) -> SensorCalibration:
         raise InputError(
             "this scanner delivers points itself: it has no camera and no light sheets",
             where=str(path),
-            remedy="name the document of a scanner with a camera",
+            remedy="name the document of a scanner with a camera, or give --poses with profiles",
         )
     return sensor
 
@@ -257,15 +290,56 @@ def _scan(
     by_source = {exposure.source: exposure for exposure in shown}
     is_simulated = recording.is_simulated
     page = scan_page(scan, by_source, provenance, warnings, is_simulated=is_simulated)
+    return _told(
+        job,
+        places,
+        scan,
+        page,
+        warnings=warnings,
+        scanner=scanner,
+        is_simulated=is_simulated,
+    )
+
+
+def _delivered(
+    job: Job, calibration: Path, names: Sequence[str], table: PoseTable, volume: Box | None
+) -> Summary:
+    """Place profiles that a sensor delivered."""
+    places = job.places(".ply", ".xyz", beside=(".html",))
+    scanner = read_scanner_calibration(calibration)
+    profiles = read_profiles(names)
+    scan = place_profiles(profiles, read_robot_poses(table.path, table.euler), scanner, volume)
+    files = [path for name in names for path in profile_files(Path(name))]
+    provenance = job.provenance(
+        (*files, table.path, calibration),
+        (table,),
+        parents=(scanner.provenance,),
+        warnings=scan.warnings,
+    )
+    page = scan_page(scan, {}, provenance, scan.warnings)
+    return _told(job, places, scan, page, warnings=scan.warnings, scanner=scanner)
+
+
+def _told(
+    job: Job,
+    places: Sequence[Path],
+    scan: ScanReconstruction,
+    page: Page,
+    *,
+    warnings: Sequence[str],
+    scanner: ScannerCalibration,
+    is_simulated: bool = False,
+) -> Summary:
+    """Write a cloud in Base and say what came out."""
     written, losses = _write(job, places, scan.cloud, page)
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
         quantities=scan_quantities(scan),
-        tables=(fate_totals(scan),),
+        tables=(fate_totals(scan),) if scan.images else (),
         warnings=sentences((*warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",
-        forced=provenance.forced,
+        forced=scan.cloud.forced,
         extra={
             "kind": "scan",
             "simulated": is_simulated,

@@ -3,25 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
+from typing import Any
 
 from armscan.calibration.sheets.result import (
     LaserFit,
     PointUse,
+    SheetOptions,
     SkippedImage,
     reasons_to_refuse,
 )
 from armscan.errors import InputError, OptionError
 from armscan.geometry.estimate import FitFailure
-from armscan.jobs.job import Job
+from armscan.jobs.job import Job, solved
 from armscan.models.calibration import CameraCalibration, Provenance
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, pair_by_view, pair_exposures
 from armscan.pipeline.laser import (
     LaserOptions,
     SeenPair,
+    calibrate_sheets_again,
     calibrate_sheets_from_pairs,
     look_at_pairs,
 )
@@ -43,13 +46,16 @@ from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import (
     STEREO_SCHEMA,
     document_schema,
+    observations_of,
     read_camera_calibration,
+    read_sensor_calibration,
     read_stereo_calibration,
+    recorded_options,
     sensor_document,
 )
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.observations import pack_board_stripes
+from armscan.storage.observations import pack_board_stripes, read_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.vision.targets.target import Target, parse_target
@@ -160,6 +166,50 @@ def calibrate_sheets(
     document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = sheets_summary(fit, written, read.warnings, is_simulated=is_simulated)
+    return replace(summary, forced=provenance.forced)
+
+
+def calibrate_sheets_from_file(
+    job: Job, sensor_file: Path, changes: Mapping[str, Any] | None = None
+) -> Summary:
+    """Solve the sheets of a document again from the observations beside it, and write them anew.
+
+    Parameters
+    ----------
+    job
+        Where to write the document ``NAME.json``.
+    sensor_file
+        ``sensor.json`` with its file of observations.
+    changes
+        Fields of `SheetOptions` that are not to be as the document records them.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable or keeps too little, or the observations do not determine the
+        sheets.
+    """
+    places = job.places(".json", beside=(".npz", ".html"))
+    sensor, observations_file = read_sensor_calibration(sensor_file), observations_of(sensor_file)
+    found = read_observations(observations_file)
+    recorded = recorded_options(sensor.provenance, SheetOptions)
+    options = SheetOptions(**{**recorded, **(changes or {})})
+    fit = solved(calibrate_sheets_again(found, sensor, options), sensor_file)
+    nonsense = reasons_to_refuse(fit)
+    provenance = job.provenance(
+        (sensor_file, observations_file),
+        (options,),
+        parents=(sensor.provenance,),
+        warnings=sheet_warnings(fit),
+        forced=nonsense,
+    )
+    is_simulated = are_simulated([Path(item.path) for item in sensor.provenance.inputs])
+    page = laser_page(fit, {}, provenance, is_simulated=is_simulated)
+    job.refuse_nonsense(page, nonsense)
+    observations = pack_board_stripes(fit, found.sha256)
+    document = sensor_document(fit.to_calibration(provenance), (places[1].name, observations))
+    written = job.write(dict(zip(places, (document, observations, page), strict=True)))
+    summary = sheets_summary(fit, written, (), is_simulated=is_simulated)
     return replace(summary, forced=provenance.forced)
 
 

@@ -12,12 +12,7 @@ from typing import cast, get_args
 import numpy as np
 
 from armscan.calibration.cameras.board_pose import estimate_board_pose
-from armscan.calibration.sheets.board_points import (
-    HeadCameras,
-    SeenBoard,
-    place_board,
-    poses_chi2,
-)
+from armscan.calibration.sheets.board_points import HeadCameras, SeenBoard, place_board, poses_chi2
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import (
     BoardStripes,
@@ -26,8 +21,11 @@ from armscan.calibration.sheets.result import (
     SheetOptions,
     SkippedImage,
 )
-from armscan.calibration.sheets.stripes_on_board import BoardImage
-from armscan.calibration.sheets.target_edges import find_target_edges, runs_along_edge
+from armscan.calibration.sheets.stripes_on_board import (
+    BoardImage,
+    find_target_edges,
+    runs_along_edge,
+)
 from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.estimate import FitFailure

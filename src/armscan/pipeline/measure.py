@@ -42,6 +42,7 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
+from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import LaserColour, StripeOptions
 
@@ -72,11 +73,14 @@ class MeasureOptions:
         head's own rule takes.
     sheet
         Name of the sheet that drew all stripes; empty to find it. For one camera only.
+    is_by_thesis
+        Tell crossed sheets by the printed rule of rows (eqs. 3.1 to 3.7).
     """
 
     stripes: StripeOptions = field(default_factory=StripeOptions)
     depths: DepthRange | None = None
     sheet: str = ""
+    is_by_thesis: bool = False
 
     def accepted_depths(self, sensor: SensorCalibration) -> DepthRange:
         """Depths in which points are kept."""
@@ -100,10 +104,18 @@ def labeller_for(
     Raises
     ------
     OptionError
-        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves, or
-        if there is no such sheet.
+        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves, if
+        there is no such sheet, or if the rule of rows is asked for and has nothing to tell.
     """
     n_sheets = len(sensor.sheets)
+    if options.is_by_thesis:
+        if sensor.second is not None or n_sheets < 2 or options.sheet:
+            raise OptionError(
+                "the rule of rows tells the sheets of one camera's crossed lines",
+                where="--method thesis",
+                remedy="leave it out",
+            )
+        return RowLabeller(sensor)
     if sensor.second is not None:
         if options.sheet:
             raise OptionError(
@@ -307,16 +319,7 @@ def reconstruct(
     """
     options = options or MeasureOptions()
     left = pair_exposures(exposures, backgrounds)
-    if sensor.second is None and rights:
-        raise InputError(
-            f"{len(rights)} images of a right camera, but the sensor has one camera",
-            remedy="leave them out, or name the sensor of the stereo head",
-        )
-    if sensor.second is not None and len(rights) != len(left):
-        raise InputError(
-            f"{len(left)} images of the left camera but {len(rights)} of the right one",
-            remedy="give the right camera's image of every instant, in the same order",
-        )
+    _check_cameras(sensor, len(left), len(rights))
     cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
 
     def stills() -> Iterator[InstantImages]:
@@ -340,6 +343,20 @@ def reconstruct(
     depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
     warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
+
+
+def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None:
+    """Raise `InputError` unless the images are of as many cameras as the sensor has."""
+    if sensor.second is None and n_right:
+        raise InputError(
+            f"{n_right} images of a right camera, but the sensor has one camera",
+            remedy="leave them out, or name the sensor of the stereo head",
+        )
+    if sensor.second is not None and n_right != n_left:
+        raise InputError(
+            f"{n_left} images of the left camera but {n_right} of the right one",
+            remedy="give the right camera's image of every instant, in the same order",
+        )
 
 
 def nothing_measured(images: Sequence[LabelledProfile]) -> str:

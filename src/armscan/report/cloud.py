@@ -41,7 +41,7 @@ def cloud_quantities(result: Reconstruction) -> tuple[Quantity, ...]:
 
 
 def _point_quantities(cloud: PointCloud, images: Sequence[LabelledProfile]) -> tuple[Quantity, ...]:
-    n_stripe = sum(len(image.profile) for image in images)
+    n_stripe = sum(len(image.profile) for image in images) or len(cloud)
     median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
     low, top = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
     return (
@@ -191,28 +191,29 @@ def scan_page(
     cloud = scan.cloud
     size = " × ".join(f"{value:.0f}" for value in np.ptp(cloud.points_mm, axis=0))
     without = f"{len(scan.without_pose)} had no pose of the arm" if scan.without_pose else ""
-    sections = [
-        Section("The cloud", (Gallery((cloud_view(cloud),), 560),)),
-        Section("What became of the points", (Text(FATE_TEXT), fate_totals(scan))),
-        Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)),
-    ]
+    n_placed = scan.count(ExposureStatus.PLACED)
+    sections = [Section("The cloud", (Gallery((cloud_view(cloud),), 560),))]
+    if scan.images:
+        totals = (Text(FATE_TEXT), fate_totals(scan))
+        sections.append(Section("What became of the points", totals))
+    sections.append(Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)))
     if scan.without_pose:
         table = Table(("exposure", "why"), tuple(scan.without_pose), "", (1,))
         sections.append(Section("Exposures without a pose", (table,)))
-    sections += [
-        Section("The stripes", stripe_gallery(scan.images, cloud.sheet_names, exposures)),
-        Section("Exposure by exposure", (_exposure_table(scan),), is_folded=True),
-    ]
+    if scan.images:
+        stripes = stripe_gallery(scan.images, cloud.sheet_names, exposures)
+        sections += [
+            Section("The stripes", stripes),
+            Section("Exposure by exposure", (_exposure_table(scan),), is_folded=True),
+        ]
     return page_of(
         provenance,
         "Scan in Base",
-        f"{len(cloud):,} points from {len(scan.images)} exposures of a moving arm",
+        f"{len(cloud):,} points from {n_placed} exposures of a moving arm",
         sections,
         cards=(
             *only(scan_quantities(scan), "n_points", "sigma_median_mm"),
-            fact(
-                "Exposures placed", str(len(scan.images)), without or "each with a pose of the arm"
-            ),
+            fact("Exposures placed", str(n_placed), without or "each with a pose of the arm"),
             fact("Extent", f"{size} mm", "along X, Y, Z of Base"),
         ),
         warnings=warnings,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from ast import literal_eval
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
@@ -396,6 +397,31 @@ def document_schema(path: Path) -> str | None:
     return found if isinstance(found, str) else None
 
 
+def observations_of(path: Path) -> Path:
+    """The file of observations beside a document, as the document says it was written.
+
+    Raises
+    ------
+    FileFormatError
+        If the document names none, or the file is missing or another one.
+    """
+    entry = parse_json(read_bytes(path), path_text(path)).get("observations")
+    if not isinstance(entry, dict):
+        raise FileFormatError(
+            "the document names no observations from which it could be solved again",
+            where=path_text(path),
+            remedy="calibrate again from the images",
+        )
+    beside = path.parent / Path(str(entry.get("file"))).name
+    if sha256(read_bytes(beside)).hexdigest() != entry.get("sha256"):
+        raise FileFormatError(
+            f"these are not the observations that {path.name} was solved from",
+            where=path_text(beside),
+            remedy="keep both files together as they were written",
+        )
+    return beside
+
+
 def is_scanner_document(path: Path) -> bool:
     """True if a file says that it is a scanner's document; it need not be whole.
 
@@ -624,3 +650,17 @@ def _entries(group: Any) -> Iterator[tuple[str, str]]:
             yield from _entries(value)
         else:
             yield f"{type(group).__name__}.{item.name}", str(value)
+
+
+def recorded_options(provenance: Provenance, kind: type) -> dict[str, Any]:
+    """Fields of an options class as a document records them; those that it does not know lack."""
+    recorded = dict(provenance.options)
+    names = {item.name: f"{kind.__name__}.{item.name}" for item in fields(kind)}
+    found: dict[str, Any] = {}
+    for name, entry in names.items():
+        if entry in recorded:
+            try:
+                found[name] = literal_eval(recorded[entry])
+            except (ValueError, SyntaxError):
+                found[name] = recorded[entry]
+    return found

@@ -7,8 +7,7 @@ import numpy as np
 
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse
-from armscan.calibration.sheets.stripes_on_board import PULL_WIDTHS
-from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
+from armscan.calibration.sheets.stripes_on_board import PULL_WIDTHS, TargetEdges, runs_along_edge
 from rigs.sheet_rig import SheetRig, thesis_rig
 
 PULL_PX = 0.25

@@ -4,8 +4,12 @@
 import numpy as np
 import pytest
 
-from armscan.calibration.sheets import target_edges
-from armscan.calibration.sheets.target_edges import TargetEdges, find_target_edges, runs_along_edge
+from armscan.calibration.sheets import stripes_on_board
+from armscan.calibration.sheets.stripes_on_board import (
+    TargetEdges,
+    find_target_edges,
+    runs_along_edge,
+)
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
@@ -104,7 +108,7 @@ def test_a_stripe_through_the_middle_of_a_circle_crosses_its_rim(
 ) -> None:
     edges = edges_of(CircleGrid(3, 2, 10.0), ellipse(30.0, 30.0)[0])
     assert len(near_px(upright(100.0, 50.0, 150.0), edges)) == 0
-    monkeypatch.setattr(target_edges, "LARGEST_ANGLE_DEG", 90.0)
+    monkeypatch.setattr(stripes_on_board, "LARGEST_ANGLE_DEG", 90.0)
     assert runs_along_edge(upright(100.0, 50.0, 150.0), edges).any()
 
 

@@ -3,17 +3,23 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from armscan.cli.run import main
 from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
+from armscan.geometry.rotations import euler_from_rotations
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan import ExposureStatus, place_profiles
 from armscan.records.profile import PointProfile
+from armscan.storage.clouds import read_ply
+from armscan.storage.documents import scanner_document
 from rigs import placing_rig as rig
 
 NOISE_MM = 0.01
@@ -87,3 +93,29 @@ def test_poses_that_do_not_pair_and_scanners_with_a_camera_are_refused() -> None
         place_profiles(profiles, poses[:-1], device())
     with pytest.raises(InputError):
         place_profiles(profiles, poses, rig.scanner())
+
+
+def test_the_command_places_a_folder_of_profiles(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    profiles, poses, truth = scan()
+    folder = tmp_path / "profiles"
+    folder.mkdir()
+    for k, profile in enumerate(profiles):
+        rows = "\n".join(f"{x:.9f},{z:.9f}" for x, _, z in profile.points_mm.tolist())
+        (folder / f"p{k}.csv").write_text(f"x_mm,z_mm\n{rows}\n", "utf-8")
+    lines = []
+    for pose in poses:
+        angles = np.degrees(euler_from_rotations(pose.rotation[None], "extrinsic-xyz")[0])
+        lines.append(" ".join(f"{value:.12f}" for value in (*pose.translation_mm, *angles)))
+    (tmp_path / "poses.txt").write_text("\n".join(lines), "utf-8")
+    (tmp_path / "scanner.json").write_bytes(scanner_document(device()))
+    words = ["reconstruct", folder, "--poses", tmp_path / "poses.txt", "--scanner"]
+    words += [tmp_path / "scanner.json", "-o", tmp_path / "cloud.ply", "--json"]
+    assert main([str(word) for word in words]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["n_points"] == len(truth)
+    assert told["frame"] == "Base"
+    cloud = read_ply(tmp_path / "cloud.ply")
+    assert np.abs(cloud.points_mm - truth).max() < 6.0 * NOISE_MM
+    assert (tmp_path / "cloud.html").is_file()

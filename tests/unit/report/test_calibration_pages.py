@@ -15,7 +15,7 @@ from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import LaserFit, PointUse
-from armscan.calibration.sheets.target_edges import TargetEdges, runs_along_edge
+from armscan.calibration.sheets.stripes_on_board import TargetEdges, runs_along_edge
 from armscan.jobs.sheets import sheets_summary
 from armscan.models.calibration import FTest
 from armscan.pipeline.documents import camera_calibration

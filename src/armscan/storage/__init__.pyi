@@ -24,7 +24,7 @@ from .observations import read_observations as read_observations
 from .points import read_marker_list as read_marker_list
 from .points import read_probed_points as read_probed_points
 from .points import read_profiles as read_profiles
-from .poses import read_robot_poses as read_robot_poses
+from .points import read_robot_poses as read_robot_poses
 from .recording import FolderRecording as FolderRecording
 from .recording import read_recording as read_recording
 from .recording import write_recording as write_recording

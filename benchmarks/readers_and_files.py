@@ -62,8 +62,8 @@ from armscan.storage.points import (
     read_points_or_plane,
     read_probed_points,
     read_profiles,
+    read_robot_poses,
 )
-from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import read_arm_track, read_recording
 from armscan.vision.targets.target import TargetView
 
@@ -191,7 +191,7 @@ def _scanner() -> ScannerCalibration:
     hand_eye = HandEyeCalibration(
         tool_from_sensor=pose,
         covariance=_covariance(6),
-        sensor_coupling=np.arange(150).reshape(6, 25) / 7,
+        dhand_eye_dsensor=np.arange(150).reshape(6, 25) / 7,
         arm_noise=ArmNoise(position_mm=0.02, rotation_rad=1e-5),
         rms_mm=0.03,
         n_postures=12,

@@ -60,7 +60,8 @@ def test_no_option_with_a_default_of_its_own_is_a_field_of_a_class() -> None:
     """What a command decides by itself is listed here; all else is read from a class."""
     known = {
         ("demo", "scene"), ("demo", "output"), ("demo", "seed"), ("demo", "preset"),
-        ("calibrate stereo", "intrinsics"),
+        ("calibrate stereo", "intrinsics"), ("calibrate hand-eye", "method"),
+        ("register", "method"),
     }  # fmt: skip
     own = {
         (" ".join(path), option.name)

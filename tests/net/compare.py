@@ -229,10 +229,8 @@ def differences(
                 is_free = "~" in place or "/provenance/options/" in place
                 yield Difference(place, old[key], "(gone)", is_free)
                 continue
-            own: float | dict[str, float] = (
-                sigma.get(key, 0.0) if isinstance(sigma, dict) else sigma
-            )
-            own = own or known_sigma(old, key)
+            given = sigma.get(key, 0.0) if isinstance(sigma, dict) else sigma
+            own = given or known_sigma(old, key)
             yield from differences(old[key], new[key], limits, place, scale=scale, sigma=own)
         for key in new.keys() - old.keys():
             yield Difference(f"{where}/{key}", "(none)", new[key], is_warning=True)

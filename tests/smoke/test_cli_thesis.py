@@ -38,6 +38,16 @@ def test_the_plate_by_the_printed_objective_stands_beside_ours(
     assert (tmp_path / "scanner.json").is_file()
 
 
+def test_printed_centres_are_those_of_circles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ["calibrate", "camera", str(INPUTS / "left"), "--target", "chessboard:9x6:20"]
+    assert main([*words, "--method", "thesis"]) == 2
+    assert "--method thesis" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_sphere_without_pure_shifts_says_why_the_two_steps_fail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -58,6 +68,18 @@ def test_markers_are_paired_by_the_eight_steps(
     before, after = (read_marker_list(path, frame="Base").markers for path in (old, new))
     pairs = match_after_thesis(before, after, 0.16)
     assert found["n_matched"] == len(pairs) >= 4
+
+
+def test_the_rule_of_rows_tells_crossed_lines_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Eqs. 3.1 to 3.7: one line has nothing to tell; without earlier exposures nothing is told."""
+    monkeypatch.chdir(tmp_path)
+    words = ["reconstruct", str(INPUTS / "plain/cross.jpg"), "--method", "thesis", "--sensor"]
+    assert main([*words, str(INPUTS / "documents/sensor.json")]) == 2
+    assert "--method thesis" in capsys.readouterr().err
+    assert main([*words, str(INPUTS / "documents/cross.json")]) == 2
+    assert "could be measured" in capsys.readouterr().err
 
 
 def test_the_eight_steps_need_two_lists(

@@ -52,8 +52,9 @@ def test_the_tutorial_runs_and_shows_what_comes_out(
         assert main(words) == 0
         output = capsys.readouterr().out
         expected, found = figures(shown), figures(output)
-        checked = {"rms", "hold-out rms", "fx", "fy", "images", "points", "Y"} & expected.keys()
-        checked |= {"Residual", "Depth covered"} & expected.keys()
+        checked = {"fx", "fy", "Images", "Points", "Y"} & expected.keys()
+        checked |= {"Reprojection residual", "On images it has not seen"} & expected.keys()
+        checked |= {"Target points", "Residual", "Depth covered"} & expected.keys()
         assert checked
         for label in checked:
             assert found[label] == pytest.approx(expected[label], rel=SAME_FIGURE), label

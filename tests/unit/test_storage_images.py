@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import io
+import resource
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -215,3 +218,48 @@ def test_repeated_names_are_told_apart(tmp_path: Path) -> None:
     deep = [Path("a/x/1.png"), Path("b/x/1.png"), Path("y/1.png"), Path("1.png")]
     assert source_names(deep) == ("a/x/1.png", "b/x/1.png", "y/1.png", "1.png")
     assert tuple(exposure.source for exposure in read_exposures(paths)) == names
+
+
+def claiming(kind: str, width: int, height: int) -> bytes:
+    """A small picture whose header claims a size; a PNG's checksum fits."""
+    ending = {"PNG": ".png", "JPEG": ".jpg", "BMP": ".bmp", "TIFF": ".tif", "PGM": ".pgm"}[kind]
+    content = bytearray(cv2.imencode(ending, noise((8, 8)))[1].tobytes())
+    if kind == "PNG":
+        content[16:24] = struct.pack(">II", width, height)
+        content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    elif kind == "JPEG":
+        frame = content.index(b"\xff\xc0")
+        content[frame + 5 : frame + 9] = struct.pack(">HH", height, width)
+    elif kind == "BMP":
+        content[18:26] = struct.pack("<ii", width, height)
+    elif kind == "PGM":
+        content[: content.index(b"255")] = f"P5\n{width} {height}\n".encode()
+    else:
+        directory = struct.unpack_from("<I", content, 4)[0]
+        for k in range(struct.unpack_from("<H", content, directory)[0]):
+            entry = directory + 2 + 12 * k
+            tag = struct.unpack_from("<H", content, entry)[0]
+            if tag in (256, 257):
+                size = width if tag == 256 else height
+                struct.pack_into("<HII", content, entry + 2, 4, 1, size)
+    return bytes(content)
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "BMP", "TIFF", "PGM"])
+@pytest.mark.parametrize("size", [(32_000, 32_000), (2**16 - 1, 2**16 - 1), (9000, 9000)])
+def test_a_size_that_a_file_cannot_hold_is_refused_at_once(
+    tmp_path: Path, kind: str, size: tuple[int, int]
+) -> None:
+    """A few hundred bytes once made six gigabytes of a grey picture."""
+    path = tmp_path / "image"
+    path.write_bytes(claiming(kind, *size))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(FileFormatError):
+        read_exposure(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
+
+
+def test_names_that_are_no_text_have_one() -> None:
+    assert source_names([Path("na\udcefve/1.png")]) == ("1.png",)
+    assert source_names([Path("na\udcefve/1.png"), Path("1.png")])[0] == "na\\xefve/1.png"
+    assert natural_key("1²2.png") != natural_key("12.png")

@@ -18,6 +18,8 @@ from armscan.cli.options import (
     Document,
     Force,
     ForceBad,
+    Method,
+    MethodOption,
     Target,
     given,
     run,
@@ -70,6 +72,7 @@ def camera(
     board_warp: Annotated[
         bool, typer.Option("--board-warp", help="Also solve a bow of the board.")
     ] = False,
+    method: MethodOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
     force: Force = False,
@@ -98,7 +101,13 @@ def camera(
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: calibrate_camera(
-            job, target, images or (), scan=scan, options=options, image_options=pixels
+            job,
+            target,
+            images or (),
+            scan=scan,
+            options=options,
+            image_options=pixels,
+            is_beside_thesis=method is Method.THESIS,
         ),
         as_json=as_json,
         output=output,

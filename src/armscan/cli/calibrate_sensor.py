@@ -204,7 +204,7 @@ def hand_eye(
         float | None,
         typer.Option(help="Scatter of the plate's surface; left out, estimated."),
     ] = None,
-    method: MethodOption = Method.ARMSCAN,
+    method: MethodOption = None,
     output: Document = Path("scanner.json"),
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,

@@ -18,6 +18,8 @@ from armscan.cli.options import (
     EulerAngles,
     Force,
     LaserColourOption,
+    Method,
+    MethodOption,
     StripeMethodOption,
     given,
     progress_bar,
@@ -233,6 +235,7 @@ def reconstruct(
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
     ] = Path("cloud.ply"),
+    method: MethodOption = None,
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
     bits_used: BitsUsed = None,
@@ -256,6 +259,7 @@ def reconstruct(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
         depths=None if depth_margin is None else DepthRange(depth_margin),
         sheet=sheet,
+        is_by_thesis=method is Method.THESIS,
     )
     pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(

@@ -96,14 +96,13 @@ BitsAlign = Annotated[
 
 
 class Method(StrEnum):
-    """Whose way a result is found."""
+    """Whose way a result is found beside armscan's own."""
 
-    ARMSCAN = "armscan"
     THESIS = "thesis"
 
 
 MethodOption = Annotated[
-    Method,
+    Method | None,
     typer.Option("--method", help="thesis: as the thesis prints it, to set it beside armscan's."),
 ]
 StripeMethodOption = Annotated[

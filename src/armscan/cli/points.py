@@ -244,7 +244,7 @@ def register(
         bool,
         typer.Option("--by-id", help="With --moved: equal ids in both lists are one marker."),
     ] = False,
-    method: MethodOption = Method.ARMSCAN,
+    method: MethodOption = None,
     as_json: AsJson = False,
 ) -> None:
     """Join scans by markers: views of a handheld scanner, or an arm that moved to a new place.
@@ -262,7 +262,7 @@ def register(
         match=given(MarkerMatchOptions, least_common=least_common),
         sigma_mm=sigma_mm,
         is_by_id=by_id,
-        method=method.value,
+        is_by_thesis=method is Method.THESIS,
     )
     run(
         lambda job: register_scans(job, lists, moved=moved, clouds=cloud or (), options=options),

@@ -94,6 +94,17 @@ def _frozen(values: ArrayLike, dtype: np.dtype[Any], shape: Shape, name: str) ->
     return array
 
 
+def homogeneous(points: FloatArray) -> FloatArray:
+    """Points (N, D) with a last coordinate of 1, (N, D + 1); of normalised (x, y) the rays."""
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def apply_homography(homography: FloatArray, points: FloatArray) -> FloatArray:
+    """Points (N, 2) mapped by a homography (3, 3)."""
+    mapped = homogeneous(points) @ homography.T
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Column:
     """What an array field of a record holds; ``dtype`` None stands for a tuple."""

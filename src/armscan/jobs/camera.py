@@ -15,6 +15,7 @@ from armscan.models.camera import PARAMETER_NAMES
 from armscan.pipeline.cameras import (
     CameraRun,
     calibrate_camera_from_found,
+    calibrate_camera_from_views,
 )
 from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.targets import find_targets
@@ -37,7 +38,14 @@ from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
-from armscan.vision.targets.target import Target, describe_target, format_target, parse_target
+from armscan.thesis.ellipse import with_printed_centres
+from armscan.vision.targets.target import (
+    CircleGrid,
+    Target,
+    describe_target,
+    format_target,
+    parse_target,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +67,7 @@ def calibrate_camera(
     scan: Path | None = None,
     options: CameraOptions | None = None,
     image_options: ImageOptions | None = None,
+    is_beside_thesis: bool = False,
 ) -> Summary:
     """Read, calibrate, write ``camera.json``, ``.npz`` and ``.html``, and say what came out.
 
@@ -74,6 +83,8 @@ def calibrate_camera(
         Folder recording of the target, instead of images.
     options, image_options
         Of the calibration, and how pixels are read.
+    is_beside_thesis
+        Tell what the printed way to find circle centres gives of the same images.
 
     Raises
     ------
@@ -83,6 +94,12 @@ def calibrate_camera(
     """
     options, image_options = options or CameraOptions(), image_options or ImageOptions()
     plate = parse_target(target)
+    if is_beside_thesis and not isinstance(plate, CircleGrid):
+        raise OptionError(
+            "the printed centres are those of circles",
+            where="--method thesis",
+            remedy="take a circle grid, or leave it out",
+        )
     places = job.places(".json", beside=(".npz", ".html"))
     read = _camera_images(images, scan, image_options)
     check_same_size(read.exposures)
@@ -115,7 +132,30 @@ def calibrate_camera(
     document = camera_document(calibration, (places[1].name, observations))
     written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     summary = _camera_summary(run, plate, read, written)
+    if is_beside_thesis:
+        views = [with_printed_centres(view, by_source[view.source]) for view in found.views]
+        table, data = _beside_thesis(calibrate_camera_from_views(views, options), run)
+        extra = {**summary.extra, "thesis": data}
+        summary = replace(summary, tables=(*summary.tables, table), extra=extra)
     return replace(summary, forced=nonsense)
+
+
+def _beside_thesis(
+    printed: CameraRun | FitFailure, ours: CameraRun
+) -> tuple[Table, dict[str, object]]:
+    """The camera from the printed circle centres beside ours, for people and for programs."""
+    columns = ("As the thesis prints it (eqs. 2.22 to 2.27)", "", "ours")
+    if isinstance(printed, FitFailure):
+        return Table(columns, (("not found", printed.reason, ""),)), {"failure": printed.reason}
+    rows = [("rms, px", significant(printed.fit.rms_px), significant(ours.fit.rms_px))]
+    values = zip(
+        PARAMETER_NAMES, printed.fit.camera.parameters, ours.fit.camera.parameters, strict=True
+    )
+    rows += [(name, f"{there:.6g}", f"{here:.6g}") for name, there, here in values]
+    return Table(columns, tuple(rows), "", (1, 2)), {
+        "rms_px": printed.fit.rms_px,
+        "parameters": printed.fit.camera.parameters.tolist(),
+    }
 
 
 def _camera_images(

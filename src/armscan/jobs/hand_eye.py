@@ -26,11 +26,7 @@ from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import (
-    ObservedStripes,
-    observe_stripes,
-    posed_stripes_from_profiles,
-)
+from armscan.pipeline.hand_eye import ObservedStripes, observe_stripes, posed_stripes_from_profiles
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
@@ -49,13 +45,14 @@ from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.documents import read_sensor_calibration, scanner_document
 from armscan.storage.image_paths import are_simulated
+from armscan.storage.observations import pack_posed_stripes
 from armscan.storage.points import (
     parse_plane,
     profile_files,
     read_points_or_plane,
     read_profiles,
+    read_robot_poses,
 )
-from armscan.storage.poses import read_robot_poses
 from armscan.storage.recording import FolderRecording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed
@@ -210,7 +207,7 @@ def calibrate_hand_eye(
     stripe_options: StripeOptions | None = None,
     is_beside_thesis: bool = False,
 ) -> Summary:
-    """Read, calibrate, write ``scanner.json`` and ``.html``, and say what came out.
+    """Read, calibrate, write ``scanner.json``, ``.npz`` and ``.html``, and say what came out.
 
     Parameters
     ----------
@@ -233,7 +230,7 @@ def calibrate_hand_eye(
     diameter = artefact.sphere_diameter_mm
     if diameter is not None and options.solve_plate:
         raise OptionError("a sphere has no plate to solve", remedy="leave --solve-plate out")
-    places = job.places(".json", beside=(".html",))
+    places = job.places(".json", beside=(".npz", ".html"))
     inputs = read_hand_eye_inputs(source, artefact, stripe_options, job.progress)
     parents = () if inputs.sensor is None else (inputs.sensor.provenance,)
     used = (options, stripe_options)
@@ -283,7 +280,9 @@ def calibrate_hand_eye(
         repeats=repeats or (),
         is_simulated=inputs.is_simulated,
     )
-    written = job.write(dict(zip(places, (scanner_document(scanner), page), strict=True)))
+    observations = pack_posed_stripes(inputs.stripes, {})
+    document = scanner_document(scanner, (places[1].name, observations))
+    written = job.write(dict(zip(places, (document, observations, page), strict=True)))
     tables = (posture_table(fit),) if repeats is None else (repeats[0], posture_table(fit))
     summary = hand_eye_summary(fit, scanner, written, tables, is_simulated=inputs.is_simulated)
     if is_beside_thesis:

@@ -59,7 +59,7 @@ def probe(
     written: tuple[Path, ...] = ()
     if job.output is not None:
         surface = ProbedPoints(
-            plate.surface_mm[list(plate.is_used)],
+            plate.surface_mm[plate.is_used],
             plate.reference.tip_diameter_mm,
             is_compensated=True,
         )
@@ -107,7 +107,7 @@ def plate_quantities(plate: ProbedPlate) -> tuple[Quantity, ...]:
     """What is told of a probed plate."""
     reference = plate.reference
     plane = reference.plane
-    rms = float(np.sqrt(np.mean(plate.residual_mm[list(plate.is_used)] ** 2)))
+    rms = float(np.sqrt(np.mean(plate.residual_mm[plate.is_used] ** 2)))
     points = f"{reference.n_points} of {len(plate.is_used)} touches"
     if reference.tip_diameter_mm:
         points += f", tip of {reference.tip_diameter_mm:g} mm compensated"

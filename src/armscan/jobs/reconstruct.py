@@ -47,8 +47,7 @@ from armscan.storage.documents import (
 )
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
-from armscan.storage.points import profile_files, read_profiles
-from armscan.storage.poses import read_robot_poses
+from armscan.storage.points import profile_files, read_profiles, read_robot_poses
 from armscan.storage.recording import FolderRecording, is_recording, read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 

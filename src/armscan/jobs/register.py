@@ -213,7 +213,7 @@ def _check(
         for is_given, option in (
             (bool(clouds), "--cloud"),
             (options.is_by_id, "--by-id"),
-            (options.method == "thesis", "--method"),
+            (options.is_by_thesis, "--method"),
         ):
             if is_given:
                 raise OptionError("it needs --moved", where=option, remedy="leave it out")

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, frozen_floats
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    BoolArray,
+    FloatArray,
+    floats,
+    frozen_floats,
+    homogeneous,
+)
 
 NEWTON_STEPS = 20
 NEWTON_TOLERANCE = 1e-9
@@ -285,7 +292,7 @@ class CameraModel(ArrayRecord):
             (N, 2, 9) derivative by the camera's parameters at a fixed pixel.
         """
         xy, is_valid = self.undistort(q_px)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        rays = homogeneous(xy)
         _, dq_dpoint, dq_dparameters = self.project_with_jacobian(rays)
         dq_dxy = dq_dpoint[:, :, :2].copy()
         dq_dxy[~is_valid] = np.eye(2)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, homogeneous
 
 BOW_TERMS: tuple[tuple[int, int], ...] = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1))
 """Powers (i, j) of the bow's terms ``u^i v^j``, u along the stripe and v along the depth; the terms
@@ -147,7 +147,7 @@ class LightSheet(ArrayRecord):
             (N,) False where the ray is parallel to the sheet, meets it behind the camera, or passes
             by its bow without meeting it.
         """
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        rays = homogeneous(xy)
         plane = self.plane
         slope = rays @ plane[:3]
         is_valid = np.abs(slope) > 1e-9 * np.linalg.norm(rays, axis=1)
@@ -178,7 +178,7 @@ class LightSheet(ArrayRecord):
             (N, 3, 8) by the sheet's parameters (tilts, offset, bow).
         """
         points, is_valid = self.intersect(xy)
-        rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+        rays = homogeneous(xy)
         _, gradient, dh_dparameters = self.height_with_jacobian(points)
         along = np.einsum("ni,ni->n", gradient, rays)
         along = np.where(is_valid, along, 1.0)

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, floats, homogeneous
 from armscan.geometry.poses import CameraRight, Pose, Sensor
 from armscan.geometry.rotations import skew
 from armscan.models.calibration import (
@@ -137,9 +137,9 @@ def epipolar_distances_px(
     left, left_ok, left_dxy_dq, _ = views.left.undistort_with_jacobian(left_px)
     right, right_ok, right_dxy_dq, _ = views.right.undistort_with_jacobian(right_px)
     essential = views.essential
-    line_right = _homogeneous(left) @ essential.T
-    line_left = _homogeneous(right) @ essential
-    value = np.sum(_homogeneous(right) * line_right, axis=1)
+    line_right = homogeneous(left) @ essential.T
+    line_left = homogeneous(right) @ essential
+    value = np.sum(homogeneous(right) * line_right, axis=1)
     is_valid = left_ok & right_ok
     return (
         _over_gradient(value, line_left, left_dxy_dq, is_valid),
@@ -163,10 +163,6 @@ def sampson_distances_px(in_left_px: FloatArray, in_right_px: FloatArray) -> Flo
     product = np.abs(in_left_px * in_right_px)
     length = np.hypot(in_left_px, in_right_px)
     return np.asarray(sign * product / np.where(length > 0.0, length, 1.0))
-
-
-def _homogeneous(xy: FloatArray) -> FloatArray:
-    return np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
 
 
 def _over_gradient(
@@ -238,7 +234,7 @@ def triangulate_directly(views: TwoViews, left_px: FloatArray, right_px: FloatAr
     right, right_ok = views.right.undistort(right_px)
     rotation = views.right_from_left.rotation
     translation = views.right_from_left.translation_mm
-    rays = np.concatenate([left, np.ones((len(left), 1))], axis=1)
+    rays = homogeneous(left)
     turned = rays @ rotation.T
     u = right[:, 0]
     below = u * turned[:, 2] - turned[:, 0]
@@ -310,9 +306,8 @@ def _midway(
     left, left_ok = views.left.undistort(left_px)
     right, right_ok = views.right.undistort(right_px)
     sensor_from_right = views.right_from_left.inverse()
-    ones = np.ones((len(left), 1))
-    a = np.concatenate([left, ones], axis=1)
-    b = np.concatenate([right, ones], axis=1) @ sensor_from_right.rotation.T
+    a = homogeneous(left)
+    b = sensor_from_right.rotate(homogeneous(right))
     origin = sensor_from_right.translation_mm
     across = np.cross(a, b)
     squares = np.sum(across**2, axis=1)

@@ -42,6 +42,7 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
+from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import LaserColour, StripeOptions
 
@@ -72,11 +73,14 @@ class MeasureOptions:
         head's own rule takes.
     sheet
         Name of the sheet that drew all stripes; empty to find it. For one camera only.
+    is_by_thesis
+        Tell crossed sheets by the printed rule of rows (eqs. 3.1 to 3.7).
     """
 
     stripes: StripeOptions = field(default_factory=StripeOptions)
     depths: DepthRange | None = None
     sheet: str = ""
+    is_by_thesis: bool = False
 
     def accepted_depths(self, sensor: SensorCalibration) -> DepthRange:
         """Depths in which points are kept."""
@@ -100,10 +104,18 @@ def labeller_for(
     Raises
     ------
     OptionError
-        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves, or
-        if there is no such sheet.
+        If a sheet is chosen for two cameras, which tell the sheet of every stripe themselves, if
+        there is no such sheet, or if the rule of rows is asked for and has nothing to tell.
     """
     n_sheets = len(sensor.sheets)
+    if options.is_by_thesis:
+        if sensor.second is not None or n_sheets < 2 or options.sheet:
+            raise OptionError(
+                "the rule of rows tells the sheets of one camera's crossed lines",
+                where="--method thesis",
+                remedy="leave it out",
+            )
+        return RowLabeller(sensor)
     if sensor.second is not None:
         if options.sheet:
             raise OptionError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -52,14 +52,14 @@ class RegisterOptions:
         Standard deviation an axis of markers whose list gives no covariance.
     is_by_id
         Take markers with the same ``id`` in both lists as the same, instead of matching them.
-    method
-        ``thesis`` for the eight steps of section 4.3.1, which check nothing afterwards.
+    is_by_thesis
+        Pair markers by the eight steps of section 4.3.1, which check nothing afterwards.
     """
 
     match: MarkerMatchOptions = field(default_factory=MarkerMatchOptions)
     sigma_mm: float = ASSUMED_SIGMA_MM
     is_by_id: bool = False
-    method: Literal["armscan", "thesis"] = "armscan"
+    is_by_thesis: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 < self.sigma_mm < 100.0:
@@ -181,7 +181,7 @@ def register_views(
 def _common(old: MarkerList, new: MarkerList, options: RegisterOptions) -> tuple[IntArray, int]:
     if options.is_by_id:
         return _same_ids(old, new), BY_ID
-    if options.method == "thesis":
+    if options.is_by_thesis:
         pairs = match_after_thesis(old.markers, new.markers, THESIS_SIGMAS * options.sigma_mm)
         if len(pairs) < LEAST_LEFT:
             raise EstimationError(

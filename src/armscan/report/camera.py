@@ -164,14 +164,13 @@ def camera_page(
     if fit.warp is not None:
         sections.append(_warp_section(fit.warp))
     sections.append(_covariance_section(fit))
-    cards = [f"parameters.{name}" for name in ("fx", "fy", "cx", "cy")]
     return page_of(
         provenance,
         CAMERA_TITLE,
         f"{fit.camera.width_px} × {fit.camera.height_px} px camera, "
         f"{fit.n_views} of {n_images} images used, {fit.n_points} target points",
         sections,
-        cards=only(told, *cards, "rms_px", "hold_out_rms_px"),
+        cards=only(told, "parameters.fx", "parameters.cx", "rms_px", "hold_out_rms_px"),
         warnings=fit.warnings,
         is_simulated=is_simulated,
     )

@@ -156,7 +156,7 @@ def image_axes(camera: CameraModel) -> tuple[Figure, Axes]:
 
 def named_rows(axes: Axes, names: Sequence[str], label: str) -> None:
     """Lay out horizontal bars: a name a row, the first on top."""
-    axes.set_yticks(range(len(names)), [short(name) for name in names])
+    axes.set_yticks(range(len(names)), [short(name, 32) for name in names])
     axes.invert_yaxis()
     axes.set_xlabel(label)
     axes.grid(axis="x")

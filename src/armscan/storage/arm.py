@@ -22,7 +22,7 @@ from armscan.models.arm import AXIS_PARAMETERS, ArmModel, forward
 from armscan.records.recording import NO_TRIGGER, ArmTrack, PoseForm, Session
 from armscan.storage.codec import Layout, MismatchError, RecordCodec, parse_toml, toml_bytes
 from armscan.storage.files import new_folder, path_text, read_bytes, told_of
-from armscan.storage.poses import (
+from armscan.storage.points import (
     FORM_COLUMNS,
     METRES_REMEDY,
     POSITION,

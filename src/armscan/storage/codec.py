@@ -555,7 +555,7 @@ def _number(content: Any, key: str, limits: tuple[float, float] | None = None) -
         _limits(key.rstrip(".0123456789").rpartition(".")[2]) if limits is None else limits
     )
     if not least <= content <= most:
-        raise MismatchError(key, f"is {content:g}, not within {least:g} and {most:g}")
+        raise MismatchError(key, f"is {_told(content)}, not within {least:g} and {most:g}")
     return float(content)
 
 

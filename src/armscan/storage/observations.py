@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from types import NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -36,9 +37,6 @@ Arrays = Mapping[str, NDArray[Any]]
 MOST_BYTES = 512 * 2**20
 """Of all arrays together; a file of some megabytes may claim any size."""
 MOST_RECORDS = 1_000_000
-NOT_KEPT = {TargetView: ("edges",), PosedStripe: ("by_sensor",)}
-"""Fields that follow from the rest, or that nothing needs again: the derivatives of a stripe's
-points follow from the points, their sheets and the sensor."""
 DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, InputError, OSError, EOFError),
     *(ValueError, TypeError, KeyError, IndexError, OverflowError, SyntaxError, RecursionError),
@@ -214,12 +212,16 @@ def _array(content: bytes) -> NDArray[Any]:
 
 
 def _kept(kind: type[Any]) -> dict[str, Any]:
-    """Fields of a record and their types."""
+    """Fields of a record and their types, without those that may be None.
+
+    Those follow from the rest (the derivatives of a stripe's points from the points, their sheets
+    and the sensor), or nothing needs them again (the edge points of circles).
+    """
     hints = get_type_hints(kind)
     return {
         item.name: hints[item.name]
         for item in fields(kind)
-        if item.name not in NOT_KEPT.get(kind, ())
+        if NoneType not in get_args(hints[item.name])
     }
 
 
@@ -266,7 +268,7 @@ def _unpacked(kind: type[R], word: str, arrays: Arrays) -> tuple[R, ...]:
             columns[name] = [Pose(*pair) for pair in zip(turns, shifts, strict=True)]
             continue
         array = arrays[f"{word}_{name}"]
-        if np.ndarray in (get_origin(hint), *map(get_origin, get_args(hint))):
+        if get_origin(hint) is np.ndarray:
             if len(array) != ends[-1]:
                 raise ValueError(f"{name} has not a row a point")
             columns[name] = np.split(array, ends[:-1])

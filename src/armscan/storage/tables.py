@@ -24,6 +24,8 @@ INT64 = np.iinfo(np.int64)
 WHOLE_NUMBER = re.compile(r"[-+]?[0-9]+")
 NAN = re.compile(r"[-+]?nan", re.IGNORECASE)
 DECIMAL = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+PLAIN_NUMBERS = re.compile(r"[-+0-9.eE\n]*")
+PLAIN_INTEGERS = re.compile(r"-?[0-9]{1,18}(?:\n-?[0-9]{1,18})*")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 COORDINATES = ("x_mm", "y_mm", "z_mm")
 SMALLEST_EXTENT_MM = 2.0
@@ -160,10 +162,17 @@ class CsvTable:
         columns = [self._column(name, may_lack) for name in names]
         return np.array(columns, dtype=np.float64).reshape(len(names), len(self)).T
 
-    def _column(self, name: str, may_lack: bool) -> list[float]:
+    def _column(self, name: str, may_lack: bool) -> FloatArray | list[float]:
         cells = self.columns[name]
+        values = _plain_floats(cells, may_lack=may_lack)
+        most = LARGEST_MM if name.endswith("_mm") else LARGEST
+        if values is not None and not (np.abs(values) > most).any():
+            return values
+        return self._checked_floats(name, most, may_lack=may_lack)
+
+    def _checked_floats(self, name: str, most: float, *, may_lack: bool) -> list[float]:
         values: list[float] = []
-        for row, cell in enumerate(cells):
+        for row, cell in enumerate(self.columns[name]):
             value = _number(cell)
             if not (math.isfinite(value) or (may_lack and math.isnan(value))):
                 raise FileFormatError(
@@ -172,7 +181,7 @@ class CsvTable:
                     remedy="write it as -12.5 or 1.25e-3"
                     + (", or leave it empty where it is not known" if may_lack else ""),
                 )
-            if abs(value) > (LARGEST_MM if name.endswith("_mm") else LARGEST):
+            if abs(value) > most:
                 raise FileFormatError(
                     f"{value:g} in column {name} is beyond all that is measured",
                     where=self.place(row),
@@ -196,8 +205,10 @@ class CsvTable:
         FileFormatError
             Naming line and column of a cell that is no whole number of 64 bits.
         """
-        cells = enumerate(self.columns[name])
-        values = [self._int(cell, row, name, missing) for row, cell in cells]
+        cells = self.columns[name]
+        if PLAIN_INTEGERS.fullmatch("\n".join(cells)):
+            return np.array(list(map(int, cells)), dtype=np.int64)
+        values = [self._int(cell, row, name, missing) for row, cell in enumerate(cells)]
         return np.array(values, dtype=np.int64)
 
     def _int(self, cell: str, row: int, name: str, missing: int | None) -> int:
@@ -241,7 +252,7 @@ def parse_csv(data: bytes, where: str) -> CsvTable:
         if stripped.startswith("#"):
             comments.append(stripped[1:].strip())
         elif stripped:
-            rows.append((number, _cells(line, f"{where}, line {number}")))
+            rows.append((number, _cells(line, where, number)))
     if not rows:
         raise FileFormatError("the table has no header", where=where, remedy="copy the file again")
     header = _checked_header(rows[0][1], where)
@@ -307,13 +318,14 @@ def _decoded(data: bytes, where: str) -> str:
     return text
 
 
-def _cells(line: str, where: str) -> list[str]:
+def _cells(line: str, where: str, number: int) -> list[str]:
     try:
-        return [cell.strip() for cell in next(csv.reader([line], strict=True))]
+        words = next(csv.reader([line], strict=True)) if '"' in line else line.split(",")
+        return [cell.strip() for cell in words]
     except csv.Error as error:
         raise FileFormatError(
             f"the line cannot be split ({error})",
-            where=where,
+            where=f"{where}, line {number}",
             remedy='close every quotation mark, and write " inside quotes twice',
         ) from error
 
@@ -344,6 +356,16 @@ def _checked_header(header: list[str], where: str) -> list[str]:
             fact = f"more than one column is called {shown(repeated[0], MOST_QUOTED)}"
         raise FileFormatError(f"{fact} in the header", where=where, remedy="name each column once")
     return header
+
+
+def _plain_floats(cells: Sequence[str], *, may_lack: bool) -> FloatArray | None:
+    """Values of many cells at once; None if one of them needs a closer look."""
+    if not PLAIN_NUMBERS.fullmatch("\n".join(cells)):
+        return None
+    try:
+        return np.array([cell or "nan" for cell in cells] if may_lack else cells, dtype=np.float64)
+    except ValueError:
+        return None
 
 
 def _number(cell: str) -> float:

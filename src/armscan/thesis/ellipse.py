@@ -13,17 +13,24 @@ ellipse, where f cannot vanish, and all columns are of the size 1.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
+from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.vision.targets.grey import Grey8
+from armscan.records.exposure import Exposure
+from armscan.vision.targets.grey import Grey8, grey_channels, to_grey8
+from armscan.vision.targets.target import TargetView
 
 MIN_POINTS = 6
 CANNY_LOW, CANNY_HIGH = 60.0, 160.0
 _GAUSSIAN_SIGMA_PX = 1.0
 _BAND_PX = 3.0
+PRINTED_SIGMA_PX = 0.1
+"""One weight for all: the printed way has no other."""
 
 
 def fit_ellipse_algebraic(points_px: FloatArray) -> FloatArray | FitFailure:
@@ -85,6 +92,26 @@ def thesis_centres(grey8: Grey8, centres_px: FloatArray, shapes_px2: FloatArray)
         if not isinstance(fit, FitFailure):
             centres[k] = ellipse_centre(fit)
     return centres
+
+
+def with_printed_centres(view: TargetView, exposure: Exposure) -> TargetView:
+    """A view of a circle grid whose centres are those of the printed way, all of one weight.
+
+    Circles without an ellipse are dropped; the edges go, so that no centre is corrected later.
+    """
+    edges = view.edges
+    if edges is None:
+        raise InputError("no edges of circles are known", where=view.source)
+    window = exposure.window.to_image(view.points_px)
+    offsets = [edges.points_px[edges.circle == k] - view.points_px[k] for k in range(len(view))]
+    shapes = np.array([2.0 * np.cov(offset.T) for offset in offsets])
+    grey = to_grey8(grey_channels(exposure)[0], exposure.full_scale)
+    centres = thesis_centres(grey, window, shapes)
+    found = np.asarray(np.isfinite(centres).all(axis=1))
+    full = exposure.window.to_full_sensor(centres)
+    even = np.broadcast_to(np.eye(2) * PRINTED_SIGMA_PX**2, (len(view), 2, 2))
+    printed = replace(view, points_px=np.where(found[:, None], full, 0.0), covariance_px2=even)
+    return replace(printed.select(found), edges=None)
 
 
 def _in_pixels(own: FloatArray, mean: FloatArray, scale: float) -> FloatArray:

@@ -155,7 +155,10 @@ def test_a_misread_convention_is_named_before_the_plate_is_blamed(read: EulerCon
 def test_a_posture_that_the_hand_eye_rests_on_is_named() -> None:
     """Sigmas of 0.01: a move by 6 of them in one parameter is named, one by 4 is not."""
     names = [f"posture{k:02d}" for k in range(N)]
-    left = {k: LeftOut(size * np.eye(9)[4], 1.0, 1.0, 1.0) for k, size in ((3, 0.04), (11, -0.06))}
+    left = {
+        k: LeftOut(change=size * np.eye(9)[4], normalised=1.0, pose_sigmas=1.0, probability=1.0)
+        for k, size in ((3, 0.04), (11, -0.06))
+    }
     (warning,) = influence_warnings(names, left, 1e-4 * np.eye(6))
     assert "without posture posture11" in warning and "by 6 of its stated sigmas" in warning
 

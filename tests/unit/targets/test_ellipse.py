@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 
 from armscan.geometry.estimate import FitFailure
-from armscan.thesis.ellipse import ellipse_centre, fit_ellipse_algebraic, thesis_centres
+from armscan.simulation.objects.boards import CirclePattern
+from armscan.thesis.ellipse import (
+    ellipse_centre,
+    fit_ellipse_algebraic,
+    thesis_centres,
+    with_printed_centres,
+)
+from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
+from armscan.vision.targets.target import CircleGrid, TargetView
+from rigs.target_scenes import exposure, render
 
 CENTRE = np.array([2811.3, 1450.8])
 HALF = np.array([36.0, 24.0])
@@ -124,3 +133,17 @@ def test_canny_centre_of_a_disc_is_right_to_a_fraction_of_a_pixel() -> None:
     found = thesis_centres(image, centres, shapes)
     np.testing.assert_allclose(found[0], [60.3125, 57.8125], atol=0.1)
     assert np.isnan(found[1]).all()
+
+
+def test_a_view_with_printed_centres_keeps_its_numbers_and_loses_its_edges() -> None:
+    """Eqs. 2.22 to 2.27 on each circle: within the pixel grid's pull of the rendered truth."""
+    pattern = CirclePattern(9, 7, 10.0, 5.0)
+    scene = render(pattern, 250.0, tilt_deg=20.0)
+    seen = exposure(scene.image)
+    view = detect_target(seen, CircleGrid(9, 7, 10.0))
+    assert isinstance(view, TargetView)
+    printed = with_printed_centres(view, seen)
+    assert printed.edges is None
+    assert len(printed) == len(view)
+    np.testing.assert_array_equal(printed.point_index, view.point_index)
+    assert 0.0 < np.abs(printed.points_px - view.points_px).max() < 0.5

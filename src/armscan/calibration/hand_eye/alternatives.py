@@ -253,7 +253,12 @@ def find_contradiction(
         and float(np.abs(change / np.sqrt(variance)).max()) > MOST_SIGMAS
     )
     failure = _contradicted(best, fit, plate)
-    return Contradiction(failure, is_refused, np.outer(change, change), best.arm_mm)
+    return Contradiction(
+        failure=failure,
+        is_refused=is_refused,
+        widening=np.outer(change, change),
+        arm_mm=best.arm_mm,
+    )
 
 
 def plane_in_words(found: Sequence[Alternative]) -> str:

@@ -373,14 +373,14 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
     block, explained = solution.linear.projected[np.ix_(rows, rows)], solution.explained[rows]
     values, vectors = np.linalg.eigh(block)
     used = values > 1e-10 * values[-1]
-    spread = (vectors[:, used] / values[used]) @ vectors[:, used].T
-    predicted = spread @ explained
+    inverse = (vectors[:, used] / values[used]) @ vectors[:, used].T
+    predicted = inverse @ explained
     shape = _pose_errors(solution, rows)
     weighted = block @ shape
     if weights is not None and weights[posture] < 1.0:
         arm, sigma = solution.components[0], float(solution.noise.sigmas[0])
         lent = (1.0 - weights[posture]) * sigma**2 * arm.covariance[np.ix_(rows, rows)]
-        weighted = np.linalg.pinv(spread - lent, rcond=1e-10, hermitian=True) @ shape
+        weighted = np.linalg.pinv(inverse - lent, rcond=1e-10, hermitian=True) @ shape
     weight, score = shape.T @ weighted, weighted.T @ predicted
     strength = np.linalg.eigvalsh(weight)
     rank = max(int((strength > 1e-6 * strength[-1]).sum()), 1)
@@ -484,7 +484,12 @@ def conditioning_at(
     is_full = rank == N_HAND_EYE
     condition = float(singular[0] / singular[-1]) if is_full else float("inf")
     sigma_mm = 1.0 / float(singular[-1]) if is_full else float("inf")
-    return Conditioning(singular, rank, condition, _weakest(vectors[:, 0], sigma_mm))
+    return Conditioning(
+        singular_values=singular,
+        rank=rank,
+        condition=condition,
+        weakest=_weakest(vectors[:, 0], sigma_mm),
+    )
 
 
 def _weakest(direction: FloatArray, sigma_mm: float) -> str:

@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plate from touches of a ball probe: plane with covariance, its side, touches that do not
-belong to it.
-"""
+"""A plate from touches of a ball probe: its plane, its side, touches that do not belong to it."""
 
 from __future__ import annotations
 
@@ -14,7 +12,7 @@ from scipy.stats import t as student
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, bools, floats, items
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.shapes import Plane, fit_plane, plane_from_coefficients
 from armscan.models.probe import compensate_tip
@@ -178,8 +176,7 @@ class ProbingOptions:
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ProbedPlate:
+class ProbedPlate(ArrayRecord):
     """A probed plate with its evidence.
 
     Parameters
@@ -193,7 +190,7 @@ class ProbedPlate:
     outliers
         Numbers of the touches that do not fit the others, from 0, worst first.
     is_used
-        Whether each touch took part.
+        (N,) whether each touch took part.
     side_from
         How the side of the probe was found, in words.
     warnings
@@ -203,18 +200,18 @@ class ProbedPlate:
     """
 
     reference: PlateReference
-    surface_mm: FloatArray
-    residual_mm: FloatArray
+    surface_mm: FloatArray = floats("N", 3)
+    residual_mm: FloatArray = floats("N")
     outliers: tuple[int, ...]
-    is_used: tuple[bool, ...]
+    is_used: BoolArray = bools("N")
     side_from: str
     warnings: tuple[str, ...]
-    rows: tuple[int, ...]
+    rows: tuple[int, ...] = items()
 
     @property
     def flatness_mm(self) -> float:
         """Largest minus smallest distance of the touches that took part."""
-        return float(np.ptp(self.residual_mm[list(self.is_used)]))
+        return float(np.ptp(self.residual_mm[self.is_used]))
 
 
 def plate_from_probing(
@@ -291,8 +288,16 @@ def fit_probed_plate(
     named = tuple(f"{rows[k]} ({residual[k]:+.3f} mm)" for k in outliers)
     is_guessed = is_tip and TAKEN_FOR_GRANTED in side_from
     warnings = _warnings(reference.n_points, named, options, side_from if is_guessed else "")
-    used = tuple(bool(value) for value in is_used)
-    return ProbedPlate(reference, surface, residual, outliers, used, side_from, warnings, rows)
+    return ProbedPlate(
+        reference=reference,
+        surface_mm=surface,
+        residual_mm=residual,
+        outliers=outliers,
+        is_used=is_used,
+        side_from=side_from,
+        warnings=warnings,
+        rows=rows,
+    )
 
 
 def plate_from_coefficients(

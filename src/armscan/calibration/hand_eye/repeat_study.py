@@ -22,7 +22,7 @@ CONFIDENCE = 0.95
 GIMBAL_SINE = 0.9999
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RepeatStudy:
     """K hand-eyes of one head, calibrated anew each time.
 
@@ -145,7 +145,13 @@ def study_poses(
         predicted = np.sqrt(np.diag(np.mean(spread, axis=0)))
     low, high = np.sqrt(chi2.ppf([0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE], n - 1) / (n - 1))
     std = values.std(axis=0, ddof=1)
-    return RepeatStudy(values, mean, std, predicted, (float(low), float(high)))
+    return RepeatStudy(
+        values=values,
+        mean=mean,
+        std=std,
+        predicted=predicted,
+        ratio_range=(float(low), float(high)),
+    )
 
 
 def angle_covariance(rotation: FloatArray, covariance: FloatArray) -> FloatArray:

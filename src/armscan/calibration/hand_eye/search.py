@@ -251,7 +251,13 @@ def find_start(observations: CondensedObservations, plate: PlateSurface) -> Star
     rms = posture_rms_at(observations, plate, best)
     if is_many:
         wrong = _are_gross(rms)
-    return Start(best, linear, rms, wrong, _alternatives(candidates, costs, best))
+    return Start(
+        tool_from_sensor=best,
+        linear=linear,
+        rms_mm=rms,
+        is_wrong=wrong,
+        alternatives=_alternatives(candidates, costs, best),
+    )
 
 
 def _possible(

@@ -26,7 +26,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, apply_homography
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.crossings import (
@@ -266,8 +266,7 @@ def off_lattice(
         homography, _ = cv2.findHomography(board[trusted], points_px[trusted], 0)
         if homography is None:
             break
-        image = np.column_stack([board, np.ones(len(board))]) @ np.asarray(homography).T
-        mapped = np.asarray(image[:, :2] / image[:, 2:], dtype=np.float64)
+        mapped = apply_homography(np.asarray(homography), board)
         field = _terms(mapped)
         for _ in range(_ROUNDS):
             size = np.hypot(*_without_itself(field, points_px - mapped, weights).T)

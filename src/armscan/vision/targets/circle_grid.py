@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.geometry.estimate import FitFailure
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
@@ -136,7 +136,7 @@ def _distorted(ideal_px: FloatArray, camera: CameraModel) -> tuple[FloatArray, F
     """Pixels (N, 2) of points given without distortion, and the derivative (N, 2, 2)."""
     focal = np.array([camera.fx_px, camera.fy_px])
     xy = (ideal_px - [camera.cx_px, camera.cy_px]) / focal
-    rays = np.column_stack([xy, np.ones(len(xy))])
+    rays = homogeneous(xy)
     points, dq_dray, _ = camera.project_with_jacobian(rays)
     return points, dq_dray[:, :, :2] / focal
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray, IntArray, apply_homography
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
@@ -67,15 +67,10 @@ def _steps(
     homography = np.asarray(found, dtype=np.float64)
     gap_mm = (target.square_mm - target.marker_mm) / np.sqrt(2.0)
     length_mm = min(target.square_mm, _CLEARANCE * gap_mm / WINDOW_FRACTION)
-    centre = _mapped(homography, board)
-    along_x = _mapped(homography, board + np.array([length_mm, 0.0])) - centre
-    along_y = _mapped(homography, board + np.array([0.0, length_mm])) - centre
+    centre = apply_homography(homography, board)
+    along_x = apply_homography(homography, board + np.array([length_mm, 0.0])) - centre
+    along_y = apply_homography(homography, board + np.array([0.0, length_mm])) - centre
     return along_x, along_y
-
-
-def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
-    h = np.column_stack([points, np.ones(len(points))]) @ homography.T
-    return np.asarray(h[:, :2] / h[:, 2:])
 
 
 def _failure(exposure: Exposure, target: Charuco, n_markers: int, n_corners: int) -> FitFailure:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -61,16 +60,6 @@ def to_grey8(grey: RawGrey, full_scale: int) -> Grey8:
         return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
     top = max(float(np.percentile(grey[::4, ::4], 99.9)), full_scale / 64.0)
     return np.clip(np.rint(grey * (255.0 / top)), 0, 255).astype(np.uint8)
-
-
-def reduced(grey8: Grey8, size_px: int) -> tuple[Grey8, float]:
-    """Reduce an image to at most ``size_px``; returns it and the factor back to full size."""
-    factor = max(grey8.shape) / size_px
-    if factor <= 1.0:
-        return grey8, 1.0
-    size = (round(grey8.shape[1] / factor), round(grey8.shape[0] / factor))
-    small = cv2.resize(grey8, size, interpolation=cv2.INTER_AREA)
-    return np.asarray(small, dtype=np.uint8), grey8.shape[1] / size[0]
 
 
 def sample(grey: RawGrey | Grey32, points_px: FloatArray) -> FloatArray:

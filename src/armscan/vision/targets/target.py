@@ -12,7 +12,15 @@ import cv2
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, RowRecord, floats, ints
+from armscan.geometry.arrays import (
+    ArrayRecord,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    floats,
+    homogeneous,
+    ints,
+)
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
 
@@ -150,7 +158,7 @@ def parse_target(text: str) -> Target:
 
 def rightness(board: FloatArray, points_px: FloatArray) -> float:
     """Cosine of the angle between the board's x, places (N, 2), and the image's, points (N, 2)."""
-    design = np.column_stack([board, np.ones(len(board))])
+    design = homogeneous(board)
     affine = np.linalg.lstsq(design, points_px, rcond=None)[0]
     return float(affine[0, 0] / np.hypot(affine[0, 0], affine[0, 1]))
 

@@ -30,6 +30,14 @@ def path_text(path: Path | str) -> str:
     return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
+def is_file(path: Path) -> bool:
+    """True for a file; False also for a path that no system takes."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
+
+
 def read_bytes(path: Path) -> bytes:
     """Content of a file that must exist and hold something.
 

@@ -37,7 +37,7 @@ from armscan.storage.arm import (
     read_arm_model,
     read_arm_table,
 )
-from armscan.storage.files import new_folder, read_bytes
+from armscan.storage.files import is_file, new_folder, read_bytes
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.images import ImageOptions, read_exposure
 from armscan.storage.recording_session import (
@@ -365,7 +365,7 @@ class FolderRecording:
 
 def is_recording(folder: Path) -> bool:
     """True for a folder that holds the list of a recording's exposures."""
-    return (folder / EXPOSURES_FILE).is_file()
+    return is_file(folder / EXPOSURES_FILE)
 
 
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
@@ -488,7 +488,7 @@ def _assumed_of_arm(found: ArmTable, said: SessionFile) -> list[str]:
 
 def _odd_head(folder: Path, head: str | None) -> list[str]:
     where = str(folder / SESSION_FILE)
-    if head is None or (is_inside(head) and (folder / head).is_file()):
+    if head is None or (is_inside(head) and is_file(folder / head)):
         return []
     if not is_inside(head):
         raise FileFormatError(
@@ -660,7 +660,7 @@ def _write_tables(
         (folder / ARM_MODEL_FILE).write_bytes(arm_model_toml(model))
     if isinstance(source, FolderRecording) and session.head is not None:
         head = source.folder / session.head
-        if head.is_file():
+        if is_file(head):
             (folder / session.head).parent.mkdir(parents=True, exist_ok=True)
             (folder / session.head).write_bytes(head.read_bytes())
     (folder / SESSION_FILE).write_bytes(session_toml(session))

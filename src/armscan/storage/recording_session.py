@@ -33,7 +33,7 @@ from armscan.storage.codec import (
     parse_toml,
     toml_bytes,
 )
-from armscan.storage.files import path_text, read_bytes
+from armscan.storage.files import is_file, path_text, read_bytes
 from armscan.storage.tables import CsvTable
 
 SESSION_FILE = "session.toml"
@@ -227,7 +227,7 @@ def check_files(folder: Path, rows: Sequence[ExposureRow]) -> None:
     FileFormatError
         Naming the first one and the count.
     """
-    missing = [row.source for row in rows if not (folder / row.source).is_file()]
+    missing = [row.source for row in rows if not is_file(folder / row.source)]
     if missing:
         raise FileFormatError(
             f"{len(missing)} of {len(rows)} images that are listed do not exist, the first is "

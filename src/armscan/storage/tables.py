@@ -360,7 +360,10 @@ def _checked_header(header: list[str], where: str) -> list[str]:
 
 def _plain_floats(cells: Sequence[str], *, may_lack: bool) -> FloatArray | None:
     """Values of many cells at once; None if one of them needs a closer look."""
-    if not PLAIN_NUMBERS.fullmatch("\n".join(cells)):
+    # an array of texts is as wide as the longest
+    if max(map(len, cells), default=0) > MOST_QUOTED or not PLAIN_NUMBERS.fullmatch(
+        "\n".join(cells)
+    ):
         return None
     try:
         return np.array([cell or "nan" for cell in cells] if may_lack else cells, dtype=np.float64)

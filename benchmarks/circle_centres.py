@@ -20,8 +20,12 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
-from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.boards import (
+    CirclePattern,
+    Lighting,
+    RenderedTarget,
+    render_flat_target,
+)
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.thesis.ellipse import thesis_centres
 from armscan.vision.targets.circle_edges import measure_circles

@@ -40,7 +40,7 @@ from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.objects.fixtures import BALL_DIAMETER_MM
-from armscan.simulation.shots import TwinScan
+from armscan.simulation.station import TwinScan
 from armscan.simulation.twin import SimulatedInstrument
 from armscan.storage.documents import read_scanner_calibration
 

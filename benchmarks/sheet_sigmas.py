@@ -40,8 +40,7 @@ from armscan.simulation.head import sheet_points_mm
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.scenes import camera_shots, laser_shots
-from armscan.simulation.shots import RenderRequest
-from armscan.simulation.station import Target
+from armscan.simulation.station import RenderRequest, Target
 from armscan.simulation.targets import PATTERN, made_target
 from armscan.vision.targets.target import TargetView
 from rigs.sheet_rig import PROVENANCE, make_profile

@@ -23,9 +23,9 @@ def main() -> None:
         scan = TwinName(head, "thesis", 5).build().scan(scene)
         image = scan.exposure(index).image
         height, width = (size // SHRINK for size in image.shape[:2])
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-        cv2.imwrite(str(HERE / f"{name}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 88])
-        print(name, scan.rows[index].lasers, image.shape)
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(HERE / f"{name}.jpg"), small, [cv2.IMWRITE_JPEG_QUALITY, 88])
+        print(name, scan.rows[index].lasers, small.shape)
 
 
 if __name__ == "__main__":

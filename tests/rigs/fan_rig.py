@@ -19,8 +19,7 @@ from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.two_views import StereoCalibration
-from armscan.simulation.head import Tolerances, draw_lasers
-from armscan.simulation.heads import printed_heads
+from armscan.simulation.head import Tolerances, draw_lasers, printed_heads
 from armscan.simulation.optics.lasers import LineLaser
 from rigs.sheet_rig import PROVENANCE, SheetRig, make_profile, project, stripe_on_board
 

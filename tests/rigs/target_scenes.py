@@ -11,8 +11,12 @@ import numpy as np
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.models.camera import CameraModel
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.simulation.objects.board_image import Lighting, RenderedTarget, render_flat_target
-from armscan.simulation.objects.boards import FlatPattern
+from armscan.simulation.objects.boards import (
+    FlatPattern,
+    Lighting,
+    RenderedTarget,
+    render_flat_target,
+)
 from armscan.simulation.optics.camera import RenderCamera
 from rigs.flat_prints import ChessboardPattern
 from rigs.slow_renderer import add_noise

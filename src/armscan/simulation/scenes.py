@@ -28,8 +28,7 @@ from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.objects.fixtures import Fixtures
 from armscan.simulation.optics.scene import Floor, RoomLight, SceneObject
 from armscan.simulation.plans import PLANS
-from armscan.simulation.shots import Light, Moment, RenderRequest, instant_shots
-from armscan.simulation.station import Station, Target
+from armscan.simulation.station import Light, Moment, RenderRequest, Station, Target, instant_shots
 from armscan.simulation.targets import camera_targets, laser_targets
 
 Recorded = tuple[tuple[RenderRequest, ...], ArmTrack]

@@ -36,7 +36,7 @@ from armscan.simulation.scenes import (
     still_part_scene,
     still_step_scene,
 )
-from armscan.simulation.shots import TwinScan
+from armscan.simulation.station import TwinScan
 from armscan.simulation.targets import TARGET
 
 

@@ -602,9 +602,9 @@ def fingerprint(path: Path) -> InputFile:
 
 
 def new_provenance(
-    inputs: Iterable[Path],
+    inputs: Iterable[Path] = (),
     *,
-    command: Sequence[str],
+    command: Sequence[str] = (),
     options: Iterable[Any] = (),
     parents: Sequence[Provenance] = (),
     warnings: Sequence[str] = (),
@@ -617,7 +617,7 @@ def new_provenance(
     inputs
         Files that went in; each is hashed.
     command
-        The command line, one word an entry.
+        The command line, one word an entry; empty in a program.
     options
         Options dataclasses in force; every field is recorded as ``Class.field``, one
         that is a dataclass itself by its own class and fields.

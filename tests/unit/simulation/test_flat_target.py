@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from armscan.errors import InputError
-from armscan.simulation.objects.board_image import (
+from armscan.simulation.objects.boards import (
+    CirclePattern,
     Lighting,
     illumination,
     reflectance_image,
     render_flat_target,
 )
-from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.optics.camera import RenderCamera
 from rigs.flat_prints import ChessboardPattern
 

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.poses import Base, Plate, Pose, Sensor, Tool
 from armscan.geometry.rotations import rotations_from_euler
-from armscan.simulation.head import Head, Tolerances, Window, build_head
-from armscan.simulation.heads import SINGLE_SHEET
+from armscan.simulation.head import SINGLE_SHEET, Head, Tolerances, Window, build_head
 from armscan.simulation.objects.shapes import FlatPlate, Placed
 from armscan.simulation.optics.scene import SceneObject
 from armscan.simulation.station import ExposureSettings, Station, TrueStripe, true_stripes

@@ -20,7 +20,7 @@ from armscan.simulation.head import MountedCamera
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.plans import PLANS
 from armscan.simulation.scenes import hand_eye_poses, marker_poses
-from armscan.simulation.shots import RenderRequest, TwinScan
+from armscan.simulation.station import RenderRequest, TwinScan
 from armscan.simulation.twin import build_twin
 from armscan.storage.recording import read_recording, write_recording
 

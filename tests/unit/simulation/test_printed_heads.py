@@ -14,8 +14,10 @@ from armscan.errors import InputError
 from armscan.geometry.poses import Base, Plate, Pose, Sensor
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import (
+    CROSS_SHEETS,
     HEADS,
     LEFT,
+    MULTI_SHEETS,
     RIGHT,
     Head,
     Tolerances,
@@ -23,7 +25,6 @@ from armscan.simulation.head import (
     sheet_middle_mm,
     sheet_points_mm,
 )
-from armscan.simulation.heads import CROSS_SHEETS, MULTI_SHEETS
 from armscan.simulation.objects.shapes import FlatPlate, Placed
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.scene import SceneObject

@@ -14,8 +14,7 @@ import numpy as np
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.head import build_head
-from armscan.simulation.objects.board_image import Lighting, render_flat_target
-from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.boards import CirclePattern, Lighting, render_flat_target
 from armscan.simulation.objects.fixtures import N_MARKERS
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.optics.scene import Floor, Scene, Sphere

@@ -8,7 +8,7 @@ import pytest
 
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.plans import PLANS
-from armscan.simulation.shots import TwinScan
+from armscan.simulation.station import TwinScan
 from armscan.simulation.twin import build_twin
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.board_image import Lighting, RenderedTarget
+from armscan.simulation.objects.boards import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.saddle import fit_saddles
 from armscan.vision.targets.target import Charuco, Chessboard, TargetView

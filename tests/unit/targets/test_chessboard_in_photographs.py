@@ -10,7 +10,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.board_image import Lighting, RenderedTarget
+from armscan.simulation.objects.boards import Lighting, RenderedTarget
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView
 from rigs.flat_prints import ChessboardPattern

@@ -7,8 +7,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.simulation.objects.board_image import Lighting, RenderedTarget
-from armscan.simulation.objects.boards import CirclePattern
+from armscan.simulation.objects.boards import CirclePattern, Lighting, RenderedTarget
 from armscan.vision.targets.circle_edges import measure_circles
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import detect_target

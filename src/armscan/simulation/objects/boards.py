@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Printed boards: circle grids, chessboards and ChArUco boards as functions of the place on the
-board.
+"""Printed boards: circle grids as functions of the place on the board, and their images,
+supersampled at the edges.
 """
 
 from __future__ import annotations
@@ -8,12 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.simulation.optics.scene import MISS
+from armscan.simulation.optics.camera import RenderCamera, blur_image
+from armscan.simulation.optics.render import camera_rays
+from armscan.simulation.optics.scene import MISS, Floor, RoomLight, Scene
 
 
 class FlatPattern(Protocol):
@@ -166,3 +170,301 @@ class PrintedBoard:
         x_min, y_min, x_max, y_max = self.pattern.extent_board_mm
         x, y = board_mm[:, 0], board_mm[:, 1]
         return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
+
+
+SUBPIXELS = 2
+"""Fine-grid cells per pixel along each axis, on which the lens's blur acts."""
+SAMPLES = 8
+"""Samples per fine-grid cell along each axis, where an edge may cross it."""
+_COARSE_STEP_PX = 16
+_CHUNK = 1_000
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """Grey levels of the print (8-bit scale: 255 is full scale).
+
+    Parameters
+    ----------
+    light_level, dark_level
+        Levels of the two tones where the illumination is full.
+    surround
+        Reflectance beyond the print, between the two tones.
+    gradient
+        Fraction of the illumination lost from one border of the image to the opposite one.
+    gradient_azimuth_rad
+        Direction in the image along which it gets darker; 0 is to the right.
+    """
+
+    light_level: float = 200.0
+    dark_level: float = 40.0
+    surround: float = 1.0
+    gradient: float = 0.0
+    gradient_azimuth_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedTarget:
+    """A rendered image with its truth.
+
+    Parameters
+    ----------
+    image
+        (H, W) grey levels without noise.
+    marks_px
+        (N, 2) true projections of the pattern's marks.
+    """
+
+    image: FloatArray
+    marks_px: FloatArray
+
+
+def render_flat_target(
+    camera: RenderCamera,
+    pattern: FlatPattern,
+    rotation: FloatArray,
+    translation_mm: FloatArray,
+    lighting: Lighting | None = None,
+) -> RenderedTarget:
+    """Render a print seen by a camera.
+
+    Parameters
+    ----------
+    camera
+        Lens, sensor and blur.
+    pattern
+        The print.
+    rotation, translation_mm
+        (3, 3) and (3,): ``camera_from_board``.
+    lighting
+        Grey levels and illumination.
+
+    Raises
+    ------
+    InputError
+        If the camera looks at the back of the print.
+    """
+    light = Lighting() if lighting is None else lighting
+    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, light.surround)
+    reflectance = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+    levels = light.dark_level + (light.light_level - light.dark_level) * reflectance
+    return RenderedTarget(
+        levels * illumination(camera, light), marks_px(camera, pattern, rotation, translation_mm)
+    )
+
+
+def reflectance_image(
+    camera: RenderCamera,
+    pattern: FlatPattern,
+    rotation: FloatArray,
+    translation_mm: FloatArray,
+    surround: float = 1.0,
+) -> FloatArray:
+    """Return the print's mean reflectance (H, W) in each pixel's aperture, without lens blur."""
+    return _bin(_fine_reflectance(camera, pattern, rotation, translation_mm, surround))
+
+
+def marks_px(
+    camera: RenderCamera, pattern: FlatPattern, rotation: FloatArray, translation_mm: FloatArray
+) -> FloatArray:
+    """Return the true projections (N, 2) of the pattern's marks."""
+    return camera.project(pattern.marks_board_mm @ np.asarray(rotation).T + translation_mm)
+
+
+def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
+    """Return the relative illumination (H, W), 1 where it is full."""
+    if lighting.gradient == 0.0:
+        return np.broadcast_to(1.0, (camera.height_px, camera.width_px))
+    u = (np.arange(camera.width_px) / max(camera.width_px - 1, 1))[None, :] - 0.5
+    v = (np.arange(camera.height_px) / max(camera.height_px - 1, 1))[:, None] - 0.5
+    cosine, sine = np.cos(lighting.gradient_azimuth_rad), np.sin(lighting.gradient_azimuth_rad)
+    along = (u * cosine + v * sine) / (abs(cosine) + abs(sine))
+    return np.asarray(1.0 - lighting.gradient * (along + 0.5))
+
+
+def _fine_reflectance(
+    camera: RenderCamera,
+    pattern: FlatPattern,
+    rotation: FloatArray,
+    translation_mm: FloatArray,
+    surround: float,
+) -> NDArray[np.float32]:
+    board = _BoardPlane.of(camera, rotation, translation_mm)
+    x, y = board.coarse_mm()
+    reach_mm = _reach_mm(x, y)
+    beyond_mm = _beyond_border_mm(pattern, x, y)
+    is_on_print = beyond_mm <= 0.0
+    near_edge = np.abs(beyond_mm) < reach_mm
+    near_edge[is_on_print] |= pattern.edge_distance_mm(x[is_on_print], y[is_on_print]) < reach_mm
+    tone = np.full(x.shape, surround, dtype=np.float32)
+    tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
+    size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
+    fine = np.asarray(cv2.resize(tone, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
+    rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
+    for start in range(0, len(rows), _CHUNK):
+        v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
+        cells = _sample(board, pattern, u, v, surround)
+        for b in range(SUBPIXELS):
+            for a in range(SUBPIXELS):
+                fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
+    return fine
+
+
+def _sample(
+    board: _BoardPlane, pattern: FlatPattern, u: IntArray, v: IntArray, surround: float
+) -> NDArray[np.float32]:
+    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of each pixel's fine cells (row, column)."""
+    centre, d_du, d_dv = board.linearised_mm(np.stack([u, v], axis=-1).astype(np.float64))
+    n = SUBPIXELS * SAMPLES
+    offset = (np.arange(n) + 0.5) / n - 0.5
+    step_u = d_du[:, :, None] * offset
+    step_v = d_dv[:, :, None] * offset
+    points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
+    tones = _tones(pattern, points[:, 0], points[:, 1], surround)
+    cells = tones.reshape(-1, SUBPIXELS, SAMPLES, SUBPIXELS, SAMPLES).mean(axis=(2, 4))
+    return np.asarray(cells, dtype=np.float32)
+
+
+def _tones(
+    pattern: FlatPattern, x: FloatArray, y: FloatArray, surround: float
+) -> NDArray[np.float32]:
+    light = pattern.is_light(x, y).astype(np.float32)
+    return np.where(_beyond_border_mm(pattern, x, y) <= 0.0, light, np.float32(surround))
+
+
+def _beyond_border_mm(pattern: FlatPattern, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Distance past the print's border, negative on the print."""
+    x_min, y_min, x_max, y_max = pattern.extent_board_mm
+    beyond_x = np.maximum(x_min - x, x - x_max)
+    beyond_y = np.maximum(y_min - y, y - y_max)
+    return np.maximum(beyond_x, beyond_y)
+
+
+def _reach_mm(x: FloatArray, y: FloatArray) -> float:
+    """Longest way on the board, mm, from a pixel's centre to its corner, with a small margin."""
+    along_u = np.hypot(np.diff(x[::4], axis=1)[:, ::4], np.diff(y[::4], axis=1)[:, ::4]).max()
+    along_v = np.hypot(np.diff(x[:, ::4], axis=0)[::4], np.diff(y[:, ::4], axis=0)[::4]).max()
+    return 1.05 * 0.5 * float(along_u + along_v)
+
+
+def _bin(fine: NDArray[np.float32]) -> FloatArray:
+    height, width = fine.shape[0] // SUBPIXELS, fine.shape[1] // SUBPIXELS
+    binned = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(binned, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _BoardPlane:
+    """Where pixels meet the board's plane."""
+
+    camera: RenderCamera
+    board_from_ray: FloatArray
+
+    @staticmethod
+    def of(camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray) -> _BoardPlane:
+        r = np.asarray(rotation, dtype=np.float64)
+        t = np.asarray(translation_mm, dtype=np.float64)
+        if float(r[:, 2] @ t) <= 0.0:
+            raise InputError(
+                "the camera looks at the back of the print",
+                remedy="turn the board: its z axis points away from the camera",
+            )
+        return _BoardPlane(camera, np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t])))
+
+    def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
+        """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
+        rays = self.camera.rays(pixels_px)
+        h = rays @ self.board_from_ray[:, :2].T + self.board_from_ray[:, 2]
+        # The third component is 1 / depth: rays that never meet the plane see the surround.
+        return np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+
+    def coarse_mm(self) -> tuple[FloatArray, FloatArray]:
+        """Board coordinates (H, W) of every pixel, by linear interpolation on a coarse grid."""
+        u, weights_u = _interpolation(self.camera.width_px)
+        v, weights_v = _interpolation(self.camera.height_px)
+        grid = self.exact_mm(np.stack(np.meshgrid(u, v), axis=-1))
+        x = weights_v @ grid[..., 0].astype(np.float32) @ weights_u.T
+        y = weights_v @ grid[..., 1].astype(np.float32) @ weights_u.T
+        return x, y
+
+    def linearised_mm(self, pixels_px: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(N, 2) board coordinates of pixel centres, and their change per pixel in u and v."""
+        half_u, half_v = np.array([0.5, 0.0]), np.array([0.0, 0.5])
+        d_du = self.exact_mm(pixels_px + half_u) - self.exact_mm(pixels_px - half_u)
+        d_dv = self.exact_mm(pixels_px + half_v) - self.exact_mm(pixels_px - half_v)
+        return self.exact_mm(pixels_px), d_du, d_dv
+
+
+def _interpolation(size_px: int) -> tuple[FloatArray, FloatArray]:
+    """Knots (K,) over 0..size and linear weights (size, K) that reach every pixel."""
+    knots = np.arange(0, size_px + _COARSE_STEP_PX, _COARSE_STEP_PX, dtype=np.float64)
+    where = np.arange(size_px)[:, None]
+    weights = np.maximum(0.0, 1.0 - np.abs(where - knots) / _COARSE_STEP_PX)
+    return knots, weights.astype(np.float32)
+
+
+_OUTLINE_STEPS = 24
+_OUTLINE_BITS = 6
+
+
+def render_board(
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: FloatArray
+) -> FloatArray:
+    """Render a board under room light over a background image.
+
+    Parameters
+    ----------
+    board, camera, lamp
+        What is seen, by what, under which light.
+    background
+        (H, W, 3) parts of full scale.
+
+    Returns
+    -------
+    (H, W, 3) parts of full scale, blurred by the lens, without noise.
+    """
+    pose = board.sensor_from_board
+    print_ = render_flat_target(
+        camera,
+        board.pattern,
+        pose.rotation,
+        pose.translation_mm,
+        Lighting(light_level=board.light, dark_level=board.dark),
+    ).image
+    lit = (print_ * _lamp_on_board(board, camera, lamp))[..., None]
+    cover = _coverage(board, camera)[..., None]
+    return np.asarray(cover * lit + (1.0 - cover) * background)
+
+
+def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
+    """(N, 2) pixels along the board's rim."""
+    x_min, y_min, x_max, y_max = board.pattern.extent_board_mm
+    corners = np.array([[x_min, y_min], [x_max, y_min], [x_max, y_max], [x_min, y_max]])
+    share = (np.arange(_OUTLINE_STEPS) / _OUTLINE_STEPS)[:, None]
+    sides = [a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
+    rim = np.concatenate(sides)
+    pose = board.sensor_from_board
+    return camera.project(rim @ pose.rotation[:, :2].T + pose.translation_mm)
+
+
+def _coverage(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
+    """(H, W) part of each pixel that the board covers, blurred by the lens."""
+    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    outline = np.rint(outline_px(board, camera) * (1 << _OUTLINE_BITS)).astype(np.int32)
+    cv2.fillPoly(mask, [outline], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
+    return blur_image(mask.astype(np.float64) / 255.0, camera.blur_sigma_px)
+
+
+def _lamp_on_board(board: PrintedBoard, camera: RenderCamera, lamp: RoomLight) -> FloatArray:
+    """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
+    pose = board.sensor_from_board
+    plane = Floor(pose.translation_mm, -pose.rotation[:, 2], (1.0, 1.0, 1.0))
+    height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
+    rows, columns = np.indices((height, width))
+    cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
+    pixels = (cells + 0.5) * _COARSE_STEP_PX - 0.5
+    scene = Scene((plane,), lamp=lamp)
+    light = scene.room_light(scene.trace(np.zeros(3), camera_rays(camera, pixels)))
+    coarse = light[:, 0].reshape(height, width)
+    size = (camera.width_px, camera.height_px)
+    return np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR))

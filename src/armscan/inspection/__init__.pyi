@@ -1,0 +1,15 @@
+# SPDX-License-Identifier: Apache-2.0
+# What `from armscan.inspection import ...` offers; loaded when it is first asked for.
+from .conformity import Check as Check
+from .conformity import check_size as check_size
+from .conformity import judge as judge
+from .plane import inspect_plane as inspect_plane
+from .results import Deviations as Deviations
+from .results import MeasuredLength as MeasuredLength
+from .results import PlaneInspection as PlaneInspection
+from .results import SphereInspection as SphereInspection
+from .results import StepInspection as StepInspection
+from .selection import InspectionOptions as InspectionOptions
+from .selection import StepOptions as StepOptions
+from .sphere import inspect_sphere as inspect_sphere
+from .step import inspect_step as inspect_step

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+# What `from armscan.storage import ...` offers; loaded when it is first asked for.
+from .arm import read_arm_model as read_arm_model
+from .arm import read_probe_tip as read_probe_tip
+from .clouds import ply_bytes as ply_bytes
+from .clouds import read_cloud as read_cloud
+from .clouds import xyz_bytes as xyz_bytes
+from .documents import camera_document as camera_document
+from .documents import new_provenance as new_provenance
+from .documents import read_camera_calibration as read_camera_calibration
+from .documents import read_scanner_calibration as read_scanner_calibration
+from .documents import read_sensor_calibration as read_sensor_calibration
+from .documents import read_stereo_calibration as read_stereo_calibration
+from .documents import scanner_document as scanner_document
+from .documents import sensor_document as sensor_document
+from .documents import stereo_document as stereo_document
+from .files import write_files as write_files
+from .image_paths import expand_paths as expand_paths
+from .images import ImageOptions as ImageOptions
+from .images import read_exposure as read_exposure
+from .images import read_exposures as read_exposures
+from .observations import Observations as Observations
+from .observations import read_observations as read_observations
+from .points import read_marker_list as read_marker_list
+from .points import read_probed_points as read_probed_points
+from .points import read_profiles as read_profiles
+from .points import read_robot_poses as read_robot_poses
+from .recording import FolderRecording as FolderRecording
+from .recording import read_recording as read_recording
+from .recording import write_recording as write_recording

@@ -24,7 +24,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import Estimate
 from armscan.pipeline.cameras import CameraRun, calibrate_camera_from_views

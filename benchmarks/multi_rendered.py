@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.devices.registry import load_driver
+from armscan.devices.sources import load_driver
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import (
     CameraCalibration,

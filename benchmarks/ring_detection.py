@@ -35,8 +35,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.markers.stereo_matching import RingStatus, match_rings
 from armscan.records.exposure import Exposure
 from armscan.records.points import RingImages
-from armscan.vision.ring_edges import measure_rims
-from armscan.vision.rings import detect_rings
+from armscan.vision.rings import detect_rings, measure_rims
 from armscan.vision.targets.circle_lattice import Blobs
 from rigs.ring_pair_scenes import CALIBRATION_COVARIANCE, MarkerScene, random_scene
 from rigs.ring_scenes import Mark, Rendered, render, tilted

@@ -27,14 +27,14 @@ from typing import Any
 import cv2
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit
 from armscan.geometry.arrays import FloatArray
 from armscan.models.camera import CameraModel
-from armscan.pipeline.documents import camera_calibration
+from armscan.pipeline.cameras import camera_calibration
 from armscan.pipeline.truth import sheet_errors
 from armscan.simulation.head import sheet_points_mm
 from armscan.simulation.instrument import Instrument

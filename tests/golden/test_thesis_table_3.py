@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
 from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
-from armscan.calibration.hand_eye.repeat_study import angle_covariance
-from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.result import HandEyeFit, angle_covariance
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.geometry.rotations import nearest_rotation, rotations_from_euler, vector_from_rotation

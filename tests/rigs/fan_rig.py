@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import HeadCameras, place_board
 from armscan.calibration.sheets.result import BoardStripes
 from armscan.geometry.arrays import FloatArray

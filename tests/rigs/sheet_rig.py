@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.result import BoardStripes
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Board, Pose, Sensor

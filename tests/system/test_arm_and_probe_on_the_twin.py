@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 
 from armscan.calibration.hand_eye.probed_plate import ProbedPlate, fit_probed_plate
-from armscan.devices.registry import load_driver
-from armscan.devices.sources import Twin
-from armscan.models.arm import forward, quarter_turn_flange, thesis_arm
-from armscan.models.probe import tip_centres, tool_from_probe
+from armscan.devices.sources import Twin, load_driver
+from armscan.models.arm import (
+    forward,
+    quarter_turn_flange,
+    thesis_arm,
+    tip_centres,
+    tool_from_probe,
+)
 from armscan.records.points import ProbedPoints
 
 D_MM, L_MM = (300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0)

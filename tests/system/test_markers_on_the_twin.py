@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from armscan.devices.registry import load_driver
-from armscan.devices.sources import Twin
+from armscan.devices.sources import Twin, load_driver
 from armscan.geometry.arrays import FloatArray
 from armscan.markers.stereo_matching import match_rings
 from armscan.models.camera import CameraModel

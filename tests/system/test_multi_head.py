@@ -12,8 +12,7 @@ from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import PlaneInspection
 from armscan.jobs.demo import Calibrated, DemoRequest, calibrate_head
 from armscan.pipeline.scan import ScanReconstruction, measure_scan
-from armscan.pipeline.scan_part import fewer_views
-from armscan.pipeline.simulate import TwinName
+from armscan.pipeline.simulate import TwinName, fewer_views
 from armscan.pipeline.truth import hand_eye_errors, naming_errors, sheet_errors, true_names
 
 HEAD, SEED = "thesis-multi-5", 4

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where exposures and arm samples come from: a live rig, a recording or the twin, all alike."""
+"""Sources of a scan, and the registry in which drivers are found by name."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, Protocol
+from importlib.metadata import entry_points
+from typing import Any, Literal, Protocol
 
+from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, CameraRight, Pose, Sensor, Tool
 from armscan.records.exposure import Exposure
@@ -198,3 +200,28 @@ class Twin(Protocol):
 
     def probe_plate(self) -> Probing:
         """Touch the plate of the scene ``hand-eye``."""
+
+
+GROUP = "armscan.drivers"
+
+
+def driver_names() -> tuple[str, ...]:
+    """Names of all installed drivers, sorted."""
+    return tuple(sorted(entry_points(group=GROUP).names))
+
+
+def load_driver(name: str) -> Any:
+    """Return the object that the driver ``name`` registers.
+
+    Raises
+    ------
+    OptionError
+        If no installed package registers that name.
+    """
+    found = entry_points(group=GROUP, name=name)
+    if not found:
+        raise OptionError(
+            f"no driver is called '{name}'",
+            remedy=f"choose one of: {', '.join(driver_names()) or 'none is installed'}",
+        )
+    return next(iter(found)).load()

@@ -18,20 +18,13 @@ from armscan.pipeline.cameras import (
     CameraRun,
     calibrate_camera_from_found,
     calibrate_camera_from_views,
+    camera_calibration,
 )
-from armscan.pipeline.documents import camera_calibration
 from armscan.pipeline.targets import find_targets
 from armscan.records.exposure import Exposure
 from armscan.report.camera import CAMERA_TITLE, camera_page, camera_quantities
 from armscan.report.photographs import refused_page, tried_targets
-from armscan.report.quantity import (
-    Quantity,
-    Summary,
-    Table,
-    sentences,
-    significant,
-    without_source,
-)
+from armscan.report.quantity import Quantity, Summary, Table, sentences, significant, without_source
 from armscan.storage.documents import (
     camera_document,
     observations_of,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from armscan import kernels
-from armscan.devices.registry import driver_names
+from armscan.devices.sources import driver_names
 from armscan.errors import ArmscanError, FileFormatError
 from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import (

@@ -12,7 +12,7 @@ from armscan.calibration.hand_eye.probed_plate import ProbedPlate, ProbingOption
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.jobs.job import Job, solved
-from armscan.models.probe import tip_centres, tool_from_probe
+from armscan.models.arm import tip_centres, tool_from_probe
 from armscan.records.points import ProbedPoints
 from armscan.report.quantity import Quantity, Summary, Table, sentences, significant
 from armscan.storage.arm import ARM_FILE, PROBE_FILE, read_probe_tip

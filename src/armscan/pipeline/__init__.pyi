@@ -2,9 +2,9 @@
 # What `from armscan.pipeline import ...` offers; loaded when it is first asked for.
 from .cameras import calibrate_camera_from_exposures as calibrate_camera_from_exposures
 from .cameras import calibrate_stereo_from_exposures as calibrate_stereo_from_exposures
+from .cameras import camera_calibration as camera_calibration
 from .cameras import pair_lists as pair_lists
 from .cameras import stereo_calibration as stereo_calibration
-from .documents import camera_calibration as camera_calibration
 from .hand_eye import observe_stripes as observe_stripes
 from .hand_eye import posed_stripes_from_profiles as posed_stripes_from_profiles
 from .instants import pair_by_view as pair_by_view

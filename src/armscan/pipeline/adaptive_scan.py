@@ -16,8 +16,7 @@ from armscan.pipeline.instants import Instant, InstantImages
 from armscan.pipeline.measure import MeasureOptions, measure_instants
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.scan import sensor_poses
-from armscan.pipeline.scan_part import SimulatedPart
-from armscan.pipeline.simulate import TwinName, in_processes
+from armscan.pipeline.simulate import SimulatedPart, TwinName, in_processes
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import PASS_GAP_NS, StripeLabeller
 from armscan.reconstruction.sync import exposure_poses

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From photographs of a target to one calibrated camera or a calibrated stereo pair."""
+"""Calibrate cameras from exposures: find the target, solve, correct circle centres, and make
+the document's content of what was found; one camera or two.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,18 @@ import numpy as np
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, StereoOptions, StereoPair
-from armscan.calibration.cameras.result import MIN_VIEWS, CameraFit, CameraOptions
+from armscan.calibration.cameras.result import MIN_VIEWS, BoardWarp, CameraFit, CameraOptions
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import vector_from_rotation
-from armscan.models.calibration import CameraCalibration, CameraDiagnostics, Provenance
+from armscan.models.calibration import (
+    CameraCalibration,
+    CameraDiagnostics,
+    FTest,
+    Provenance,
+    WarpedBoard,
+)
 from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.models.two_views import StereoCalibration, StereoDiagnostics
 from armscan.pipeline.instants import group_instants
@@ -452,3 +460,43 @@ def _stereo_moved_sigmas(before: StereoFit, after: StereoFit) -> float:
 def _listed(exposures: Sequence[Exposure]) -> str:
     names = [exposure.source for exposure in exposures[:LISTED]]
     return ", ".join(names) + (", ..." if len(exposures) > LISTED else "")
+
+
+def camera_calibration(fit: CameraFit, provenance: Provenance) -> CameraCalibration:
+    """The document's content of a fit."""
+    return CameraCalibration(
+        camera=fit.camera,
+        covariance=fit.covariance,
+        has_covariance=True,
+        rms_px=fit.rms_px,
+        sigma_point_px=fit.sigma_point_px,
+        n_views=fit.n_views,
+        n_points=fit.n_points,
+        covered_px=fit.coverage.covered_px,
+        provenance=provenance,
+        diagnostics=_camera_diagnostics(fit),
+    )
+
+
+def _camera_diagnostics(fit: CameraFit) -> CameraDiagnostics:
+    """Diagnostics of a camera's calibration."""
+    held_out = fit.cross_validation
+    return CameraDiagnostics(
+        free_parameters=fit.free_parameters,
+        model_reason=fit.model_reason,
+        hold_out_rms_px=None if held_out is None else held_out.rms_px,
+        n_folds=0 if held_out is None else held_out.n_folds,
+        condition=fit.condition,
+        noise_scale=fit.noise_scale,
+        covered_fraction=fit.coverage.fraction,
+        board=None if fit.warp is None else _bowed_board(fit.warp),
+    )
+
+
+def _bowed_board(warp: BoardWarp) -> WarpedBoard:
+    bow_x, bow_y = warp.bow_mm.tolist()
+    sigma_x, sigma_y = warp.sigma_mm.tolist()
+    test = FTest(
+        f_ratio=warp.f_statistic, degrees_of_freedom=len(warp.bow_mm), p_value=warp.p_value
+    )
+    return WarpedBoard((bow_x, bow_y), (sigma_x, sigma_y), test)

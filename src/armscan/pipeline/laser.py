@@ -11,7 +11,7 @@ from typing import cast, get_args
 
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import HeadCameras, SeenBoard, place_board, poses_chi2
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import (

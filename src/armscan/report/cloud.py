@@ -14,11 +14,20 @@ from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.charts import Bars, histogram_chart
-from armscan.report.drawing import ACCENT, PALETTE, new_figure, raster_markup, styled
+from armscan.report.drawing import (
+    ACCENT,
+    PALETTE,
+    SceneDots,
+    new_figure,
+    ramp_colours,
+    ramp_markup,
+    raster_markup,
+    scene_markup,
+    styled,
+)
 from armscan.report.page import Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import evenly_chosen, stripe_gallery
 from armscan.report.quantity import Quantity, Table, fact, only, plural, significant
-from armscan.report.scene3d import SceneDots, ramp_colours, ramp_markup, scene_markup
 
 MAX_SHOWN = 20_000
 MAX_PROFILES = 6

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from armscan.calibration.hand_eye.observations import PosedStripe
-from armscan.calibration.hand_eye.repeat_study import study_repeats
-from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult
+from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, study_repeats
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import euler_from_rotations, rotation_from_vector
@@ -35,23 +34,21 @@ from armscan.report.drawing import (
     LINE,
     MUTED,
     PALETTE,
+    SceneDots,
+    SceneLines,
     chart_markup,
+    closed_outline,
     new_figure,
+    pyramid,
+    ramp_colours,
+    ramp_markup,
     raster_markup,
+    scene_markup,
     styled,
 )
 from armscan.report.page import Block, Facts, Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import stripe_gallery
 from armscan.report.quantity import Quantity, Table, fact, for_people, significant, with_sigma
-from armscan.report.scene3d import (
-    SceneDots,
-    SceneLines,
-    closed_outline,
-    pyramid,
-    ramp_colours,
-    ramp_markup,
-    scene_markup,
-)
 
 TITLE = "Hand-eye calibration"
 ANGLE_STEP_RAD = 1e-6

@@ -24,7 +24,18 @@ from armscan.inspection.results import (
 )
 from armscan.models.calibration import Provenance
 from armscan.records.cloud import PointCloud
-from armscan.report.drawing import ACCENT, ALERT, INK, MUTED, chart_markup, new_figure, styled
+from armscan.report.drawing import (
+    ACCENT,
+    ALERT,
+    INK,
+    MUTED,
+    SceneDots,
+    chart_markup,
+    new_figure,
+    ramp_markup,
+    scene_markup,
+    styled,
+)
 from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.quantity import (
     Quantity,
@@ -36,7 +47,6 @@ from armscan.report.quantity import (
     significant,
     with_sigma,
 )
-from armscan.report.scene3d import SceneDots, ramp_markup, scene_markup
 
 LEAST_MM = 5e-5
 """Smaller lengths, as the mean of what was fitted, are shown as zero."""

@@ -13,10 +13,21 @@ from armscan.models.calibration import Provenance
 from armscan.pipeline.register import MarkerResiduals
 from armscan.records.cloud import PointCloud
 from armscan.report.charts import named_columns, round_below
-from armscan.report.drawing import ACCENT, ALERT, MUTED, PALETTE, chart_markup, new_figure, styled
+from armscan.report.drawing import (
+    ACCENT,
+    ALERT,
+    MUTED,
+    PALETTE,
+    SceneDots,
+    SceneLines,
+    chart_markup,
+    new_figure,
+    scene_markup,
+    styled,
+    uniform_dots,
+)
 from armscan.report.page import Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.quantity import Quantity, Table, significant
-from armscan.report.scene3d import SceneDots, SceneLines, scene_markup, uniform_dots
 
 HOW_TO_READ = (
     "A residual is how far a marker, carried to the common frame, lies from where the others say. "

@@ -29,10 +29,15 @@ from armscan.report.drawing import (
     LINE,
     MUTED,
     PALETTE,
+    SceneLines,
+    closed_outline,
     new_figure,
     photo_markup,
+    pyramid,
     raster_markup,
+    scene_markup,
     styled,
+    uniform_dots,
 )
 from armscan.report.page import Block, Facts, Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import (
@@ -53,7 +58,6 @@ from armscan.report.quantity import (
     significant,
     with_sigma,
 )
-from armscan.report.scene3d import SceneLines, closed_outline, pyramid, scene_markup, uniform_dots
 
 TITLE = "Light sheet calibration"
 USE_COLOURS = {

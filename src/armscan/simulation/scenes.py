@@ -16,12 +16,14 @@ from armscan.records.recording import ArmTrack
 from armscan.simulation.arm.arm import COMFORTABLE_RAD, reach
 from armscan.simulation.arm.hand import (
     HeadOrientation,
+    SweptScene,
     aim_point_mm,
     facing_both,
+    scan_passes,
     sensor_over,
+    still_step,
     sweep,
 )
-from armscan.simulation.arm.passes import SweptScene, scan_passes, still_step
 from armscan.simulation.head import Head
 from armscan.simulation.instrument import Instrument, track_of_readings, track_of_sweeps
 from armscan.simulation.objects.boards import CirclePattern

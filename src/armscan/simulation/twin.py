@@ -14,7 +14,7 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, CameraRight, Pose, Sensor, Tool
 from armscan.records.recording import SessionKind
-from armscan.simulation.arm.passes import SweptScene
+from armscan.simulation.arm.hand import SweptScene
 from armscan.simulation.head import HEADS, RIGHT, sheet_points_mm
 from armscan.simulation.instrument import (
     TIP_DIAMETER_MM,

@@ -22,7 +22,7 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.records.exposure import Exposure
-from armscan.vision.targets.grey import Grey8, grey_channels, to_grey8
+from armscan.vision.targets.saddle import Grey8, grey_channels, to_grey8
 from armscan.vision.targets.target import TargetView
 
 MIN_POINTS = 6

@@ -4,14 +4,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.cameras.board_pose import (
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.result import CameraFit, CameraOptions
+from armscan.calibration.cameras.start import (
     AMBIGUOUS_CHI2,
     board_pose_candidates,
     estimate_board_pose,
     mirrored_pose,
 )
-from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.result import CameraFit, CameraOptions
 from armscan.errors import InputError
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor

@@ -4,7 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.result import (
     CameraFit,
@@ -13,6 +12,7 @@ from armscan.calibration.cameras.result import (
     measure_coverage,
 )
 from armscan.calibration.cameras.robust import excess_variance_px2
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.estimate import Estimate
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import TargetView

@@ -7,7 +7,7 @@ from typing import cast
 
 import pytest
 
-from armscan.calibration.cameras.model_choice import MODELS, ChosenModel, choose_model
+from armscan.calibration.cameras.calibrate import MODELS, ChosenModel, choose_model
 from armscan.calibration.cameras.result import CrossValidation, DistortionModel
 from armscan.calibration.cameras.robust import Solution
 from armscan.geometry.estimate import FitFailure

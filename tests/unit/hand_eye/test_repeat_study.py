@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from armscan.calibration.hand_eye.repeat_study import (
+from armscan.calibration.hand_eye.result import (
     REPEAT_NAMES,
     RepeatStudy,
     angle_covariance,

@@ -9,8 +9,7 @@ import pytest
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets
-from armscan.calibration.sheets.lack_of_fit import board_scatter, stripe_noise
-from armscan.calibration.sheets.model import start_sheet
+from armscan.calibration.sheets.model import board_scatter, start_sheet, stripe_noise
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, SheetOptions
 from armscan.calibration.sheets.solve import (
     CommonErrors,

@@ -4,7 +4,7 @@
 import pytest
 from scipy import stats
 
-from armscan.calibration.sheets.lack_of_fit import StripeNoise, lack_of_fit
+from armscan.calibration.sheets.model import StripeNoise, lack_of_fit
 
 NOISE = StripeNoise(1.2, 4.0, 500.0)
 """500 degrees of freedom in points, of which four count as one: 125."""

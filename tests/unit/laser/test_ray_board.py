@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import dpose_dcamera, intersect_board
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from armscan.calibration.sheets.lack_of_fit import scatter_by_stripe, stripe_noise
+from armscan.calibration.sheets.model import scatter_by_stripe, stripe_noise
 from armscan.calibration.sheets.solve import SheetObservations
 from armscan.geometry.arrays import FloatArray
 

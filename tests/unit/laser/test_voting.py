@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from armscan.calibration.cameras.board_pose import estimate_board_pose
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.calibrate import calibrate_sheets
 from armscan.calibration.sheets.result import BoardStripes, LaserFit, PointUse, SheetOptions

@@ -10,7 +10,7 @@ import pytest
 
 from armscan.errors import InputError
 from armscan.geometry.poses import Pose
-from armscan.models.probe import compensate_tip, tip_centres, tool_from_probe
+from armscan.models.arm import compensate_tip, tip_centres, tool_from_probe
 from armscan.records.recording import ArmTrack
 
 

@@ -21,8 +21,13 @@ from armscan.jobs import simulate as simulate_job_simulate
 from armscan.jobs.simulate import SimulateRequest, run_simulation
 from armscan.pipeline import simulate
 from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.scan_part import fewer_views
-from armscan.pipeline.simulate import SimulatedScene, SimulateOptions, simulate_scene, truth_path
+from armscan.pipeline.simulate import (
+    SimulatedScene,
+    SimulateOptions,
+    fewer_views,
+    simulate_scene,
+    truth_path,
+)
 from armscan.storage import files
 from armscan.storage.arm import read_probe_tip
 from armscan.storage.image_paths import are_simulated

@@ -12,7 +12,7 @@ from armscan.errors import EstimationError, OptionError
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.scan_part import fewer_views
+from armscan.pipeline.simulate import fewer_views
 from armscan.pipeline.truth import hand_eye_errors, true_names
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session

@@ -18,7 +18,7 @@ from armscan.calibration.sheets.result import LaserFit, PointUse
 from armscan.calibration.sheets.stripes_on_board import TargetEdges, runs_along_edge
 from armscan.jobs.sheets import sheets_summary
 from armscan.models.calibration import FTest
-from armscan.pipeline.documents import camera_calibration
+from armscan.pipeline.cameras import camera_calibration
 from armscan.records.exposure import Exposure
 from armscan.records.profile import REJECTING, StripeFlag
 from armscan.report.camera import camera_page

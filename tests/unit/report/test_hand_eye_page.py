@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.calibration.hand_eye.repeat_study import angle_covariance
+from armscan.calibration.hand_eye.result import angle_covariance
 from armscan.geometry.rotations import rotations_from_euler
 from armscan.jobs.hand_eye import hand_eye_summary
 from armscan.models.calibration import HandEyeCalibration, ScannerCalibration

@@ -11,19 +11,17 @@ import numpy as np
 import pytest
 
 from armscan.records.exposure import Exposure, SensorWindow
-from armscan.report.drawing import Marks, display_levels, photo_markup
-from armscan.report.page import (
-    Facts,
-    Gallery,
-    Legend,
-    Page,
-    Picture,
-    Section,
-    Text,
-    render_page,
+from armscan.report.drawing import (
+    Marks,
+    SceneLines,
+    display_levels,
+    photo_markup,
+    ramp_colours,
+    scene_markup,
+    uniform_dots,
 )
+from armscan.report.page import Facts, Gallery, Legend, Page, Picture, Section, Text, render_page
 from armscan.report.quantity import Table, fact
-from armscan.report.scene3d import SceneLines, ramp_colours, scene_markup, uniform_dots
 
 HOSTILE = '<script>alert("1")</script>&'
 

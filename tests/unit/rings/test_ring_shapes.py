@@ -8,8 +8,13 @@ import pytest
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.vision.ring_edges import common_centres
-from armscan.vision.rings import RingOptions, perimeter_limits, perimeters_px, roundness
+from armscan.vision.rings import (
+    RingOptions,
+    common_centres,
+    perimeter_limits,
+    perimeters_px,
+    roundness,
+)
 from armscan.vision.targets.ellipse import Ellipses, fit_ellipses
 
 FOCAL_PX, DISTANCE_MM = 5000.0, 140.0

@@ -12,10 +12,16 @@ import pytest
 
 from armscan.devices.sources import TwinScene
 from armscan.geometry.poses import Points, Sensor
-from armscan.pipeline.scan_part import fewer_views
+from armscan.pipeline.simulate import fewer_views
 from armscan.simulation.arm.arm import reach
-from armscan.simulation.arm.hand import CAMERA_CLOCK_NS, HeadOrientation, aim_point_mm, sensor_over
-from armscan.simulation.arm.passes import SweptScene, scan_passes
+from armscan.simulation.arm.hand import (
+    CAMERA_CLOCK_NS,
+    HeadOrientation,
+    SweptScene,
+    aim_point_mm,
+    scan_passes,
+    sensor_over,
+)
 from armscan.simulation.head import MountedCamera
 from armscan.simulation.instrument import Instrument
 from armscan.simulation.plans import PLANS

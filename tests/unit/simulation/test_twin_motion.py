@@ -14,9 +14,9 @@ from armscan.simulation.arm.hand import (
     HandTremor,
     HeadOrientation,
     ScanPass,
+    scan_passes,
     sweep,
 )
-from armscan.simulation.arm.passes import scan_passes
 from armscan.simulation.head import sheet_middle_mm
 from armscan.simulation.instrument import SAMPLE_NS
 from armscan.simulation.twin import build_twin

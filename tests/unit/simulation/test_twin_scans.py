@@ -9,8 +9,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from armscan.devices.registry import load_driver
-from armscan.devices.sources import Probing, ScanSource, Twin, TwinScene, TwinTruth
+from armscan.devices.sources import Probing, ScanSource, Twin, TwinScene, TwinTruth, load_driver
 from armscan.errors import OptionError
 from armscan.simulation.objects.fixtures import STEP_CENTRES_MM
 from armscan.simulation.twin import build_twin

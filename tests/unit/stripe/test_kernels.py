@@ -7,7 +7,17 @@ from scipy.ndimage import correlate
 from scipy.optimize import curve_fit
 
 from armscan.kernels.chains import find_other_lines, walk_chains
-from armscan.kernels.profile_fit import AMPLITUDE, CENTRE, SIGMA, VARIANCE, fit_profiles, read_sides
+from armscan.kernels.profile_fit import (
+    AMPLITUDE,
+    CENTRE,
+    SHIFT,
+    SIGMA,
+    SMOOTH_SIGMA,
+    VARIANCE,
+    fit_profiles,
+    read_sides,
+    smooth_chains,
+)
 from armscan.kernels.ridge import (
     derivatives_at,
     find_runs,
@@ -15,8 +25,6 @@ from armscan.kernels.ridge import (
     interpolate_columns,
     refine_candidates,
 )
-from armscan.kernels.smooth import SHIFT, smooth_chains
-from armscan.kernels.smooth import SIGMA as SMOOTH_SIGMA
 
 FLOAT32 = 3e-5
 """Rounding of 32-bit sums over a few hundred pixels of grey level 255, relative to 1."""

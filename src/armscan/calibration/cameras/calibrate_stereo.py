@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from armscan.calibration.cameras.calibrate import rms
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,
@@ -24,7 +25,6 @@ from armscan.calibration.cameras.joint import (
     stack_pair_observations,
     stereo_covariance,
 )
-from armscan.calibration.cameras.model_choice import rms
 from armscan.calibration.cameras.pairs import (
     MIN_PAIRS,
     StereoOptions,

@@ -10,10 +10,9 @@ from typing import get_args
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import basis_of
-from armscan.calibration.cameras.board_pose import estimate_board_pose
-from armscan.calibration.cameras.calibrate import calibrate_camera
-from armscan.calibration.cameras.model_choice import rms
+from armscan.calibration.cameras.calibrate import calibrate_camera, rms
 from armscan.calibration.cameras.result import MIN_VIEW_POINTS, CameraFit, CameraOptions
+from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure

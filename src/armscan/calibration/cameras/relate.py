@@ -19,9 +19,9 @@ from armscan.calibration.cameras.adjustment import (
     condition_number,
     gather,
 )
-from armscan.calibration.cameras.board_pose import estimate_board_poses
-from armscan.calibration.cameras.model_choice import NO_SHARED
+from armscan.calibration.cameras.calibrate import NO_SHARED
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, SingleCamera, StereoPair
+from armscan.calibration.cameras.start import estimate_board_poses
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
 from armscan.geometry.estimate import FitFailure

@@ -52,7 +52,7 @@ class CameraOptions:
     ----------
     distortion
         Which coefficients are free; ``auto`` decides by the rule of
-        `armscan.calibration.cameras.model_choice`.
+        `armscan.calibration.cameras.calibrate`.
     is_aspect_fixed
         Hold ``fy = fx`` (square pixels).
     is_principal_point_fixed

@@ -15,7 +15,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, bools, floats, items
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.shapes import Plane, fit_plane, plane_from_coefficients
-from armscan.models.probe import compensate_tip
+from armscan.models.arm import compensate_tip
 from armscan.records.points import ProbedPoints
 
 ProbeSide = Literal["+x", "-x", "+y", "-y", "+z", "-z"]

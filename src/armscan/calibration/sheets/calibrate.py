@@ -20,17 +20,15 @@ from armscan.calibration.sheets.coplanarity import (
     refuse_underdetermined_tilt,
 )
 from armscan.calibration.sheets.labels import SheetAssignment, assign_sheets, board_numbers
-from armscan.calibration.sheets.lack_of_fit import (
-    find_outlier_view,
-    scatter_by_stripe,
-    stripe_noise,
-)
 from armscan.calibration.sheets.model import (
     SheetModel,
     choose_model,
     compare_planes,
+    find_outlier_view,
+    scatter_by_stripe,
     sheet_geometry,
     start_sheet,
+    stripe_noise,
 )
 from armscan.calibration.sheets.result import (
     LACK_OF_FIT_P,

@@ -10,14 +10,14 @@ from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.kernels.smooth import (
+from armscan.kernels.profile_fit import (
     BEND,
     BEND_SIGMA,
     PREDICTED,
     PREDICTED_SIGMA,
     SHIFT,
-    SIGMA,
     SLOPE,
+    SMOOTH_SIGMA,
     smooth_chains,
 )
 
@@ -123,7 +123,7 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     return SmoothedCentres(
         course.points + shift[:, None] * normals,
         turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        np.where(used, result[:, SIGMA], course.sigma),
+        np.where(used, result[:, SMOOTH_SIGMA], course.sigma),
         is_outlier,
     )
 

@@ -37,8 +37,14 @@ from armscan.vision.targets.crossings import (
     find_lattices,
     predict_cells,
 )
-from armscan.vision.targets.grey import MIN_CONTRAST, Grey32, RawGrey, grey_channels, sample
-from armscan.vision.targets.saddle import fit_saddles
+from armscan.vision.targets.saddle import (
+    MIN_CONTRAST,
+    Grey32,
+    RawGrey,
+    fit_saddles,
+    grey_channels,
+    sample,
+)
 from armscan.vision.targets.target import Chessboard, OtherCountSeen, TargetView, rightness
 
 Side = Literal["ends", "may end", "continues", "unknown"]

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.vision.targets.ellipse import BandPixels, Ellipses, Rims, band_pixels, fit_ellipses
-from armscan.vision.targets.grey import RawGrey
+from armscan.vision.targets.saddle import RawGrey
 
 APERTURE_SIGMA_PX = 0.29
 """Standard deviation of a pixel's own width, 1 / sqrt(12): no edge is sharper."""

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats
-from armscan.vision.targets.grey import MIN_CONTRAST, Grey8
+from armscan.vision.targets.saddle import MIN_CONTRAST, Grey8
 from armscan.vision.targets.target import CircleGrid, rightness
 
 MIN_CIRCLE_PX, MAX_CIRCLE_PX = 8.0, 400.0

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
-from armscan.vision.targets.grey import Grey32
+from armscan.vision.targets.saddle import Grey32
 
 _BLUR_PX = 1.2
 _RING_PX = 4.0

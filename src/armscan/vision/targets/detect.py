@@ -14,15 +14,8 @@ from armscan.geometry.poses import Board, Pose
 from armscan.records.exposure import Exposure
 from armscan.vision.targets.chessboard import detect_chessboard
 from armscan.vision.targets.circle_grid import detect_circle_grid
-from armscan.vision.targets.grey import grey_channels, to_grey8
-from armscan.vision.targets.saddle import WINDOW_FRACTION, fit_saddles
-from armscan.vision.targets.target import (
-    Charuco,
-    Chessboard,
-    CircleGrid,
-    Target,
-    TargetView,
-)
+from armscan.vision.targets.saddle import WINDOW_FRACTION, fit_saddles, grey_channels, to_grey8
+from armscan.vision.targets.target import Charuco, Chessboard, CircleGrid, Target, TargetView
 
 MIN_CORNERS = 6
 """Fewer corners make no view: four fix a homography and leave nothing to judge it by."""

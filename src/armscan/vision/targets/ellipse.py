@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
-from armscan.vision.targets.grey import RawGrey
+from armscan.vision.targets.saddle import RawGrey
 
 _STEPS = 12
 _TERMS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2))

@@ -321,17 +321,13 @@ def reconstruct(
     left = pair_exposures(exposures, backgrounds)
     _check_cameras(sensor, len(left), len(rights))
     cameras = [left] if sensor.second is None else [left, pair_exposures(rights, right_backgrounds)]
-
-    def stills() -> Iterator[InstantImages]:
-        for done, pairs in enumerate(zip(*cameras, strict=True)):
-            progress(ProgressEvent(STAGE, done, len(left), pairs[0][0].source))
-            yield InstantImages(pairs)
-
     images: list[LabelledProfile] = []
     clouds: list[PointCloud] = []
     weak: list[str] = []
     labeller = labeller_for(sensor, options)
-    for instant in measure_instants(stills(), labeller, sensor, options, is_pass=False):
+    for instant in measure_instants(
+        _stills(cameras, progress), labeller, sensor, options, is_pass=False
+    ):
         for found in instant.profiles:
             images.append(found.labelled)
             weak += found.warnings
@@ -343,6 +339,15 @@ def reconstruct(
     depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
     warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
+
+
+def _stills(
+    cameras: Sequence[Sequence[ExposurePair]], progress: Progress
+) -> Iterator[InstantImages]:
+    """Each exposure with its partner of the other camera, as an instant of its own."""
+    for done, pairs in enumerate(zip(*cameras, strict=True)):
+        progress(ProgressEvent(STAGE, done, len(cameras[0]), pairs[0][0].source))
+        yield InstantImages(pairs)
 
 
 def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None:

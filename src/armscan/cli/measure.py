@@ -195,6 +195,11 @@ ProfilePoses = Annotated[
 ]
 
 
+Volume = Annotated[
+    str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
+]
+
+
 def reconstruct(
     *,
     images: Annotated[
@@ -226,9 +231,7 @@ def reconstruct(
     ] = None,
     sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
     depth_margin: DepthMargin = None,
-    volume: Annotated[
-        str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
-    ] = "",
+    volume: Volume = "",
     arm: ArmFile = None,
     poses: ProfilePoses = None,
     euler: EulerAngles = None,

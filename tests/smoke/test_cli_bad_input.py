@@ -209,7 +209,7 @@ def test_no_folder_to_write_to(
 ) -> None:
     images = calibrated.camera_images if command == "camera" else calibrated.on
     words = words_of(command, calibrated, tmp_path / "absent", images)
-    assert "no such folder to write to" in fails(*words, writes=tmp_path)
+    assert "there is no such folder" in fails(*words, writes=tmp_path)
 
 
 @COMMANDS

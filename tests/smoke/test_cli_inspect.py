@@ -138,7 +138,7 @@ def test_what_cannot_be_inspected_gets_one_sentence(
         ("--mpe=-0.1", "the limit is -0.1 mm"),
         ("--ball=nan", "--ball: a diameter of nan mm"),
         ("--ball=inf", "--ball: a diameter of inf mm"),
-        ("--feature-mm=nan", "feature_mm is nan"),
+        ("--feature-mm=nan", "a feature band of nan mm"),
         ("--region=1,0,0,1,0,1", "--region: xmin 1 is not below xmax 0"),
     ],
 )

@@ -53,13 +53,16 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Done:
     return Done(folder, summary, content["heads"][HEAD])
 
 
+DOCUMENTS = ("camera", "sensor", "scanner")
+
+
 def test_everything_is_written_and_nothing_else(demo: Done) -> None:
     assert {path.name for path in demo.folder.iterdir()} == {
         RECORDINGS,
         TRUTH,
         FILES,
-        *(f"{name}.{end}" for name in ("camera", "sensor") for end in ("json", "npz", "html")),
-        *("plate.csv", "scanner.json", "scanner.html"),
+        *(f"{name}.{end}" for name in DOCUMENTS for end in ("json", "npz", "html")),
+        "plate.csv",
         *("cloud.ply", "report.html", "summary.json"),
     }
     scanner = read_scanner_calibration(demo.folder / "scanner.json")

@@ -51,4 +51,4 @@ def test_the_commands_end_as_the_page_shows(
             )
     refused = ["board.refused.html", "wrong.refused.html"]
     found = sorted(path.name for path in tmp_path.iterdir())
-    assert found == sorted([*refused, "scanner.html", "scanner.json"])
+    assert found == sorted([*refused, "scanner.html", "scanner.json", "scanner.npz"])

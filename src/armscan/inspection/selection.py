@@ -45,7 +45,7 @@ class InspectionOptions:
     def __post_init__(self) -> None:
         if not SEARCH_BAND_MM <= self.feature_mm < math.inf:
             raise OptionError(
-                f"a feature band of {self.feature_mm} mm is less than the search band",
+                f"a feature band of {self.feature_mm} mm does not hold the search band",
                 where="--feature-mm",
                 remedy=f"give {SEARCH_BAND_MM:g} mm or more, as 1.0",
             )

@@ -49,13 +49,5 @@ def test_two_known_points_are_too_few() -> None:
     stripe, _ = RIG.stripe(0, RIG.sheets[0], rng)
     few = view.points_board_mm[:, 0] < 2 * RIG.pitch_mm
     few &= view.points_board_mm[:, 1] < 2 * RIG.pitch_mm
-    small = type(view)(
-        view.source,
-        view.width_px,
-        view.height_px,
-        view.point_index[few],
-        view.points_px[few],
-        view.covariance_px2[few],
-        view.points_board_mm[few],
-    )
+    small = view.select(few)
     assert cross_ratio_points(small, stripe, RIG.camera).shape == (0, 2)

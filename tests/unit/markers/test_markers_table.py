@@ -45,7 +45,7 @@ def test_a_table_reads_back_as_the_same_numbers(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ("cov_zz_mm2", "sigma_z", "cov_zz_mm2"),
-        ("\n3,", "\n0,", "id 0 occurs 2 times"),
+        ("\n3,", "\n0,", "id 0 appears again"),
     ],
 )
 def test_other_tables_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:

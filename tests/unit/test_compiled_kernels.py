@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import stat
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from armscan.cli.run import VARIABLE, give_kernels_a_folder
@@ -56,3 +58,35 @@ def test_numba_is_left_alone_where_it_finds_a_place(
     monkeypatch.setenv(VARIABLE, "mine")
     give_kernels_a_folder(tmp_path, tmp_path)
     assert os.environ[VARIABLE] == "mine"
+
+
+@pytest.mark.parametrize("damage", ["nbc cut", "nbi cut", "nbi junk", "nbc empty"])
+def test_a_damaged_cache_is_compiled_anew(
+    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a killed process or a full disk leaves it."""
+    monkeypatch.setattr("numba.core.config.CACHE_DIR", str(tmp_path / "cache"))
+    source = tmp_path / "kernel_of_a_test.py"
+    source.write_text(
+        "from __future__ import annotations\n"
+        "from armscan.kernels.arrays import Floats, compiled\n\n\n"
+        "@compiled()\ndef total(values: Floats) -> float:\n    return values.sum()\n"
+    )
+
+    def total() -> float:
+        spec = importlib.util.spec_from_file_location("kernel_of_a_test", source)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return float(module.total(np.array([1.0, 2.0])))
+
+    assert total() == 3.0
+    end, how = damage.split()
+    files = list(tmp_path.rglob(f"*.{end}"))
+    assert files != []
+    for path in files:
+        content = path.read_bytes()
+        path.write_bytes({"cut": content[:100], "junk": b"junk" * 40, "empty": b""}[how])
+    assert total() == 3.0
+    assert total() == 3.0, "the cache is whole again"

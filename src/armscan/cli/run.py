@@ -82,8 +82,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     from armscan.cli.app import command
 
-    pass
-
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     give_kernels_a_folder(Path(__file__).parents[1])
     if isinstance(sys.stdout, io.TextIOWrapper):

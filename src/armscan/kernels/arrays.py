@@ -70,9 +70,26 @@ def compiled(
     def compile_kernel(kernel: F) -> F:
         named = dict(kernel.__annotations__)
         signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
-        found: F = njit(
-            signature, cache=True, nogil=True, fastmath=fastmath, error_model=error_model
-        )(kernel)
-        return found
+
+        def built(*, cache: bool) -> F:
+            found: F = njit(
+                signature, cache=cache, nogil=True, fastmath=fastmath, error_model=error_model
+            )(kernel)
+            return found
+
+        try:
+            return built(cache=True)
+        except Exception:
+            # what a killed process or a full disk left of an earlier compilation
+            return built(cache=_forgotten(njit(cache=True)(kernel)))
 
     return compile_kernel
+
+
+def _forgotten(kernel: Any) -> bool:
+    """Empty the cache of one kernel; False if its folder may not be written."""
+    try:
+        kernel._cache.flush()
+    except OSError:
+        return False
+    return True

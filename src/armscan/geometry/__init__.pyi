@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 # What `from armscan.geometry import ...` offers; loaded when it is first asked for.
-from .arrays import ArrayRecord as ArrayRecord
 from .arrays import Box as Box
-from .arrays import RowRecord as RowRecord
 from .estimate import Estimate as Estimate
 from .estimate import FitFailure as FitFailure
-from .least_squares import levenberg_marquardt as levenberg_marquardt
-from .least_squares import robust_sigma as robust_sigma
 from .poses import Base as Base
 from .poses import Board as Board
 from .poses import Cad as Cad

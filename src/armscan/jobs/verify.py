@@ -219,7 +219,7 @@ def _report(name: str, result: Verification, measured: Measured) -> InspectionRe
     cards = [
         fact(
             check.name.capitalize(),
-            _value(check, check.error),
+            f"E {_value(check, check.error)}",
             f"limit {_value(check, check.limit)}: {check.verdict}",
         )
         for check in result.checks

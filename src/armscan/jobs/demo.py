@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -11,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, TypeVar
-from uuid import uuid4
 
 import numpy as np
 
@@ -77,7 +75,7 @@ from armscan.storage.documents import (
     read_scanner_calibration,
     read_sensor_calibration,
 )
-from armscan.storage.files import write_files
+from armscan.storage.files import replaced_folder, told_path, write_files
 from armscan.storage.recording import FolderRecording, read_recording
 
 Result = TypeVar("Result")
@@ -134,45 +132,31 @@ class DemoRequest:
 
 
 @contextmanager
-def demo_folder(folder: Path) -> Iterator[None]:
-    """Make a folder anew, and list what was written into it; what it held comes back on an error.
+def demo_folder(folder: Path) -> Iterator[Path]:
+    """Give a folder to make a demo in; complete and listed, it replaces the earlier one.
 
     Raises
     ------
     OutputError
-        If the folder holds a file that no earlier demo listed, or cannot be written.
+        If the folder holds a file that no earlier demo listed, now or at the end, or cannot be
+        written.
     """
-    target = folder.resolve()
-    listing = target / FILES
+    with replaced_folder(folder, partial(_check_replaceable, folder)) as place:
+        yield place
+        names = [*_files_in(place), FILES]
+        (place / FILES).write_text("\n".join(names) + "\n", "utf-8")
+
+
+def _check_replaceable(folder: Path) -> None:
+    listing = folder / FILES
     listed = listing.read_text("utf-8").splitlines() if listing.is_file() else []
-    foreign = [name for name in _files_in(target) if name not in listed]
-    if foreign or (target.exists() and not target.is_dir()):
+    foreign = [name for name in _files_in(folder) if name not in listed]
+    if foreign or (folder.exists() and not folder.is_dir()):
         raise OutputError(
             f"the folder holds other files than a demo's ({', '.join(foreign[:3])})",
             where=str(folder),
             remedy="name a new or an empty folder",
         )
-    earlier = target.with_name(f".{target.name}.{uuid4().hex}.old")
-    try:
-        if target.exists():
-            target.rename(earlier)
-        target.mkdir(parents=True)
-        try:
-            yield
-            names = [*_files_in(target), FILES]
-            listing.write_text("\n".join(names) + "\n", "utf-8")
-        except BaseException:
-            shutil.rmtree(target, ignore_errors=True)
-            if earlier.exists():
-                earlier.rename(target)
-            raise
-        shutil.rmtree(earlier, ignore_errors=True)
-    except OSError as error:
-        raise OutputError(
-            f"the demo cannot be written ({error.strerror or error})",
-            where=str(folder),
-            remedy="free some space or choose another folder",
-        ) from error
 
 
 def _files_in(folder: Path) -> list[str]:
@@ -248,14 +232,13 @@ def run_head_demo(request: DemoRequest, progress: Progress = silent) -> Summary:
         written, or a stage does not determine its result.
     """
     _check_head(request)
-    with demo_folder(request.folder):
-        return make_head_demo(request, request.folder, progress)[0]
+    with demo_folder(request.folder) as place:
+        return make_head_demo(request, place, progress)[0]
 
 
 def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
     """Run the demo of each head, each in its own folder, and compare them; raises the same."""
-    folder = request.folder
-    with demo_folder(folder):
+    with demo_folder(request.folder) as folder:
         heads: dict[str, Any] = {}
         demos: dict[str, HeadDemo] = {}
         warnings: list[str] = []
@@ -275,8 +258,9 @@ def run_all_heads(request: DemoRequest, progress: Progress = silent) -> Summary:
             title="Demo of three simulated heads on the same scenes",
             tables=(comparison_table(heads),),
             warnings=tuple(warnings),
-            written=(*folders, page, result),
-            next_step=f"open {page} in a browser; each head has its own page in its folder",
+            written=tuple(map(told_path, (*folders, page, result))),
+            next_step=f"open {told_path(page)} in a browser; each head has its own page in its "
+            "folder",
             extra={**data, "heads": heads},
         )
         document = render_page(heads_page(heads, demos, footer(provenance)))
@@ -444,8 +428,8 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
         quantities=(fact("time", f"{sum(seconds.values()):.0f} s"),),
         tables=(comparison_table({name: head}), truth_table(demo, head), *naming, commands),
         warnings=marked,
-        written=(folder / RECORDINGS, *sorted(folder.glob("*.*")), result),
-        next_step=f"open {report} in a browser",
+        written=_told(folder, result),
+        next_step=f"open {told_path(report)} in a browser",
         extra={
             "kind": "demo",
             "simulated": True,
@@ -459,32 +443,39 @@ def _written(run: _Run, demo: HeadDemo, warnings: tuple[str, ...]) -> Summary:
     return summary
 
 
+def _told(folder: Path, result: Path) -> tuple[Path, ...]:
+    """What was written into a demo's folder, as it will lie."""
+    return tuple(map(told_path, (folder / RECORDINGS, *sorted(folder.glob("*.*")), result)))
+
+
 def _commands(run: _Run, demo: HeadDemo) -> Table:
     """Each step once more by hand; results go to the current folder."""
     truth, target = run.twin.truth, run.twin.target
     kind = "camera" if demo.sensor.second is None else "stereo"
 
+    def place(scene: str) -> Path:
+        return told_path(run.place(scene))
+
     def scan(scene: str) -> str:
-        return f"armscan reconstruct {run.place(scene)} --scanner scanner.json -o {scene}.ply"
+        return f"armscan reconstruct {place(scene)} --scanner scanner.json -o {scene}.ply"
 
     normal = ",".join(f"{value:.6f}" for value in demo.still_normal)
     heights = (f"armscan inspect step steps.ply --height {h:g}" for h in truth.step_heights_mm)
     lines = (
-        f"armscan calibrate {kind} --scan {run.place('camera')} --target {target} -o {kind}.json",
-        f"armscan calibrate laser --camera {kind}.json --scan {run.place('laser')} "
+        f"armscan calibrate {kind} --scan {place('camera')} --target {target} -o {kind}.json",
+        f"armscan calibrate laser --camera {kind}.json --scan {place('laser')} "
         f"--target {target} -o sensor.json",
-        f"armscan probe {run.place('probing')} -o plate.csv",
-        f"armscan calibrate hand-eye {run.place('hand-eye')} --sensor sensor.json "
+        f"armscan probe {place('probing')} -o plate.csv",
+        f"armscan calibrate hand-eye {place('hand-eye')} --sensor sensor.json "
         "--plate plate.csv -o scanner.json",
         scan("plate"),
         "armscan inspect plane plate.ply --plate plate.csv",
         scan("ball"),
         f"armscan inspect sphere ball.ply --diameter {truth.ball_diameter_mm:g}",
-        f"armscan verify {run.place('ball')} --scanner scanner.json "
-        f"--ball {truth.ball_diameter_mm:g}",
+        f"armscan verify {place('ball')} --scanner scanner.json --ball {truth.ball_diameter_mm:g}",
         scan("steps"),
         *heights,
-        f"armscan reconstruct {run.place('still-step')} --sensor sensor.json "
+        f"armscan reconstruct {place('still-step')} --sensor sensor.json "
         f"--depth-margin {STILL_MARGIN:g} -o still.ply",
         f"armscan inspect step still.ply --height {demo.still_step.nominal_height_mm:g} "
         f"--normal={normal}",
@@ -503,23 +494,24 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
     Writes the recordings of the photographs, ``camera.json``, ``sensor.json``, ``cloud.ply``, a
     page beside each, and ``summary.json``; raises as `run_head_demo`.
     """
-    folder = request.folder
     twin = request.twin.build()
-    with demo_folder(folder):
+    with demo_folder(request.folder) as folder:
         run = _Run(request, folder, twin, progress, request.command("photos"))
         write_files({folder / TRUTH: twin.truth.document()})
         run.timed("render", partial(run.record, PHOTO_SCENES))
         boards, lines, still = (run.place(scene) / "images" for scene in PHOTO_SCENES)
         on, off, lit, dark = (
-            str(path)
-            for path in (lines / "on", lines / "off", still / "0001.png", still / "0002.png")
+            *(lines / "on", lines / "off"),
+            *(still / "0001.png", still / "0002.png"),
         )
         target = twin.target
         camera, sensor, cloud = (folder / n for n in ("camera.json", "sensor.json", "cloud.ply"))
         of_camera = partial(calibrate_camera, run.job(camera), target, (str(boards),))
-        images = SheetImages((on,), (off,))
+        images = SheetImages((str(on),), (str(off),))
         of_laser = partial(calibrate_sheets, run.job(sensor), camera, target, images)
-        of_cloud = partial(reconstruct_files, run.job(cloud), sensor, StillPaths((lit,), (dark,)))
+        of_cloud = partial(
+            reconstruct_files, run.job(cloud), sensor, StillPaths((str(lit),), (str(dark),))
+        )
         works = (
             ("camera", "calibrate_camera", of_camera),
             ("laser", "calibrate_laser", of_laser),
@@ -528,10 +520,12 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
         stages = {name: run.timed(stage, work) for name, stage, work in works}
         errors = _photo_errors(run, read_sensor_calibration(sensor), read_ply(cloud))
         commands = _typed(
-            f"armscan calibrate camera {boards} --target {target} -o camera.json",
-            f"armscan calibrate laser --camera camera.json --on {on} --off {off} "
+            f"armscan calibrate camera {told_path(boards)} --target {target} -o camera.json",
+            f"armscan calibrate laser --camera camera.json --on {told_path(on)} "
+            f"--off {told_path(off)} "
             f"--target {target} -o sensor.json",
-            f"armscan reconstruct {lit} --background {dark} --sensor sensor.json -o cloud.ply",
+            f"armscan reconstruct {told_path(lit)} --background {told_path(dark)} "
+            "--sensor sensor.json -o cloud.ply",
         )
         result = folder / "summary.json"
         summary = Summary(
@@ -540,9 +534,10 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
             quantities=_photo_facts(errors),
             tables=(commands,),
             warnings=tuple(text for stage in stages.values() for text in stage.warnings),
-            written=(run.place(""), *sorted(folder.glob("*.*")), result),
-            next_step=f"open {folder / 'camera.html'}, {folder / 'sensor.html'} and "
-            f"{folder / 'cloud.html'} in a browser",
+            written=_told(folder, result),
+            next_step="open {}, {} and {} in a browser".format(
+                *(told_path(path.with_suffix(".html")) for path in (camera, sensor, cloud))
+            ),
             extra={
                 "kind": "demo",
                 "simulated": True,

@@ -36,6 +36,7 @@ from armscan.report.inspect import (
 )
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import read_cloud
+from armscan.storage.files import path_text
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import parse_plane, read_points_or_plane
 
@@ -165,8 +166,10 @@ def read_plate(
         fit = solved(fit_probed_plate(found, towards_mm, ProbingOptions(side=side)), path)
         return fit.reference, fit.warnings
     if side is None:
-        return PlateReference(plane=plane_from_coefficients(found, near_mm), source=str(path)), ()
-    return solved(plate_from_coefficients(found, near_mm, side, str(path)), path), ()
+        return PlateReference(
+            plane=plane_from_coefficients(found, near_mm), source=path_text(path)
+        ), ()
+    return solved(plate_from_coefficients(found, near_mm, side, path_text(path)), path), ()
 
 
 def _flat_by_itself(cloud: PointCloud) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from armscan.models.arm import tip_centres, tool_from_probe
 from armscan.records.points import ProbedPoints
 from armscan.report.quantity import Quantity, Summary, Table, sentences, significant
 from armscan.storage.arm import ARM_FILE, PROBE_FILE, read_probe_tip
+from armscan.storage.files import path_text
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import probed_points_csv, read_probed_points
 from armscan.storage.recording import read_arm_track
@@ -97,7 +98,7 @@ def read_touches(source: Path, tip: Path | None = None) -> Touches:
     known = read_probe_tip(tip or source / PROBE_FILE)
     centres = tip_centres(track, tool_from_probe(known.centre_tool_mm))
     rows = tuple(int(row) + 1 for row in np.flatnonzero(track.is_known))
-    points = ProbedPoints(centres, known.diameter_mm, source=str(source), rows=rows)
+    points = ProbedPoints(centres, known.diameter_mm, source=path_text(source), rows=rows)
     n_gaps = int((~track.is_known).sum())
     gaps = (f"for {n_gaps} of {len(track)} touches the arm gave no pose",) if n_gaps else ()
     return Touches(points, track.translations_mm[track.is_known], (*notes, *gaps))

@@ -8,7 +8,7 @@ import os
 import shutil
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
@@ -24,9 +24,29 @@ STALE_SECONDS = 86_400.0
 """Where files cannot be locked, what an interrupted run left is taken for a rest after a day."""
 
 
+_NAMES_TO_COME: dict[Path, Path] = {}
+"""Folders that `replaced_folder` lends, and how the folder is called whose place they take."""
+
+
+def told_path(path: Path) -> Path:
+    """Where a file will lie, if it lies in a folder that has not got its name yet."""
+    for part, folder in _NAMES_TO_COME.items():
+        if path.is_relative_to(part):
+            return folder / path.relative_to(part)
+    return path
+
+
+def present_path(told: Path) -> Path:
+    """Where a file lies now that `told_path` told of."""
+    for part, folder in _NAMES_TO_COME.items():
+        if told.is_relative_to(folder):
+            return part / told.relative_to(folder)
+    return told
+
+
 def path_text(path: Path | str) -> str:
-    """The path with ``/``; bytes of a name that are not UTF-8 are told as ``\\xef``."""
-    text = path.as_posix() if isinstance(path, Path) else path
+    """The path as `told_path`, with ``/``; bytes that are not UTF-8 are told as ``\\xef``."""
+    text = told_path(path).as_posix() if isinstance(path, Path) else path
     return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
@@ -227,6 +247,76 @@ def new_folder(folder: Path, beside: Mapping[Path, bytes] | None = None) -> Iter
         shutil.rmtree(partial, ignore_errors=True)
 
 
+@contextmanager
+def replaced_folder(folder: Path, check: Callable[[], None]) -> Iterator[Path]:
+    """Give a folder of another name to write into; it takes the folder's place when it is complete.
+
+    Until then the folder stays as it is, also if the block raises or the run is killed. A folder
+    that a killed run moved away and did not replace comes back, what else it left is removed.
+    Documents written meanwhile name files where they will lie.
+
+    Parameters
+    ----------
+    folder
+        Made if need be, with those above it.
+    check
+        Raises if the folder may not be replaced; asked before anything is written and at the end.
+
+    Raises
+    ------
+    OutputError
+        If the disk is full or refuses, or as ``check``.
+    """
+    target = folder.resolve()
+    partial = _part_name(target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _bring_back(target)
+        check()
+        _remove_rests(target)
+        partial.mkdir()
+        with _locked(partial):
+            _NAMES_TO_COME[partial] = folder
+            yield partial
+            check()
+            _swap(partial, target)
+    except OSError as error:
+        raise OutputError(
+            f"nothing was written ({error.strerror or error})",
+            where=path_text(folder),
+            remedy="free some space or choose another folder",
+        ) from error
+    finally:
+        _NAMES_TO_COME.pop(partial, None)
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _swap(partial: Path, target: Path) -> None:
+    """Exchange them: what is now the partial one, whole or not, is a rest that goes."""
+    if not target.exists():
+        partial.rename(target)
+        return
+    old = partial.with_suffix(".old")
+    with _locked(target):
+        target.rename(old)
+        try:
+            partial.rename(target)
+        except BaseException:
+            old.rename(target)
+            raise
+        old.rename(partial)
+
+
+def _bring_back(target: Path) -> None:
+    """Undo the half exchange of a killed run, where nothing else has the name."""
+    for old in _rests(target, ".old"):
+        if _is_abandoned(old):
+            with suppress(OSError):
+                target.rmdir()
+            if not target.exists():
+                old.rename(target)
+
+
 def _check_parent(folder: Path) -> None:
     if folder.is_dir():
         return
@@ -295,15 +385,15 @@ def _locked(part: Path) -> Iterator[None]:
 def _remove_rests(path: Path) -> None:
     """Remove what killed runs left of a file or folder of this name."""
     with suppress(OSError):
-        stem = _part_stem(path)
-        rests = [
-            item
-            for item in path.parent.iterdir()
-            if item.name.startswith(stem) and item.suffix == ".part"
-        ]
-        for rest in rests:
+        for rest in _rests(path, ".part", ".old"):
             if _is_abandoned(rest):
                 shutil.rmtree(rest, ignore_errors=True) if rest.is_dir() else rest.unlink()
+
+
+def _rests(path: Path, *suffixes: str) -> list[Path]:
+    stem = _part_stem(path)
+    found = path.parent.iterdir()
+    return sorted(item for item in found if item.name.startswith(stem) and item.suffix in suffixes)
 
 
 def _is_abandoned(part: Path) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
 from armscan.storage.codec import parse_json, parse_toml
-from armscan.storage.files import read_bytes
+from armscan.storage.files import present_path, read_bytes
 
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
 
@@ -136,7 +136,8 @@ def are_simulated(paths: Iterable[Path]) -> bool:
     The mark is ``simulated = true`` in a recording's ``session.toml``, or ``"simulated": true`` in
     the ``truth.json`` of rendered photographs; the truth itself is never read.
     """
-    folders = {folder for path in paths for folder in islice(path.resolve().parents, LEVELS)}
+    present = (present_path(path).resolve() for path in paths)
+    folders = {folder for path in present for folder in islice(path.parents, LEVELS)}
     return any(
         _has_mark(folder / "truth.json") or _says_simulated(folder / "session.toml")
         for folder in folders

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new demo takes the place of an earlier one, and never of anything else."""
+"""A new demo takes the place of an earlier one when it is complete, and never of anything else."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from armscan.errors import OutputError
 from armscan.jobs.demo import FILES, demo_folder
+from armscan.storage.documents import new_provenance
+from armscan.storage.image_paths import are_simulated
 
 NAMES = (
     "truth.json",
@@ -27,8 +31,8 @@ def write(folder: Path, word: str) -> None:
 
 
 def demo_at(folder: Path, word: str) -> Path:
-    with demo_folder(folder):
-        write(folder, word)
+    with demo_folder(folder) as place:
+        write(place, word)
     return folder
 
 
@@ -41,10 +45,15 @@ def names_in(folder: Path) -> set[str]:
 
 
 def test_a_new_demo_takes_the_place_of_the_whole_earlier_one(tmp_path: Path) -> None:
-    with demo_folder(tmp_path / "demo"):
-        write(tmp_path / "demo", "old")
-        (tmp_path / "demo/recordings/part/images/0002.png").write_text("old")
-    folder = demo_at(tmp_path / "demo", "new")
+    folder = tmp_path / "demo"
+    with demo_folder(folder) as place:
+        write(place, "old")
+        (place / "recordings/part/images/0002.png").write_text("old")
+        assert not folder.exists()
+    with demo_folder(folder) as place:
+        write(place, "new")
+        assert place.parent == tmp_path
+        assert word_of(folder) == "old"
     assert word_of(folder) == "new"
     assert {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} == {
         *NAMES,
@@ -58,8 +67,8 @@ def test_a_run_that_ends_early_leaves_the_earlier_demo(
     tmp_path: Path, error: type[BaseException]
 ) -> None:
     folder = demo_at(tmp_path / "demo", "old")
-    with pytest.raises(error), demo_folder(folder):
-        write(folder, "new")
+    with pytest.raises(error), demo_folder(folder) as place:
+        write(place, "new")
         raise error
     assert word_of(folder) == "old"
     assert names_in(tmp_path) == {"demo"}
@@ -69,8 +78,8 @@ def test_a_run_that_ends_early_leaves_the_earlier_demo(
 def test_a_first_run_that_ends_early_leaves_nothing(
     tmp_path: Path, error: type[BaseException]
 ) -> None:
-    with pytest.raises(error), demo_folder(tmp_path / "some/demo"):
-        write(tmp_path / "some/demo", "new")
+    with pytest.raises(error), demo_folder(tmp_path / "some/demo") as place:
+        write(place, "new")
         raise error
     assert names_in(tmp_path / "some") == set()
 
@@ -101,6 +110,83 @@ def test_the_current_folder_can_be_made_anew(
 ) -> None:
     demo_at(tmp_path / "demo", "old")
     monkeypatch.chdir(tmp_path / "demo")
-    with demo_folder(Path()):
-        write(tmp_path / "demo", "new")
+    with demo_folder(Path()) as place:
+        write(place, "new")
     assert word_of(tmp_path / "demo") == "new"
+
+
+def test_own_files_that_come_while_it_works_are_kept(tmp_path: Path) -> None:
+    folder = demo_at(tmp_path / "demo", "old")
+    with pytest.raises(OutputError, match=r"late\.txt"), demo_folder(folder) as place:
+        write(place, "new")
+        (folder / "late.txt").write_text("mine")
+    assert word_of(folder) == "old"
+    assert (folder / "late.txt").read_text() == "mine"
+    assert names_in(tmp_path) == {"demo"}
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from armscan.jobs.demo import demo_folder
+calls, rename = [], Path.rename
+def killed(*_):
+    os.kill(os.getpid(), signal.SIGKILL)
+def counted(path, name):
+    calls.append(path)
+    if len(calls) > int(sys.argv[2]):
+        killed()
+    return rename(path, name)
+Path.rename = counted
+with demo_folder(Path(sys.argv[1])) as place:
+    (place / "report.html").write_text("killed")
+    (place / "recordings").mkdir()
+killed()
+"""
+
+
+@pytest.mark.parametrize(
+    ("n_renames", "left"),
+    [(0, {"demo", ".part"}), (1, {".old", ".part"}), (2, {"demo", ".old"})],
+)
+def test_the_run_after_a_killed_one_finds_a_whole_demo(
+    tmp_path: Path, n_renames: int, left: set[str]
+) -> None:
+    """Killed before the new demo takes the place, while it does, and just after."""
+    folder = demo_at(tmp_path / "demo", "old")
+    other = tmp_path / ".other.0123456789ab.0123456789ab.part"
+    other.mkdir()
+    subprocess.run([sys.executable, "-c", KILLED, str(folder), str(n_renames)], check=False)
+    names = names_in(tmp_path) - {other.name}
+    assert {Path(name).suffix or name for name in names} == left
+    with pytest.raises(RuntimeError), demo_folder(folder):
+        raise RuntimeError
+    assert word_of(folder) == ("killed" if n_renames == 2 else "old")
+    assert names_in(tmp_path) == {"demo", other.name}
+    assert word_of(demo_at(folder, "new")) == "new"
+    assert names_in(tmp_path) == {"demo", other.name}
+
+
+def test_own_files_where_a_killed_run_left_no_demo_stay_beside_the_earlier(tmp_path: Path) -> None:
+    folder = demo_at(tmp_path / "demo", "old")
+    subprocess.run([sys.executable, "-c", KILLED, str(folder), "1"], check=False)
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"notes\.txt"), demo_folder(folder):
+        pytest.fail("the work was begun")
+    (folder / "notes.txt").unlink()
+    with pytest.raises(RuntimeError), demo_folder(folder):
+        raise RuntimeError
+    assert word_of(folder) == "old"
+
+
+def test_documents_name_files_where_they_will_lie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with demo_folder(Path("demo")) as place:
+        (place / "truth.json").write_text('{"simulated": true}')
+        (item,) = new_provenance((place / "truth.json",)).inputs
+        assert item.path == "demo/truth.json"
+        assert are_simulated((Path(item.path),)) and are_simulated((place / "a.json",))
+    assert are_simulated((Path(item.path),))

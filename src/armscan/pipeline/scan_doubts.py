@@ -80,14 +80,6 @@ class ScanDoubt:
     cause: str = ""
     warnings: tuple[str, ...] = ()
 
-    @property
-    def is_sound(self) -> bool:
-        """False if passes disagree, or another reading of the recording is plainly the right one.
-
-        True also where nothing overlaps: then nothing is known.
-        """
-        return not self.warnings
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scan:

@@ -19,6 +19,7 @@ from rigs.ring_pair_scenes import (
     random_scene,
     true_views,
 )
+from rigs.stereo_rig import project_right
 
 N_SCENES = 45
 
@@ -110,7 +111,7 @@ def test_rows_along_the_epipolar_lines_are_not_guessed() -> None:
     """An even row of markers along one epipolar line, shifted by one place, fits as well."""
     views, scene = true_views(), random_scene(0)
     places = np.column_stack([np.linspace(-27.0, 27.0, 7), np.zeros(7), np.full(7, 140.0)])
-    left_px, right_px = views.left.project(places), views.project_right(places)
+    left_px, right_px = views.left.project(places), project_right(views, places)
     n = len(places)
 
     def rings(centres: np.ndarray) -> RingImages:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two cameras: projection, epipolar constraint, points from both (eq. 4.7), calibration."""
+"""Two cameras: projection, epipolar constraint, points from both, and their calibration."""
 
 from __future__ import annotations
 

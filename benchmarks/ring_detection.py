@@ -125,7 +125,7 @@ def mixed_sizes(scene: MarkerScene, seed: int) -> MarkerScene:
 
 def matching(title: str, *, is_mixed: bool) -> None:
     n_both = n_right = n_wrong = 0
-    fates: Counter[RingStatus] = Counter()
+    statuses: Counter[RingStatus] = Counter()
     for seed in range(FIRST_SCENE, FIRST_SCENE + N_SCENES):
         scene = random_scene(seed)
         if is_mixed:
@@ -135,11 +135,11 @@ def matching(title: str, *, is_mixed: bool) -> None:
         n_both += scene.seen_by_both
         n_right += int(same.sum())
         n_wrong += int((~same).sum())
-        fates.update(matches.fates)
+        statuses.update(matches.statuses)
     dropped = ", ".join(
-        f"{fates[fate]} {fate.name.lower()}"
-        for fate in RingStatus
-        if fate not in (RingStatus.MATCHED, RingStatus.NO_PARTNER)
+        f"{statuses[status]} {status.name.lower()}"
+        for status in RingStatus
+        if status not in (RingStatus.MATCHED, RingStatus.NO_PARTNER)
     )
     print(
         f"matching, {title}: {n_right} of {n_both} pairs ({100.0 * n_right / n_both:.2f} %), "

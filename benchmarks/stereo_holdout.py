@@ -44,6 +44,7 @@ from armscan.models.two_views import TwoViews, epipolar_distances_px
 from armscan.storage.images import read_exposure
 from armscan.vision.targets.detect import detect_target
 from armscan.vision.targets.target import Chessboard, TargetView
+from rigs.stereo_rig import project_right
 
 DATA = Path(os.environ.get("ARMSCAN_DATA", Path(__file__).resolve().parents[2] / "shared/data"))
 TARGET = Chessboard(9, 6, 25.0)
@@ -111,7 +112,7 @@ def held_out(views: TwoViews, points: Points) -> tuple[FloatArray, FloatArray, F
         return views.left.project(board_in_sensor(pose, board)) - left
 
     def in_right(pose: FloatArray) -> FloatArray:
-        return views.project_right(board_in_sensor(pose, board)) - right
+        return project_right(views, board_in_sensor(pose, board)) - right
 
     def in_both(pose: FloatArray) -> FloatArray:
         return np.concatenate([in_left(pose), in_right(pose)])

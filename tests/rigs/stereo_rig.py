@@ -38,6 +38,12 @@ RIGHT = CameraModel(
 CONVERGING: Pose[CameraRight, Sensor] = Pose.from_vectors([0.02, 0.45, -0.01], [-128.0, 2.0, 35.0])
 """The axes meet about 270 mm ahead, 26 degrees apart."""
 
+
+def project_right(views: TwoViews, points_sensor_mm: FloatArray) -> FloatArray:
+    """(N, 2) pixels of points of the Sensor frame in the right image; NaN behind the camera."""
+    return views.right.project(views.points_right_mm(points_sensor_mm))
+
+
 GRID = CircleGrid(11, 9, 12.0)
 
 
@@ -121,7 +127,7 @@ def pair_at(
         ),
         view_in(
             views.right,
-            views.project_right(moved),
+            project_right(views, moved),
             scene,
             scene.noise_px[1],
             rng,

@@ -68,11 +68,6 @@ def frozen_floats(
     return array
 
 
-def frozen_ints(values: ArrayLike, shape: Shape, name: str) -> IntArray:
-    """Return a read-only int64 array of ``values`` after checking its shape."""
-    return _frozen(values, np.dtype(np.int64), shape, name)
-
-
 def _frozen(values: ArrayLike, dtype: np.dtype[Any], shape: Shape, name: str) -> NDArray[Any]:
     if (
         isinstance(values, np.ndarray)

@@ -58,6 +58,8 @@ B = TypeVar("B", bound=Frame)
 C = TypeVar("C", bound=Frame)
 
 ORTHONORMAL_TOLERANCE = 1e-6
+"""Rotations are computed, or were made exact when read: what is left is rounding, so that this is
+stricter than what `armscan.storage.points` grants to printed decimals."""
 
 
 class Points(RowRecord, Generic[A], kw_only=False):

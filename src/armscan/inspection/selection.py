@@ -16,7 +16,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import SMALLEST_EXTENT_MM, PointCloud
 
 OUTLIER_SIGMAS = 4.0
 """A fit leaves out points further from its surface than this many robust standard deviations, in
@@ -82,8 +82,6 @@ class Surface(Protocol):
 
 S = TypeVar("S", bound=Surface)
 MAX_ROUNDS = 20
-SMALLEST_EXTENT_MM = 2.0
-"""Points that all lie this near to each other are taken for metres."""
 
 LEAST_CONCENTRATION = 0.5
 """Part of the feature's points that must lie within the search band of the surface that was found:

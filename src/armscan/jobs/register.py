@@ -298,9 +298,6 @@ def _rms(residual_mm: FloatArray) -> float:
     return float(np.sqrt((residual_mm**2).sum(axis=1).mean()))
 
 
-# ---- views of a handheld scanner
-
-
 def _join_views(job: Job, paths: Sequence[Path], options: RegisterOptions) -> _Joined:
     lists = [read_marker_list(path, frame="Sensor", sigma_mm=options.sigma_mm) for path in paths]
     names = _different_names(paths)
@@ -486,9 +483,6 @@ def _views_warnings(
             f"{joined.n_contradictions} pairs of markers contradict stronger ones and were dropped"
         )
     return (*found, *_too_small(joined.map.chi2, joined.map.degrees_of_freedom))
-
-
-# ---- an arm that moved to a new place
 
 
 def _join_place(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The job behind `armscan simulate`."""
+"""From scenes of the twin to folders with their recordings."""
 
 from __future__ import annotations
 

@@ -16,6 +16,7 @@ from armscan.geometry.arrays import (
     IntArray,
     RowRecord,
     floats,
+    homogeneous,
     ints,
 )
 from armscan.models.camera import CameraModel
@@ -106,7 +107,7 @@ def diameters_mm(
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     axes_px = np.stack([half[:, 1:] * along, half[:, :1] * across], axis=2)
     xy, _, by_px, _ = camera.undistort_with_jacobian(rings.centres_px[rows])
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    rays = homogeneous(xy)
     length = np.linalg.norm(rays, axis=1)[:, None]
     unit = rays / length
     axes = np.concatenate([by_px @ axes_px, np.zeros((len(rows), 1, 2))], axis=1)

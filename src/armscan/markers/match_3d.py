@@ -3,8 +3,7 @@
 unique.
 
 Labels vote (4.3.1), congruent triangles give alignments, markers within the noise of their
-positions count for them, and two questions are asked of the best: would chance explain as
-many
+positions count for them, and two questions are asked of the best: would chance explain as many
 (Moisan and Stival 2004, a contrario), and does another alignment explain nearly as many?
 """
 

@@ -46,7 +46,7 @@ class StereoMatches(ArrayRecord):
         M markers in the Sensor frame; a marker's id is the row of its left ring.
     distance_px, sigma_px
         (M,) epipolar distances (eq. 4.26 in pixels) and their standard deviations.
-    fates
+    statuses
         What became of each ring of the left image.
     n_candidates
         Count of pairs within the epipolar threshold.
@@ -59,15 +59,15 @@ class StereoMatches(ArrayRecord):
     markers: MarkerSet
     distance_px: FloatArray = floats("M")
     sigma_px: FloatArray = floats("M")
-    fates: tuple[RingStatus, ...]
+    statuses: tuple[RingStatus, ...]
     n_candidates: int
     n_planes: int
 
     @property
     def counts(self) -> dict[RingStatus, int]:
-        """How many rings of the left image met each fate."""
-        found = Counter(self.fates)
-        return {fate: found[fate] for fate in RingStatus}
+        """How many rings of the left image have each status."""
+        found = Counter(self.statuses)
+        return {status: found[status] for status in RingStatus}
 
 
 def match_rings(
@@ -112,14 +112,14 @@ def match_rings(
         matched = only_supported(pairs, rank, best)
     crossed = _out_of_order(pairs.select(matched), left, views)
     kept = matched[~crossed]
-    fates = _fates(len(left), pairs, np.asarray(rank >= 2), matched, crossed)
-    return _matches(left, pairs.select(kept), fates, len(pairs), n_planes)
+    statuses = _statuses(len(left), pairs, np.asarray(rank >= 2), matched, crossed)
+    return _matches(left, pairs.select(kept), statuses, len(pairs), n_planes)
 
 
 def _matches(
     left: RingImages,
     chosen: CandidatePairs,
-    fates: tuple[RingStatus, ...],
+    statuses: tuple[RingStatus, ...],
     n_candidates: int,
     n_planes: int,
 ) -> StereoMatches:
@@ -136,23 +136,23 @@ def _matches(
         markers=markers,
         distance_px=chosen.distance_px,
         sigma_px=chosen.sigma_px,
-        fates=fates,
+        statuses=statuses,
         n_candidates=n_candidates,
         n_planes=n_planes,
     )
 
 
-def _fates(
+def _statuses(
     n: int, pairs: CandidatePairs, supported: BoolArray, matched: IntArray, crossed: BoolArray
 ) -> tuple[RingStatus, ...]:
-    fates = [RingStatus.NO_PARTNER] * n
+    statuses = [RingStatus.NO_PARTNER] * n
     for row in pairs.left:
-        fates[row] = RingStatus.UNSUPPORTED
+        statuses[row] = RingStatus.UNSUPPORTED
     for row in pairs.left[supported]:
-        fates[row] = RingStatus.AMBIGUOUS
+        statuses[row] = RingStatus.AMBIGUOUS
     for row, is_crossed in zip(pairs.left[matched], crossed, strict=True):
-        fates[row] = RingStatus.OUT_OF_ORDER if is_crossed else RingStatus.MATCHED
-    return tuple(fates)
+        statuses[row] = RingStatus.OUT_OF_ORDER if is_crossed else RingStatus.MATCHED
+    return tuple(statuses)
 
 
 def _out_of_order(pairs: CandidatePairs, left: RingImages, views: TwoViews) -> BoolArray:

@@ -17,6 +17,7 @@ from armscan.geometry.arrays import (
     IntArray,
     bools,
     floats,
+    homogeneous,
 )
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.candidates import CandidatePairs, RingMatchOptions
@@ -180,7 +181,7 @@ def _count_inliers(
     equations = _equations(left[samples], right[samples])
     # The last row of V' spans the null space of the eight equations.
     matrices = np.linalg.svd(equations)[2][:, -1].reshape(-1, 3, 3)
-    own = np.concatenate([left, np.ones((len(left), 1))], axis=1)
+    own = homogeneous(left)
     mapped = np.einsum("sij,nj->sni", matrices, own)
     weight = np.where(np.abs(mapped[..., 2:]) > 1e-12, mapped[..., 2:], 1e-12)
     distance = np.linalg.norm(mapped[..., :2] / weight - right, axis=2)
@@ -206,7 +207,7 @@ def _normaliser(points_px: FloatArray) -> FloatArray:
 
 
 def _mapped(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    mapped = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ matrix.T
+    mapped = homogeneous(points) @ matrix.T
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
@@ -309,7 +310,7 @@ def depth_misfits(pairs: CandidatePairs, seeds: CandidatePairs, left: RingImages
 
 def _misfit(point_mm: FloatArray, neighbours_mm: FloatArray) -> float:
     n = len(neighbours_mm)
-    design = np.column_stack([neighbours_mm[:, :2] / neighbours_mm[:, 2:], np.ones(n)])
+    design = homogeneous(neighbours_mm[:, :2] / neighbours_mm[:, 2:])
     inverse = 1.0 / neighbours_mm[:, 2]
     triples = np.array(list(combinations(range(n), MIN_NEIGHBOURS)), np.int64)
     triples = triples[_are_spread(design[triples])]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import field, replace
+from dataclasses import field
 
 import numpy as np
 
@@ -99,17 +99,6 @@ class ArmModel(ArrayRecord):
         """Names in the order of ``parameters``, as ``axis_2.offset_mm``."""
         return tuple(
             f"axis_{axis + 1}.{name}" for axis in range(self.n_axes) for name in AXIS_PARAMETERS
-        )
-
-    def with_parameters(self, parameters: FloatArray) -> ArmModel:
-        """The same arm with other (4 n,) ``parameters``; flange, limits and name stay."""
-        table = frozen_floats(parameters, (4 * self.n_axes,), "arm parameters").reshape(-1, 4)
-        return replace(
-            self,
-            theta_offset_rad=table[:, 0],
-            offset_mm=table[:, 1],
-            length_mm=table[:, 2],
-            twist_rad=table[:, 3],
         )
 
 

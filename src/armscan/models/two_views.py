@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two cameras: projection, epipolar constraint, points from both (eq. 4.7), calibration."""
+"""Two cameras: projection, epipolar constraint, points from both, and their calibration."""
 
 from __future__ import annotations
 
@@ -64,10 +64,6 @@ class TwoViews:
         """(N, 3) points of the Sensor frame in the right camera's (eqs. 4.3 and 4.17)."""
         return self.right_from_left.apply(points_sensor_mm)
 
-    def project_right(self, points_sensor_mm: FloatArray) -> FloatArray:
-        """Project (N, 3) points into the right image (eqs. 4.17 and 4.18); NaN behind it."""
-        return self.right.project(self.points_right_mm(points_sensor_mm))
-
     def project_right_with_jacobian(
         self, points_sensor_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -102,12 +98,6 @@ class TwoViews:
         """
         pose = self.right_from_left
         return np.asarray(skew(pose.translation_mm) @ pose.rotation)
-
-    @property
-    def fundamental(self) -> FloatArray:
-        """(3, 3) matrix F of eq. 4.26, ``p_r' F p_l = 0``, for pixels free of distortion."""
-        left, right = np.linalg.inv(self.left.matrix), np.linalg.inv(self.right.matrix)
-        return np.asarray(right.T @ self.essential @ left)
 
 
 def epipolar_distances_px(
@@ -208,41 +198,6 @@ class TriangulatedPoints:
     dpoint_dparameters: FloatArray
     chi2: FloatArray
     is_valid: BoolArray
-
-
-def triangulate_directly(views: TwoViews, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
-    """Points by the closed form of eq. 4.7.
-
-    It uses both coordinates of the left pixel and the first one of the right; what the second one
-    says against them is not looked at. Ideal normalised coordinates take the place of
-    ``u / f``, so that the two focal lengths of a camera may differ and the lens may distort.
-
-    Parameters
-    ----------
-    views
-        The cameras.
-    left_px, right_px
-        (N, 2) pixels as taken, row by row of one point.
-
-    Returns
-    -------
-    points_sensor_mm
-        (N, 3); NaN where a pixel cannot be undistorted, the point lies behind the left camera, or
-        the epipolar line runs along v in the right image, so that its u says nothing.
-    """
-    left, left_ok = views.left.undistort(left_px)
-    right, right_ok = views.right.undistort(right_px)
-    rotation = views.right_from_left.rotation
-    translation = views.right_from_left.translation_mm
-    rays = homogeneous(left)
-    turned = rays @ rotation.T
-    u = right[:, 0]
-    below = u * turned[:, 2] - turned[:, 0]
-    above = translation[0] - u * translation[2]
-    is_known = left_ok & right_ok & (np.abs(below) > PARALLEL_SINE)
-    depth = np.where(is_known, above / np.where(is_known, below, 1.0), np.nan)
-    depth = np.where(depth > 0.0, depth, np.nan)
-    return np.asarray(depth[:, None] * rays)
 
 
 def triangulate_points(

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.rotations import (
     EulerConvention,
     euler_from_rotations,
@@ -79,14 +80,6 @@ class ScanDoubt:
     agreement: PassAgreement | None
     cause: str = ""
     warnings: tuple[str, ...] = ()
-
-    @property
-    def is_sound(self) -> bool:
-        """False if passes disagree, or another reading of the recording is plainly the right one.
-
-        True also where nothing overlaps: then nothing is known.
-        """
-        return not self.warnings
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -429,7 +422,7 @@ def _other_hand_eye(stripes: Stripes) -> tuple[Stripes, float, float] | None:
         design -= _by_hand_eye(stripes, found.nearest, found.normal)
         left = found.distance_mm
         for _ in range(3):
-            scale = 1.4826 * float(np.median(np.abs(left))) + 1e-9
+            scale = robust_sigma(left) + 1e-9
             weight = 1.0 / np.maximum(1.0, np.abs(left) / (2.0 * scale))
             # a weak prior keeps what the passes do not show: 5 mm, 2 degrees
             prior = np.diag(scale / np.array([0.035, 0.035, 0.035, 5.0, 5.0, 5.0]))

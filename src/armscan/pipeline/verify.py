@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans compared with what the simulator knows, or repeated scans with each other."""
+"""Check a scanner on a standard: a scan of a ball or of a probed plate against what is known of it,
+and its exposures against each other.
+"""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
 from armscan.geometry.least_squares import square_root
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
@@ -76,7 +76,7 @@ def possible_sheets(
         (H,) indices, ordered by point.
     """
     xy, is_valid = sensor.camera.camera.undistort(points_px)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    rays = homogeneous(xy)
     planes = np.stack([s.sheet.plane for s in sensor.sheets])
     slope = rays @ planes[:, :3].T
     depth = -planes[:, 3] / np.where(np.abs(slope) > 1e-9, slope, np.nan)

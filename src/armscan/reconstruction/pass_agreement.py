@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the passes of a scan show one surface: what a track or a clock cannot tell of itself.
 
-A pass is what was scanned without a pause, in one direction. Its own stripes lie side by
-side, so a wrong clock or pose bends it smoothly and nothing shows; where two passes cross,
-they then lie apart. So each pass makes local quadrics of its own stripes, and points of
-other
-passes that fall among those stripes are compared with them, in units of what both claim of
-themselves.
+A pass is what was scanned without a pause, in one direction. Its own stripes lie side by side, so
+a wrong clock or pose bends it smoothly and nothing shows; where two passes cross, they then lie
+apart. So each pass makes local quadrics of its own stripes, and points of other passes that fall
+among those stripes are compared with them, in units of what both claim of themselves.
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 
 PAUSE_PERIODS = 4.0
 """A pause of so many median periods between exposures begins a new pass."""
@@ -269,7 +268,7 @@ class _PassSurface:
         left_out = bare.distances(some, -1, is_own=True).distance_mm
         if len(left_out) < FEWEST_POINTS:
             return None
-        return replace(bare, misfit_mm=1.4826 * float(np.median(np.abs(left_out))))
+        return replace(bare, misfit_mm=robust_sigma(left_out))
 
     def distances(self, asked: IntArray, number: int, *, is_own: bool = False) -> PassDistances:
         """Of the points that lie among its stripes; ``is_own`` leaves out a point's own stripe."""

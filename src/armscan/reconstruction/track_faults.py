@@ -11,6 +11,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.records.recording import ArmTrack
 
 FaultKind = Literal["jump", "off the track", "stands still", "repeated"]
@@ -226,7 +227,7 @@ def _judged_steps(places: FloatArray, t_ns: IntArray, resolution_mm: float) -> _
         return empty
     sample, leap, speed = np.concatenate(samples), np.concatenate(leaps), np.concatenate(speeds)
     size = _largest(leap)
-    scatter = 1.4826 * float(np.median(size)) + resolution_mm
+    scatter = robust_sigma(size) + resolution_mm
     time = np.maximum(seconds[sample], 1e-9 * period)
     moved = SPEED_SHARE * speed * time + ACCELERATION_MM_S2 * time**2
     # at the ends of a piece the speed is known from one side only

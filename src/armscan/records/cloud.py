@@ -12,6 +12,10 @@ from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, int
 
 CloudFrame = Literal["Sensor", "Base", "Part", "Cad"]
 
+SMALLEST_EXTENT_MM = 2.0
+"""Points that all lie this near to each other are taken for metres: nothing that small is measured,
+probed to place a scanner or carries markers, and a plate in metres is not larger."""
+
 
 class PointCloud(RowRecord):
     """Points in one frame; every point carries its covariance from the first day.

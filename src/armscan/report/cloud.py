@@ -32,7 +32,7 @@ from armscan.report.quantity import Quantity, Table, fact, only, plural, signifi
 MAX_SHOWN = 20_000
 MAX_PROFILES = 6
 PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
-FATE_TEXT = (
+STATUS_TEXT = (
     "What became of every stripe point. Points that were flagged or left out are in no cloud; "
     "points that were measured but are wrong would be in it, and only an inspection shows them."
 )
@@ -161,17 +161,17 @@ def cloud_page(
 
 def fate_table(result: Reconstruction) -> Table:
     """What became of the stripe points of each image."""
-    fates = _fates(result.images)
+    statuses = _statuses(result.images)
     rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates), image.reason)
+        (image.profile.source, *(str(image.count(status)) for status in statuses), image.reason)
         for image in result.images
     )
-    columns = ("image", *(fate.label for fate in fates), "sheet chosen by")
+    columns = ("image", *(status.label for status in statuses), "sheet chosen by")
     return Table(columns, rows, "", (len(columns) - 1,))
 
 
-def _fates(images: Sequence[LabelledProfile]) -> list[PointStatus]:
-    return [fate for fate in PointStatus if any(image.count(fate) for image in images)]
+def _statuses(images: Sequence[LabelledProfile]) -> list[PointStatus]:
+    return [status for status in PointStatus if any(image.count(status) for image in images)]
 
 
 def scan_page(
@@ -203,7 +203,7 @@ def scan_page(
     n_placed = scan.count(ExposureStatus.PLACED)
     sections = [Section("The cloud", (Gallery((cloud_view(cloud),), 560),))]
     if scan.images:
-        totals = (Text(FATE_TEXT), fate_totals(scan))
+        totals = (Text(STATUS_TEXT), fate_totals(scan))
         sections.append(Section("What became of the points", totals))
     sections.append(Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)))
     if scan.without_pose:
@@ -232,11 +232,11 @@ def scan_page(
 
 def fate_totals(scan: ScanReconstruction) -> Table:
     """All stripe points by what became of them."""
-    counts = {fate: sum(image.count(fate) for image in scan.images) for fate in PointStatus}
+    counts = {status: sum(image.count(status) for image in scan.images) for status in PointStatus}
     n_all = max(sum(counts.values()), 1)
     rows = tuple(
-        (fate.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
-        for fate, count in counts.items()
+        (status.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
+        for status, count in counts.items()
         if count
     )
     return Table(("stripe points", "count", "share"), rows)
@@ -244,11 +244,12 @@ def fate_totals(scan: ScanReconstruction) -> Table:
 
 def _exposure_table(scan: ScanReconstruction) -> Table:
     """Every exposure with what became of its points."""
-    fates = _fates(scan.images)
+    statuses = _statuses(scan.images)
     rows = tuple(
-        (image.profile.source, *(str(image.count(fate)) for fate in fates)) for image in scan.images
+        (image.profile.source, *(str(image.count(status)) for status in statuses))
+        for image in scan.images
     )
-    return Table(("exposure", *(fate.label for fate in fates)), rows)
+    return Table(("exposure", *(status.label for status in statuses)), rows)
 
 
 def cloud_view(cloud: PointCloud) -> Picture:

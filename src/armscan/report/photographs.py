@@ -40,7 +40,7 @@ FLAG_COLOURS = {
     StripeFlag.END: ("#f4f1de", "flagged: cut off at a slant"),
     StripeFlag.TARGET_EDGE: ("#8d7bff", "flagged: along an edge of the target"),
 }
-FATE_COLOURS = {
+STATUS_COLOURS = {
     PointStatus.NO_RAY: "#8a6d5a",
     PointStatus.OUT_OF_DEPTH: "#ff7a3c",
     PointStatus.AMBIGUOUS: "#ffd23f",
@@ -202,8 +202,8 @@ def stripe_gallery(
     exposures
         Images by source name; those that are missing are not shown.
     """
-    seen = {fate for fate in FATE_COLOURS if any(image.count(fate) for image in images)}
-    fates = [(FATE_COLOURS[fate], fate.label) for fate in PointStatus if fate in seen]
+    seen = {status for status in STATUS_COLOURS if any(image.count(status) for image in images)}
+    statuses = [(STATUS_COLOURS[status], status.label) for status in PointStatus if status in seen]
     flags = flags_of((image.profile, image.status) for image in images)
     shown = evenly_chosen([image for image in images if image.profile.source in exposures])
     pictures = tuple(
@@ -212,7 +212,7 @@ def stripe_gallery(
             image.profile,
             image.status,
             image.sheet,
-            {int(fate): colour for fate, colour in FATE_COLOURS.items()},
+            {int(status): colour for status, colour in STATUS_COLOURS.items()},
             caption=f"{image.count(PointStatus.MEASURED)} of {len(image.profile)} points measured",
         )
         for image in shown
@@ -220,15 +220,15 @@ def stripe_gallery(
     text = "Every stripe point, measured or not. Dark photographs are brightened here."
     if len(shown) < len(images):
         text += f" {len(shown)} of {len(images)} images are shown, evenly chosen."
-    return Text(text), stripe_legend(sheet_names, fates, flags), Gallery(pictures, 420)
+    return Text(text), stripe_legend(sheet_names, statuses, flags), Gallery(pictures, 420)
 
 
 def stripe_picture(
     exposure: Exposure,
     profile: Profile,
-    fate: IntArray,
+    status: IntArray,
     sheet: IntArray,
-    fate_colours: Mapping[int, str],
+    status_colours: Mapping[int, str],
     *,
     outline_px: FloatArray | None = None,
     caption: str = "",
@@ -239,12 +239,12 @@ def stripe_picture(
     ----------
     exposure, profile
         The image and all its stripe points.
-    fate
-        (N,) what became of each point: 0 good, 1 flagged, other values as ``fate_colours``.
+    status
+        (N,) what became of each point: 0 good, 1 flagged, other values as ``status_colours``.
     sheet
         (N,) index of the sheet of good points; -1 for none.
-    fate_colours
-        Colour of each fate above 1.
+    status_colours
+        Colour of each status above 1.
     outline_px
         (M, 2) points of the target, whose outline is drawn; None for no target.
     caption
@@ -252,15 +252,15 @@ def stripe_picture(
     """
     points = profile.points_px
     marks = [] if outline_px is None else _outline(outline_px)
-    for value, colour in fate_colours.items():
-        marks.append(Marks(points[fate == value], colour, "dot", DOT_SIZE))
-    is_open = fate == 1
+    for value, colour in status_colours.items():
+        marks.append(Marks(points[status == value], colour, "dot", DOT_SIZE))
+    is_open = status == 1
     for flag, (colour, _) in FLAG_COLOURS.items():
         chosen = is_open & ((profile.flags & int(flag)) != 0)
         marks.append(Marks(points[chosen], colour, "dot", DOT_SIZE))
         is_open &= ~chosen
     for index in range(int(sheet.max(initial=0)) + 1):
-        chosen = (fate == 0) & (np.maximum(sheet, 0) == index)
+        chosen = (status == 0) & (np.maximum(sheet, 0) == index)
         marks.append(Marks(points[chosen], sheet_colour(index), "dot", DOT_SIZE))
     markup = photo_markup(
         exposure, marks, f"Stripe points of {profile.source}", longest_px=1200, is_grey=True
@@ -269,19 +269,19 @@ def stripe_picture(
 
 
 def stripe_legend(
-    sheet_names: Sequence[str], fates: Iterable[tuple[str, str]], flags: int
+    sheet_names: Sequence[str], statuses: Iterable[tuple[str, str]], flags: int
 ) -> Legend:
-    """Colours with their meaning: sheets, then fates (colour, label), then the flags that occur."""
+    """Colours with their meaning: sheets, statuses (colour, label), flags that occur."""
     sheets = [(sheet_colour(k), f"sheet {name}") for k, name in enumerate(sheet_names)]
     flagged = [entry for flag, entry in FLAG_COLOURS.items() if flags & int(flag)]
-    return Legend((*sheets, *fates, *flagged))
+    return Legend((*sheets, *statuses, *flagged))
 
 
 def flags_of(profiles: Iterable[tuple[Profile, IntArray]]) -> int:
-    """All flags of the points whose fate is 1, flagged."""
+    """All flags of the points whose status is 1, flagged."""
     flags = 0
-    for profile, fate in profiles:
-        flags |= int(np.bitwise_or.reduce(profile.flags[fate == 1], initial=0))
+    for profile, status in profiles:
+        flags |= int(np.bitwise_or.reduce(profile.flags[status == 1], initial=0))
     return flags
 
 

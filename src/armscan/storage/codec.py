@@ -41,9 +41,6 @@ MAY_LACK = ("rms_", "sigma_")
 SYMMETRY_TOLERANCE = 1e-9
 
 
-# text ---------------------------------------------------------------------------------------------
-
-
 def json_bytes(value: Any) -> bytes:
     """Encode as UTF-8 JSON; floats round-trip exactly, lists of plain values stay on one line.
 
@@ -185,9 +182,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise ValueError(f"the key {name[:60]!r} appears twice")
         result[name] = value
     return result
-
-
-# records ------------------------------------------------------------------------------------------
 
 
 class MismatchError(ValueError):

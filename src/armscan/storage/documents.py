@@ -91,9 +91,6 @@ COUPLING_NAMES = ("row_names", "column_names")
 LARGEST_LATENCY_NS = 10**12
 
 
-# what stands in the files -------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanTransform:
     """Where one scan lies in the common frame, and how well its markers fit.
@@ -314,8 +311,6 @@ LAYOUTS: Mapping[type, Layout] = {
 CODEC = RecordCodec(LAYOUTS)
 
 
-# writing ------------------------------------------------------------------------------------------
-
 Observations = tuple[str, bytes] | None
 """Name and content of the file of observations beside a document."""
 
@@ -379,9 +374,6 @@ def content_hash(content: Mapping[str, Any]) -> str:
     rest = {key: value for key, value in content.items() if key != "sha256"}
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return sha256(text.encode()).hexdigest()
-
-
-# reading ------------------------------------------------------------------------------------------
 
 
 def document_schema(path: Path) -> str | None:
@@ -591,9 +583,6 @@ def _explained(path: Path, schema: str) -> Iterator[None]:
             where=path_text(path),
             remedy="use the file as it was written, or make it anew",
         ) from error
-
-
-# how a document came to be ------------------------------------------------------------------------
 
 
 def fingerprint(path: Path) -> InputFile:

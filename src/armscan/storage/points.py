@@ -51,7 +51,8 @@ FORM_COLUMNS: Final[dict[PoseForm, tuple[str, ...]]] = {
 }
 NORM_TOLERANCE = 1e-6
 ORTHONORMAL_TOLERANCE = 1e-5
-"""Six decimals of nine numbers leave up to about 3e-6."""
+"""Six decimals of nine numbers leave up to about 3e-6, more than a `Pose` allows; what passes is
+made exact before it becomes one."""
 FULL_TURNS_DEG = 720.0
 
 

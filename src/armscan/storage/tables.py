@@ -18,6 +18,7 @@ import numpy as np
 
 from armscan.errors import FileFormatError, InputError, shown
 from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.records.cloud import SMALLEST_EXTENT_MM
 from armscan.storage.files import path_text, read_bytes
 
 INT64 = np.iinfo(np.int64)
@@ -28,9 +29,6 @@ PLAIN_NUMBERS = re.compile(r"[-+0-9.eE\n]*")
 PLAIN_INTEGERS = re.compile(r"-?[0-9]{1,18}(?:\n-?[0-9]{1,18})*")
 LINE_BREAK = re.compile(r"\r\n|\n|\r")
 COORDINATES = ("x_mm", "y_mm", "z_mm")
-SMALLEST_EXTENT_MM = 2.0
-"""Points that all lie this near to each other are taken for metres: nothing that small is probed
-to place a scanner or carries markers, and a plate in metres is not larger."""
 MOST_COLUMNS, MOST_CELLS = 500, 20_000_000
 """No table of armscan has more; some gigabytes of memory hold so many cells."""
 MOST_QUOTED = 60

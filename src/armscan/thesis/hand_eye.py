@@ -24,7 +24,7 @@ from armscan.calibration.hand_eye.observations import (
     check_diameter,
     find_sections,
 )
-from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray
+from armscan.geometry.arrays import ArrayRecord, FloatArray, IntArray, homogeneous
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import levenberg_marquardt
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
@@ -61,8 +61,8 @@ def design_rows(plane_tool: FloatArray, points_mm: FloatArray) -> FloatArray:
     points_mm
         (N, 3) in the Sensor frame.
     """
-    homogeneous = np.column_stack([points_mm, np.ones(len(points_mm))])
-    rows = plane_tool[None, :3, None] * homogeneous[:, None, :]
+    points = homogeneous(points_mm)
+    rows = plane_tool[None, :3, None] * points[:, None, :]
     return np.asarray(rows.reshape(len(points_mm), 12))
 
 

@@ -19,6 +19,7 @@ from rigs.ring_pair_scenes import (
     random_scene,
     true_views,
 )
+from rigs.stereo_rig import project_right
 
 N_SCENES = 45
 
@@ -58,11 +59,11 @@ def test_no_wrong_pair_and_most_are_matched(
     assert n_right >= 0.95 * sum(scene.seen_by_both for scene, _ in results)
 
 
-def test_every_ring_has_its_fate(results: list[tuple[MarkerScene, StereoMatches]]) -> None:
+def test_every_ring_has_its_status(results: list[tuple[MarkerScene, StereoMatches]]) -> None:
     for scene, matches in results:
         assert sum(matches.counts.values()) == len(scene.left)
         assert matches.counts[RingStatus.MATCHED] == len(matches.left)
-        rows = [k for k, fate in enumerate(matches.fates) if fate is RingStatus.MATCHED]
+        rows = [k for k, status in enumerate(matches.statuses) if status is RingStatus.MATCHED]
         np.testing.assert_array_equal(np.sort(matches.left), rows)
         np.testing.assert_array_equal(matches.markers.ids, matches.left)
 
@@ -101,8 +102,8 @@ def test_a_partner_that_was_not_seen_is_not_replaced() -> None:
         is_alone = ~np.isin(scene.left_marker, scene.right_marker)
         tempted = np.unique(pairs.left[is_alone[pairs.left]])
         n_tried += len(tempted)
-        fates = matched(scene).fates
-        assert all(fates[row] is not RingStatus.MATCHED for row in tempted)
+        statuses = matched(scene).statuses
+        assert all(statuses[row] is not RingStatus.MATCHED for row in tempted)
     assert n_tried >= 5
 
 
@@ -110,7 +111,7 @@ def test_rows_along_the_epipolar_lines_are_not_guessed() -> None:
     """An even row of markers along one epipolar line, shifted by one place, fits as well."""
     views, scene = true_views(), random_scene(0)
     places = np.column_stack([np.linspace(-27.0, 27.0, 7), np.zeros(7), np.full(7, 140.0)])
-    left_px, right_px = views.left.project(places), views.project_right(places)
+    left_px, right_px = views.left.project(places), project_right(views, places)
     n = len(places)
 
     def rings(centres: np.ndarray) -> RingImages:
@@ -153,7 +154,7 @@ def test_three_rings_are_matched_only_if_their_size_is_known() -> None:
         )
     )
     matches = match_rings(left, right, scene.views, CALIBRATION_COVARIANCE)
-    assert set(matches.fates) == {RingStatus.UNSUPPORTED}
+    assert set(matches.statuses) == {RingStatus.UNSUPPORTED}
     sized = match_rings(
         left,
         right,
@@ -161,10 +162,10 @@ def test_three_rings_are_matched_only_if_their_size_is_known() -> None:
         CALIBRATION_COVARIANCE,
         RingMatchOptions(diameter_mm=2.0 * RADIUS_MM),
     )
-    assert set(sized.fates) == {RingStatus.MATCHED}
+    assert set(sized.statuses) == {RingStatus.MATCHED}
     none = match_rings(some_of(left, []), right, scene.views, CALIBRATION_COVARIANCE)
     assert len(none.left) == 0
-    assert none.fates == ()
+    assert none.statuses == ()
 
 
 def test_order_of_rings_changes_nothing() -> None:

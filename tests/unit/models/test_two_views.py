@@ -17,10 +17,10 @@ from armscan.models.two_views import (
     TwoViews,
     epipolar_distances_px,
     sampson_distances_px,
-    triangulate_directly,
     triangulate_points,
 )
-from rigs.stereo_rig import CONVERGING, LEFT, RIGHT
+from armscan.thesis.two_views import triangulate_directly
+from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, project_right
 
 VIEWS = TwoViews(LEFT, RIGHT, CONVERGING)
 SIGMA_PX = 0.1
@@ -65,7 +65,7 @@ def test_the_right_projection_is_opencvs() -> None:
         points(), turn, CONVERGING.translation_mm, RIGHT.matrix, RIGHT.distortion
     )
     assert np.abs(found - expected.reshape(-1, 2)).max() < 1e-9
-    assert np.abs(found - VIEWS.project_right(points())).max() < 1e-11
+    assert np.abs(found - project_right(VIEWS, points())).max() < 1e-11
     # OpenCV's derivative by the translation is that by the point in the right camera's frame.
     by_translation = jacobian.reshape(-1, 2, jacobian.shape[1])[:, :, 3:6]
     assert np.abs(by_point - by_translation @ CONVERGING.rotation).max() < 1e-8
@@ -75,7 +75,7 @@ def test_the_right_projection_is_opencvs() -> None:
 def test_jacobian_of_the_right_projection_by_parameters(number: int) -> None:
     _, _, by_second = VIEWS.project_right_with_jacobian(points())
     step = step_of(number)
-    plus, minus = (nudged(VIEWS, number, sign * step).project_right(points()) for sign in (1, -1))
+    plus, minus = (project_right(nudged(VIEWS, number, sign * step), points()) for sign in (1, -1))
     expected = (plus - minus) / (2.0 * step)
     assert np.abs(by_second[:, :, number - 9] - expected).max() < 1e-6 * np.abs(expected).max()
 
@@ -88,14 +88,16 @@ def test_epipolar_constraint_in_pixels_free_of_distortion() -> None:
         for camera in (LEFT, RIGHT)
     ]
     views = TwoViews(no_lens[0], no_lens[1], CONVERGING)
-    left, right = no_lens[0].project(points()), views.project_right(points())
+    left, right = no_lens[0].project(points()), project_right(views, points())
     ones = np.ones((len(left), 1))
     a, b = np.hstack([left, ones]), np.hstack([right, ones])
-    scale = np.linalg.norm(views.fundamental) * np.linalg.norm(a) * np.linalg.norm(b)
-    assert np.abs(np.sum(b * (a @ views.fundamental.T), axis=1)).max() < 1e-12 * scale
+    inverse_left, inverse_right = (np.linalg.inv(camera.matrix) for camera in no_lens)
+    fundamental = inverse_right.T @ views.essential @ inverse_left
+    scale = np.linalg.norm(fundamental) * np.linalg.norm(a) * np.linalg.norm(b)
+    assert np.abs(np.sum(b * (a @ fundamental.T), axis=1)).max() < 1e-12 * scale
     # Without a lens the distance is that of a point from a straight line: by hand.
     moved = right + np.array([0.3, -0.4])
-    line = a @ views.fundamental.T
+    line = a @ fundamental.T
     by_hand = np.sum(np.hstack([moved, ones]) * line, axis=1) / np.hypot(line[:, 0], line[:, 1])
     found = epipolar_distances_px(views, left, moved)[1]
     sign = np.sign(np.sum(found * by_hand))
@@ -125,20 +127,20 @@ def test_distances_are_those_from_the_bent_line() -> None:
     """Walk along the image of the left ray in the right image: the distance stays that stepped."""
     left = LEFT.project(points(5))
     rays = points(5)
-    along = [VIEWS.project_right(rays * (1.0 + k)) for k in (0.0, 1e-4)]
+    along = [project_right(VIEWS, rays * (1.0 + k)) for k in (0.0, 1e-4)]
     direction = along[1] - along[0]
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     across = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
     for offset in (0.5, -0.2):
         found = epipolar_distances_px(VIEWS, left, along[0] + offset * across)[1]
         assert np.abs(np.abs(found) - abs(offset)).max() < 2e-4
-    far = VIEWS.project_right(rays * 1.1)
+    far = project_right(VIEWS, rays * 1.1)
     assert np.abs(epipolar_distances_px(VIEWS, left, far)[1]).max() < 1e-9
 
 
 def test_swapping_the_cameras_keeps_the_sign() -> None:
     left = LEFT.project(points())
-    right = VIEWS.project_right(points()) + np.array([0.2, 0.3])
+    right = project_right(VIEWS, points()) + np.array([0.2, 0.3])
     back = CONVERGING.inverse()
     swapped = TwoViews(RIGHT, LEFT, Pose(back.rotation, back.translation_mm))
     a, b = epipolar_distances_px(VIEWS, left, right)
@@ -151,7 +153,7 @@ def test_noise_gives_sampson_distances_of_its_own_size() -> None:
     n = 4000
     rng = np.random.default_rng(1)
     left = LEFT.project(points(n)) + SIGMA_PX * rng.normal(size=(n, 2))
-    right = VIEWS.project_right(points(n)) + SIGMA_PX * rng.normal(size=(n, 2))
+    right = project_right(VIEWS, points(n)) + SIGMA_PX * rng.normal(size=(n, 2))
     distances = sampson_distances_px(*epipolar_distances_px(VIEWS, left, right))
     assert abs(distances.std() / SIGMA_PX - 1.0) < 4.0 / np.sqrt(2.0 * n)
     chi2 = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE).chi2
@@ -175,7 +177,7 @@ def test_the_closed_form_is_equation_4_7_as_printed() -> None:
     )
     views = TwoViews(left, right, CONVERGING)
     truth = points(6)
-    (u_l, v_l), u_r = left.project(truth).T, views.project_right(truth)[:, 0]
+    (u_l, v_l), u_r = left.project(truth).T, project_right(views, truth)[:, 0]
     r1, r2, r3, _, _, _, r7, r8, r9 = CONVERGING.rotation.ravel()
     t_x, _, t_z = CONVERGING.translation_mm
     z = (
@@ -185,13 +187,13 @@ def test_the_closed_form_is_equation_4_7_as_printed() -> None:
     )
     by_hand = np.stack([z * u_l / f_l, z * v_l / f_l, z], axis=1)
     assert np.abs(by_hand - truth).max() < 1e-9
-    found = triangulate_directly(views, left.project(truth), views.project_right(truth))
+    found = triangulate_directly(views, left.project(truth), project_right(views, truth))
     assert np.abs(found - by_hand).max() < 1e-9
 
 
 def test_points_without_noise_are_found_again_as_opencv_finds_them() -> None:
     truth = points()
-    left, right = LEFT.project(truth), VIEWS.project_right(truth)
+    left, right = LEFT.project(truth), project_right(VIEWS, truth)
     ideal = [camera.undistort(q)[0] for camera, q in ((LEFT, left), (RIGHT, right))]
     matrices = [np.eye(3, 4), CONVERGING.matrix[:3]]
     found = cv2.triangulatePoints(matrices[0], matrices[1], ideal[0].T, ideal[1].T)
@@ -206,7 +208,7 @@ def test_the_optimal_point_is_the_least_squares_one() -> None:
     rng = np.random.default_rng(2)
     truth = points(5)
     left = LEFT.project(truth) + 0.5 * rng.normal(size=(5, 2))
-    right = VIEWS.project_right(truth) + 0.5 * rng.normal(size=(5, 2))
+    right = project_right(VIEWS, truth) + 0.5 * rng.normal(size=(5, 2))
     covariance_left = np.array([[0.04, 0.01], [0.01, 0.09]])
     root = np.linalg.cholesky(np.linalg.inv(covariance_left)).T
     found = triangulate_points(VIEWS, left, right, covariance_left, COVARIANCE)
@@ -214,7 +216,7 @@ def test_the_optimal_point_is_the_least_squares_one() -> None:
 
         def residuals(point: FloatArray, k: int = k) -> FloatArray:
             in_left = root @ (LEFT.project(point[None])[0] - left[k])
-            in_right = (VIEWS.project_right(point[None])[0] - right[k]) / SIGMA_PX
+            in_right = (project_right(VIEWS, point[None])[0] - right[k]) / SIGMA_PX
             return np.concatenate([in_left, in_right])
 
         best = least_squares(residuals, truth[k], xtol=1e-14, ftol=1e-14, gtol=1e-14)
@@ -227,7 +229,7 @@ def test_covariance_of_points_holds_the_scatter() -> None:
     truth = np.tile(points(1), (n, 1))
     rng = np.random.default_rng(3)
     left = LEFT.project(truth) + SIGMA_PX * rng.normal(size=(n, 2))
-    right = VIEWS.project_right(truth) + SIGMA_PX * rng.normal(size=(n, 2))
+    right = project_right(VIEWS, truth) + SIGMA_PX * rng.normal(size=(n, 2))
     found = triangulate_points(VIEWS, left, right, COVARIANCE, COVARIANCE)
     scatter = np.cov(found.points_sensor_mm.T)
     ratio = np.linalg.eigvals(np.linalg.solve(found.noise_mm2.mean(axis=0), scatter)).real
@@ -238,7 +240,7 @@ def test_covariance_of_points_holds_the_scatter() -> None:
 
 @pytest.mark.parametrize("number", range(24))
 def test_points_follow_the_parameters(number: int) -> None:
-    left, right = LEFT.project(points(6)), VIEWS.project_right(points(6))
+    left, right = LEFT.project(points(6)), project_right(VIEWS, points(6))
 
     def found(views: TwoViews) -> FloatArray:
         return triangulate_points(views, left, right, COVARIANCE, COVARIANCE).points_sensor_mm

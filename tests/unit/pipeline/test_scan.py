@@ -84,13 +84,13 @@ def test_what_is_missing_is_counted_and_named(device: ScannerCalibration) -> Non
     result = measure_scan(
         as_source(replace(late, arm=replace(scan.arm, is_known=known), broken=(2,))), device
     )
-    fates = [exposure.status for exposure in result.exposures]
+    statuses = [exposure.status for exposure in result.exposures]
     placed, unreadable, no_pose = (
         ExposureStatus.PLACED,
         ExposureStatus.UNREADABLE,
         ExposureStatus.NO_POSE,
     )
-    assert fates == [placed] * 2 + [unreadable] + [placed] * 2 + [no_pose] * 3
+    assert statuses == [placed] * 2 + [unreadable] + [placed] * 2 + [no_pose] * 3
     assert result.image_rows == (0, 1, 3, 4)
     assert result.cloud.exposure_sources == tuple(f"images/{k}.png" for k in (0, 1, 3, 4))
     assert [source for source, _ in result.without_pose] == [f"images/{k}.png" for k in (5, 6, 7)]

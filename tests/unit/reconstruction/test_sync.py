@@ -85,7 +85,7 @@ def test_unknown_samples_are_not_bridged() -> None:
         PoseStatus.GAP,
         PoseStatus.FOUND,
     ]
-    assert [PoseStatus(int(fate)) for fate in poses.status] == expected
+    assert [PoseStatus(int(status)) for status in poses.status] == expected
     assert poses.sample.tolist() == [2, -1, -1, -1, 5]
     assert "2 in a gap" in poses.missing
     with pytest.raises(InputError, match="gap"):

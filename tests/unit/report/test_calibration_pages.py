@@ -138,7 +138,7 @@ def test_laser_page_shows_every_point_and_the_bow() -> None:
     assert dots >= sum(len(image.profile) for image in fit.images)
 
 
-def test_laser_page_names_the_points_along_an_edge_and_gives_every_fate_a_colour() -> None:
+def test_laser_page_names_the_points_along_an_edge_and_gives_every_status_a_colour() -> None:
     """The first half of one stripe runs on an edge of the target."""
     rig = thesis_rig()
     boards = rig.boards(rig.camera, np.random.default_rng(5))

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from armscan.errors import InputError
+from armscan.geometry.arrays import FloatArray
 from armscan.simulation.objects.boards import (
     CirclePattern,
     Lighting,
     illumination,
-    reflectance_image,
     render_flat_target,
 )
 from armscan.simulation.optics.camera import RenderCamera
@@ -19,10 +21,20 @@ from rigs.flat_prints import ChessboardPattern
 CAMERA = RenderCamera(1000.0, 1000.0, 150.3, 99.8, width_px=300, height_px=200, blur_sigma_px=0.8)
 TILTED = cv2.Rodrigues(np.array([0.5, -0.4, 0.2]))[0]
 
+INK = Lighting(light_level=1.0, dark_level=0.0)
+
+
+def reflectance(
+    pattern: CirclePattern, rotation: FloatArray, translation_mm: FloatArray
+) -> FloatArray:
+    """(H, W) mean reflectance in each pixel's aperture, without the lens's blur."""
+    sharp = replace(CAMERA, blur_sigma_px=0.0)
+    return render_flat_target(sharp, pattern, rotation, translation_mm, INK).image
+
 
 def test_frontal_disc_has_the_right_area_and_centre_of_mass() -> None:
     pattern = CirclePattern(1, 1, 10.0, 6.0)
-    ink = 1.0 - reflectance_image(CAMERA, pattern, np.eye(3), np.array([0.0, 0.0, 100.0]))
+    ink = 1.0 - reflectance(pattern, np.eye(3), np.array([0.0, 0.0, 100.0]))
     v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
     # 16 samples across a pixel, some 190 pixels on the rim
     assert ink.sum() == pytest.approx(np.pi * 30.0**2, rel=2e-4)
@@ -33,7 +45,7 @@ def test_frontal_disc_has_the_right_area_and_centre_of_mass() -> None:
 def test_tilted_disc_has_the_moments_of_its_conic() -> None:
     pattern = CirclePattern(1, 1, 12.0, 9.0)
     t = np.array([0.4, -0.2, 100.0])
-    ink = 1.0 - reflectance_image(CAMERA, pattern, TILTED, t)
+    ink = 1.0 - reflectance(pattern, TILTED, t)
     matrix = np.array([[1000.0, 0, 150.3], [0, 1000.0, 99.8], [0, 0, 1]])
     h = np.linalg.inv(matrix @ np.column_stack([TILTED[:, 0], TILTED[:, 1], t]))
     conic = h.T @ np.diag([1.0, 1.0, -(4.5**2)]) @ h

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which distortion model the views support: tests of nested models, and the error on views that
-took no part.
+"""Calibrate one camera from views of a target: which distortion model the views support, which
+views do not fit, and the error on views that took no part.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import (
     MISFIT_LEVEL,
     MISFIT_OUTLIERS,
+    WRONG_LEVEL,
     Solution,
     board_residuals,
     chi2_of_points,
@@ -516,10 +517,6 @@ def _left_out_fit(
         left_out=note,
     )
 
-
-WRONG_LEVEL = 100.0
-"""A view whose residuals are ten times those of the typical view is not noisy but wrong: numbered
-wrongly, or moved during the exposure."""
 
 EXCESS_ROUNDS = 2
 

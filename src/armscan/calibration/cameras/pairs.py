@@ -143,7 +143,7 @@ def check_pairs(pairs: Sequence[StereoPair], leave_out: Sequence[str]) -> list[S
     ]
 
 
-WRONG_LEVEL = 100.0
+FOREIGN_LEVEL = 100.0
 """Given intrinsics ten standard deviations from what the images say are of another camera, if those
 given for the other camera lie within three..."""
 RIGHT_LEVEL = 9.0
@@ -302,7 +302,7 @@ def _strange(
 ) -> FitFailure | None:
     """Why the given camera cannot be the one that took the images."""
     word, other = SIDES[side], SIDES[1 - side]
-    if _level(own, given[side]) > WRONG_LEVEL and _level(own, given[1 - side]) < RIGHT_LEVEL:
+    if _level(own, given[side]) > FOREIGN_LEVEL and _level(own, given[1 - side]) < RIGHT_LEVEL:
         return FitFailure(
             f"the {word} images fit the calibration given for the {other} camera, and not that "
             f"given for the {word} one: left and right are swapped",

@@ -21,6 +21,7 @@ from armscan.calibration.cameras.adjustment import (
 )
 from armscan.calibration.cameras.calibrate import NO_SHARED
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, SingleCamera, StereoPair
+from armscan.calibration.cameras.robust import FALSE_ALARM, MISFIT_LEVEL, WRONG_LEVEL
 from armscan.calibration.cameras.start import estimate_board_poses
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, frozen_floats
@@ -121,10 +122,6 @@ def differences(
     turns = Rotation.from_matrix(rotations @ reference.rotation.T).as_rotvec()
     return np.concatenate([turns, translations_mm - reference.translation_mm], axis=1)
 
-
-WRONG_LEVEL = 100.0
-"""A pair whose squared distance from the others, over its noise, is a hundred times that of the
-typical pair does not scatter: it is wrong."""
 
 NO_AGREEMENT_LEVEL = 2500.0
 """The typical pair lies fifty of its standard deviations from the best compromise."""
@@ -368,15 +365,6 @@ def true_order(
     if best is None or 2 * best[0] <= n or best[0] < 3:
         return None
     return tuple(int(p) for p in best[1])
-
-
-FALSE_ALARM = 1e-3
-"""A pair is a misfit if noise would yield one so far out, among all pairs, once in a thousand
-calibrations..."""
-
-MISFIT_LEVEL = 9.0
-"""...and if it lies three times as far out as the typical pair: lenses and boards are never quite
-as modelled, so that more than noise sets the pairs apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -74,11 +74,16 @@ MEDIAN_OF_CHI2_2 = 2.0 * float(np.log(2.0))
 """Median of a chi-squared variable with two degrees of freedom."""
 
 FALSE_ALARM = 1e-3
-"""A point is an outlier if Gaussian noise would yield one so far out, among all the points of a
-calibration, once in a thousand calibrations."""
+"""A point or a pair of views is an outlier if Gaussian noise would yield one so far out, among all
+of a calibration, once in a thousand calibrations."""
+
+WRONG_LEVEL = 100.0
+"""A view or a pair whose squared residuals are a hundred times those of the typical one is not
+noisy but wrong: numbered wrongly, or moved during the exposure."""
 
 MISFIT_LEVEL = 9.0
-"""A view is a misfit if its residuals are three times as large as in the typical view."""
+"""A view or a pair is a misfit if its residuals are three times as large as in the typical one:
+lenses and boards are never quite as modelled, so that more than noise sets them apart."""
 
 MISFIT_OUTLIERS = 0.25
 """...or if more than this share of its points are outliers."""

@@ -27,7 +27,7 @@ from armscan.calibration.cameras.result import (
 )
 from armscan.calibration.cameras.robust import excess_variance_px2, residuals_px
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.rotations import nearest_rotation, rotation_from_vector, vector_from_rotation
@@ -113,7 +113,7 @@ def _linear(board: FloatArray, image: FloatArray) -> FloatArray:
 def _refine(homography: FloatArray, board: FloatArray, image: FloatArray) -> FloatArray:
     """Gauss-Newton on the image distances; the points are centred, so that h33 is not zero."""
     h = homography / homography[2, 2]
-    rows = np.column_stack([board, np.ones(len(board))])
+    rows = homogeneous(board)
     best: FloatArray = h
     best_cost = float(np.sum((_apply(h, board) - image) ** 2))
     for _ in range(REFINEMENT_STEPS):

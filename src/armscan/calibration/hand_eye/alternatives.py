@@ -37,7 +37,7 @@ from armscan.calibration.hand_eye.search import (
     three_a_stripe,
 )
 from armscan.calibration.hand_eye.surface import N_HAND_EYE, PlateSurface, dresidual_dsensor
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention, euler_from_rotations, rotations_from_euler
@@ -465,7 +465,7 @@ def _along_reversed_rays(
         terms, inverse_depth = _terms(rays[of_sheet], degree), 1.0 / given.points_mm[of_sheet, 2]
         inverse = np.linalg.lstsq(terms, inverse_depth, rcond=1e-9)[0]
         depth = 1.0 / np.maximum(_terms(turned[of_sheet], degree) @ inverse, 1e-6)
-        points[of_sheet] = np.column_stack([turned[of_sheet], np.ones(len(depth))]) * depth[:, None]
+        points[of_sheet] = homogeneous(turned[of_sheet]) * depth[:, None]
     return replace(given, points_mm=points)
 
 

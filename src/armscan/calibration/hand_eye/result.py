@@ -409,12 +409,6 @@ class RepeatStudy:
         return _values(self.mean)
 
     @property
-    def population_std(self) -> FloatArray:
-        """(6,) standard deviation with K in the denominator, as Table 4 prints it."""
-        n = len(self.values)
-        return np.asarray(self.std * np.sqrt((n - 1) / n))
-
-    @property
     def ratio(self) -> FloatArray | None:
         """(6,) observed over predicted standard deviation; None without prediction."""
         return None if self.predicted is None else self.std / self.predicted

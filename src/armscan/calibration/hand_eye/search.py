@@ -21,7 +21,7 @@ from armscan.calibration.hand_eye.surface import (
     ReferenceSurface,
     SphereSurface,
 )
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import nearest_rotation
 from armscan.geometry.shapes import Plane
@@ -431,7 +431,7 @@ def linear_hand_eye(
         return None
     n_axes = 2 if extent[2] < FLAT_RATIO * extent[1] else 3
     scale = float(extent[0]) / np.sqrt(len(points))
-    local = np.column_stack([(points - centre) @ axes[:n_axes].T / scale, np.ones(len(points))])
+    local = homogeneous((points - centre) @ axes[:n_axes].T / scale)
     normals, constants = plate_in_tool(observations, plane)
     rows = (local[:, :, None] * normals[:, None, :]).reshape(len(points), -1)
     if is_offset_free:

@@ -14,7 +14,7 @@ import numpy as np
 
 from armscan.calibration.sheets.result import PlacedBoard
 from armscan.errors import InputError
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
 from armscan.geometry.estimate import Estimate
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
 from armscan.geometry.rotations import skew, vector_from_rotation
@@ -143,7 +143,7 @@ def intersect_board(
     eq. 2.21.
     """
     xy, is_valid, dxy_dq, dxy_dcamera = camera.undistort_with_jacobian(q_px)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    rays = homogeneous(xy)
     normal = sensor_from_board.rotation[:, 2]
     slope = rays @ normal
     is_valid = is_valid & (np.abs(slope) > GRAZING * np.linalg.norm(rays, axis=1))

@@ -2,12 +2,9 @@
 """Does the sheet's model explain the stripes? F test against the noise along each stripe, the
 scatter between boards, and the view without which a plane would do.
 
-A board that is bent, or a lens that the camera's model does not follow, moves a board's
-stripe as a
-whole: more than the covariance of its pose allows, and differently on every board. A bow of
-the
-sheet moves them all by one law, and curves them. The likelihood of both readings tells them
-apart;
+A board that is bent, or a lens that the camera's model does not follow, moves a board's stripe as a
+whole: more than the covariance of its pose allows, and differently on every board. A bow of the
+sheet moves them all by one law, and curves them. The likelihood of both readings tells them apart;
 against the noise along the stripes alone, either would look certain.
 """
 

@@ -23,6 +23,7 @@ from armscan.calibration.sheets.board_points import (
 from armscan.calibration.sheets.result import BoardStripes, PlacedBoard, PointUse
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.geometry.shapes import Line, fit_line
 from armscan.models.camera import CameraModel
@@ -506,7 +507,7 @@ def _on_course(points: FloatArray, sigma_mm: FloatArray, line: Line, near: BoolA
         root = np.sqrt(weight)
         course = np.linalg.lstsq(scaled * root[:, None], target * root, rcond=None)[0]
         missed = np.abs(target - scaled @ course)
-        scale = max(1.0, 1.4826 * float(np.median(missed)))
+        scale = max(1.0, robust_sigma(missed))
         weight = HUBER * scale / np.maximum(missed, HUBER * scale)
     normalised = (across - design @ course) / sigma_mm
     return np.asarray(near & (np.abs(normalised) < OUTLIER_SIGMA * scale))

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.coplanarity import MIN_SPREAD_RATIO
 from armscan.calibration.sheets.labels import LEAST_FAN, board_numbers
 from armscan.calibration.sheets.result import BoardStripes, PointUse, SheetOptions, SkippedImage
 from armscan.calibration.sheets.solve import square_matrix_root
@@ -24,6 +25,7 @@ from armscan.calibration.sheets.stripes_on_board import (
     observe_board_stripes,
 )
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 
 LEAST_BOARDS = 3
 """Any two lines that meet are coplanar: only a third one can agree."""
@@ -51,8 +53,6 @@ border or a lit edge behind the boards that stays where it is lies, carried to a
 plane of its own rays. A light sheet at so small an angle measures no depth."""
 GRAZING = 0.1
 """Sine of the angle between sheet and board below which a pixel's height is not trusted."""
-MIN_SPREAD_RATIO = 0.01
-"""Of two lines: how wide they must lie apart over their length to span a plane."""
 REFITS = 3
 SEED = 12
 
@@ -361,7 +361,7 @@ def _refined(
         scatter_mm2 = (ends - middle).T @ ((ends - middle) * weight[:, None])
         normal = np.linalg.eigh(scatter_mm2)[1][:, 0]
         refit = _held_against(lines, is_open, normal, float(normal @ middle), found.limit_px)
-        scatter = 1.4826 * float(np.median(refit.residual_px[agrees]))
+        scatter = robust_sigma(refit.residual_px[agrees])
         limit = float(np.clip(OUTLYING * scatter, TOLERANCES_PX[0], tolerance_px))
         found = _held_against(lines, is_open, refit.normal, refit.offset, limit)
     return found

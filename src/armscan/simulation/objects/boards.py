@@ -253,17 +253,6 @@ def render_flat_target(
     )
 
 
-def reflectance_image(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    surround: float = 1.0,
-) -> FloatArray:
-    """Return the print's mean reflectance (H, W) in each pixel's aperture, without lens blur."""
-    return _bin(_fine_reflectance(camera, pattern, rotation, translation_mm, surround))
-
-
 def marks_px(
     camera: RenderCamera, pattern: FlatPattern, rotation: FloatArray, translation_mm: FloatArray
 ) -> FloatArray:

@@ -14,6 +14,7 @@ from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     CENTRE,
+    FIT_COLUMNS,
     REACH_SIGMAS,
     SIDE_SPAN,
     SIGMA,
@@ -119,7 +120,6 @@ NOISE_SAMPLE = 1500
 NOISE_ROUNDS = 2
 SIDE_HALF = 8
 """Neighbours over which the background beside the line is averaged."""
-RESULT_COLUMNS = 8
 CLEAR_SIGMAS = 11.0
 """Another line within this many sigmas may light up the background beside a slanted line."""
 LEAST_REACH_PX = 6.0
@@ -174,7 +174,7 @@ def fit_ridge(
     noise = start_noise(background_noise)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     for _ in range(NOISE_ROUNDS):
-        sample = np.zeros((len(pick), RESULT_COLUMNS))
+        sample = np.zeros((len(pick), FIT_COLUMNS))
         fit_profiles(
             plane.image,
             plane.clipped,
@@ -186,7 +186,7 @@ def fit_ridge(
             sample,
         )
         noise = estimate_noise(plane.image, table[pick], sides[pick], sample, noise)
-    values = np.zeros((len(table), RESULT_COLUMNS))
+    values = np.zeros((len(table), FIT_COLUMNS))
     fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, reach, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(

@@ -101,7 +101,7 @@ def is_short(points: FloatArray, chain: IntArray) -> BoolArray:
     return np.asarray(chain_lengths_px(points, chain) < SHORTEST_PX)
 
 
-HALF = 4
+SHAPE_HALF = 4
 """Neighbours over which the profile's shape is averaged."""
 LEAST_SINE = 0.25
 """Cuts at a smaller angle to the line are followed no farther than those of this sine."""
@@ -167,14 +167,14 @@ def is_cut_off(
 
 def _shapes(fits: ProfileFits, points: FloatArray, width_px: FloatArray) -> _Shape:
     table, values, chain = fits.ridge.table, fits.values, fits.ridge.chain
-    lean = sum_along(values[:, SKEW], chain, HALF)
-    norm = sum_along(values[:, SKEW_NORM], chain, HALF)
+    lean = sum_along(values[:, SKEW], chain, SHAPE_HALF)
+    norm = sum_along(values[:, SKEW_NORM], chain, SHAPE_HALF)
     across = axis_component(table)
     ones = np.ones(len(table))
     return _Shape(
         points,
         width_px,
-        mean_along(width_px, ones, chain, HALF),
+        mean_along(width_px, ones, chain, SHAPE_HALF),
         lean / np.sqrt(np.maximum(norm, 1e-12)),
         np.sqrt(np.maximum(1.0 - across**2, 0.0)),
     )
@@ -199,7 +199,7 @@ def _count_cut(seen: _Shape, inwards: IntArray, sigma_px: float) -> int:
     last = (reach + BLUR_PX) * slant / np.sqrt(1.0 - slant**2)
     width = float(np.median(seen.width[chosen]))
     scatter = max(
-        _robust_std(seen.width[chosen]) / np.sqrt(2 * HALF + 1),
+        _robust_std(seen.width[chosen]) / np.sqrt(2 * SHAPE_HALF + 1),
         _robust_std(seen.mean_width[chosen]),
     )
     narrow = width - max(LEAST_SHRINKING * width, SCATTERS * scatter)

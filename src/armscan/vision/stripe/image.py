@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
+from armscan.geometry.least_squares import robust_sigma
 from armscan.records.exposure import Exposure
-from armscan.vision.stripe.ridge import FloatImage, mean_along, strong_median
+from armscan.vision.stripe.ridge import SAMPLE_STEP_PX, FloatImage, mean_along, strong_median
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
 LaserColour = Literal[
@@ -86,7 +87,6 @@ class StripeOptions:
             raise OptionError(f"smoothing_px is {self.smoothing_px}", remedy="give 0 or up")
 
 
-SAMPLE_STEP_PX = 4
 ROUNDS = 4
 TRIM_SIGMAS = 2.5
 GAIN_LIMITS = (0.05, 20.0)
@@ -125,7 +125,7 @@ def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage
             gain = float(np.clip(slope, *GAIN_LIMITS))
         offset = float(np.median(y[use] - gain * x[use]))
         rest = np.abs(y - gain * x - offset)
-        use = rest <= TRIM_SIGMAS * max(1.4826 * float(np.median(rest)), 0.5)
+        use = rest <= TRIM_SIGMAS * max(robust_sigma(rest), 0.5)
     return np.asarray(lit - np.float32(gain) * dark - np.float32(offset), dtype=np.float32)
 
 
@@ -320,7 +320,8 @@ def _core_channel(images: ColourImages, excess: FloatImage, own: int) -> int | N
 CORE_SIGMAS = 3.0
 BESIDE_SIGMAS = (5.0, 8.0)
 LEAST_CORE_PX = 3.0
-HALF = 4
+COLOUR_HALF = 4
+"""Neighbours over which the excess of the laser's colour is averaged."""
 NOISE_FACTOR = 4.0
 LEAST_SHARE = 0.25
 
@@ -343,7 +344,7 @@ def has_laser_colour(
         np.median(_across(gate, table, -far), axis=1), np.median(_across(gate, table, far), axis=1)
     )
     ones = np.ones(len(table))
-    contrast = mean_along(inside - beside, ones, chain, HALF)
+    contrast = mean_along(inside - beside, ones, chain, COLOUR_HALF)
     step = np.abs(np.diff(gate[::7, :], axis=1))
     noise = 1.05 * float(np.median(step)) if step.size else 0.0
     typical = strong_median(np.maximum(contrast, 0.0))

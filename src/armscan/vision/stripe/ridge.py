@@ -22,6 +22,7 @@ FloatImage: TypeAlias = NDArray[np.float32]
 CELL_PX = 64
 SQRT2 = math.sqrt(2.0)
 SAMPLE_STEP_PX = 4
+"""What holds for the whole image is told from every fourth row and column."""
 CLUTTER_LAG_PX = 12
 BACKGROUND_QUANTILE = 0.4
 LEAST_NOISE = 0.35

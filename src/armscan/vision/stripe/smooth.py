@@ -17,6 +17,7 @@ from armscan.kernels.profile_fit import (
     PREDICTED_SIGMA,
     SHIFT,
     SLOPE,
+    SMOOTH_COLUMNS,
     SMOOTH_SIGMA,
     smooth_chains,
 )
@@ -25,7 +26,6 @@ SMALLEST_WINDOW_PX = 3.2
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
-RESULT_COLUMNS = 8
 SCATTER_HALVES = (30, 16, 8)
 """Wide windows show slow noise too, but need long chains."""
 UNKNOWN_SCATTER_PX = 0.5
@@ -60,7 +60,7 @@ class Polyline:
 
     def fit_parabolas(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
         """Result (N, 8) of the smoothing kernel with these half windows."""
-        result = np.zeros((len(self), RESULT_COLUMNS))
+        result = np.zeros((len(self), SMOOTH_COLUMNS))
         smooth_chains(
             self.points,
             self.normals,

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.special import ndtr
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.vision.targets.ellipse import BandPixels, Ellipses, Rims, band_pixels, fit_ellipses
-from armscan.vision.targets.saddle import RawGrey
+from armscan.vision.targets.saddle import APERTURE_SIGMA_PX, RawGrey
 
-APERTURE_SIGMA_PX = 0.29
-"""Standard deviation of a pixel's own width, 1 / sqrt(12): no edge is sharper."""
 LEVEL_SCATTER = 0.03
 """Scatter of the levels along a rim, as a fraction of the contrast."""
 _STEPS = 5
@@ -283,7 +282,7 @@ def _robust_fit(points: FloatArray, sigma: FloatArray) -> tuple[Ellipses, FloatA
         used = np.isfinite(sigma)
         scaled = np.where(used, np.abs(distance) / np.where(used, sigma, 1.0), np.nan)
         scaled[~used.any(axis=1)] = 0.0
-        typical = np.maximum(1.0, 1.4826 * np.nanmedian(scaled, axis=1))
+        typical = np.maximum(1.0, MAD_TO_SIGMA * np.nanmedian(scaled, axis=1))
         sigma = np.where(scaled <= _OUTLIER_SIGMAS * typical[:, None], sigma, np.inf)
         ellipses = fit_ellipses(points, sigma**-2.0)
     excess = ellipses.chi2 / np.maximum(ellipses.degrees_of_freedom, 1.0)

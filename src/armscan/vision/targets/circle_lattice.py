@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats
+from armscan.geometry.least_squares import robust_sigma
 from armscan.vision.targets.saddle import MIN_CONTRAST, Grey8
 from armscan.vision.targets.target import CircleGrid, rightness
 
@@ -96,7 +97,7 @@ def _noise(grey8: Grey8) -> float:
     """Standard deviation of the pixel noise, from second differences along rows."""
     rows = grey8[::8].astype(np.float64)
     second = rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]
-    return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
+    return robust_sigma(second) / float(np.sqrt(6.0))
 
 
 def _ellipse_of(

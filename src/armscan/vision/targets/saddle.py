@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grey images in which a target may show, the likeliest first."""
+"""Corners where two edges cross, fitted as saddles to raw pixels, and the grey images of an
+exposure in which a target may show, the likeliest first.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.records.exposure import Exposure
 
 MIN_CONTRAST = 0.02
@@ -290,7 +293,7 @@ def _is_disturbed(residual: FloatArray, contrast: FloatArray, is_good: BoolArray
 def _without_outliers(residuals: FloatArray, weights: FloatArray) -> FloatArray:
     """Drop pixels that a laser line or dirt put far off the model."""
     size = np.where(weights > 0.0, np.abs(residuals), np.nan)
-    sigma = 1.4826 * np.nanmedian(size, axis=1)
+    sigma = MAD_TO_SIGMA * np.nanmedian(size, axis=1)
     kept = np.abs(residuals) <= _OUTLIER_SIGMAS * np.maximum(sigma, 0.3)[:, None]
     return np.asarray(weights * kept)
 

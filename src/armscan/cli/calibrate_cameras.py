@@ -23,6 +23,7 @@ from armscan.cli.options import (
     OptionalTarget,
     Target,
     given,
+    refuse_vain,
     run,
 )
 
@@ -108,11 +109,14 @@ def camera(
         "leave_out_misfits": auto_leave_out or None,
     }
     if again is not None:
-        if images or scan or target:
-            raise OptionError(
-                "--from takes target and views from the document's own files",
-                remedy="leave out --target and the images",
-            )
+        vain: dict[str, object] = {
+            "the images": images,
+            "--scan": scan,
+            "--target": target,
+            "--method": method,
+        }
+        vain |= {"--bits-used": bits_used, "--bits-align": bits_align, "--no-cache": not cache}
+        refuse_vain(vain, "--from takes target and views from the document's own files")
         changes = {key: value for key, value in changed.items() if value is not None}
         run(
             lambda job: calibrate_camera_from_file(job, again, changes),

@@ -27,6 +27,7 @@ from armscan.cli.options import (
     Side,
     StripeMethodOption,
     given,
+    refuse_vain,
     run,
 )
 
@@ -160,7 +161,6 @@ def laser(
 ) -> None:
     """Calibrate light sheets from images of laser lines on a flat target."""
     from armscan.calibration.sheets.result import SheetOptions
-    from armscan.errors import OptionError
     from armscan.jobs.sheets import (
         SheetImages,
         calibrate_sheets,
@@ -177,11 +177,17 @@ def laser(
         "is_bow_allowed": False if plane_only else None,
     }
     if again is not None:
-        if camera or target or on or off or scan or leave_out:
-            raise OptionError(
-                "--from takes cameras and stripes from the document's own files",
-                remedy="leave out --camera, --target and the images",
-            )
+        vain: dict[str, object] = {
+            "--camera": camera,
+            "--target": target,
+            "--on": on,
+            "--off": off,
+            "--scan": scan,
+        }
+        vain |= {"--leave-out": leave_out, "--stripe-method": stripe_method}
+        vain |= {"--laser-colour": laser_colour, "--bits-used": bits_used}
+        vain |= {"--bits-align": bits_align, "--no-cache": not cache}
+        refuse_vain(vain, "--from takes cameras and stripes from the document's own files")
         changes = {key: value for key, value in changed.items() if value is not None}
         run(
             lambda job: calibrate_sheets_from_file(job, again, changes),

@@ -23,6 +23,7 @@ from armscan.cli.options import (
     StripeMethodOption,
     given,
     progress_bar,
+    refuse_vain,
     run,
     show,
 )
@@ -163,7 +164,8 @@ def simulate(
 
     Scenes: camera and laser are images of a target for the head's calibration; hand-eye is the
     plate from many postures; plate, ball, steps, part and waves are scans by hand; still-step is
-    one exposure; markers is a part with ring markers, place by place, and markers-moved the same
+    one exposure of the steps, and still-part one of the part, with the same view without laser;
+    markers is a part with ring markers, place by place, and markers-moved the same
     part after the arm was put down elsewhere; probing is the plate touched with a tip.
     """
     from armscan.jobs.simulate import SimulateRequest, run_simulation
@@ -257,6 +259,15 @@ def reconstruct(
     paths = StillPaths(
         tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
     )
+    if poses is None:
+        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
+    else:
+        vain: dict[str, object] = {"--sheet": sheet, "--depth-margin": depth_margin, "--arm": arm}
+        vain |= {"--background": background, "--right": right, "--method": method}
+        vain |= {"--right-background": right_background, "--laser-colour": laser_colour}
+        vain |= {"--stripe-method": stripe_method, "--bits-used": bits_used}
+        vain |= {"--bits-align": bits_align}
+        refuse_vain(vain, "profiles with --poses are points already: no image is read")
     table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),

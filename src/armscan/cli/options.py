@@ -8,7 +8,7 @@ and left to that class, and help reads it from there when it is printed.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from enum import StrEnum
@@ -162,6 +162,36 @@ PageOption = Annotated[
 def given(options: type[T], **values: Any) -> T:
     """Options of which only those that are not None were given."""
     return options(**{name: value for name, value in values.items() if value is not None})
+
+
+def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out") -> None:
+    """Refuse options that would be without effect.
+
+    Parameters
+    ----------
+    options
+        Value of each option by its name; None, False, or empty where it was not given.
+    what
+        Why they have no effect.
+    remedy
+        What to do, in front of the names.
+
+    Raises
+    ------
+    OptionError
+        If one or more were given.
+    """
+    from armscan.errors import OptionError
+
+    # zero is a value: `== False` would take it for one that was not given
+    named = [
+        name
+        for name, value in options.items()
+        if not (value is None or value is False or value in ("", [], ()))
+    ]
+    if named:
+        names = ", ".join(named)
+        raise OptionError(what, where=names, remedy=f"{remedy} {names}")
 
 
 def numbers(text: str, option: str) -> tuple[float, ...]:

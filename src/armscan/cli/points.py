@@ -18,6 +18,7 @@ from armscan.cli.options import (
     MethodOption,
     Side,
     given,
+    refuse_vain,
     run,
 )
 
@@ -178,6 +179,12 @@ def markers(
     if code and stereo is not None:
         raise OptionError(
             "codes are looked for in single images", where="--code", remedy="leave --stereo out"
+        )
+    if stereo is None:
+        refuse_vain(
+            {"--diameter": diameter, "--depth": depth},
+            "sizes and depths are of markers that two cameras see",
+            "give --stereo, or leave out",
         )
     depth_mm = parse_depth(depth) if depth else None
     matching = given(RingMatchOptions, depth_mm=depth_mm, diameter_mm=diameter)

@@ -399,6 +399,15 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
 
 def _observations(path: Path) -> dict[str, Any]:
     found = read_observations(path)
+    if found.stripes:
+        postures = {one.posture for one in found.stripes}
+        return {
+            "what": f"observations of a hand-eye: {len(found.stripes)} exposures with points and "
+            f"the arm's pose, of {len(postures)} postures",
+            "exposures": len(found.stripes),
+            "postures": len(postures),
+            "points": sum(len(one.points_mm) for one in found.stripes),
+        }
     return {
         "what": f"observations of a calibration: {len(found.views)} target views, "
         f"{len(found.profiles)} stripe images",

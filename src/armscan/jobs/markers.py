@@ -72,18 +72,21 @@ def find_markers(
     warnings = tuple(
         f"no ring was found in {found.rings.source}" for found in detections if not found.rings
     )
-    provenance = job.provenance(paths, (rings, image_options), warnings=warnings)
     lines = [
         (found.rings.source, line)
         for found in detections
         for line in find_coded_lines(found.rings.centres_px, found.rings.covariance_px2, known)
     ]
+    if known and not lines:
+        names = " or ".join(code.name for code in known)
+        warnings += (f"no four rings on a line have the cross ratio of {names}",)
+    provenance = job.provenance(paths, (rings, image_options), warnings=warnings)
     is_simulated = are_simulated(paths)
     page = detection_page(exposures, detections, warnings, provenance, is_simulated=is_simulated)
     return Summary(
         title="Ring markers in simulated images." if is_simulated else "Ring markers.",
         quantities=ring_quantities(detections),
-        tables=(_counts(detections), *((_coded_lines(lines),) if known else ())),
+        tables=(_counts(detections), *((_coded_lines(lines),) if lines else ())),
         warnings=warnings,
         written=job.write({places[0]: page}),
         next_step=f"open {places[0]}",

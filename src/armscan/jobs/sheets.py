@@ -61,6 +61,8 @@ from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 from armscan.vision.targets.target import Target, parse_target
 
 REQUESTED = "left out by request"
+STRIPES = "StripeOptions."
+"""Entries of a document's record that say how stripes were found."""
 COUNTS = ("columns", "rows")
 SIZES = ("square_mm", "pitch_mm")
 SCAN_TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
@@ -203,6 +205,9 @@ def calibrate_sheets_from_file(
         warnings=sheet_warnings(fit),
         forced=nonsense,
     )
+    # the stripes are the old document's: how they were found goes on word for word
+    found_by = (entry for entry in sensor.provenance.options if entry[0].startswith(STRIPES))
+    provenance = replace(provenance, options=(*found_by, *provenance.options))
     is_simulated = are_simulated([Path(item.path) for item in sensor.provenance.inputs])
     page = laser_page(fit, {}, provenance, is_simulated=is_simulated)
     job.refuse_nonsense(page, nonsense)

@@ -58,6 +58,10 @@ NOTHING_MEASURED_REMEDY = (
     "check that the images show a laser line, that camera and sheet are the right ones, and give a "
     "larger --depth-margin if the object stood further outside the calibrated depths"
 )
+RULE_OF_ROWS_REMEDY = (
+    "give the recording of a scan, with scanner.json, that has each laser alone before both "
+    "(column lasers of exposures.csv), or leave --method thesis out"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,7 +339,7 @@ def reconstruct(
     progress(ProgressEvent(STAGE, len(left), len(left)))
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
-        raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
+        raise nothing_measured(images, is_by_thesis=options.is_by_thesis)
     depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
     warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
@@ -364,17 +368,35 @@ def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None
         )
 
 
-def nothing_measured(images: Sequence[LabelledProfile]) -> str:
-    """Say why these images gave no point at all."""
+def nothing_measured(
+    images: Sequence[LabelledProfile], *, is_by_thesis: bool = False
+) -> EstimationError:
+    """Why these images gave no point at all, to be raised."""
     n_points = sum(len(image.profile) for image in images)
     if n_points == 0:
-        return f"no stripe was found in {len(images)} images"
+        return EstimationError(
+            f"no stripe was found in {len(images)} images", remedy=NOTHING_MEASURED_REMEDY
+        )
+    n_stray, n_flagged = (
+        sum(image.count(status) for image in images)
+        for status in (PointStatus.STRAY, PointStatus.FLAGGED)
+    )
+    if is_by_thesis and n_stray and n_stray + n_flagged == n_points:
+        return EstimationError(
+            f"the rule of rows gave none of {n_stray} stripe points to a sheet: it compares them "
+            "with the rows of earlier exposures of one laser alone",
+            where="--method thesis",
+            remedy=RULE_OF_ROWS_REMEDY,
+        )
     counts = ", ".join(
         f"{count} {status.label}"
         for status in PointStatus
         if (count := sum(image.count(status) for image in images))
     )
-    return f"none of {n_points} stripe points could be measured: {counts}"
+    return EstimationError(
+        f"none of {n_points} stripe points could be measured: {counts}",
+        remedy=NOTHING_MEASURED_REMEDY,
+    )
 
 
 def summarised(warnings: Sequence[str]) -> tuple[str, ...]:

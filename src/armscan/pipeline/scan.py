@@ -17,7 +17,6 @@ from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
 from armscan.pipeline.measure import (
-    NOTHING_MEASURED_REMEDY,
     MeasureOptions,
     cameras_of,
     labeller_for,
@@ -393,7 +392,7 @@ def _joined(
                 remedy="give limits in mm in the arm's base frame, or none",
             )
         images = [one.labelled for one in placed.values()]
-        raise EstimationError(nothing_measured(images), remedy=NOTHING_MEASURED_REMEDY)
+        raise nothing_measured(images, is_by_thesis=options.measure.is_by_thesis)
     if not options.has_normals:
         return cloud, ()
     return _with_normals(cloud, list(placed), poses, transform)

@@ -79,7 +79,7 @@ def test_the_rule_of_rows_tells_crossed_lines_only(
     assert main([*words, str(INPUTS / "documents/sensor.json")]) == 2
     assert "--method thesis" in capsys.readouterr().err
     assert main([*words, str(INPUTS / "documents/cross.json")]) == 2
-    assert "could be measured" in capsys.readouterr().err
+    assert "rule of rows" in capsys.readouterr().err
 
 
 def test_the_eight_steps_need_two_lists(

@@ -11,6 +11,7 @@ import pytest
 
 from armscan.cli import main
 from armscan.storage.documents import read_sensor_calibration
+from rigs.drawn_bench import Bench
 
 INPUTS = Path(__file__).parents[1] / "net" / "inputs"
 DOCUMENTS = INPUTS / "documents"
@@ -58,16 +59,15 @@ def test_an_option_without_effect_is_refused(
 
 
 def test_sheets_solved_again_keep_how_their_stripes_were_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    calibrated: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    old = read_sensor_calibration(DOCUMENTS / "sensor.json").provenance.options
+    again = calibrated.sensor
+    old = read_sensor_calibration(again).provenance.options
     found_by = [entry for entry in old if entry[0].startswith("StripeOptions.")]
-    again = DOCUMENTS / "sensor.json"
-    for output in ("again.json", "twice.json"):
-        words = ["calibrate", "laser", "--from", str(again), "-o", output]
+    for output in (tmp_path / "again.json", tmp_path / "twice.json"):
+        words = ["calibrate", "laser", "--from", str(again), "-o", str(output)]
         assert main(words) == 0, capsys.readouterr().err
-        again = tmp_path / output
+        again = output
         new = read_sensor_calibration(again).provenance.options
         assert [entry for entry in new if entry[0].startswith("StripeOptions.")] == found_by != []
 

@@ -109,13 +109,9 @@ def camera(
         "leave_out_misfits": auto_leave_out or None,
     }
     if again is not None:
-        vain: dict[str, object] = {
-            "the images": images,
-            "--scan": scan,
-            "--target": target,
-            "--method": method,
-        }
+        vain: dict[str, object] = {"the images": images, "--scan": scan, "--target": target}
         vain |= {"--bits-used": bits_used, "--bits-align": bits_align, "--no-cache": not cache}
+        vain["--method"] = method
         refuse_vain(vain, "--from takes target and views from the document's own files")
         changes = {key: value for key, value in changed.items() if value is not None}
         run(

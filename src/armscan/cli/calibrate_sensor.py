@@ -177,13 +177,8 @@ def laser(
         "is_bow_allowed": False if plane_only else None,
     }
     if again is not None:
-        vain: dict[str, object] = {
-            "--camera": camera,
-            "--target": target,
-            "--on": on,
-            "--off": off,
-            "--scan": scan,
-        }
+        vain: dict[str, object] = {"--camera": camera, "--target": target, "--scan": scan}
+        vain |= {"--on": on, "--off": off}
         vain |= {"--leave-out": leave_out, "--stripe-method": stripe_method}
         vain |= {"--laser-colour": laser_colour, "--bits-used": bits_used}
         vain |= {"--bits-align": bits_align, "--no-cache": not cache}

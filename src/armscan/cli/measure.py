@@ -202,6 +202,18 @@ Volume = Annotated[
 ]
 
 
+SensorOrScanner = Annotated[
+    Path,
+    typer.Option(
+        "--sensor",
+        "--scanner",
+        help="Calibration: a recording with scanner.json is placed in Base, all else is in the "
+        "Sensor frame.",
+        show_default=False,
+    ),
+]
+
+
 def reconstruct(
     *,
     images: Annotated[
@@ -211,16 +223,7 @@ def reconstruct(
             show_default=False,
         ),
     ],
-    sensor: Annotated[
-        Path,
-        typer.Option(
-            "--sensor",
-            "--scanner",
-            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
-            "the Sensor frame.",
-            show_default=False,
-        ),
-    ],
+    sensor: SensorOrScanner,
     background: Annotated[
         list[str] | None, typer.Option(help="The same views without laser; repeatable.")
     ] = None,

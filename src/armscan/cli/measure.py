@@ -23,6 +23,7 @@ from armscan.cli.options import (
     StripeMethodOption,
     given,
     progress_bar,
+    refuse_given,
     refuse_vain,
     run,
     show,
@@ -34,6 +35,10 @@ SIMULATE_EXAMPLE = (
     "  armscan simulate thesis-single camera -o board\n"
     "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
     "  armscan simulate thesis-multi markers -o markers"
+)
+OF_IMAGES = (
+    "background right right_background sheet depth_margin arm "
+    "method stripe_method laser_colour bits_used bits_align"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -203,6 +208,7 @@ Volume = Annotated[
 
 
 def reconstruct(
+    context: typer.Context,
     *,
     images: Annotated[
         list[str],
@@ -262,12 +268,9 @@ def reconstruct(
     if poses is None:
         refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
     else:
-        vain: dict[str, object] = {"--sheet": sheet, "--depth-margin": depth_margin, "--arm": arm}
-        vain |= {"--background": background, "--right": right, "--method": method}
-        vain |= {"--right-background": right_background, "--laser-colour": laser_colour}
-        vain |= {"--stripe-method": stripe_method, "--bits-used": bits_used}
-        vain |= {"--bits-align": bits_align}
-        refuse_vain(vain, "profiles with --poses are points already: no image is read")
+        refuse_given(
+            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
+        )
     table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),

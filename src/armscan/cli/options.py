@@ -194,6 +194,17 @@ def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out"
         raise OptionError(what, where=names, remedy=f"{remedy} {names}")
 
 
+def refuse_given(context: typer.Context, names: str, what: str) -> None:
+    """Refuse parameters of a command, named between blanks, that would be without effect here."""
+    options: dict[str, Any] = {}
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in names.split() and source is not None and source.name == "COMMANDLINE":
+            is_off = context.params[parameter.name] is False
+            options[(parameter.secondary_opts if is_off else parameter.opts)[0]] = True
+    refuse_vain(options, what)
+
+
 def numbers(text: str, option: str) -> tuple[float, ...]:
     """Numbers between commas.
 

@@ -262,15 +262,9 @@ def reconstruct(
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 
-    paths = StillPaths(
-        tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
-    )
-    if poses is None:
-        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
-    else:
-        refuse_given(
-            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
-        )
+    left, dark = tuple(images), tuple(background or ())
+    paths = StillPaths(left, dark, tuple(right or ()), tuple(right_background or ()))
+    _check_poses(context, poses, euler)
     table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
@@ -294,3 +288,13 @@ def reconstruct(
         output=output,
         force=force,
     )
+
+
+def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:
+    """Refuse options without effect on profiles, and angles of no table."""
+    if poses is None:
+        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
+    else:
+        refuse_given(
+            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
+        )

@@ -196,12 +196,17 @@ def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out"
 
 def refuse_given(context: typer.Context, names: str, what: str) -> None:
     """Refuse parameters of a command, named between blanks, that would be without effect here."""
-    options: dict[str, Any] = {}
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name in names.split() and source is not None and source.name == "COMMANDLINE":
-            is_off = context.params[parameter.name] is False
-            options[(parameter.secondary_opts if is_off else parameter.opts)[0]] = True
+    sources = {name: context.get_parameter_source(name) for name in names.split()}
+    given_here = [
+        parameter
+        for parameter in context.command.params
+        if (source := sources.get(parameter.name or "")) and source.name == "COMMANDLINE"
+    ]
+    is_off = [context.params[parameter.name or ""] is False for parameter in given_here]
+    options = {
+        (parameter.secondary_opts if off else parameter.opts)[0]: True
+        for parameter, off in zip(given_here, is_off, strict=True)
+    }
     refuse_vain(options, what)
 
 

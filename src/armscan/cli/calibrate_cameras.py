@@ -23,10 +23,11 @@ from armscan.cli.options import (
     OptionalTarget,
     Target,
     given,
-    refuse_vain,
+    refuse_given,
     run,
 )
 
+NOT_AGAIN = "images scan target method bits_used bits_align cache"
 CAMERA_EXAMPLE = (
     "\b\nExample:\n"
     "  armscan calibrate camera 'photos/*.png' --target chessboard:11x6:13 -o camera.json\n\n"
@@ -109,10 +110,9 @@ def camera(
         "leave_out_misfits": auto_leave_out or None,
     }
     if again is not None:
-        vain: dict[str, object] = {"the images": images, "--scan": scan, "--target": target}
-        vain |= {"--bits-used": bits_used, "--bits-align": bits_align, "--no-cache": not cache}
-        vain["--method"] = method
-        refuse_vain(vain, "--from takes target and views from the document's own files")
+        refuse_given(
+            context, NOT_AGAIN, "--from takes target and views from the document's own files"
+        )
         changes = {key: value for key, value in changed.items() if value is not None}
         run(
             lambda job: calibrate_camera_from_file(job, again, changes),

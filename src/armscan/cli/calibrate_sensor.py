@@ -27,10 +27,13 @@ from armscan.cli.options import (
     Side,
     StripeMethodOption,
     given,
-    refuse_vain,
+    refuse_given,
     run,
 )
 
+NOT_AGAIN = (
+    "camera target on off scan leave_out stripe_method laser_colour bits_used bits_align cache"
+)
 LASER_EXAMPLE = (
     "\b\nExample:\n"
     "  armscan calibrate laser --camera camera.json --on 'on/*.png' --off 'off/*.png' \\\n"
@@ -177,12 +180,9 @@ def laser(
         "is_bow_allowed": False if plane_only else None,
     }
     if again is not None:
-        vain: dict[str, object] = {"--camera": camera, "--target": target, "--scan": scan}
-        vain |= {"--on": on, "--off": off}
-        vain |= {"--leave-out": leave_out, "--stripe-method": stripe_method}
-        vain |= {"--laser-colour": laser_colour, "--bits-used": bits_used}
-        vain |= {"--bits-align": bits_align, "--no-cache": not cache}
-        refuse_vain(vain, "--from takes cameras and stripes from the document's own files")
+        refuse_given(
+            context, NOT_AGAIN, "--from takes cameras and stripes from the document's own files"
+        )
         changes = {key: value for key, value in changed.items() if value is not None}
         run(
             lambda job: calibrate_sheets_from_file(job, again, changes),

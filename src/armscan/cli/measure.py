@@ -23,6 +23,7 @@ from armscan.cli.options import (
     StripeMethodOption,
     given,
     progress_bar,
+    refuse_given,
     refuse_vain,
     run,
     show,
@@ -34,6 +35,10 @@ SIMULATE_EXAMPLE = (
     "  armscan simulate thesis-single camera -o board\n"
     "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
     "  armscan simulate thesis-multi markers -o markers"
+)
+OF_IMAGES = (
+    "background right right_background sheet depth_margin arm "
+    "method stripe_method laser_colour bits_used bits_align"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -202,19 +207,8 @@ Volume = Annotated[
 ]
 
 
-SensorOrScanner = Annotated[
-    Path,
-    typer.Option(
-        "--sensor",
-        "--scanner",
-        help="Calibration: a recording with scanner.json is placed in Base, all else is in the "
-        "Sensor frame.",
-        show_default=False,
-    ),
-]
-
-
 def reconstruct(
+    context: typer.Context,
     *,
     images: Annotated[
         list[str],
@@ -223,7 +217,16 @@ def reconstruct(
             show_default=False,
         ),
     ],
-    sensor: SensorOrScanner,
+    sensor: Annotated[
+        Path,
+        typer.Option(
+            "--sensor",
+            "--scanner",
+            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
+            "the Sensor frame.",
+            show_default=False,
+        ),
+    ],
     background: Annotated[
         list[str] | None, typer.Option(help="The same views without laser; repeatable.")
     ] = None,
@@ -259,18 +262,9 @@ def reconstruct(
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 
-    paths = StillPaths(
-        tuple(images), tuple(background or ()), tuple(right or ()), tuple(right_background or ())
-    )
-    if poses is None:
-        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
-    else:
-        vain: dict[str, object] = {"--sheet": sheet, "--depth-margin": depth_margin, "--arm": arm}
-        vain |= {"--background": background, "--right": right, "--method": method}
-        vain |= {"--right-background": right_background, "--laser-colour": laser_colour}
-        vain |= {"--stripe-method": stripe_method, "--bits-used": bits_used}
-        vain |= {"--bits-align": bits_align}
-        refuse_vain(vain, "profiles with --poses are points already: no image is read")
+    left, dark = tuple(images), tuple(background or ())
+    paths = StillPaths(left, dark, tuple(right or ()), tuple(right_background or ()))
+    _check_poses(context, poses, euler)
     table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
@@ -294,3 +288,13 @@ def reconstruct(
         output=output,
         force=force,
     )
+
+
+def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:
+    """Refuse options without effect on profiles, and angles of no table."""
+    if poses is None:
+        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
+    else:
+        refuse_given(
+            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
+        )

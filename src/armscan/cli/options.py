@@ -194,6 +194,22 @@ def refuse_vain(options: Mapping[str, Any], what: str, remedy: str = "leave out"
         raise OptionError(what, where=names, remedy=f"{remedy} {names}")
 
 
+def refuse_given(context: typer.Context, names: str, what: str) -> None:
+    """Refuse parameters of a command, named between blanks, that would be without effect here."""
+    sources = {name: context.get_parameter_source(name) for name in names.split()}
+    given_here = [
+        parameter
+        for parameter in context.command.params
+        if (source := sources.get(parameter.name or "")) and source.name == "COMMANDLINE"
+    ]
+    is_off = [context.params[parameter.name or ""] is False for parameter in given_here]
+    options = {
+        (parameter.secondary_opts if off else parameter.opts)[0]: True
+        for parameter, off in zip(given_here, is_off, strict=True)
+    }
+    refuse_vain(options, what)
+
+
 def numbers(text: str, option: str) -> tuple[float, ...]:
     """Numbers between commas.
 

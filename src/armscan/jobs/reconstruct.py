@@ -30,10 +30,10 @@ from armscan.records.exposure import Exposure
 from armscan.report.cloud import (
     cloud_page,
     cloud_quantities,
-    fate_table,
-    fate_totals,
     scan_page,
     scan_quantities,
+    status_table,
+    status_totals,
 )
 from armscan.report.page import Page
 from armscan.report.photographs import evenly_chosen
@@ -224,7 +224,7 @@ def _stills(
     return Summary(
         title="Points measured" + (" on simulated images." if is_simulated else "."),
         quantities=cloud_quantities(result),
-        tables=(fate_table(result),),
+        tables=(status_table(result),),
         warnings=sentences((*result.warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, and the cloud in any viewer",
@@ -335,7 +335,7 @@ def _told(
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
         quantities=scan_quantities(scan),
-        tables=(fate_totals(scan),) if scan.images else (),
+        tables=(status_totals(scan),) if scan.images else (),
         warnings=sentences((*warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",

@@ -137,7 +137,7 @@ def cloud_page(
     span = f"{depth.min():.1f} to {depth.max():.1f} mm"
     with_points = [k for k in range(len(cloud.exposure_sources)) if (cloud.exposure == k).any()]
     profiles = [profile_view(cloud, sensor, k) for k in evenly_chosen(with_points, MAX_PROFILES)]
-    stripes = (*stripe_gallery(result.images, cloud.sheet_names, exposures), fate_table(result))
+    stripes = (*stripe_gallery(result.images, cloud.sheet_names, exposures), status_table(result))
     return page_of(
         provenance,
         "Measured points",
@@ -159,7 +159,7 @@ def cloud_page(
     )
 
 
-def fate_table(result: Reconstruction) -> Table:
+def status_table(result: Reconstruction) -> Table:
     """What became of the stripe points of each image."""
     statuses = _statuses(result.images)
     rows = tuple(
@@ -203,7 +203,7 @@ def scan_page(
     n_placed = scan.count(ExposureStatus.PLACED)
     sections = [Section("The cloud", (Gallery((cloud_view(cloud),), 560),))]
     if scan.images:
-        totals = (Text(STATUS_TEXT), fate_totals(scan))
+        totals = (Text(STATUS_TEXT), status_totals(scan))
         sections.append(Section("What became of the points", totals))
     sections.append(Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)))
     if scan.without_pose:
@@ -230,7 +230,7 @@ def scan_page(
     )
 
 
-def fate_totals(scan: ScanReconstruction) -> Table:
+def status_totals(scan: ScanReconstruction) -> Table:
     """All stripe points by what became of them."""
     counts = {status: sum(image.count(status) for image in scan.images) for status in PointStatus}
     n_all = max(sum(counts.values()), 1)

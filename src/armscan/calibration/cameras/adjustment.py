@@ -420,7 +420,9 @@ def descend(
         return move(state, *step), float(promised)
 
     found = minimise(start, evaluate, propose, max_steps=max_steps)
-    return found or FitFailure("the starting values put the board behind the camera")
+    if found is None:
+        return FitFailure("the starting values put the board behind the camera")
+    return found
 
 
 SINGULAR_CONDITION = 1e13

@@ -165,7 +165,7 @@ def blur_where(
     for v in range(height):
         for u in range(width):
             if not wanted[v, u]:
-                blurred[v, u] = np.float32(mask[v, u] / 255.0)
+                blurred[v, u] = np.float32(mask[v, u] * (1.0 / 255.0))
                 continue
             total = 0.0
             for b in range(-reach, reach + 1):

@@ -25,7 +25,7 @@ from armscan.simulation.objects.shapes import Placed
 from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
 from armscan.simulation.optics.lasers import LineLaser, in_sources
 from armscan.simulation.optics.render import Imaging, Region, find_stripe, laser_bands, to_pixels
-from armscan.simulation.optics.scene import Hits, Material, RoomLight, Scene, SceneObject, Surface
+from armscan.simulation.optics.scene import Material, RoomLight, Scene, SceneObject, Surface
 from armscan.simulation.optics.stray_light import stray_lights
 from armscan.simulation.optics.stripe_light import PosedView, band_light, look
 
@@ -196,7 +196,8 @@ def exposure_light(
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    room = _room(eye, station, poses, views, region)[inside]
+    # Its grid is coarser than any motion over the exposure.
+    room = _room(eye, station, poses[middle], views[middle], region)[inside]
     return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness, light))
 
 
@@ -255,39 +256,22 @@ def _view(eye: MountedCamera, station: Station, pose: Pose[Base, Any], region: R
     return look(seen_from(station, pose), (*finishes, Material()), eye.camera, region)
 
 
-def _room(
-    eye: MountedCamera,
-    station: Station,
-    poses: Sequence[Pose[Base, Any]],
-    views: Sequence[PosedView],
-    region: Region,
-) -> NDArray[np.float32]:
-    """Light (H, W) of a region under the full room, mean over the views.
-
-    It is coarse, but a target and markers are drawn sharply.
-    """
-    both = list(zip(poses, views, strict=True))
-    if station.markers or station.target is not None:
-        light = sum(_drawn(eye, station, pose, view, region) for pose, view in both)
-    else:
-        light = to_pixels(
-            np.asarray(sum(_room_nodes(v.scene, v.nodes, region) for v in views)), region
-        )
-    return np.asarray(light if len(views) == 1 else light / np.float32(len(views)))
-
-
-def _room_nodes(scene: Scene, nodes: Hits, region: Region) -> NDArray[np.float32]:
+def _room_nodes(scene: Scene, view: PosedView, region: Region) -> NDArray[np.float32]:
     _, (rows, columns) = region.nodes_px()
-    return scene.room_light(nodes)[:, 0].reshape(rows, columns).astype(np.float32)
+    if view.numbers is not None and scene is view.scene:
+        light = view.numbers.room_light(view.nodes)
+    else:
+        light = scene.room_light(view.nodes)[:, 0]
+    return light.reshape(rows, columns).astype(np.float32)
 
 
-def _drawn(
+def _room(
     eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
 ) -> NDArray[np.float32]:
-    """Room light of one view with the markers or the target."""
+    """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
     # The nodes are too far apart for markers: they get the face's own colour.
     scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
-    coarse = to_pixels(_room_nodes(scene, view.nodes, region), region)
+    coarse = to_pixels(_room_nodes(scene, view, region), region)
     camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     if station.markers:
         markers = [marker.seen_from(pose) for marker in station.markers]

@@ -25,7 +25,7 @@ from armscan.simulation.kernels import (
 )
 from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
 from armscan.simulation.optics.render import camera_rays
-from armscan.simulation.optics.scene import MISS, Floor, RoomLight, Scene
+from armscan.simulation.optics.scene import MISS, RoomLight
 
 
 class FlatPattern(Protocol):
@@ -516,15 +516,17 @@ def _lamp_on_board(
     board: PrintedBoard, camera: RenderCamera, lamp: RoomLight
 ) -> NDArray[np.float32]:
     """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
-    pose = board.sensor_from_board
-    plane = Floor(pose.translation_mm, -pose.rotation[:, 2], (1.0, 1.0, 1.0))
+    pose, up = board.sensor_from_board, -board.sensor_from_board.rotation[:, 2]
     height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
     rows, columns = np.indices((height, width))
     cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    pixels = (cells + 0.5) * _COARSE_STEP_PX - 0.5
-    scene = Scene((plane,), lamp=lamp)
-    light = scene.room_light(scene.trace(np.zeros(3), camera_rays(camera, pixels)))
-    coarse = light[:, 0].reshape(height, width).astype(np.float32)
+    rays = camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE)
+    with np.errstate(divide="ignore"):
+        away = (pose.translation_mm @ up) / (rays @ up)
+    to_lamp = lamp.position_mm - np.where(away > 0.0, away, 0.0)[:, None] * rays
+    facing = np.maximum(to_lamp @ up / np.linalg.norm(to_lamp, axis=1), 0.0)
+    light = lamp.even * (2.0 + up @ np.asarray(lamp.up)) / 3.0 + lamp.direct * facing
+    coarse = np.where(away > 0.0, light, 0.0).reshape(height, width).astype(np.float32)
     size = (camera.width_px, camera.height_px)
     fine = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
     return np.asarray(fine, dtype=np.float32)

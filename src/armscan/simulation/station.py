@@ -196,9 +196,8 @@ def exposure_light(
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    # Its grid is coarser than any motion over the exposure.
-    room = _room(eye, station, poses[middle], views[middle], region)[inside]
-    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness, light))
+    room = _room(eye, station, poses, views, region)[inside]
+    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness / len(views), light))
 
 
 def true_stripes(
@@ -266,9 +265,26 @@ def _room_nodes(scene: Scene, view: PosedView, region: Region) -> NDArray[np.flo
 
 
 def _room(
+    eye: MountedCamera,
+    station: Station,
+    poses: Sequence[Pose[Base, Any]],
+    views: Sequence[PosedView],
+    region: Region,
+) -> NDArray[np.float32]:
+    """Light (H, W) of a region under the full room, added up over the views.
+
+    It is coarse, but a target and markers are drawn sharply.
+    """
+    if station.markers or station.target is not None:
+        both = zip(poses, views, strict=True)
+        return np.asarray(sum(_drawn(eye, station, pose, view, region) for pose, view in both))
+    return to_pixels(np.asarray(sum(_room_nodes(v.scene, v, region) for v in views)), region)
+
+
+def _drawn(
     eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
 ) -> NDArray[np.float32]:
-    """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
+    """Light of one view, with the markers or the target."""
     # The nodes are too far apart for markers: they get the face's own colour.
     scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
     coarse = to_pixels(_room_nodes(scene, view, region), region)

@@ -6,6 +6,7 @@ supersampled at the edges.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
@@ -15,9 +16,16 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.simulation.optics.camera import RenderCamera, blur_image
+from armscan.simulation.kernels import (
+    SAMPLES,
+    SUBPIXELS,
+    blur_where,
+    disc_cells,
+    lay_over,
+)
+from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
 from armscan.simulation.optics.render import camera_rays
-from armscan.simulation.optics.scene import MISS, Floor, RoomLight, Scene
+from armscan.simulation.optics.scene import MISS, RoomLight
 
 
 class FlatPattern(Protocol):
@@ -172,12 +180,12 @@ class PrintedBoard:
         return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
 
 
-SUBPIXELS = 2
-"""Fine-grid cells per pixel along each axis, on which the lens's blur acts."""
-SAMPLES = 8
-"""Samples per fine-grid cell along each axis, where an edge may cross it."""
 _COARSE_STEP_PX = 16
 _CHUNK = 1_000
+_BLUR_REACH = 6.0
+_RIM_STEPS = 24
+_KNOT_STEP_PX = 8
+_KNOT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,9 +253,9 @@ def render_flat_target(
         If the camera looks at the back of the print.
     """
     light = Lighting() if lighting is None else lighting
-    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, light.surround)
-    reflectance = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
-    levels = light.dark_level + (light.light_level - light.dark_level) * reflectance
+    reflectance = _reflectance(camera, pattern, rotation, translation_mm, light.surround)
+    span = light.light_level - light.dark_level
+    levels = light.dark_level + span * reflectance.astype(np.float64)
     return RenderedTarget(
         levels * illumination(camera, light), marks_px(camera, pattern, rotation, translation_mm)
     )
@@ -269,6 +277,60 @@ def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
     cosine, sine = np.cos(lighting.gradient_azimuth_rad), np.sin(lighting.gradient_azimuth_rad)
     along = (u * cosine + v * sine) / (abs(cosine) + abs(sine))
     return np.asarray(1.0 - lighting.gradient * (along + 0.5))
+
+
+def _reflectance(
+    camera: RenderCamera,
+    pattern: FlatPattern,
+    rotation: FloatArray,
+    translation_mm: FloatArray,
+    surround: float,
+) -> NDArray[np.float32]:
+    """(H, W) part of the light tone in each pixel, blurred by the lens."""
+    if isinstance(pattern, CirclePattern) and surround == float(not pattern.is_light_on_dark):
+        return _discs(camera, pattern, _BoardPlane.of(camera, rotation, translation_mm))
+    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, surround)
+    return _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+
+
+def _discs(camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane) -> NDArray[np.float32]:
+    """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
+    tone = np.full((camera.height_px, camera.width_px), not pattern.is_light_on_dark, np.float32)
+    sign = np.float32(1.0 if pattern.is_light_on_dark else -1.0)
+    margin = int(np.ceil(_BLUR_REACH * camera.blur_sigma_px)) + 2
+    lens, knots_x, knots_y = _lens_knots(camera)
+    angle = 2.0 * np.pi * np.arange(_RIM_STEPS) / _RIM_STEPS
+    radius = 0.5 * pattern.diameter_mm
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM_STEPS)], axis=1)
+    for centre in pattern.marks_board_mm:
+        pixels = board.project(centre + rim)
+        if not np.isfinite(pixels).all():
+            continue
+        left, top = np.floor(pixels.min(axis=0)).astype(int) - margin
+        right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
+        left, top = max(int(left), 0), max(int(top), 0)
+        right, bottom = min(int(right), camera.width_px), min(int(bottom), camera.height_px)
+        if left >= right or top >= bottom:
+            continue
+        cells = np.zeros((SUBPIXELS * (bottom - top), SUBPIXELS * (right - left)), np.float32)
+        disc = np.array([centre[0], centre[1], radius])
+        disc_cells(disc, left, top, lens, knots_x, knots_y, board.board_from_ray, cells)
+        cover = _bin(blur_image(cells, SUBPIXELS * camera.blur_sigma_px))
+        tone[top:bottom, left:right] += sign * cover
+    return tone
+
+
+@lru_cache(maxsize=8)
+def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(12,) numbers of a lens for `disc_cells`, and (K, L) x and y of its knots' rays."""
+    first = -_KNOT_STEP_PX
+    u = np.arange(first, camera.width_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    v = np.arange(first, camera.height_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1), _KNOT_TOLERANCE)
+    c = camera
+    lens = [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, _KNOT_STEP_PX, first, first]
+    x, y = (np.ascontiguousarray(rays[..., k]) for k in (0, 1))
+    return np.array(lens), x, y
 
 
 def _fine_reflectance(
@@ -336,10 +398,10 @@ def _reach_mm(x: FloatArray, y: FloatArray) -> float:
     return 1.05 * 0.5 * float(along_u + along_v)
 
 
-def _bin(fine: NDArray[np.float32]) -> FloatArray:
+def _bin(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = fine.shape[0] // SUBPIXELS, fine.shape[1] // SUBPIXELS
     binned = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(binned, dtype=np.float64)
+    return np.asarray(binned, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -348,6 +410,8 @@ class _BoardPlane:
 
     camera: RenderCamera
     board_from_ray: FloatArray
+    rotation: FloatArray
+    translation_mm: FloatArray
 
     @staticmethod
     def of(camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray) -> _BoardPlane:
@@ -358,7 +422,12 @@ class _BoardPlane:
                 "the camera looks at the back of the print",
                 remedy="turn the board: its z axis points away from the camera",
             )
-        return _BoardPlane(camera, np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t])))
+        plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
+        return _BoardPlane(camera, plane, r, t)
+
+    def project(self, points_board_mm: FloatArray) -> FloatArray:
+        """(N, 2) pixels of points (N, 3) of the board; NaN behind the camera."""
+        return self.camera.project(points_board_mm @ self.rotation.T + self.translation_mm)
 
     def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
         """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
@@ -397,8 +466,8 @@ _OUTLINE_BITS = 6
 
 
 def render_board(
-    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: FloatArray
-) -> FloatArray:
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Render a board under room light over a background image.
 
     Parameters
@@ -406,23 +475,17 @@ def render_board(
     board, camera, lamp
         What is seen, by what, under which light.
     background
-        (H, W, 3) parts of full scale.
+        (H, W) parts of full scale; written over.
 
     Returns
     -------
-    (H, W, 3) parts of full scale, blurred by the lens, without noise.
+    (H, W) parts of full scale, blurred by the lens, without noise.
     """
     pose = board.sensor_from_board
-    print_ = render_flat_target(
-        camera,
-        board.pattern,
-        pose.rotation,
-        pose.translation_mm,
-        Lighting(light_level=board.light, dark_level=board.dark),
-    ).image
-    lit = (print_ * _lamp_on_board(board, camera, lamp))[..., None]
-    cover = _coverage(board, camera)[..., None]
-    return np.asarray(cover * lit + (1.0 - cover) * background)
+    tone = _reflectance(camera, board.pattern, pose.rotation, pose.translation_mm, 1.0)
+    lit, cover = _lamp_on_board(board, camera, lamp), _coverage(board, camera)
+    lay_over(background, tone, lit, cover, board.dark, board.light)
+    return background
 
 
 def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
@@ -436,24 +499,34 @@ def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
     return camera.project(rim @ pose.rotation[:, :2].T + pose.translation_mm)
 
 
-def _coverage(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
+def _coverage(board: PrintedBoard, camera: RenderCamera) -> NDArray[np.float32]:
     """(H, W) part of each pixel that the board covers, blurred by the lens."""
-    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    shape = (camera.height_px, camera.width_px)
+    mask, rim = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     outline = np.rint(outline_px(board, camera) * (1 << _OUTLINE_BITS)).astype(np.int32)
     cv2.fillPoly(mask, [outline], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
-    return blur_image(mask.astype(np.float64) / 255.0, camera.blur_sigma_px)
+    kernel = blur_kernel(camera.blur_sigma_px)
+    cv2.polylines(rim, [outline], True, (1,), thickness=len(kernel) + 5, shift=_OUTLINE_BITS)
+    cover = np.zeros(shape, np.float32)
+    blur_where(mask, rim, kernel, cover)
+    return cover
 
 
-def _lamp_on_board(board: PrintedBoard, camera: RenderCamera, lamp: RoomLight) -> FloatArray:
+def _lamp_on_board(
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight
+) -> NDArray[np.float32]:
     """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
-    pose = board.sensor_from_board
-    plane = Floor(pose.translation_mm, -pose.rotation[:, 2], (1.0, 1.0, 1.0))
+    pose, up = board.sensor_from_board, -board.sensor_from_board.rotation[:, 2]
     height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
     rows, columns = np.indices((height, width))
     cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    pixels = (cells + 0.5) * _COARSE_STEP_PX - 0.5
-    scene = Scene((plane,), lamp=lamp)
-    light = scene.room_light(scene.trace(np.zeros(3), camera_rays(camera, pixels)))
-    coarse = light[:, 0].reshape(height, width)
+    rays = camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE)
+    with np.errstate(divide="ignore"):
+        away = (pose.translation_mm @ up) / (rays @ up)
+    to_lamp = lamp.position_mm - np.where(away > 0.0, away, 0.0)[:, None] * rays
+    facing = np.maximum(to_lamp @ up / np.linalg.norm(to_lamp, axis=1), 0.0)
+    light = lamp.even * (2.0 + up @ np.asarray(lamp.up)) / 3.0 + lamp.direct * facing
+    coarse = np.where(away > 0.0, light, 0.0).reshape(height, width).astype(np.float32)
     size = (camera.width_px, camera.height_px)
-    return np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR))
+    fine = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine, dtype=np.float32)

@@ -156,15 +156,8 @@ class LineLaser:
         return v @ self.forward, v @ self.across, v @ self.normal, distance
 
 
-NARROW_RIM_PX, WIDE_RIM_PX = 1, 4
-
-
 class TracedLight(Protocol):
     """Light whose brightness is ``peak * exp(-reach**2 / 2)``, both smooth along a surface."""
-
-    @property
-    def rim_px(self) -> int:
-        """How far around it nodes are traced, so that its rim is not taken for an edge."""
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """Distance (N,) from the nearest centre, in sigmas, and the number of centres below."""
@@ -209,9 +202,14 @@ class LaserSource:
         object.__setattr__(self, "_between_rad", 0.5 * (angles[1:] + angles[:-1]))
 
     @property
-    def rim_px(self) -> int:
-        """As for `TracedLight`: it saves a third of the rays of many sheets, little of one."""
-        return NARROW_RIM_PX if len(self.sheets) == 1 else WIDE_RIM_PX
+    def sense(self) -> float:
+        """1 if angles about the middle sheet's source grow with the sheets' order, else -1."""
+        return self._sense
+
+    @property
+    def between_rad(self) -> FloatArray:
+        """(K - 1,) angles, times the sense, midway between neighbouring sheets."""
+        return self._between_rad
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

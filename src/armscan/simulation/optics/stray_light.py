@@ -14,7 +14,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose
 from armscan.simulation.objects.shapes import FlatPlate, Placed
-from armscan.simulation.optics.lasers import WIDE_RIM_PX, LaserSource, LineLaser, TracedLight
+from armscan.simulation.optics.lasers import LaserSource, LineLaser, TracedLight
 from armscan.simulation.optics.render import Imaging
 from armscan.simulation.optics.scene import SceneObject
 
@@ -46,11 +46,6 @@ class CentreSpot:
     direction: FloatArray
     sigma_mm: float
     irradiance: float
-
-    @property
-    def rim_px(self) -> int:
-        """As for `TracedLight`."""
-        return WIDE_RIM_PX
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

@@ -281,7 +281,7 @@ def show(outcomes: Sequence[Outcome]) -> None:
         squares = np.array([one.square for one in found])
         inside = np.mean([one.square <= one.limit for one in found])
         half = np.sqrt(max(inside * (1.0 - inside), 0.01) / len(found))
-        spread = float((squares / 6.0).std() / np.sqrt(len(squares)))
+        spread = float(squares.std()) / 6.0 / np.sqrt(len(squares))
         middle, upper = np.quantile([one.ratio for one in found], [0.5, 0.9])
         unsettled = sum(not one.is_settled for one in found)
         print(
@@ -306,9 +306,7 @@ def main() -> None:
             with typical_times(factor):
                 rng = np.random.default_rng(given.seed)
                 outcomes = [
-                    study(
-                        Drawn.draw(rng, counts), 1_000_000 * given.seed + k, is_whole=given.whole
-                    )
+                    study(Drawn.draw(rng, counts), 1_000_000 * given.seed + k, is_whole=given.whole)
                     for k in range(given.runs)
                 ]
             print(f"{reference}, seed {given.seed}, priors' locations x {factor:g}")

@@ -176,6 +176,11 @@ class HandEyeSolution:
                 return float(sigma)
         return 0.0
 
+    def log_sigma_of(self, name: str) -> float:
+        """Standard deviation of the logarithm of that; 0 where it was given."""
+        k = [component.name for component in self.components].index(name)
+        return float(np.sqrt(self.noise.log_covariance[k, k]))
+
     def scatter_of(self, name: str, rows: IntArray) -> FloatArray:
         """(n, n) covariance of some residuals by one cause of scatter."""
         own = next(component for component in self.components if component.name == name)
@@ -270,8 +275,10 @@ def estimate(
         is_settled = noise.is_settled and float(np.abs(change).max()) < settled
         if is_settled:
             break
-    found = _solution(problem, state, components, noise, known)
-    return found and replace(found, is_settled=found.is_settled and is_settled)
+    solution = _solution(problem, state, components, noise, known)
+    if solution is None:
+        return None
+    return replace(solution, is_settled=solution.is_settled and is_settled)
 
 
 def first_sigmas(
@@ -442,7 +449,7 @@ def estimate_robustly(problem: Problem, start: HandEyeState) -> HandEyeSolution 
         weights = updated
         solution = estimate(replace(problem, weights=weights), solution.state)
     else:
-        return solution and replace(solution, is_settled=False)
+        return None if solution is None else replace(solution, is_settled=False)
     return solution
 
 

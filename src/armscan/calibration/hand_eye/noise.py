@@ -62,8 +62,8 @@ WIDE = 1.0
 of 30 to 300 mm lie within it."""
 ARM_WIDTH = 1.5
 """Of arms and robots, and of plates: a factor of 4.5."""
-TOUCHED_WIDTH = 0.8
-"""Of an arm whose touches of the plate are known: a factor of 2.2."""
+TOUCHED_WIDTH = 1.0
+"""Of an arm whose touches of the plate are known: a factor of 2.7."""
 VERY_WIDE = 2.0
 """Of the form of stripes on a sphere: a factor of 7."""
 NARROW = 0.5
@@ -116,7 +116,7 @@ def noise_components(
     posture = _same(observations.posture)
     if weights is not None:
         posture = posture / weights[observations.posture][:, None]
-    components = _pose_components(
+    components: tuple[NoiseComponent, ...] = _pose_components(
         (posture * shift, posture * turn),
         _component("arm", shift, options.arm_position_mm, *_expected_arm(surface)),
         options.arm_rotation_rad,
@@ -130,7 +130,7 @@ def noise_components(
         form = _component("form", _same(observations.stripe), None, TYPICAL_FORM_MM, VERY_WIDE)
         return (*components, form, stripe)
     if _has_exposure_part(observations, options):
-        exposure = _same(observations.stripe)
+        exposure = _same(observations.exposure)
         typical = TYPICAL_EXPOSURE_SHARE * components[0].sigma
         new = _component("exposure", shift, options.exposure_position_mm, typical, ARM_WIDTH)
         components += _pose_components(
@@ -164,7 +164,7 @@ def _has_exposure_part(observations: CondensedObservations, options: HandEyeOpti
     """True if a part that is new in every exposure was given, or can be told from the posture's."""
     if options.exposure_position_mm is not None or options.exposure_rotation_rad is not None:
         return True
-    is_repeated = len(np.unique(observations.stripe)) > len(observations.used_postures)
+    is_repeated = len(np.unique(observations.exposure)) > len(observations.used_postures)
     return is_repeated and options.arm_position_mm is None
 
 

@@ -237,7 +237,7 @@ def posture_results(
         results.append(
             PostureResult(
                 posture=name,
-                n_exposures=len(of_posture),
+                n_exposures=len(np.unique(observations.exposure[rows])),
                 n_points=len(distances),
                 mean_mm=float(distances.mean()),
                 rms_mm=float(np.sqrt((distances**2).mean())),

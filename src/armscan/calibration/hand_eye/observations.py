@@ -568,7 +568,7 @@ def condense_plate(
 
 def _exposures(stripes: Sequence[PosedStripe]) -> IntArray:
     """(S,) number of each stripe's exposure: images of one instant are one, with one pose."""
-    keys = [(one.posture, one.instant or str(k)) for k, one in enumerate(stripes)]
+    keys = [(one.posture, one.instant or str(id(one))) for one in stripes]
     numbers = {key: k for k, key in enumerate(dict.fromkeys(keys))}
     return np.array([numbers[key] for key in keys], dtype=np.int64)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from armscan.calibration.sheets.board_points import N_CAMERA, HeadCameras
-from armscan.calibration.sheets.checks import check_points
+from armscan.calibration.sheets.checks import check_points, estimate_shapes_mm
 from armscan.calibration.sheets.coplanarity import (
     CommonPlane,
     fit_common_plane,
@@ -242,9 +242,11 @@ class _Case:
         noise = np.array([model.noise.factor for model in models])
         noise_px = used.sigma_px * noise[used.sheet]
         points = check_points(used, solution, noise_px, self.images, self.cameras)
+        independent = np.array([model.noise.sigma_factor for model in models])[used.sheet]
+        shapes = estimate_shapes_mm(used, solution, used.sigma_px * independent)
         sheets = []
         for k in range(len(models)):
-            fit = self._sheet_fit(k, used, solution, points[k])
+            fit = self._sheet_fit(k, used, solution, points[k], shapes[k])
             if isinstance(fit, FitFailure):
                 return _Refused(k, fit)
             sheets.append(fit)
@@ -300,7 +302,12 @@ class _Case:
         return tuple(warnings)
 
     def _sheet_fit(
-        self, k: int, used: SheetObservations, solution: SheetSolution, points: SheetPointCheck
+        self,
+        k: int,
+        used: SheetObservations,
+        solution: SheetSolution,
+        points: SheetPointCheck,
+        shape_mm: float,
     ) -> SheetFit | FitFailure:
         name, model, sheet = self.assignment.names[k], self.models[k], solution.sheets[k]
         of_sheet = used.sheet == k
@@ -334,6 +341,7 @@ class _Case:
                 n_points=len(observations),
                 depth_range_mm=geometry.depth_range_mm,
                 is_redundant=geometry.n_boards > 2,
+                shape_mm=shape_mm,
             ),
             diagnostics=SheetDiagnostics(
                 rms_px=float(np.sqrt((residual_px[of_sheet] ** 2).mean())),

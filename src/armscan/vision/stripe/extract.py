@@ -128,6 +128,7 @@ def thesis_profile(
         intensity=np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
         flags=flags,
         segment=chain,
+        noise_length=np.ones(len(points)),
     )
 
 
@@ -159,15 +160,17 @@ def to_profile(
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     binning = exposure.window.binning
+    sigma = np.maximum(smoothed.sigma, LEAST_SIGMA_PX)
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),
         normals_px=smoothed.normals,
-        sigma_px=np.maximum(smoothed.sigma, LEAST_SIGMA_PX) * binning,
+        sigma_px=sigma * binning,
         width_px=width * binning,
         intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
         flags=flags,
         segment=np.unique(chain, return_inverse=True)[1],
+        noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),
     )
 
 

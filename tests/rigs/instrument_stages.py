@@ -277,6 +277,7 @@ class SheetResult:
 
     outcome: Outcome
     fit: LaserFit | None
+    names: tuple[int, ...] = ()
 
 
 def run_sheets(
@@ -304,7 +305,7 @@ def run_sheets(
         result = "rightly refused" if is_hopeless else "wrongly refused"
         return SheetResult(Outcome("sheet", result, reasons[0], seconds=seconds), None)
     outcome = _judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
-    return SheetResult(outcome, fit)
+    return SheetResult(outcome, fit, tuple(light_of(made, sheet, lines) for sheet in fit.sheets))
 
 
 def _boards_of_lights(made: Instrument, lines: Sequence[SeenLine]) -> list[int]:
@@ -321,11 +322,13 @@ def _stripes_on_boards(
 ) -> tuple[list[BoardStripes], list[SeenPoints], list[SeenLine]]:
     cameras = HeadCameras.of(camera)
     sides = [views_of(made, places, side, 2) for side in range(n_cameras)]
-    rng = made.rng(3)
+    rng, is_alone = made.rng(3), made.lasers_alone or not _are_all_shown(made, places)
     boards: list[BoardStripes] = []
     lines: list[SeenLine] = []
     for k, place in enumerate(places):
-        poses = [estimate_board_pose(side.found[k], cameras.model(c)) for c, side in enumerate(sides)]
+        poses = [
+            estimate_board_pose(side.found[k], cameras.model(c)) for c, side in enumerate(sides)
+        ]
         usable = [(c, sides[c].found[k], pose) for c, pose in enumerate(poses) if pose]
         if not usable:
             continue
@@ -339,18 +342,29 @@ def _stripes_on_boards(
                     numbers.append(j)
                     lines.append(SeenLine(place, c, q, normal, j))
             sigma = made.claimed[1] * made.stripe_px
-            groups = [[i] for i in range(len(stripes))] if made.lasers_alone else [range(len(stripes))]
+            groups = [[i] for i in range(len(stripes))] if is_alone else [range(len(stripes))]
             for group in groups:
                 if not len(group):
                     continue
-                name = made.lights[numbers[group[0]]].name if made.lasers_alone else "all"
+                name = made.lights[numbers[group[0]]].name if is_alone else "all"
                 profile = make_profile(
                     f"laser{c}-{k:02d}-{name}.png", [stripes[i] for i in group], sigma
                 )
-                lasers = (name,) if made.lasers_alone else ()
+                lasers = (name,) if is_alone else ()
                 boards.append(BoardStripes(profile, view, pose, lasers, None, c, placed, f"{k}"))
     seen = [one for side in sides for one in side.seen]
     return boards, seen, lines
+
+
+def _are_all_shown(made: Instrument, places: Sequence[Placement]) -> bool:
+    """Whether nearly every board shows every line, so that they may be on together."""
+    rng = made.rng(4)
+    shown = [
+        len(seen_stripe(made, lit_on_board(made, light, place), 0, 40, rng)[0]) > 0
+        for place in places
+        for light in made.lights
+    ]
+    return bool(np.mean(shown) > 0.8)
 
 
 def _judge_sheets(
@@ -422,9 +436,7 @@ def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> in
     """The true line to which a calibrated sheet is nearest."""
     shown = [k for k, n in enumerate(_boards_of_lights(made, lines)) if n]
     miss = [
-        float(
-            (sheet.sheet.height_with_jacobian(points_of_light(made, lines, k))[0] ** 2).mean()
-        )
+        float((sheet.sheet.height_with_jacobian(points_of_light(made, lines, k))[0] ** 2).mean())
         for k in shown
     ]
     return shown[int(np.argmin(miss))]

@@ -74,9 +74,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class Light:
-    """A laser line: rays from a source that fill a shallow cone.
+    """A laser line: rays from a source that fill a circular cone, as a tilted line lens makes it.
 
-    ``p = source + r (cos f forward + sin f across + (cone sin^2 f + skew sin^3 f) normal)``.
+    The cone touches the plane of ``forward`` and ``across`` in its middle ray and rises from it by
+    ``cone (|p| - p.forward)``; a twist of ``skew`` (p.across)^3 / (p.forward)^2 is added.
     """
 
     source: FloatArray
@@ -95,16 +96,21 @@ class Light:
     def rays(self, n: int) -> FloatArray:
         """(n, 3) directions over the fan."""
         f = np.linspace(-self.half_angle, self.half_angle, n)[:, None]
-        rise = self.cone * np.sin(f) ** 2 + self.skew * np.sin(f) ** 3
-        return np.asarray(np.cos(f) * self.forward + np.sin(f) * self.across + rise * self.normal)
+        along, aside = np.cos(f), np.sin(f)
+        rise = np.zeros_like(f)
+        for _ in range(8):
+            rise = self._rise(along, aside, rise)
+        return np.asarray(along * self.forward + aside * self.across + rise * self.normal)
 
     def height(self, points: FloatArray) -> FloatArray:
         """(N,) distance of points from the surface of light, along the plane's normal."""
         local = points - self.source
-        along, aside = local @ self.forward, local @ self.across
-        r = np.hypot(along, aside)
-        sine = aside / r
-        return np.asarray(local @ self.normal - r * (self.cone * sine**2 + self.skew * sine**3))
+        along, aside, up = local @ self.forward, local @ self.across, local @ self.normal
+        return np.asarray(up - self._rise(along, aside, up))
+
+    def _rise(self, along: FloatArray, aside: FloatArray, up: FloatArray) -> FloatArray:
+        whole = np.sqrt(along**2 + aside**2 + up**2)
+        return np.asarray(self.cone * (whole - along) + self.skew * aside**3 / along**2)
 
 
 @dataclass(frozen=True)
@@ -286,9 +292,7 @@ def _draw_lens(rng: np.random.Generator, width: int, height: int, focal: float) 
             return lens
 
 
-def _draw_right(
-    rng: np.random.Generator, left: Lens, stand_off: float
-) -> tuple[Lens, Placement]:
+def _draw_right(rng: np.random.Generator, left: Lens, stand_off: float) -> tuple[Lens, Placement]:
     """A second camera that looks at the middle of the field from any side."""
     base, azimuth = np.radians(rng.uniform(8.0, 50.0)), rng.uniform(0.0, 2.0 * np.pi)
     middle = np.array([0.0, 0.0, stand_off])
@@ -337,8 +341,8 @@ def _draw_lights(
         tilted = Rotation.from_rotvec(steps[k] * level).apply(forward)
         across = Rotation.from_rotvec(turns[k] * tilted).apply(level)
         bow = 0.0 if straight else rng.normal(0.0, 2e-3) * 0.5 * field
-        cone = bow * reach / (0.5 * field) ** 2
-        skew = 0.1 * rng.normal() * cone * reach / field
+        cone = 2.0 * bow * reach / (0.5 * field) ** 2
+        skew = 0.03 * rng.normal() * bow * reach**2 / (0.5 * field) ** 3
         name = f"{chr(65 + k)}"
         lights.append(Light(source, tilted, across, cone, skew, float(half), name))
     return tuple(lights)
@@ -360,7 +364,7 @@ def _draw_print(rng: np.random.Generator, field: float) -> Print:
 
 def _draw_arm(rng: np.random.Generator, fault: str) -> ArmKind:
     position = _log(rng, 0.005, 0.2)
-    n = int(rng.integers(8, 21))
+    n = int(rng.integers(7, 15))
     spread = "all round"
     if rng.random() < 0.25:
         n, spread = int(rng.integers(4, 7)), str(rng.choice(["all round", "one side"]))
@@ -368,7 +372,7 @@ def _draw_arm(rng: np.random.Generator, fault: str) -> ArmKind:
         spread = str(rng.choice(["one side", "nearly parallel"]))
     if fault == "two postures":
         n = 2
-    exposures = int(rng.choice([1, 1, 2, 3]))
+    exposures = int(rng.choice([1, 1, 1, 2]))
     share = float(rng.uniform(0.1, 0.6)) if exposures > 1 else 0.0
     return ArmKind(position, _log(rng, 30.0, 300.0), share, n, exposures, spread)
 

@@ -116,9 +116,82 @@ class CirclePattern:
         return np.array(self.misplaced_mm)
 
 
+@dataclass(frozen=True, slots=True)
+class Substrate:
+    """What a print is made on: paper in which light spreads, a board that is bowed.
+
+    Parameters
+    ----------
+    spread_mm
+        Length over which light that enters the paper fades sideways. It darkens the paper beside
+        the ink more than it brightens the ink, so that an edge is no error function (optical dot
+        gain; Yule and Nielsen, TAGA Proc. 1951).
+    ink
+        Part of the light that passes the ink once.
+    bow_mm
+        By how much the middle stands out, away from the viewer, over the two ends along x and
+        along y: a parabola each.
+    """
+
+    spread_mm: float = 0.0
+    ink: float = 0.3
+    bow_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.spread_mm < 0.0 or not 0.0 <= self.ink < 1.0:
+            raise InputError("light spreads over a positive length, under ink that is not clear")
+
+    @property
+    def reach_mm(self) -> float:
+        """Distance from an edge beyond which the tones are pure."""
+        return _SPREAD_REACH * self.spread_mm
+
+    def reflectance(self, is_light: BoolArray, edge_mm: FloatArray) -> FloatArray:
+        """Share (N,) of the light tone at a distance (N,) from a straight edge of tone (N,).
+
+        Light passes the print, spreads in the paper by ``exp(-|x| / spread)`` and passes the print
+        again; it is scaled so that the pure tones are 0 and 1.
+        """
+        if self.spread_mm == 0.0:
+            return is_light.astype(np.float64)
+        fading = 0.5 * np.exp(-edge_mm / self.spread_mm) / (1.0 + self.ink)
+        return np.where(is_light, 1.0 - fading, self.ink * fading)
+
+    def height_mm(self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Place (N,) of the print along the board's z axis."""
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return np.asarray(bow_x * (1.0 - along_x**2) + bow_y * (1.0 - along_y**2))
+
+    def slopes(
+        self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change (N,) of the height with x and with y."""
+        x_min, y_min, x_max, y_max = pattern.extent_board_mm
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return -4.0 * bow_x * along_x / (x_max - x_min), -4.0 * bow_y * along_y / (y_max - y_min)
+
+
+_SPREAD_REACH = 6.0
+_BOW_STEPS = 4
+FLAT = Substrate()
+
+
+def _from_middle(
+    pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Places along x and y, from -1 to 1 on the print."""
+    x_min, y_min, x_max, y_max = pattern.extent_board_mm
+    return (
+        (2.0 * x_mm - x_min - x_max) / (x_max - x_min),
+        (2.0 * y_mm - y_min - y_max) / (y_max - y_min),
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedBoard:
-    """A flat print somewhere in the scene, seen from its front only.
+    """A print somewhere in the scene, seen from its front only.
 
     Parameters
     ----------
@@ -130,6 +203,8 @@ class PrintedBoard:
         Albedo of the two tones, for every colour.
     edge_mm
         Width over which a sample averages the two tones: about the size of a sample's footprint.
+    substrate
+        Paper and bow.
     """
 
     pattern: FlatPattern
@@ -137,6 +212,7 @@ class PrintedBoard:
     light: float = 0.85
     dark: float = 0.08
     edge_mm: float = 0.1
+    substrate: Substrate = FLAT
 
     def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
         """As for `Surface`."""
@@ -145,20 +221,33 @@ class PrintedBoard:
         height = (origins_mm - self.sensor_from_board.translation_mm) @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where((along < 0.0) & (height > 0.0), -height / along, np.nan)
-        points = origins_mm + distance[:, None] * directions
-        return np.where(self._is_on_print(self._on_board(points)), distance, MISS)
+        points = self._on_board(origins_mm + distance[:, None] * directions)
+        if any(self.substrate.bow_mm):
+            for _ in range(_BOW_STEPS):
+                height = self.substrate.height_mm(self.pattern, points[:, 0], points[:, 1])
+                distance = distance - (height - points[:, 2]) / along
+                points = self._on_board(origins_mm + distance[:, None] * directions)
+        return np.where(self._is_on_print(points), distance, MISS)
 
     def normals(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
-        return np.broadcast_to(-self.sensor_from_board.rotation[:, 2], points_mm.shape)
+        rotation = self.sensor_from_board.rotation
+        if not any(self.substrate.bow_mm):
+            return np.broadcast_to(-rotation[:, 2], points_mm.shape)
+        board = self._on_board(points_mm)
+        slope_x, slope_y = self.substrate.slopes(self.pattern, board[:, 0], board[:, 1])
+        away = np.stack([slope_x, slope_y, -np.ones(len(board))], axis=1)
+        return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True) @ rotation.T)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
         board = self._on_board(points_mm)
         x, y = board[:, 0], board[:, 1]
-        side = np.where(self.pattern.is_light(x, y), 1.0, -1.0)
-        signed = side * self.pattern.edge_distance_mm(x, y)
-        share = np.clip(0.5 + signed / self.edge_mm, 0.0, 1.0)
+        is_light, edge = self.pattern.is_light(x, y), self.pattern.edge_distance_mm(x, y)
+        if self.substrate.spread_mm > self.edge_mm:
+            share = self.substrate.reflectance(is_light, edge)
+        else:
+            share = np.clip(0.5 + np.where(is_light, edge, -edge) / self.edge_mm, 0.0, 1.0)
         albedo = self.dark + (self.light - self.dark) * share
         return np.repeat(albedo[:, None], 3, axis=1)
 
@@ -225,6 +314,8 @@ def render_flat_target(
     rotation: FloatArray,
     translation_mm: FloatArray,
     lighting: Lighting | None = None,
+    *,
+    substrate: Substrate = FLAT,
 ) -> RenderedTarget:
     """Render a print seen by a camera.
 
@@ -238,6 +329,8 @@ def render_flat_target(
         (3, 3) and (3,): ``camera_from_board``.
     lighting
         Grey levels and illumination.
+    substrate
+        Paper and bow.
 
     Raises
     ------
@@ -245,19 +338,16 @@ def render_flat_target(
         If the camera looks at the back of the print.
     """
     light = Lighting() if lighting is None else lighting
-    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, light.surround)
+    board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
+    fine = _fine_reflectance(board, light.surround)
     reflectance = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
     levels = light.dark_level + (light.light_level - light.dark_level) * reflectance
+    marks = pattern.marks_board_mm.copy()
+    marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
     return RenderedTarget(
-        levels * illumination(camera, light), marks_px(camera, pattern, rotation, translation_mm)
+        levels * illumination(camera, light),
+        camera.project(marks @ np.asarray(rotation).T + translation_mm),
     )
-
-
-def marks_px(
-    camera: RenderCamera, pattern: FlatPattern, rotation: FloatArray, translation_mm: FloatArray
-) -> FloatArray:
-    """Return the true projections (N, 2) of the pattern's marks."""
-    return camera.project(pattern.marks_board_mm @ np.asarray(rotation).T + translation_mm)
 
 
 def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
@@ -271,20 +361,23 @@ def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
     return np.asarray(1.0 - lighting.gradient * (along + 0.5))
 
 
-def _fine_reflectance(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    surround: float,
-) -> NDArray[np.float32]:
-    board = _BoardPlane.of(camera, rotation, translation_mm)
+@dataclass(frozen=True, slots=True)
+class _Print:
+    """A pattern on its substrate."""
+
+    pattern: FlatPattern
+    substrate: Substrate
+
+
+def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
+    camera, pattern = board.camera, board.print_.pattern
     x, y = board.coarse_mm()
     reach_mm = _reach_mm(x, y)
     beyond_mm = _beyond_border_mm(pattern, x, y)
     is_on_print = beyond_mm <= 0.0
     near_edge = np.abs(beyond_mm) < reach_mm
-    near_edge[is_on_print] |= pattern.edge_distance_mm(x[is_on_print], y[is_on_print]) < reach_mm
+    edge_mm = pattern.edge_distance_mm(x[is_on_print], y[is_on_print])
+    near_edge[is_on_print] |= edge_mm < reach_mm + board.print_.substrate.reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
     size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
@@ -292,16 +385,14 @@ def _fine_reflectance(
     rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
     for start in range(0, len(rows), _CHUNK):
         v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
-        cells = _sample(board, pattern, u, v, surround)
+        cells = _sample(board, u, v, surround)
         for b in range(SUBPIXELS):
             for a in range(SUBPIXELS):
                 fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
     return fine
 
 
-def _sample(
-    board: _BoardPlane, pattern: FlatPattern, u: IntArray, v: IntArray, surround: float
-) -> NDArray[np.float32]:
+def _sample(board: _BoardPlane, u: IntArray, v: IntArray, surround: float) -> NDArray[np.float32]:
     """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of each pixel's fine cells (row, column)."""
     centre, d_du, d_dv = board.linearised_mm(np.stack([u, v], axis=-1).astype(np.float64))
     n = SUBPIXELS * SAMPLES
@@ -309,16 +400,19 @@ def _sample(
     step_u = d_du[:, :, None] * offset
     step_v = d_dv[:, :, None] * offset
     points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
-    tones = _tones(pattern, points[:, 0], points[:, 1], surround)
+    tones = _tones(board.print_, points[:, 0], points[:, 1], surround)
     cells = tones.reshape(-1, SUBPIXELS, SAMPLES, SUBPIXELS, SAMPLES).mean(axis=(2, 4))
     return np.asarray(cells, dtype=np.float32)
 
 
-def _tones(
-    pattern: FlatPattern, x: FloatArray, y: FloatArray, surround: float
-) -> NDArray[np.float32]:
-    light = pattern.is_light(x, y).astype(np.float32)
-    return np.where(_beyond_border_mm(pattern, x, y) <= 0.0, light, np.float32(surround))
+def _tones(print_: _Print, x: FloatArray, y: FloatArray, surround: float) -> NDArray[np.float32]:
+    light = print_.pattern.is_light(x, y)
+    if print_.substrate.spread_mm > 0.0:
+        edge_mm = print_.pattern.edge_distance_mm(x, y)
+        tones = print_.substrate.reflectance(light, edge_mm).astype(np.float32)
+    else:
+        tones = light.astype(np.float32)
+    return np.where(_beyond_border_mm(print_.pattern, x, y) <= 0.0, tones, np.float32(surround))
 
 
 def _beyond_border_mm(pattern: FlatPattern, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -344,13 +438,17 @@ def _bin(fine: NDArray[np.float32]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoardPlane:
-    """Where pixels meet the board's plane."""
+    """Where pixels meet the board."""
 
     camera: RenderCamera
     board_from_ray: FloatArray
+    eye_board_mm: FloatArray
+    print_: _Print
 
     @staticmethod
-    def of(camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray) -> _BoardPlane:
+    def of(
+        camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray, print_: _Print
+    ) -> _BoardPlane:
         r = np.asarray(rotation, dtype=np.float64)
         t = np.asarray(translation_mm, dtype=np.float64)
         if float(r[:, 2] @ t) <= 0.0:
@@ -358,14 +456,34 @@ class _BoardPlane:
                 "the camera looks at the back of the print",
                 remedy="turn the board: its z axis points away from the camera",
             )
-        return _BoardPlane(camera, np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t])))
+        plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
+        return _BoardPlane(camera, plane, -r.T @ t, print_)
 
     def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
         """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
         rays = self.camera.rays(pixels_px)
         h = rays @ self.board_from_ray[:, :2].T + self.board_from_ray[:, 2]
         # The third component is 1 / depth: rays that never meet the plane see the surround.
-        return np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        flat = np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        if not any(self.print_.substrate.bow_mm):
+            return flat
+        return self._on_bow_mm(flat)
+
+    def _on_bow_mm(self, flat_mm: FloatArray) -> FloatArray:
+        """Where rays that meet the flat board at (..., 2) meet the bowed one."""
+        x_min, y_min, x_max, y_max = self.print_.pattern.extent_board_mm
+        size = np.array([x_max - x_min, y_max - y_min])
+        low, high = np.array([x_min, y_min]) - size, np.array([x_max, y_max]) + size
+        eye = self.eye_board_mm
+        met = flat_mm
+        for _ in range(_BOW_STEPS):
+            # far beyond the print the parabola is not followed
+            near = np.clip(met, low, high)
+            height = self.print_.substrate.height_mm(
+                self.print_.pattern, near[..., 0], near[..., 1]
+            )
+            met = flat_mm + (height / eye[2])[..., None] * (eye[:2] - flat_mm)
+        return np.asarray(met)
 
     def coarse_mm(self) -> tuple[FloatArray, FloatArray]:
         """Board coordinates (H, W) of every pixel, by linear interpolation on a coarse grid."""
@@ -419,6 +537,7 @@ def render_board(
         pose.rotation,
         pose.translation_mm,
         Lighting(light_level=board.light, dark_level=board.dark),
+        substrate=board.substrate,
     ).image
     lit = (print_ * _lamp_on_board(board, camera, lamp))[..., None]
     cover = _coverage(board, camera)[..., None]

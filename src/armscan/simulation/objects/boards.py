@@ -377,31 +377,40 @@ def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32
     is_on_print = beyond_mm <= 0.0
     near_edge = np.abs(beyond_mm) < reach_mm
     edge_mm = pattern.edge_distance_mm(x[is_on_print], y[is_on_print])
-    near_edge[is_on_print] |= edge_mm < reach_mm + board.print_.substrate.reach_mm
+    near_edge[is_on_print] |= edge_mm < reach_mm
+    in_halo = np.zeros_like(near_edge)
+    in_halo[is_on_print] = edge_mm < reach_mm + board.print_.substrate.reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
     size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
     fine = np.asarray(cv2.resize(tone, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
-    rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
-    for start in range(0, len(rows), _CHUNK):
-        v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
-        cells = _sample(board, u, v, surround)
-        for b in range(SUBPIXELS):
-            for a in range(SUBPIXELS):
-                fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
+    for chosen, samples in ((near_edge, SAMPLES), (in_halo & ~near_edge, 1)):
+        rows, columns = (index.astype(np.int64) for index in np.nonzero(chosen))
+        chunk = _CHUNK * (SAMPLES // samples) ** 2
+        for start in range(0, len(rows), chunk):
+            v, u = rows[start : start + chunk], columns[start : start + chunk]
+            cells = _sample(board, np.stack([u, v], axis=-1), samples, surround)
+            for b in range(SUBPIXELS):
+                for a in range(SUBPIXELS):
+                    fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
     return fine
 
 
-def _sample(board: _BoardPlane, u: IntArray, v: IntArray, surround: float) -> NDArray[np.float32]:
-    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of each pixel's fine cells (row, column)."""
-    centre, d_du, d_dv = board.linearised_mm(np.stack([u, v], axis=-1).astype(np.float64))
-    n = SUBPIXELS * SAMPLES
+def _sample(
+    board: _BoardPlane, pixels_px: IntArray, samples: int, surround: float
+) -> NDArray[np.float32]:
+    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of the fine cells (row, column) of pixels (N, 2).
+
+    Each cell has ``samples`` x ``samples`` samples.
+    """
+    centre, d_du, d_dv = board.linearised_mm(pixels_px.astype(np.float64))
+    n = SUBPIXELS * samples
     offset = (np.arange(n) + 0.5) / n - 0.5
     step_u = d_du[:, :, None] * offset
     step_v = d_dv[:, :, None] * offset
     points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
     tones = _tones(board.print_, points[:, 0], points[:, 1], surround)
-    cells = tones.reshape(-1, SUBPIXELS, SAMPLES, SUBPIXELS, SAMPLES).mean(axis=(2, 4))
+    cells = tones.reshape(-1, SUBPIXELS, samples, SUBPIXELS, samples).mean(axis=(2, 4))
     return np.asarray(cells, dtype=np.float32)
 
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -214,10 +215,9 @@ def exposure_light(
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    share = np.float32(brightness / len(views))
-    for pose, view in zip(poses, views, strict=True):
-        light += share * _room(eye, station, pose, view, region)[inside]
-    return light
+    # Its grid is coarser than any motion over the exposure.
+    room = _room(eye, station, poses[middle], views[middle], region)[inside]
+    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness, light))
 
 
 def true_stripes(
@@ -275,24 +275,31 @@ def _view(eye: MountedCamera, station: Station, pose: Pose[Base, Any], region: R
     return look(seen_from(station, pose), (*finishes, Material()), eye.camera, region)
 
 
+def _room_nodes(scene: Scene, view: PosedView, region: Region) -> NDArray[np.float32]:
+    _, (rows, columns) = region.nodes_px()
+    if view.numbers is not None and scene is view.scene:
+        light = view.numbers.room_light(view.nodes)
+    else:
+        light = scene.room_light(view.nodes)[:, 0]
+    return light.reshape(rows, columns).astype(np.float32)
+
+
 def _room(
     eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
-) -> FloatArray:
+) -> NDArray[np.float32]:
     """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
-    _, (rows, columns) = region.nodes_px()
     # The nodes are too far apart for markers: they get the face's own colour.
     scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
-    nodes = scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
-    coarse = to_pixels(nodes, region)
+    coarse = to_pixels(_room_nodes(scene, view, region), region)
     camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     if station.markers:
         markers = [marker.seen_from(pose) for marker in station.markers]
-        return draw_markers(coarse.astype(np.float64), markers, scene, camera)
+        drawn = draw_markers(coarse.astype(np.float64), markers, scene, camera)
+        return drawn.astype(np.float32)
     if station.target is None:
-        return np.asarray(coarse)
+        return coarse
     board = board_seen_from(station.target, pose)
-    background = np.asarray(coarse, dtype=np.float64)[..., None]
-    return render_board(board, camera, view.scene.lamp, background)[..., 0]
+    return render_board(board, camera, view.scene.lamp, np.array(coarse))
 
 
 def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:

@@ -52,7 +52,7 @@ class CameraOptions:
     ----------
     distortion
         Which coefficients are free; ``auto`` decides by the rule of
-        `armscan.calibration.cameras.calibrate`.
+        `armscan.calibration.cameras.distortion`.
     is_aspect_fixed
         Hold ``fy = fx`` (square pixels).
     is_principal_point_fixed
@@ -251,7 +251,9 @@ class CameraFit(ArrayRecord):
         The solution.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
-        were held are zero.
+        were held by request are zero. Coefficients that ``auto`` left at zero count as unknown, of
+        the size that lenses usually have, where the views do not say more; and all is widened if
+        residuals of one view are alike (see `armscan.calibration.cameras.distortion`).
     free_parameters
         Names of the parameters that were solved.
     joint_covariance
@@ -286,6 +288,9 @@ class CameraFit(ArrayRecord):
         Bow of the board, if it was solved.
     model_reason
         Why these parameters were free.
+    design_effect
+        Factor that variances were given because residuals of one view are alike; 1 where they
+        are not.
     warnings
         Plain sentences that a person should read.
     options
@@ -308,6 +313,7 @@ class CameraFit(ArrayRecord):
     cross_validation: CrossValidation | None
     warp: BoardWarp | None
     model_reason: str
+    design_effect: float
     warnings: tuple[str, ...]
     options: CameraOptions
 
@@ -401,6 +407,8 @@ LISTED = 3
 SQUARE_PIXELS = 0.02
 SQUARE_SIGMAS = 5.0
 """Pixels are square to a part in a thousand in nearly all cameras."""
+ALIKE = 4.0
+"""Residuals of one view are alike enough to be told if variances are widened by this."""
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""
@@ -426,6 +434,7 @@ def advise(
         *_about_coverage(fit),
         *_about_pixels(fit),
         *_about_model(fit),
+        *_about_residuals(fit),
         *_about_warp(fit),
     ]
     return replace(fit, warnings=tuple(warnings))
@@ -492,6 +501,8 @@ def _about_pixels(fit: CameraFit) -> list[str]:
     camera, (sigma_fx, sigma_fy) = fit.camera, fit.sigma[:2]
     ratio = camera.fx_px / camera.fy_px
     sigma = ratio * math.hypot(sigma_fx / camera.fx_px, sigma_fy / camera.fy_px)
+    # such a target also makes residuals alike: the widening must not hide it
+    sigma /= math.sqrt(fit.design_effect)
     if abs(ratio - 1.0) < max(SQUARE_PIXELS, SQUARE_SIGMAS * sigma):
         return []
     return [
@@ -515,6 +526,16 @@ def _about_model(fit: CameraFit) -> list[str]:
             f"used ({validation.rms_in_sample_px:.3f} px): add views"
         )
     return warnings
+
+
+def _about_residuals(fit: CameraFit) -> list[str]:
+    if fit.design_effect < ALIKE:
+        return []
+    return [
+        "residuals of one view are alike, as if the board were bent or unevenly lit: the standard "
+        f"deviations were widened by {math.sqrt(fit.design_effect):.1f}; look at the residuals' "
+        "picture, and at the board's flatness"
+    ]
 
 
 def _about_warp(fit: CameraFit) -> list[str]:

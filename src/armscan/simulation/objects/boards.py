@@ -6,6 +6,7 @@ supersampled at the edges.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
@@ -15,9 +16,16 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.simulation.optics.camera import RenderCamera, blur_image
+from armscan.simulation.kernels import (
+    SAMPLES,
+    SUBPIXELS,
+    blur_where,
+    disc_cells,
+    lay_over,
+)
+from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
 from armscan.simulation.optics.render import camera_rays
-from armscan.simulation.optics.scene import MISS, Floor, RoomLight, Scene
+from armscan.simulation.optics.scene import MISS, RoomLight
 
 
 class FlatPattern(Protocol):
@@ -261,12 +269,12 @@ class PrintedBoard:
         return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
 
 
-SUBPIXELS = 2
-"""Fine-grid cells per pixel along each axis, on which the lens's blur acts."""
-SAMPLES = 8
-"""Samples per fine-grid cell along each axis, where an edge may cross it."""
 _COARSE_STEP_PX = 16
 _CHUNK = 1_000
+_BLUR_REACH = 6.0
+_RIM_STEPS = 24
+_KNOT_STEP_PX = 8
+_KNOT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,9 +347,9 @@ def render_flat_target(
     """
     light = Lighting() if lighting is None else lighting
     board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
-    fine = _fine_reflectance(board, light.surround)
-    reflectance = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
-    levels = light.dark_level + (light.light_level - light.dark_level) * reflectance
+    span = light.light_level - light.dark_level
+    reflectance = _reflectance(board, light.surround)
+    levels = light.dark_level + span * reflectance.astype(np.float64)
     marks = pattern.marks_board_mm.copy()
     marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
     return RenderedTarget(
@@ -367,6 +375,57 @@ class _Print:
 
     pattern: FlatPattern
     substrate: Substrate
+
+
+def _reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
+    """(H, W) part of the light tone in each pixel, blurred by the lens."""
+    camera, pattern = board.camera, board.print_.pattern
+    if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
+        is_endless = surround == float(not pattern.is_light_on_dark)
+        if is_endless:
+            return _discs(camera, pattern, board)
+    fine = _fine_reflectance(board, surround)
+    return _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+
+
+def _discs(camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane) -> NDArray[np.float32]:
+    """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
+    tone = np.full((camera.height_px, camera.width_px), not pattern.is_light_on_dark, np.float32)
+    sign = np.float32(1.0 if pattern.is_light_on_dark else -1.0)
+    margin = int(np.ceil(_BLUR_REACH * camera.blur_sigma_px)) + 2
+    lens, knots_x, knots_y = _lens_knots(camera)
+    angle = 2.0 * np.pi * np.arange(_RIM_STEPS) / _RIM_STEPS
+    radius = 0.5 * pattern.diameter_mm
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM_STEPS)], axis=1)
+    for centre in pattern.marks_board_mm:
+        pixels = board.project(centre + rim)
+        if not np.isfinite(pixels).all():
+            continue
+        left, top = np.floor(pixels.min(axis=0)).astype(int) - margin
+        right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
+        left, top = max(int(left), 0), max(int(top), 0)
+        right, bottom = min(int(right), camera.width_px), min(int(bottom), camera.height_px)
+        if left >= right or top >= bottom:
+            continue
+        cells = np.zeros((SUBPIXELS * (bottom - top), SUBPIXELS * (right - left)), np.float32)
+        disc = np.array([centre[0], centre[1], radius])
+        disc_cells(disc, left, top, lens, knots_x, knots_y, board.board_from_ray, cells)
+        cover = _bin(blur_image(cells, SUBPIXELS * camera.blur_sigma_px))
+        tone[top:bottom, left:right] += sign * cover
+    return tone
+
+
+@lru_cache(maxsize=8)
+def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(12,) numbers of a lens for `disc_cells`, and (K, L) x and y of its knots' rays."""
+    first = -_KNOT_STEP_PX
+    u = np.arange(first, camera.width_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    v = np.arange(first, camera.height_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1), _KNOT_TOLERANCE)
+    c = camera
+    lens = [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, _KNOT_STEP_PX, first, first]
+    x, y = (np.ascontiguousarray(rays[..., k]) for k in (0, 1))
+    return np.array(lens), x, y
 
 
 def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
@@ -439,10 +498,10 @@ def _reach_mm(x: FloatArray, y: FloatArray) -> float:
     return 1.05 * 0.5 * float(along_u + along_v)
 
 
-def _bin(fine: NDArray[np.float32]) -> FloatArray:
+def _bin(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = fine.shape[0] // SUBPIXELS, fine.shape[1] // SUBPIXELS
     binned = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(binned, dtype=np.float64)
+    return np.asarray(binned, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -451,7 +510,8 @@ class _BoardPlane:
 
     camera: RenderCamera
     board_from_ray: FloatArray
-    eye_board_mm: FloatArray
+    rotation: FloatArray
+    translation_mm: FloatArray
     print_: _Print
 
     @staticmethod
@@ -466,7 +526,11 @@ class _BoardPlane:
                 remedy="turn the board: its z axis points away from the camera",
             )
         plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
-        return _BoardPlane(camera, plane, -r.T @ t, print_)
+        return _BoardPlane(camera, plane, r, t, print_)
+
+    def project(self, points_board_mm: FloatArray) -> FloatArray:
+        """(N, 2) pixels of points (N, 3) of the board; NaN behind the camera."""
+        return self.camera.project(points_board_mm @ self.rotation.T + self.translation_mm)
 
     def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
         """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
@@ -483,7 +547,7 @@ class _BoardPlane:
         x_min, y_min, x_max, y_max = self.print_.pattern.extent_board_mm
         size = np.array([x_max - x_min, y_max - y_min])
         low, high = np.array([x_min, y_min]) - size, np.array([x_max, y_max]) + size
-        eye = self.eye_board_mm
+        eye = -self.rotation.T @ self.translation_mm
         met = flat_mm
         for _ in range(_BOW_STEPS):
             # far beyond the print the parabola is not followed
@@ -524,8 +588,8 @@ _OUTLINE_BITS = 6
 
 
 def render_board(
-    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: FloatArray
-) -> FloatArray:
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Render a board under room light over a background image.
 
     Parameters
@@ -533,24 +597,19 @@ def render_board(
     board, camera, lamp
         What is seen, by what, under which light.
     background
-        (H, W, 3) parts of full scale.
+        (H, W) parts of full scale; written over.
 
     Returns
     -------
-    (H, W, 3) parts of full scale, blurred by the lens, without noise.
+    (H, W) parts of full scale, blurred by the lens, without noise.
     """
     pose = board.sensor_from_board
-    print_ = render_flat_target(
-        camera,
-        board.pattern,
-        pose.rotation,
-        pose.translation_mm,
-        Lighting(light_level=board.light, dark_level=board.dark),
-        substrate=board.substrate,
-    ).image
-    lit = (print_ * _lamp_on_board(board, camera, lamp))[..., None]
-    cover = _coverage(board, camera)[..., None]
-    return np.asarray(cover * lit + (1.0 - cover) * background)
+    print_ = _Print(board.pattern, board.substrate)
+    plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
+    tone = _reflectance(plane, 1.0)
+    lit, cover = _lamp_on_board(board, camera, lamp), _coverage(board, camera)
+    lay_over(background, tone, lit, cover, board.dark, board.light)
+    return background
 
 
 def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
@@ -564,24 +623,34 @@ def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
     return camera.project(rim @ pose.rotation[:, :2].T + pose.translation_mm)
 
 
-def _coverage(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
+def _coverage(board: PrintedBoard, camera: RenderCamera) -> NDArray[np.float32]:
     """(H, W) part of each pixel that the board covers, blurred by the lens."""
-    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    shape = (camera.height_px, camera.width_px)
+    mask, rim = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     outline = np.rint(outline_px(board, camera) * (1 << _OUTLINE_BITS)).astype(np.int32)
     cv2.fillPoly(mask, [outline], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
-    return blur_image(mask.astype(np.float64) / 255.0, camera.blur_sigma_px)
+    kernel = blur_kernel(camera.blur_sigma_px)
+    cv2.polylines(rim, [outline], True, (1,), thickness=len(kernel) + 5, shift=_OUTLINE_BITS)
+    cover = np.zeros(shape, np.float32)
+    blur_where(mask, rim, kernel, cover)
+    return cover
 
 
-def _lamp_on_board(board: PrintedBoard, camera: RenderCamera, lamp: RoomLight) -> FloatArray:
+def _lamp_on_board(
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight
+) -> NDArray[np.float32]:
     """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
-    pose = board.sensor_from_board
-    plane = Floor(pose.translation_mm, -pose.rotation[:, 2], (1.0, 1.0, 1.0))
+    pose, up = board.sensor_from_board, -board.sensor_from_board.rotation[:, 2]
     height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
     rows, columns = np.indices((height, width))
     cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    pixels = (cells + 0.5) * _COARSE_STEP_PX - 0.5
-    scene = Scene((plane,), lamp=lamp)
-    light = scene.room_light(scene.trace(np.zeros(3), camera_rays(camera, pixels)))
-    coarse = light[:, 0].reshape(height, width)
+    rays = camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE)
+    with np.errstate(divide="ignore"):
+        away = (pose.translation_mm @ up) / (rays @ up)
+    to_lamp = lamp.position_mm - np.where(away > 0.0, away, 0.0)[:, None] * rays
+    facing = np.maximum(to_lamp @ up / np.linalg.norm(to_lamp, axis=1), 0.0)
+    light = lamp.even * (2.0 + up @ np.asarray(lamp.up)) / 3.0 + lamp.direct * facing
+    coarse = np.where(away > 0.0, light, 0.0).reshape(height, width).astype(np.float32)
     size = (camera.width_px, camera.height_px)
-    return np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR))
+    fine = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine, dtype=np.float32)

@@ -39,13 +39,14 @@ class Section:
     def __post_init__(self) -> None:
         if not abs(self.skew) < 1.0 or not self.tail_sigmas >= 1.0:
             raise InputError("a section's skew is below 1 and its tail no narrower than the rest")
-        if (
-            not 0.0
-            <= min(self.tail_low, self.tail_high)
-            <= max(self.tail_low, self.tail_high)
-            < 1.0
-        ):
+        if min(self.tail_low, self.tail_high) < 0.0 or max(self.tail_low, self.tail_high) >= 1.0:
             raise InputError("a tail is a part of the peak")
+
+    @property
+    def widest(self) -> float:
+        """By how much farther than a Gaussian's its light may reach."""
+        has_tail = max(self.tail_low, self.tail_high) > 0.0
+        return (1.0 + abs(self.skew)) * (self.tail_sigmas if has_tail else 1.0)
 
     def gaussian_reach(self, reach: FloatArray) -> FloatArray:
         """Reach (N,) at which a Gaussian is as bright as this section is at a reach (N,)."""
@@ -213,15 +214,12 @@ class LineLaser:
         return v @ self.forward, v @ self.across, v @ self.normal, distance
 
 
-NARROW_RIM_PX, WIDE_RIM_PX = 1, 4
-
-
 class TracedLight(Protocol):
     """Light whose brightness is ``peak * exp(-reach**2 / 2)``, both smooth along a surface."""
 
     @property
-    def rim_px(self) -> int:
-        """How far around it nodes are traced, so that its rim is not taken for an edge."""
+    def section(self) -> Section:
+        """From which the reach follows."""
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """Distance (N,) from the nearest centre, in sigmas, and the number of centres below."""
@@ -266,9 +264,19 @@ class LaserSource:
         object.__setattr__(self, "_between_rad", 0.5 * (angles[1:] + angles[:-1]))
 
     @property
-    def rim_px(self) -> int:
-        """As for `TracedLight`: it saves a third of the rays of many sheets, little of one."""
-        return NARROW_RIM_PX if len(self.sheets) == 1 else WIDE_RIM_PX
+    def section(self) -> Section:
+        """As for `TracedLight`: that of the middle sheet; all of a source are alike."""
+        return self._middle.section
+
+    @property
+    def sense(self) -> float:
+        """1 if angles about the middle sheet's source grow with the sheets' order, else -1."""
+        return self._sense
+
+    @property
+    def between_rad(self) -> FloatArray:
+        """(K - 1,) angles, times the sense, midway between neighbouring sheets."""
+        return self._between_rad
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

@@ -354,14 +354,16 @@ def shade(
     """Reach and peak (N,) at pixels (N, 2); the light is ``peak * exp(-reach**2 / 2)``."""
     numbers, source = view.numbers, LightNumbers.of(light)
     if numbers is not None and source is not None:
-        return numbers.shade(
+        section = light.section
+        reach, peak = numbers.shade(
             camera,
             pixels,
             source,
             tolerance=RAY_TOLERANCE,
-            lit_sigmas=FAR_SIGMAS,
-            far_sigmas=FAR_SIGMAS,
+            lit_sigmas=FAR_SIGMAS * section.widest,
+            far_sigmas=FAR_SIGMAS * section.widest,
         )
+        return section.gaussian_reach(reach), peak
     reach, peak = np.full(len(pixels), FAR_SIGMAS), np.zeros(len(pixels))
     hits = view.scene.trace(np.zeros(3), camera_rays(camera, pixels, RAY_TOLERANCE))
     met = np.flatnonzero(hits.surface >= 0)

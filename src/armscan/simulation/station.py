@@ -19,7 +19,13 @@ from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session, SessionKind
 from armscan.simulation.head import Head, MountedCamera, Window
-from armscan.simulation.objects.boards import FlatPattern, PrintedBoard, render_board
+from armscan.simulation.objects.boards import (
+    FLAT,
+    FlatPattern,
+    PrintedBoard,
+    Substrate,
+    render_board,
+)
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.objects.shapes import Placed
 from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
@@ -45,12 +51,15 @@ class Target:
         Where it is; the board's z axis points away from the viewer, into the board.
     light, dark
         Albedo of the two tones.
+    substrate
+        Paper and bow.
     """
 
     pattern: FlatPattern
     base_from_board: Pose[Base, Board]
     light: float = 0.85
     dark: float = 0.08
+    substrate: Substrate = FLAT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,7 +149,7 @@ def render_exposure(
     *,
     camera: int = 0,
 ) -> ImageArray:
-    """Image (H, W) of one exposure.
+    """Image of one exposure: (H, W), or (H, W, 3) of a colour camera.
 
     Parameters
     ----------
@@ -162,8 +171,18 @@ def render_exposure(
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
-    light = exposure_light(head, station, base_from_sensor, settings, rng, camera=camera)
-    return expose_mono(light, head.imaging.detector, rng)
+    detector, colour = head.imaging.detector, head.imaging.laser_colour
+    if colour is None:
+        light = exposure_light(head, station, base_from_sensor, settings, rng, camera=camera)
+        return expose_mono(light, detector, rng)
+    dark = replace(head, imaging=replace(head.imaging, ambient=0.0))
+    in_dark = replace(settings, room_light=None)
+    line = exposure_light(dark, station, base_from_sensor, in_dark, rng, camera=camera)
+    no_laser = replace(settings, lasers=())
+    room = exposure_light(head, station, base_from_sensor, no_laser, rng, camera=camera)
+    channels = [np.float32(part) * line + room for part in colour]
+    image = np.stack([expose_mono(one, detector, rng) for one in channels], axis=-1)
+    return image.astype(np.uint8) if detector.bits <= 8 else image.astype(np.uint16)
 
 
 def exposure_light(
@@ -325,7 +344,7 @@ def _lamp_seen_from(room: RoomLight, sensor_from_base: Pose[Any, Base]) -> RoomL
 def board_seen_from(target: Target, base_from_sensor: Pose[Base, Any]) -> PrintedBoard:
     """The target in the frame of the head or of one camera."""
     pose = base_from_sensor.inverse() @ target.base_from_board
-    return PrintedBoard(target.pattern, pose, target.light, target.dark)
+    return PrintedBoard(target.pattern, pose, target.light, target.dark, substrate=target.substrate)
 
 
 def _corners(window: Window) -> tuple[int, int, int, int]:
@@ -452,6 +471,7 @@ class TwinScan:
             height_px=window.height_px,
             window=SensorWindow(window.x_px, window.y_px),
             bits_used=self.head.imaging.detector.bits,
+            colour="mono" if self.head.imaging.laser_colour is None else "rgb",
         )
 
 

@@ -124,9 +124,82 @@ class CirclePattern:
         return np.array(self.misplaced_mm)
 
 
+@dataclass(frozen=True, slots=True)
+class Substrate:
+    """What a print is made on: paper in which light spreads, a board that is bowed.
+
+    Parameters
+    ----------
+    spread_mm
+        Length over which light that enters the paper fades sideways. It darkens the paper beside
+        the ink more than it brightens the ink, so that an edge is no error function (optical dot
+        gain; Yule and Nielsen, TAGA Proc. 1951).
+    ink
+        Part of the light that passes the ink once.
+    bow_mm
+        By how much the middle stands out, away from the viewer, over the two ends along x and
+        along y: a parabola each.
+    """
+
+    spread_mm: float = 0.0
+    ink: float = 0.3
+    bow_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.spread_mm < 0.0 or not 0.0 <= self.ink < 1.0:
+            raise InputError("light spreads over a positive length, under ink that is not clear")
+
+    @property
+    def reach_mm(self) -> float:
+        """Distance from an edge beyond which the tones are pure."""
+        return _SPREAD_REACH * self.spread_mm
+
+    def reflectance(self, is_light: BoolArray, edge_mm: FloatArray) -> FloatArray:
+        """Share (N,) of the light tone at a distance (N,) from a straight edge of tone (N,).
+
+        Light passes the print, spreads in the paper by ``exp(-|x| / spread)`` and passes the print
+        again; it is scaled so that the pure tones are 0 and 1.
+        """
+        if self.spread_mm == 0.0:
+            return is_light.astype(np.float64)
+        fading = 0.5 * np.exp(-edge_mm / self.spread_mm) / (1.0 + self.ink)
+        return np.where(is_light, 1.0 - fading, self.ink * fading)
+
+    def height_mm(self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Place (N,) of the print along the board's z axis."""
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return np.asarray(bow_x * (1.0 - along_x**2) + bow_y * (1.0 - along_y**2))
+
+    def slopes(
+        self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change (N,) of the height with x and with y."""
+        x_min, y_min, x_max, y_max = pattern.extent_board_mm
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return -4.0 * bow_x * along_x / (x_max - x_min), -4.0 * bow_y * along_y / (y_max - y_min)
+
+
+_SPREAD_REACH = 6.0
+_BOW_STEPS = 4
+FLAT = Substrate()
+
+
+def _from_middle(
+    pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Places along x and y, from -1 to 1 on the print."""
+    x_min, y_min, x_max, y_max = pattern.extent_board_mm
+    return (
+        (2.0 * x_mm - x_min - x_max) / (x_max - x_min),
+        (2.0 * y_mm - y_min - y_max) / (y_max - y_min),
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedBoard:
-    """A flat print somewhere in the scene, seen from its front only.
+    """A print somewhere in the scene, seen from its front only.
 
     Parameters
     ----------
@@ -138,6 +211,8 @@ class PrintedBoard:
         Albedo of the two tones, for every colour.
     edge_mm
         Width over which a sample averages the two tones: about the size of a sample's footprint.
+    substrate
+        Paper and bow.
     """
 
     pattern: FlatPattern
@@ -145,6 +220,7 @@ class PrintedBoard:
     light: float = 0.85
     dark: float = 0.08
     edge_mm: float = 0.1
+    substrate: Substrate = FLAT
 
     def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
         """As for `Surface`."""
@@ -153,20 +229,33 @@ class PrintedBoard:
         height = (origins_mm - self.sensor_from_board.translation_mm) @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where((along < 0.0) & (height > 0.0), -height / along, np.nan)
-        points = origins_mm + distance[:, None] * directions
-        return np.where(self._is_on_print(self._on_board(points)), distance, MISS)
+        points = self._on_board(origins_mm + distance[:, None] * directions)
+        if any(self.substrate.bow_mm):
+            for _ in range(_BOW_STEPS):
+                height = self.substrate.height_mm(self.pattern, points[:, 0], points[:, 1])
+                distance = distance - (height - points[:, 2]) / along
+                points = self._on_board(origins_mm + distance[:, None] * directions)
+        return np.where(self._is_on_print(points), distance, MISS)
 
     def normals(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
-        return np.broadcast_to(-self.sensor_from_board.rotation[:, 2], points_mm.shape)
+        rotation = self.sensor_from_board.rotation
+        if not any(self.substrate.bow_mm):
+            return np.broadcast_to(-rotation[:, 2], points_mm.shape)
+        board = self._on_board(points_mm)
+        slope_x, slope_y = self.substrate.slopes(self.pattern, board[:, 0], board[:, 1])
+        away = np.stack([slope_x, slope_y, -np.ones(len(board))], axis=1)
+        return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True) @ rotation.T)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
         board = self._on_board(points_mm)
         x, y = board[:, 0], board[:, 1]
-        side = np.where(self.pattern.is_light(x, y), 1.0, -1.0)
-        signed = side * self.pattern.edge_distance_mm(x, y)
-        share = np.clip(0.5 + signed / self.edge_mm, 0.0, 1.0)
+        is_light, edge = self.pattern.is_light(x, y), self.pattern.edge_distance_mm(x, y)
+        if self.substrate.spread_mm > self.edge_mm:
+            share = self.substrate.reflectance(is_light, edge)
+        else:
+            share = np.clip(0.5 + np.where(is_light, edge, -edge) / self.edge_mm, 0.0, 1.0)
         albedo = self.dark + (self.light - self.dark) * share
         return np.repeat(albedo[:, None], 3, axis=1)
 
@@ -233,6 +322,8 @@ def render_flat_target(
     rotation: FloatArray,
     translation_mm: FloatArray,
     lighting: Lighting | None = None,
+    *,
+    substrate: Substrate = FLAT,
 ) -> RenderedTarget:
     """Render a print seen by a camera.
 
@@ -246,6 +337,8 @@ def render_flat_target(
         (3, 3) and (3,): ``camera_from_board``.
     lighting
         Grey levels and illumination.
+    substrate
+        Paper and bow.
 
     Raises
     ------
@@ -253,19 +346,16 @@ def render_flat_target(
         If the camera looks at the back of the print.
     """
     light = Lighting() if lighting is None else lighting
-    reflectance = _reflectance(camera, pattern, rotation, translation_mm, light.surround)
+    board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
     span = light.light_level - light.dark_level
+    reflectance = _reflectance(board, light.surround)
     levels = light.dark_level + span * reflectance.astype(np.float64)
+    marks = pattern.marks_board_mm.copy()
+    marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
     return RenderedTarget(
-        levels * illumination(camera, light), marks_px(camera, pattern, rotation, translation_mm)
+        levels * illumination(camera, light),
+        camera.project(marks @ np.asarray(rotation).T + translation_mm),
     )
-
-
-def marks_px(
-    camera: RenderCamera, pattern: FlatPattern, rotation: FloatArray, translation_mm: FloatArray
-) -> FloatArray:
-    """Return the true projections (N, 2) of the pattern's marks."""
-    return camera.project(pattern.marks_board_mm @ np.asarray(rotation).T + translation_mm)
 
 
 def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
@@ -279,17 +369,22 @@ def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
     return np.asarray(1.0 - lighting.gradient * (along + 0.5))
 
 
-def _reflectance(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    surround: float,
-) -> NDArray[np.float32]:
+@dataclass(frozen=True, slots=True)
+class _Print:
+    """A pattern on its substrate."""
+
+    pattern: FlatPattern
+    substrate: Substrate
+
+
+def _reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
     """(H, W) part of the light tone in each pixel, blurred by the lens."""
-    if isinstance(pattern, CirclePattern) and surround == float(not pattern.is_light_on_dark):
-        return _discs(camera, pattern, _BoardPlane.of(camera, rotation, translation_mm))
-    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, surround)
+    camera, pattern = board.camera, board.print_.pattern
+    if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
+        is_endless = surround == float(not pattern.is_light_on_dark)
+        if is_endless:
+            return _discs(camera, pattern, board)
+    fine = _fine_reflectance(board, surround)
     return _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
 
 
@@ -333,54 +428,59 @@ def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArra
     return np.array(lens), x, y
 
 
-def _fine_reflectance(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    surround: float,
-) -> NDArray[np.float32]:
-    board = _BoardPlane.of(camera, rotation, translation_mm)
+def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
+    camera, pattern = board.camera, board.print_.pattern
     x, y = board.coarse_mm()
     reach_mm = _reach_mm(x, y)
     beyond_mm = _beyond_border_mm(pattern, x, y)
     is_on_print = beyond_mm <= 0.0
     near_edge = np.abs(beyond_mm) < reach_mm
-    near_edge[is_on_print] |= pattern.edge_distance_mm(x[is_on_print], y[is_on_print]) < reach_mm
+    edge_mm = pattern.edge_distance_mm(x[is_on_print], y[is_on_print])
+    near_edge[is_on_print] |= edge_mm < reach_mm
+    in_halo = np.zeros_like(near_edge)
+    in_halo[is_on_print] = edge_mm < reach_mm + board.print_.substrate.reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
     size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
     fine = np.asarray(cv2.resize(tone, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
-    rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
-    for start in range(0, len(rows), _CHUNK):
-        v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
-        cells = _sample(board, pattern, u, v, surround)
-        for b in range(SUBPIXELS):
-            for a in range(SUBPIXELS):
-                fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
+    for chosen, samples in ((near_edge, SAMPLES), (in_halo & ~near_edge, 1)):
+        rows, columns = (index.astype(np.int64) for index in np.nonzero(chosen))
+        chunk = _CHUNK * (SAMPLES // samples) ** 2
+        for start in range(0, len(rows), chunk):
+            v, u = rows[start : start + chunk], columns[start : start + chunk]
+            cells = _sample(board, np.stack([u, v], axis=-1), samples, surround)
+            for b in range(SUBPIXELS):
+                for a in range(SUBPIXELS):
+                    fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
     return fine
 
 
 def _sample(
-    board: _BoardPlane, pattern: FlatPattern, u: IntArray, v: IntArray, surround: float
+    board: _BoardPlane, pixels_px: IntArray, samples: int, surround: float
 ) -> NDArray[np.float32]:
-    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of each pixel's fine cells (row, column)."""
-    centre, d_du, d_dv = board.linearised_mm(np.stack([u, v], axis=-1).astype(np.float64))
-    n = SUBPIXELS * SAMPLES
+    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of the fine cells (row, column) of pixels (N, 2).
+
+    Each cell has ``samples`` x ``samples`` samples.
+    """
+    centre, d_du, d_dv = board.linearised_mm(pixels_px.astype(np.float64))
+    n = SUBPIXELS * samples
     offset = (np.arange(n) + 0.5) / n - 0.5
     step_u = d_du[:, :, None] * offset
     step_v = d_dv[:, :, None] * offset
     points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
-    tones = _tones(pattern, points[:, 0], points[:, 1], surround)
-    cells = tones.reshape(-1, SUBPIXELS, SAMPLES, SUBPIXELS, SAMPLES).mean(axis=(2, 4))
+    tones = _tones(board.print_, points[:, 0], points[:, 1], surround)
+    cells = tones.reshape(-1, SUBPIXELS, samples, SUBPIXELS, samples).mean(axis=(2, 4))
     return np.asarray(cells, dtype=np.float32)
 
 
-def _tones(
-    pattern: FlatPattern, x: FloatArray, y: FloatArray, surround: float
-) -> NDArray[np.float32]:
-    light = pattern.is_light(x, y).astype(np.float32)
-    return np.where(_beyond_border_mm(pattern, x, y) <= 0.0, light, np.float32(surround))
+def _tones(print_: _Print, x: FloatArray, y: FloatArray, surround: float) -> NDArray[np.float32]:
+    light = print_.pattern.is_light(x, y)
+    if print_.substrate.spread_mm > 0.0:
+        edge_mm = print_.pattern.edge_distance_mm(x, y)
+        tones = print_.substrate.reflectance(light, edge_mm).astype(np.float32)
+    else:
+        tones = light.astype(np.float32)
+    return np.where(_beyond_border_mm(print_.pattern, x, y) <= 0.0, tones, np.float32(surround))
 
 
 def _beyond_border_mm(pattern: FlatPattern, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -406,15 +506,18 @@ def _bin(fine: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoardPlane:
-    """Where pixels meet the board's plane."""
+    """Where pixels meet the board."""
 
     camera: RenderCamera
     board_from_ray: FloatArray
     rotation: FloatArray
     translation_mm: FloatArray
+    print_: _Print
 
     @staticmethod
-    def of(camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray) -> _BoardPlane:
+    def of(
+        camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray, print_: _Print
+    ) -> _BoardPlane:
         r = np.asarray(rotation, dtype=np.float64)
         t = np.asarray(translation_mm, dtype=np.float64)
         if float(r[:, 2] @ t) <= 0.0:
@@ -423,7 +526,7 @@ class _BoardPlane:
                 remedy="turn the board: its z axis points away from the camera",
             )
         plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
-        return _BoardPlane(camera, plane, r, t)
+        return _BoardPlane(camera, plane, r, t, print_)
 
     def project(self, points_board_mm: FloatArray) -> FloatArray:
         """(N, 2) pixels of points (N, 3) of the board; NaN behind the camera."""
@@ -434,7 +537,26 @@ class _BoardPlane:
         rays = self.camera.rays(pixels_px)
         h = rays @ self.board_from_ray[:, :2].T + self.board_from_ray[:, 2]
         # The third component is 1 / depth: rays that never meet the plane see the surround.
-        return np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        flat = np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        if not any(self.print_.substrate.bow_mm):
+            return flat
+        return self._on_bow_mm(flat)
+
+    def _on_bow_mm(self, flat_mm: FloatArray) -> FloatArray:
+        """Where rays that meet the flat board at (..., 2) meet the bowed one."""
+        x_min, y_min, x_max, y_max = self.print_.pattern.extent_board_mm
+        size = np.array([x_max - x_min, y_max - y_min])
+        low, high = np.array([x_min, y_min]) - size, np.array([x_max, y_max]) + size
+        eye = -self.rotation.T @ self.translation_mm
+        met = flat_mm
+        for _ in range(_BOW_STEPS):
+            # far beyond the print the parabola is not followed
+            near = np.clip(met, low, high)
+            height = self.print_.substrate.height_mm(
+                self.print_.pattern, near[..., 0], near[..., 1]
+            )
+            met = flat_mm + (height / eye[2])[..., None] * (eye[:2] - flat_mm)
+        return np.asarray(met)
 
     def coarse_mm(self) -> tuple[FloatArray, FloatArray]:
         """Board coordinates (H, W) of every pixel, by linear interpolation on a coarse grid."""
@@ -482,7 +604,9 @@ def render_board(
     (H, W) parts of full scale, blurred by the lens, without noise.
     """
     pose = board.sensor_from_board
-    tone = _reflectance(camera, board.pattern, pose.rotation, pose.translation_mm, 1.0)
+    print_ = _Print(board.pattern, board.substrate)
+    plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
+    tone = _reflectance(plane, 1.0)
     lit, cover = _lamp_on_board(board, camera, lamp), _coverage(board, camera)
     lay_over(background, tone, lit, cover, board.dark, board.light)
     return background

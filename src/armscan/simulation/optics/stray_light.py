@@ -14,7 +14,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose
 from armscan.simulation.objects.shapes import FlatPlate, Placed
-from armscan.simulation.optics.lasers import LaserSource, LineLaser, TracedLight
+from armscan.simulation.optics.lasers import GAUSSIAN, LaserSource, LineLaser, Section, TracedLight
 from armscan.simulation.optics.render import Imaging
 from armscan.simulation.optics.scene import SceneObject
 
@@ -46,6 +46,11 @@ class CentreSpot:
     direction: FloatArray
     sigma_mm: float
     irradiance: float
+
+    @property
+    def section(self) -> Section:
+        """As for `TracedLight`."""
+        return GAUSSIAN
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

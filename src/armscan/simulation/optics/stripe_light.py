@@ -204,13 +204,15 @@ def shade(
     """
     numbers, source = view.numbers, LightNumbers.of(light)
     if numbers is not None and source is not None:
-        return numbers.shade(
+        section = light.section
+        reach, peak = numbers.shade(
             camera,
             pixels,
             source,
             tolerance=RAY_TOLERANCE,
-            far_sigmas=FAR_SIGMAS,
+            far_sigmas=FAR_SIGMAS * section.widest,
         )
+        return np.clip(section.gaussian_reach(reach), -FAR_SIGMAS, FAR_SIGMAS), peak
     reach, peak = np.full(len(pixels), FAR_SIGMAS), np.zeros(len(pixels))
     hits = view.scene.trace(np.zeros(3), camera_rays(camera, pixels, RAY_TOLERANCE))
     met = np.flatnonzero(hits.surface >= 0)

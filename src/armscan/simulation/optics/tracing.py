@@ -29,7 +29,7 @@ from armscan.simulation.kernels import (
     plate_slopes,
     waves_over,
 )
-from armscan.simulation.objects.boards import CirclePattern, PrintedBoard
+from armscan.simulation.objects.boards import FLAT, CirclePattern, PrintedBoard
 from armscan.simulation.objects.body import GRADIENT_STEP_MM, HIT_MM, Body, distance, marched
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, WavyPlate
 from armscan.simulation.optics.camera import RenderCamera
@@ -579,7 +579,11 @@ def _shape(surface: Any) -> tuple[int, list[float]] | None:
         found = _FLOOR, [*surface.point_mm, *surface.normal]
     elif isinstance(surface, Body):
         found = _BODY, []
-    elif isinstance(surface, PrintedBoard) and isinstance(surface.pattern, CirclePattern):
+    elif (
+        isinstance(surface, PrintedBoard)
+        and isinstance(surface.pattern, CirclePattern)
+        and surface.substrate == FLAT
+    ):
         found = _PRINT, _print_numbers(surface, surface.pattern)
     return found
 

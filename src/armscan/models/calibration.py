@@ -262,6 +262,10 @@ class SheetCalibration:
         False when two boards only just determine the plane, so that no residual checks it.
     diagnostics
         Evidence for a reader; None where there is none.
+    shape_mm
+        Standard deviation by which the sheet leaves its model (a plane or its bow), smooth over
+        the sheet, estimated from what the boards' stripes show alike; None in a document that is
+        older than the estimate.
     """
 
     name: str
@@ -272,6 +276,7 @@ class SheetCalibration:
     depth_range_mm: tuple[float, float]
     is_redundant: bool
     diagnostics: SheetDiagnostics | None = None
+    shape_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ from armscan.calibration.cameras.result import (
 from armscan.calibration.cameras.robust import excess_variance_px2
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.geometry.estimate import Estimate
-from armscan.models.camera import CameraModel
+from armscan.models.camera import PARAMETER_NAMES, CameraModel
 from armscan.vision.targets.target import TargetView
 from rigs.camera_scene import CAMERA, Scene, make_views
 
@@ -27,8 +27,11 @@ def solved(views: list[TargetView], options: CameraOptions | None = None) -> Cam
     return fit
 
 
+STRONG = replace(CAMERA, distortion=np.array([-0.12, 0.1, 6e-4, -4e-4, 0.4]))
+
+
 def test_good_coverage_frees_all_five() -> None:
-    fit = solved(make_views(Scene(), 1)[0])
+    fit = solved(make_views(Scene(camera=STRONG, n_views=20, reach=0.28), 1)[0])
     assert fit.free_parameters[4:] == ("k1", "k2", "p1", "p2", "k3")
     assert "all five" in fit.model_reason
     held_out = fit.cross_validation
@@ -40,19 +43,24 @@ def test_good_coverage_frees_all_five() -> None:
     assert held_out.sources == tuple(view.source for view in fit.used_views)
 
 
-def test_few_central_views_free_fewer() -> None:
+def test_few_central_views_free_fewer_and_the_covariance_counts_the_rest() -> None:
     scene = Scene(n_views=4, noise_px=0.3, distance_mm=900.0, reach=0.05, max_tilt_deg=50.0)
-    chosen = [solved(make_views(scene, seed)[0]) for seed in range(6)]
-    assert any("k3" not in fit.free_parameters for fit in chosen)
-    for fit in chosen:
-        if "k3" not in fit.free_parameters:
-            assert "worse" in fit.model_reason or "folds" in fit.model_reason
-            assert fit.camera.distortion[4] == 0.0
+    for seed in range(6):
+        views = make_views(scene, seed)[0]
+        fit = solved(views)
+        assert "k3" not in fit.free_parameters
+        assert "not told from zero" in fit.model_reason or "no better" in fit.model_reason
+        assert fit.camera.distortion[4] == 0.0
+        held = set(PARAMETER_NAMES[4:]) - set(fit.free_parameters)
+        assert all(fit.sigma[PARAMETER_NAMES.index(name)] > 0.0 for name in held)
+        asked = solved(views, CameraOptions(distortion="k1"))
+        assert (asked.sigma[5:] == 0.0).all()
+        assert (fit.sigma[:4] >= 0.9 * asked.sigma[:4]).all()
 
 
-def test_three_views_free_only_k1_and_k2() -> None:
+def test_three_views_have_no_hold_out_test() -> None:
     fit = solved(make_views(Scene(n_views=3), 2)[0])
-    assert fit.free_parameters[4:] == ("k1", "k2")
+    assert "k3" not in fit.free_parameters
     assert fit.cross_validation is None
     assert any("only 3 views" in warning for warning in fit.warnings)
 

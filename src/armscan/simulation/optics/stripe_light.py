@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.simulation.optics.camera import RenderCamera, blur_image
-from armscan.simulation.optics.lasers import NARROW_RIM_PX, TracedLight
+from armscan.simulation.optics.lasers import TracedLight
 from armscan.simulation.optics.render import (
     BAND_SIGMAS,
     BLUR_REACH,
@@ -31,6 +31,7 @@ from armscan.simulation.optics.render import (
     enlarged,
 )
 from armscan.simulation.optics.scene import FAINTEST, Hits, Material, Scene
+from armscan.simulation.optics.tracing import LightNumbers, SceneNumbers
 
 STRIDE_PX = 2
 FAR_SIGMAS = 9.0
@@ -43,6 +44,7 @@ _EDGE_SHARE = 0.25
 _BEND_SIGMAS = 0.01
 """Second difference above which every pixel is traced: an eighth of it is lost between."""
 _BRIGHT_SIGMAS = 4.5
+_RIM_PX = 4
 _SQUARE = np.ones((3, 3), np.uint8)
 
 Item = TypeVar("Item", np.float32, np.int32, np.bool_)
@@ -80,9 +82,12 @@ class Strip:
         self.is_rough = np.zeros_like(self.is_lit)
         self._near = cv2.dilate(self.is_lit.astype(np.uint8), _SQUARE) > 0
 
-    def near_nodes(self, rim_px: int) -> tuple[IntArray, ...]:
-        """Rows and columns of the nodes, `STRIDE_PX` apart, that are to be traced."""
-        square = np.ones((2 * rim_px + 1, 2 * rim_px + 1), np.uint8)
+    def near_nodes(self) -> tuple[IntArray, ...]:
+        """Rows and columns of the nodes, `STRIDE_PX` apart, that are to be traced.
+
+        They reach so far around the light that its rim is not taken for an edge.
+        """
+        square = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
         near = cv2.dilate(self.is_lit.astype(np.uint8), square)
         return np.nonzero(near[::STRIDE_PX, ::STRIDE_PX])
 
@@ -222,11 +227,14 @@ class PosedView:
         One for each surface.
     nodes
         Hits of the coarse grid's rays.
+    numbers
+        The scene for the compiled loops; None if they do not know one of its surfaces.
     """
 
     scene: Scene
     finishes: tuple[Material, ...]
     nodes: Hits
+    numbers: SceneNumbers | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -257,8 +265,12 @@ def look(
 ) -> PosedView:
     """Trace the coarse grid of a region."""
     nodes, _ = region.nodes_px()
-    hits = scene.trace(np.zeros(3), camera_rays(camera, nodes, RAY_TOLERANCE))
-    return PosedView(scene, finishes, hits)
+    numbers = SceneNumbers.of(scene, finishes)
+    if numbers is not None:
+        hits = numbers.trace(camera, nodes, RAY_TOLERANCE)
+    else:
+        hits = scene.trace(np.zeros(3), camera_rays(camera, nodes, RAY_TOLERANCE))
+    return PosedView(scene, finishes, hits, numbers)
 
 
 def trace_sheet(
@@ -296,7 +308,7 @@ class _Shader:
 
     def fill_nodes(self, strips: list[Strip]) -> None:
         """Trace every second pixel of every second row that is asked for; interpolate."""
-        places = [strip.near_nodes(self.light.rim_px) for strip in strips]
+        places = [strip.near_nodes() for strip in strips]
         found = self._shade(strips, [(STRIDE_PX * r, STRIDE_PX * c) for r, c in places])
         for strip, place, (reach, peak) in zip(strips, places, found, strict=True):
             strip.interpolate(place, reach, peak)
@@ -340,6 +352,18 @@ def shade(
     view: PosedView, camera: RenderCamera, light: TracedLight, pixels: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Reach and peak (N,) at pixels (N, 2); the light is ``peak * exp(-reach**2 / 2)``."""
+    numbers, source = view.numbers, LightNumbers.of(light)
+    if numbers is not None and source is not None:
+        section = light.section
+        reach, peak = numbers.shade(
+            camera,
+            pixels,
+            source,
+            tolerance=RAY_TOLERANCE,
+            lit_sigmas=FAR_SIGMAS * section.widest,
+            far_sigmas=FAR_SIGMAS * section.widest,
+        )
+        return section.gaussian_reach(reach), peak
     reach, peak = np.full(len(pixels), FAR_SIGMAS), np.zeros(len(pixels))
     hits = view.scene.trace(np.zeros(3), camera_rays(camera, pixels, RAY_TOLERANCE))
     met = np.flatnonzero(hits.surface >= 0)
@@ -347,17 +371,12 @@ def shade(
     normals = view.scene.normals(at)
     near, strength = light.reach_and_peak(at.points_mm, normals)
     reach[met] = near
-    lit = np.flatnonzero((np.abs(near) < _lit_sigmas(light)) & (strength > FAINTEST))
+    lit = np.flatnonzero((np.abs(near) < FAR_SIGMAS) & (strength > FAINTEST))
     lit = lit[view.scene.sees(light.source_of_mm(at.points_mm[lit]), at.points_mm[lit])]
     chosen = at.select(lit)
     reflected = view.scene.albedo(chosen)[:, 0] + _gloss(view, light, chosen, normals[lit])
     peak[met[lit]] = strength[lit] * reflected
     return reach, peak
-
-
-def _lit_sigmas(light: TracedLight) -> float:
-    """Reach up to which light is computed: all that is traced, if the rim is wide."""
-    return FAR_SIGMAS if light.rim_px > NARROW_RIM_PX else BAND_SIGMAS + 1.0
 
 
 def _gloss(view: PosedView, light: TracedLight, hits: Hits, normals: FloatArray) -> FloatArray:

@@ -255,6 +255,7 @@ LAYOUTS: Mapping[type, Layout] = {
     ),
     SheetCalibration: Layout(
         flat=("sheet",),
+        optional=("shape_mm",),
         spread={"depth_range_mm": ("depth_min_sensor_mm", "depth_max_sensor_mm")},
         check=_fault_of_sheet,
     ),

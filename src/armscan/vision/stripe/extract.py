@@ -132,6 +132,7 @@ def thesis_profile(
         intensity=np.maximum(ridge.table[:, 4], 0.0) * plane.grey_levels_per_unit,
         flags=flags,
         segment=chain,
+        noise_length=np.ones(len(points)),
     )
 
 
@@ -165,15 +166,17 @@ def to_profile(
     is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
     beside = FLANKS_PER_LEAN * np.abs(fits.lean) * width * is_on_flanks
     binning = exposure.window.binning
+    sigma = np.maximum(smoothed.sigma, LEAST_SIGMA_PX)
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),
         normals_px=smoothed.normals,
-        sigma_px=np.hypot(np.maximum(smoothed.sigma, LEAST_SIGMA_PX), beside) * binning,
+        sigma_px=np.hypot(sigma, beside) * binning,
         width_px=width * binning,
         intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
         flags=flags,
         segment=np.unique(chain, return_inverse=True)[1],
+        noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),
     )
 
 

@@ -42,7 +42,7 @@ from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
 """What pixel locking and the shape of the profile leave without any noise."""
-FLANKS_PER_LEAN = 1.5
+FLANKS_PER_LEAN = 1.0
 """Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
 its section's third-order term: what sections leave that are no Gram-Charlier series."""
 

@@ -188,7 +188,9 @@ def print_outcomes(found: dict[str, list[tuple[Row, Row]]], n_draws: int) -> Non
     for stage, pairs in found.items():
         count = Counter(outcome["result"] for _, outcome in pairs)
         whole += count
-        cells = [f"{count[result]} ({100 * count[result] / len(pairs):.1f} %)" for result in RESULTS]
+        cells = [
+            f"{count[result]} ({100 * count[result] / len(pairs):.1f} %)" for result in RESULTS
+        ]
         mean, median = certainty(pairs)
         over = np.array([o["over_bound"] for _, o in pairs if o["over_bound"]], dtype=float)
         bound = f"{np.nanmedian(over):.2f}" if np.isfinite(over).any() else "-"

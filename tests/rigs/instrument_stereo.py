@@ -42,9 +42,7 @@ def run_stereo(made: Instrument) -> Outcome:
     pairs = [StereoPair(a, b) for a, b in zip(left.found, right.found, strict=True)]
     if made.fault == "pairs shuffled":
         order = made.rng(6).permutation(len(pairs))
-        pairs = [
-            StereoPair(a, right.found[k]) for a, k in zip(left.found, order, strict=True)
-        ]
+        pairs = [StereoPair(a, right.found[k]) for a, k in zip(left.found, order, strict=True)]
     begun = time.process_time()
     try:
         fit = calibrate_stereo(pairs, target_of(made))
@@ -66,7 +64,9 @@ def run_stereo(made: Instrument) -> Outcome:
     error = stereo_error(made, fit)
     free = np.flatnonzero(np.diag(fit.covariance) > 0.0)
     covariance = fit.covariance[np.ix_(free, free)]
-    groups = {name: [list(free).index(k) for k in rows if k in free] for name, rows in GROUPS.items()}
+    groups = {
+        name: [list(free).index(k) for k in rows if k in free] for name, rows in GROUPS.items()
+    }
     ratio = np.sqrt(np.diag(covariance) / np.diag(best)[free])
     return judged(
         "stereo",

@@ -136,7 +136,8 @@ class ProfileFits:
     in `armscan.kernels.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
-    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``.
+    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``is_noise_assumed``: True if there were
+    too few residuals to estimate it, so that it is the first guess.
     """
 
     ridge: RidgePoints
@@ -145,6 +146,7 @@ class ProfileFits:
     side_sigma: FloatArray
     neighbour: FloatArray
     noise: FloatArray
+    is_noise_assumed: bool
 
 
 def axis_component(table: FloatArray) -> FloatArray:
@@ -171,7 +173,7 @@ def fit_ridge(
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
-    noise = start_noise(background_noise)
+    guess = noise = start_noise(background_noise)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     for _ in range(NOISE_ROUNDS):
         sample = np.zeros((len(pick), FIT_COLUMNS))
@@ -190,7 +192,13 @@ def fit_ridge(
     fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, reach, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
-        ridge.select(good), values[good], sides[good], side_sigma[good], neighbour[good], noise
+        ridge.select(good),
+        values[good],
+        sides[good],
+        side_sigma[good],
+        neighbour[good],
+        noise,
+        is_noise_assumed=noise is guess,
     )
 
 

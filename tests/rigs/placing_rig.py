@@ -79,6 +79,7 @@ def sensor_of(camera: CameraModel, pair: tuple[LightSheet, LightSheet]) -> Senso
             n_points=600,
             depth_range_mm=(110.0, 165.0),
             is_redundant=True,
+            shape_mm=0.0,
         )
         for name, sheet in zip("AB", pair, strict=True)
     )

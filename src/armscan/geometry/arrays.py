@@ -272,8 +272,11 @@ class RowRecord(ArrayRecord):
         for entry in dataclasses.fields(cls):
             if entry.name in changes or not entry.init:
                 continue
-            each = [getattr(part, entry.name) for part in parts]
             column = cls._columns.get(entry.name)
+            is_of_rows = column is not None and column.shape[:1] == (ROWS,)
+            # a part without rows cannot lack a column
+            full = [part for part in parts if len(part)] or parts[:1]
+            each = [getattr(part, entry.name) for part in (full if is_of_rows else parts)]
             is_missing = any(value is None for value in each)
             if column is None or column.shape[:1] != (ROWS,) or is_missing:
                 if not all(_is_same(value, each[0]) for value in each[1:]):

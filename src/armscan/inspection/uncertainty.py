@@ -109,17 +109,24 @@ def _propagated_mm(
 ) -> float:
     """Each block is shifted as a whole by an error of its points' mean covariance.
 
-    The stripes' own noise, which is independent from point to point, is taken out of that
-    covariance and counted point by point. NaN for a single block: an error of the sensor stretches
-    the one exposure, and a shift cannot tell.
+    The stripes' own noise is taken out of that covariance and counted point by point, each with the
+    correlation length that neighbours along the stripe share; a cloud that does not tell it is
+    taken as independent from point to point. What a length does with a point's error changes
+    slowly along a stripe, so that the sum over neighbours' correlations is what counts. NaN for a
+    single block: an error of the sensor stretches the one exposure, and a shift cannot tell.
     """
     if n < 2 or not cloud.covariance_mm2[rows].any():
         return math.nan
-    covariance = _without_noise(cloud, rows)
-    by_point = influence_along(fit)[:, None] * fit.directions
+    covariance, axis, share = _without_noise(cloud, rows)
+    influence = influence_along(fit)
+    by_point = influence[:, None] * fit.directions
     pull = np.stack([np.bincount(block, by_point[:, k], n) for k in range(3)], axis=1)
     count = np.bincount(block, minlength=n)
-    variance = float((by_point**2).sum(axis=1) @ (cloud.sigma_noise_mm[rows] ** 2))
+    noise = cloud.sigma_noise_mm[rows] ** 2
+    if cloud.noise_length is not None:
+        noise = noise * cloud.noise_length[rows]
+    along = share * np.einsum("ni,ni->n", axis, fit.directions) ** 2 + 1.0 - share
+    variance = float((influence**2 * along) @ noise)
     for i in range(3):
         for j in range(3):
             mean = np.bincount(block, covariance[:, i, j], n) / count
@@ -127,14 +134,17 @@ def _propagated_mm(
     return math.sqrt(max(variance, 0.0))
 
 
-def _without_noise(cloud: PointCloud, rows: IntArray) -> FloatArray:
-    """(N, 3, 3) covariances of points less their own noise, as far as a cloud tells.
+def _without_noise(cloud: PointCloud, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Covariances (N, 3, 3) of points less their own noise, as far as a cloud tells.
 
     It keeps the noise's length, not its direction. The longest axis stands for that: its variance
     is never below the noise's, so that none becomes negative; it is the right one where noise
-    prevails, and where it does not the noise matters little.
+    prevails, and where it does not the noise matters little. Also returned are that axis (N, 3) and
+    the noise's share of the variance along it (N,): how far the axis is to be trusted.
     """
     covariance = cloud.covariance_mm2[rows]
-    axis = np.linalg.eigh(covariance)[1][:, :, 2]
-    own = cloud.sigma_noise_mm[rows, None] * axis
-    return np.asarray(covariance - own[:, :, None] * own[:, None, :])
+    values, vectors = np.linalg.eigh(covariance)
+    axis, noise = vectors[:, :, 2], cloud.sigma_noise_mm[rows]
+    own = noise[:, None] * axis
+    share = np.clip(noise**2 / np.maximum(values[:, 2], np.finfo(np.float64).tiny), 0.0, 1.0)
+    return np.asarray(covariance - own[:, :, None] * own[:, None, :]), axis, share

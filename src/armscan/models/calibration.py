@@ -262,6 +262,10 @@ class SheetCalibration:
         False when two boards only just determine the plane, so that no residual checks it.
     diagnostics
         Evidence for a reader; None where there is none.
+    shape_mm
+        Standard deviation by which the sheet leaves its model (a plane or its bow), smooth over
+        the sheet, estimated from what the boards' stripes show alike; None in a document that is
+        older than the estimate.
     """
 
     name: str
@@ -272,6 +276,7 @@ class SheetCalibration:
     depth_range_mm: tuple[float, float]
     is_redundant: bool
     diagnostics: SheetDiagnostics | None = None
+    shape_mm: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -410,6 +415,9 @@ class HandEyeDiagnostics:
         Largest change when one posture is left out.
     chi2_probability
         Probability of residuals at least this large under the noise model.
+    region_factor
+        Factor on the usual limit of ``e' C^-1 e`` from which the joint 95 % region of the hand-eye
+        holds 95 %: above 1 where the scatter had to be estimated from few postures.
     """
 
     method: HandEyeMethod
@@ -422,6 +430,7 @@ class HandEyeDiagnostics:
     left_out_rotation_deg: float
     left_out_translation_mm: float
     chi2_probability: float
+    region_factor: float = 1.0
 
 
 class HandEyeCalibration(ArrayRecord):

@@ -127,7 +127,8 @@ def propagate_to_base(
     Returns
     -------
     PointCloud
-        In Base. The covariance holds the stripe's noise, that of sensor and hand-eye together
+        In Base. The covariance holds the stripe's noise, the light sheet's own shape, that of
+        sensor and hand-eye together
         (an error of the sensor that the hand-eye follows largely cancels), and the arm's: the
         part common to a posture and the part new in every exposure.
 
@@ -151,9 +152,9 @@ def propagate_to_base(
         middle = placed.points_base_mm.mean(axis=0) if len(stripe) else np.zeros(3)
     else:
         middle = base_from_tool.apply(hand_eye.tool_from_sensor.apply(transform.scan_point_mm))
-    noise = placed.by_sensor_point @ stripe.noise_mm
+    turn = placed.by_sensor_point
     arm = arm_covariance(placed.points_base_mm, middle, hand_eye.arm_noise)
-    covariance += arm + noise @ noise.transpose(0, 2, 1)
+    covariance += arm + turn @ stripe.own_covariance_mm2 @ turn.T
     return stripe_cloud(
         "Base",
         stripe,
@@ -184,6 +185,7 @@ def delivered_points(profile: PointProfile) -> StripePoints:
         row=np.arange(n),
         points_mm=profile.points_mm,
         noise_mm=noise,
+        shape_mm=np.zeros((n, 3)),
         by_sensor=np.zeros((n, 3, 0)),
         sheet=np.zeros(n, dtype=np.int64),
     )

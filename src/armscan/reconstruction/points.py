@@ -34,8 +34,10 @@ from armscan.reconstruction.triangulate import (
     N_SHEET,
     DepthRange,
     StripePoints,
+    moved_by_shape,
     sensor_columns,
     sensor_covariance,
+    shape_mm,
     triangulate_stripe,
 )
 from armscan.records.profile import Profile
@@ -49,11 +51,11 @@ STEP_SPACINGS = 3.0
 """Rays are told apart by so many of the spacings between neighbouring points."""
 CONSISTENCY_SIGMAS = 5.0
 """Points whose left and right picture disagree by more are dropped."""
-MISFIT_SHARE = 0.3
-"""Part of a sheet's residual from its calibration that is its own shape, not the stripes' noise."""
 BESIDE_ROWS = 3
 """Where the right picture is larger, not every right point has a left one: this many between."""
 N_OBSERVED = 3
+"""Distances across the left stripe, across the right stripe, and from the sheet."""
+N_STRIPES = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,8 +185,8 @@ def measure_stereo(
 ) -> tuple[MeasuredProfile, MeasuredProfile]:
     """Points of two cameras: fused where both see them, else of one camera on its sheet.
 
-    The noises of each point are those of the left stripe, of the right stripe and of the sheet's
-    shape; zero where a camera has no part in it.
+    The noises of each point are those of the left stripe and of the right stripe; zero where a
+    camera has no part in it.
 
     Raises
     ------
@@ -260,11 +262,6 @@ def _in_order(both: StripePoints, single: StripePoints) -> StripePoints:
     return joined.select(np.argsort(joined.row, kind="stable"))
 
 
-def misfit_mm(sensor: SensorCalibration, sheet: int) -> float:
-    """Standard deviation of a sheet's true surface about its model."""
-    return MISFIT_SHARE * sensor.sheets[sheet].rms_mm
-
-
 def _fused(
     row: IntArray,
     projected: Projections,
@@ -281,9 +278,15 @@ def _fused(
         moved = drift_directions(projected, sensor) @ offset.drift
         shift = -np.sum(crossings.normal * moved, axis=1)
     sigma = np.stack([left.sigma_px[row], right.sigma_px[crossings.row]], axis=1)
-    return fuse_points(
+    points = fuse_points(
         row, projected, crossings, left.normals_px[row], sigma, sensor=sensor, shift_px=shift
     )
+    if left.noise_length is None or right.noise_length is None:
+        return points
+    length = np.stack([left.noise_length[row], right.noise_length[crossings.row]], axis=1)
+    variance = np.maximum((points.noise_mm**2).sum(axis=1), np.finfo(np.float64).tiny)
+    mean = (length * variance).sum(axis=1) / variance.sum(axis=1)
+    return replace(points, noise_length=mean)
 
 
 def fuse_points(
@@ -325,12 +328,12 @@ def fuse_points(
     Returns
     -------
     StripePoints
-        The noises are those of the left stripe, of the right stripe, and of the sheet's own shape.
+        The noises are those of the left stripe and of the right stripe.
     """
     n = len(projected.sheet)
     ddistance_dpoint, ddistance_dsensor = _observations(projected, crossings, normals_px, sensor)
-    misfit = np.array([misfit_mm(sensor, k) for k in range(len(sensor.sheets))])
-    noise = np.column_stack([sigma_px, np.maximum(misfit[projected.sheet], 1e-6)])
+    shape = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
+    noise = np.column_stack([sigma_px, np.maximum(shape[projected.sheet], 1e-6)])
     covariance = np.zeros((n, N_OBSERVED, N_OBSERVED))
     for k in np.unique(projected.sheet):
         of_sheet = np.flatnonzero(projected.sheet == k)
@@ -344,7 +347,8 @@ def fuse_points(
     return StripePoints(
         row=row,
         points_mm=points,
-        noise_mm=gain[:, :, 1:] * noise[:, None, :],
+        noise_mm=gain[:, :, 1:N_OBSERVED] * noise[:, None, : N_OBSERVED - 1],
+        shape_mm=gain[:, :, N_OBSERVED] * noise[:, None, N_OBSERVED - 1],
         by_sensor=-gain @ ddistance_dsensor,
         sheet=projected.sheet,
     )
@@ -405,24 +409,20 @@ def _left_alone(
     row: IntArray, projected: Projections, left: Profile, sensor: SensorCalibration
 ) -> StripePoints:
     """Points on their sheet by the left camera alone (eq. 4.11)."""
-    noise = np.zeros((len(row), 3, N_OBSERVED))
+    noise = np.zeros((len(row), 3, N_STRIPES))
     across = np.einsum("nij,nj->ni", projected.dpoint_dpx, left.normals_px[row])
     noise[:, :, 0] = across * left.sigma_px[row, None]
-    for k in np.unique(projected.sheet):
-        of_sheet = projected.sheet == k
-        points = projected.points_mm[of_sheet]
-        _, gradient, _ = sensor.sheets[k].sheet.height_with_jacobian(points)
-        # the move along the ray by one standard deviation of the sheet's own shape
-        along = np.sum(gradient * points, axis=1)
-        noise[of_sheet, :, 2] = points / along[:, None] * misfit_mm(sensor, int(k))
+    length = left.noise_length
     second = np.zeros((len(row), 3, projected.dq_dsecond.shape[2]))
     by_sensor = np.concatenate([projected.dpoint_dsensor, second], axis=2)
     return StripePoints(
         row=row,
         points_mm=projected.points_mm,
         noise_mm=noise,
+        shape_mm=moved_by_shape(projected.points_mm, projected.points_mm, projected.sheet, sensor),
         by_sensor=by_sensor,
         sheet=projected.sheet,
+        noise_length=None if length is None else length[row],
     )
 
 
@@ -445,8 +445,7 @@ def triangulate_right(
     Returns
     -------
     StripePoints
-        In the Sensor frame. The noises are those of a left stripe (zero), of the right stripe, and
-        of the sheet's own shape.
+        In the Sensor frame. The noises are those of a left stripe (zero) and of the right stripe.
 
     Raises
     ------
@@ -459,7 +458,7 @@ def triangulate_right(
     turn = pose.rotation.T
     xy, has_ray, dxy_dpx, dxy_dcamera = camera.undistort_with_jacobian(profile.points_px[row])
     n = len(row)
-    points, noise = np.zeros((n, 3)), np.zeros((n, 3, N_OBSERVED))
+    points, noise, shape = np.zeros((n, 3)), np.zeros((n, 3, N_STRIPES)), np.zeros((n, 3))
     by_sensor = np.zeros((n, 3, len(sensor_columns(sensor, 0))))
     is_met = np.zeros(n, dtype=np.bool_)
     second = N_CAMERA + N_SHEET
@@ -478,7 +477,7 @@ def triangulate_right(
         along = np.sum(gradient * ray, axis=1)
         across = np.einsum("nij,njk,nk->ni", dpoint_dxy, dxy_dpx[at], profile.normals_px[row[at]])
         noise[at, :, 1] = (across @ turn.T) * profile.sigma_px[row[at], None]
-        noise[at, :, 2] = ray / along[:, None] * misfit_mm(sensor, k)
+        shape[at] = ray / along[:, None] * shape_mm(sensor, k)
         by_sensor[at, :, N_CAMERA:second] = turn @ dpoint_dsheet[met]
         by_sensor[at, :, second : second + N_CAMERA] = turn @ (dpoint_dxy @ dxy_dcamera[at])
         moved = np.concatenate([turn @ skew(from_centre), np.tile(-turn, (len(at), 1, 1))], axis=2)
@@ -486,5 +485,11 @@ def triangulate_right(
         slide = np.einsum("ni,nij->nj", gradient, moved) / along[:, None]
         by_sensor[at, :, second + N_CAMERA :] = moved - ray[:, :, None] * slide[:, None, :]
     return StripePoints(
-        row=row, points_mm=points, noise_mm=noise, by_sensor=by_sensor, sheet=sheet[row]
+        row=row,
+        points_mm=points,
+        noise_mm=noise,
+        shape_mm=shape,
+        by_sensor=by_sensor,
+        sheet=sheet[row],
+        noise_length=None if profile.noise_length is None else profile.noise_length[row],
     ).select(is_met)

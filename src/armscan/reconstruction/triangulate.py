@@ -146,19 +146,33 @@ class StripePoints(RowRecord):
     noise_mm
         (M, 3, J) one standard deviation of each independent noise: the direction in which it acts
         times its size. One camera has one, the stripe's own noise, which acts within the sheet;
-        a point that both cameras see has one of each camera and one of the sheet's shape.
+        a point that both cameras see has one of each camera.
+    shape_mm
+        (M, 3) move of the point by one standard deviation of the sheet's own shape, which the
+        model leaves (see `SheetCalibration`): smooth over the sheet, so that neighbours share it.
     by_sensor
         (M, 3, Q) derivative by the parameters that `sensor_columns` names for the point's sheet:
         the camera's 9, the sheet's 8, and the 15 of a second camera, if there is one.
     sheet
         (M,) index into ``sensor.sheets``.
+    noise_length
+        (M,) correlation length of the noise along the stripe, as in `Profile`; of a point of two
+        cameras the mean by variance. None where it is not known.
     """
 
     row: IntArray = ints("N")
     points_mm: FloatArray = floats("N", 3)
     noise_mm: FloatArray = floats("N", 3, None)
+    shape_mm: FloatArray = floats("N", 3)
     by_sensor: FloatArray = floats("N", 3, None)
     sheet: IntArray = ints("N")
+    noise_length: FloatArray | None = floats("N", default=None)
+
+    @property
+    def own_covariance_mm2(self) -> FloatArray:
+        """(M, 3, 3) by the stripes' noise and the sheets' shape, in Sensor."""
+        own = np.concatenate([self.noise_mm, self.shape_mm[:, :, None]], axis=2)
+        return np.asarray(own @ own.transpose(0, 2, 1))
 
 
 def triangulate(
@@ -171,8 +185,8 @@ def triangulate(
     Returns
     -------
     PointCloud
-        In the order of the profile; ``covariance_mm2`` is stripe noise plus calibration,
-        ``sigma_noise_mm`` the stripe noise alone.
+        In the order of the profile; ``covariance_mm2`` is stripe noise, sheet shape and
+        calibration, ``sigma_noise_mm`` the stripe noise alone.
     """
     return cloud_in_sensor(triangulate_stripe(profile, sheet_of_point, sensor), profile, sensor)
 
@@ -181,7 +195,7 @@ def cloud_in_sensor(
     stripe: StripePoints, profile: Profile, sensor: SensorCalibration
 ) -> PointCloud:
     """The points of one exposure as a cloud in the Sensor frame."""
-    covariance = stripe.noise_mm @ stripe.noise_mm.transpose(0, 2, 1)
+    covariance = stripe.own_covariance_mm2
     for k in range(len(sensor.sheets)):
         of_sheet = stripe.sheet == k
         jacobian = stripe.by_sensor[of_sheet]
@@ -217,6 +231,7 @@ def stripe_cloud(
         exposure_sources=(profile.source,),
         segment=segment,
         intensity=intensity,
+        noise_length=stripe.noise_length,
     )
 
 
@@ -249,16 +264,48 @@ def triangulate_stripe(
     met = intersect_with_jacobian(profile.points_px[asked], sheets[asked], sensor)
     across = np.einsum("nij,nj->ni", met.dpoint_dpx, profile.normals_px[asked])
     noise = across * profile.sigma_px[asked, None]
+    length = profile.noise_length
     rest = np.zeros((len(asked), 3, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET))
     by_sensor = np.concatenate([met.dpoint_dsensor, rest], axis=2)
     found = StripePoints(
         row=asked,
         points_mm=met.points_mm,
         noise_mm=noise[:, :, None],
+        shape_mm=moved_by_shape(met.points_mm, met.points_mm, sheets[asked], sensor),
         by_sensor=by_sensor,
         sheet=sheets[asked],
+        noise_length=None if length is None else length[asked],
     )
     return found.select(met.is_met)
+
+
+OLD_SHAPE_SHARE = 0.3
+"""Part of a sheet's residual that is taken for its own shape where a document, older than the
+estimate, states none."""
+
+
+def shape_mm(sensor: SensorCalibration, sheet: int) -> float:
+    """Standard deviation of a sheet's true surface about its model."""
+    one = sensor.sheets[sheet]
+    return OLD_SHAPE_SHARE * one.rms_mm if one.shape_mm is None else one.shape_mm
+
+
+def moved_by_shape(
+    points_mm: FloatArray, rays: FloatArray, sheet: IntArray, sensor: SensorCalibration
+) -> FloatArray:
+    """(M, 3) move of points along their rays (M, 3) by one standard deviation of a sheet's shape.
+
+    All in the Sensor frame; ``sheet`` (M,) is the index of each point's sheet.
+    """
+    moved = np.zeros((len(points_mm), 3))
+    for k in np.unique(sheet):
+        of_sheet = np.flatnonzero(sheet == k)
+        _, gradient, _ = sensor.sheets[int(k)].sheet.height_with_jacobian(points_mm[of_sheet])
+        along = np.sum(gradient * rays[of_sheet], axis=1)
+        is_met = np.abs(along) > 0.0
+        size = shape_mm(sensor, int(k)) / np.where(is_met, along, np.inf)
+        moved[of_sheet] = rays[of_sheet] * size[:, None]
+    return moved
 
 
 def noise_size_mm(noise_mm: FloatArray) -> FloatArray:

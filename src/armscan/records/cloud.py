@@ -27,10 +27,15 @@ class PointCloud(RowRecord):
     points_mm
         (N, 3) positions.
     covariance_mm2
-        (N, 3, 3) total covariance of each point: stripe noise plus calibration.
+        (N, 3, 3) total covariance of each point by itself, in the cloud's frame. In Sensor: noise
+        of the stripe or stripes, the light sheet's own shape, cameras and sheets as calibrated. In
+        Base also the hand-eye, with what it shares with the sensor, and the arm's scatter. After a
+        registration also that of the transform. What points share is in each one's covariance;
+        how much two points share is not in the cloud.
     sigma_noise_mm
-        (N,) the part that is independent from point to point: the stripe's noise, as the
-        standard deviation along the direction in which it acts.
+        (N,) the part of it that is the stripes' noise, as the root sum square of the standard
+        deviations along the directions in which the stripes of one or two cameras err. Neighbours
+        along a stripe share it as far as ``noise_length`` says.
     sheet
         (N,) index into ``sheet_names``.
     sheet_names
@@ -45,6 +50,9 @@ class PointCloud(RowRecord):
         (N,) peak grey level of the stripe.
     normals
         (N, 3) unit surface normals towards the sensor, or None where not estimated.
+    noise_length
+        (N,) correlation length of that noise along the stripe, in points of the full cloud: a sum
+        over a stripe has the variance of independent points times this. None where it is not known.
     is_simulated
         True if the points were measured on rendered images.
     forced
@@ -63,6 +71,7 @@ class PointCloud(RowRecord):
     segment: IntArray = ints("N")
     intensity: FloatArray = floats("N")
     normals: FloatArray | None = floats("N", 3, default=None)
+    noise_length: FloatArray | None = floats("N", default=None)
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
 

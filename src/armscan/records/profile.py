@@ -65,6 +65,10 @@ class Profile(RowRecord):
         (N,) bit field of `StripeFlag`.
     segment
         (N,) number of the connected segment, counted from 0; a segment's points are consecutive.
+    noise_length
+        (N,) correlation length of the centre's noise along the stripe, in points: the sum of its
+        correlations with itself and all others, 1 where each errs on its own. The variance of a sum
+        over the stripe is that of independent points times this. None where it is not known.
     """
 
     source: str
@@ -75,6 +79,7 @@ class Profile(RowRecord):
     intensity: FloatArray = floats("N")
     flags: IntArray = ints("N")
     segment: IntArray = ints("N")
+    noise_length: FloatArray | None = floats("N", default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -166,6 +166,7 @@ COVARIANCE = {
     "cov_zz_mm2": (2, 2),
 }
 INDICES = ("sheet", "exposure", "segment")
+NOISE_LENGTH = "noise_length_points"
 SIMULATED = "simulated"
 """Comment in the header of a cloud that was measured on rendered images."""
 FORCED = "forced"
@@ -195,6 +196,8 @@ def ply_bytes(cloud: PointCloud) -> bytes:
         columns |= {name: cloud.normals[:, k] for k, name in enumerate(NORMAL)}
     columns["sigma_mm"] = cloud.sigma_mm
     columns["sigma_noise_mm"] = cloud.sigma_noise_mm
+    if cloud.noise_length is not None:
+        columns[NOISE_LENGTH] = cloud.noise_length
     columns |= {name: cloud.covariance_mm2[:, i, j] for name, (i, j) in COVARIANCE.items()}
     columns["intensity"] = cloud.intensity
     columns |= {name: getattr(cloud, name) for name in INDICES}
@@ -265,6 +268,7 @@ def _own_cloud(vertices: PlyVertices, where: str) -> PointCloud:
             segment=table["segment"],
             intensity=table["intensity"],
             normals=np.stack([table[n] for n in NORMAL], axis=1) if has_normals else None,
+            noise_length=table[NOISE_LENGTH] if NOISE_LENGTH in names else None,
             is_simulated=SIMULATED in vertices.comments,
             forced=_names(vertices, FORCED),
         )

@@ -255,6 +255,7 @@ LAYOUTS: Mapping[type, Layout] = {
     ),
     SheetCalibration: Layout(
         flat=("sheet",),
+        optional=("shape_mm",),
         spread={"depth_range_mm": ("depth_min_sensor_mm", "depth_max_sensor_mm")},
         check=_fault_of_sheet,
     ),
@@ -303,7 +304,7 @@ LAYOUTS: Mapping[type, Layout] = {
     CameraDiagnostics: EVIDENCE,
     SheetDiagnostics: EVIDENCE,
     SensorDiagnostics: EVIDENCE,
-    HandEyeDiagnostics: EVIDENCE,
+    HandEyeDiagnostics: Layout(is_evidence=True, optional=("region_factor",)),
     FTest: EVIDENCE,
     ScanTransform: Layout(covariance_names=lambda _: REGISTRATION_PARAMETERS),
     Provenance: Layout(codecs={"options": FieldCodec(dict, _texts)}, optional=("forced",)),

@@ -13,8 +13,13 @@ from armscan.geometry.arrays import FloatArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.epipolar import RightStripes, find_crossings, project_on_sheets
-from armscan.reconstruction.points import fuse_points, misfit_mm, triangulate_right
-from armscan.reconstruction.triangulate import StripePoints, sensor_columns, sensor_covariance
+from armscan.reconstruction.points import fuse_points, triangulate_right
+from armscan.reconstruction.triangulate import (
+    StripePoints,
+    sensor_columns,
+    sensor_covariance,
+    shape_mm,
+)
 from rigs.sheet_rig import make_profile
 from rigs.stereo_head import StereoHead
 
@@ -93,19 +98,19 @@ def test_noises_are_the_moves_by_one_sigma_of_each_stripe() -> None:
     by_left = fused(sensor, left + SIGMA_PX * normals, right).points_mm - here.points_mm
     across = SIGMA_PX * np.sqrt(0.5)
     by_right = fused(sensor, left, right + across).points_mm - here.points_mm
-    by_sheet = here.by_sensor[:, :, 11] * misfit_mm(sensor, SHEET)
+    by_sheet = here.by_sensor[:, :, 11] * shape_mm(sensor, SHEET)
     for column, moved in enumerate((by_left, by_right, by_sheet)):
         size = np.abs(moved).max()
-        same = np.abs(here.noise_mm[:, :, column] - moved).max()
-        turned = np.abs(here.noise_mm[:, :, column] + moved).max()
+        found = here.shape_mm if column == 2 else here.noise_mm[:, :, column]
+        same, turned = np.abs(found - moved).max(), np.abs(found + moved).max()
         # the sheet's own shape has no sign
         assert (min(same, turned) if column == 2 else same) < 0.01 * size
 
 
 def predicted(found: StripePoints, sensor: SensorCalibration) -> FloatArray:
-    noise = found.noise_mm @ found.noise_mm.transpose(0, 2, 1)
     joint = sensor_covariance(sensor, SHEET)
-    return np.asarray(noise + found.by_sensor @ joint @ found.by_sensor.transpose(0, 2, 1))
+    by_sensor = found.by_sensor
+    return np.asarray(found.own_covariance_mm2 + by_sensor @ joint @ by_sensor.transpose(0, 2, 1))
 
 
 def test_covariance_holds_and_the_fused_point_beats_each_camera_alone() -> None:

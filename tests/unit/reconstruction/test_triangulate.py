@@ -66,6 +66,7 @@ def sensor(
             n_points=600,
             depth_range_mm=(120.0, 150.0),
             is_redundant=True,
+            shape_mm=0.0,
         )
         for k, sheet in enumerate(sheets)
     )

@@ -1,22 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrate one camera from views of a target: which distortion model the views support, which
-views do not fit, and the error on views that took no part.
+"""Calibrate one camera from views of a target: which views can be used, which do not fit, and the
+evidence for what comes out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import (
     Observations,
-    State,
-    adjust,
     free_basis,
     gather,
     joint_covariance,
+)
+from armscan.calibration.cameras.distortion import (
+    ChosenModel,
+    chance_of_coefficients,
+    choose_model,
+    coefficients_left_at_zero,
+    cross_validate,
+    design_effect,
+    rms,
 )
 from armscan.calibration.cameras.result import (
     MIN_VIEWS,
@@ -36,16 +43,16 @@ from armscan.calibration.cameras.robust import (
     WRONG_LEVEL,
     Solution,
     board_residuals,
+    board_warp,
     chi2_of_points,
     claimed_covariances,
     covariance_with_target_error,
-    decide_board_warp,
     estimate_target_error,
     excess_variance_px2,
     residuals_px,
     solve_robustly,
-    with_board_warp,
     with_excess,
+    with_significant_bow,
 )
 from armscan.calibration.cameras.start import (
     estimate_board_pose,
@@ -54,194 +61,11 @@ from armscan.calibration.cameras.start import (
     view_homography,
 )
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.vision.targets.target import TargetView
-
-NO_SHARED = np.zeros((11, 0))
-
-
-def cross_validate(
-    solution: Solution, sources: tuple[str, ...], n_folds: int
-) -> CrossValidation | None:
-    """Hold out views fold by fold (see `CrossValidation`).
-
-    Points that the full solution rejected as outliers count neither in the folds' solutions nor
-    in the result.
-
-    Parameters
-    ----------
-    solution
-        Of all used views; it also is the folds' starting value.
-    sources
-        Names of the views.
-    n_folds
-        Wanted folds; at most one a view.
-
-    Returns
-    -------
-    result
-        None if fewer than three views would be left to solve from, or if a fold has no solution.
-    """
-    observations = solution.observations
-    n_views = observations.n_views
-    folds = min(n_folds, n_views)
-    if folds < 2 or n_views - int(np.ceil(n_views / folds)) < MIN_VIEWS:
-        return None
-    fold_of_view = np.arange(n_views) % folds
-    held_out = np.zeros_like(observations.points_px)
-    for fold in range(folds):
-        train, test = np.flatnonzero(fold_of_view != fold), np.flatnonzero(fold_of_view == fold)
-        part, weights = subset(observations, solution.weights, train)
-        trained = adjust(part, _of_views(solution.state, train), solution.basis, weights)
-        if isinstance(trained, FitFailure):
-            return None
-        part, weights = subset(observations, solution.weights, test)
-        start = _of_views(solution.state, test)
-        start = State(trained.state.shared, start.rotations, start.translations_mm)
-        posed = adjust(part, start, NO_SHARED, weights)
-        if isinstance(posed, FitFailure):
-            return None
-        rows = np.isin(observations.view_of_point, test)
-        held_out[rows] = residuals_px(part, posed.state)
-    in_sample = residuals_px(observations, solution.state)
-    kept = solution.weights > 0.0
-    per_view = []
-    for v in range(n_views):
-        rows_of_view = observations.rows(v)
-        per_view.append(rms(held_out[rows_of_view][kept[rows_of_view]]))
-    return CrossValidation(
-        folds, rms(held_out[kept]), rms(in_sample[kept]), sources, tuple(per_view)
-    )
-
-
-def rms(residuals: FloatArray) -> float:
-    """Root mean square over (N, 2) residuals of their length, as OpenCV defines it."""
-    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
-
-
-def subset(
-    observations: Observations, weights: FloatArray, views: IntArray
-) -> tuple[Observations, FloatArray]:
-    """The observations of some views, in order, with their weights."""
-    rows = np.isin(observations.view_of_point, views)
-    counts = np.diff(observations.starts)[views]
-    part = Observations(
-        observations.points_px[rows],
-        observations.whitening[rows],
-        observations.board_mm[rows],
-        observations.board_warp_shape[rows],
-        (0, *(int(n) for n in np.cumsum(counts))),
-        observations.width_px,
-        observations.height_px,
-    )
-    return part, weights[rows]
-
-
-def _of_views(state: State, views: IntArray) -> State:
-    return State(state.shared, state.rotations[views], state.translations_mm[views])
-
-
-TOLERATED = 1.01
-MODELS: tuple[DistortionModel, ...] = ("k1k2p1p2k3", "k1k2p1p2", "k1k2", "k1")
-"""Largest first."""
-
-UNTESTED_MODEL: DistortionModel = "k1k2"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ChosenModel:
-    """A distortion model with its solution and hold-out test.
-
-    Parameters
-    ----------
-    model
-        The model.
-    solution
-        Its solution.
-    cross_validation
-        Its hold-out test, None where there was none.
-    reason
-        Why this model, in words.
-    """
-
-    model: DistortionModel
-    solution: Solution
-    cross_validation: CrossValidation | None
-    reason: str
-
-
-def choose_model(
-    solve: Callable[[DistortionModel], Solution | FitFailure],
-    validate: Callable[[Solution, Solution], CrossValidation | None],
-    folds: Callable[[Solution], bool],
-) -> ChosenModel | FitFailure:
-    """Apply the rule of this module.
-
-    Parameters
-    ----------
-    solve
-        Solves with a given model.
-    validate
-        Tests a solution on held-out views, on the points that the second solution kept.
-    folds
-        Whether a solution's distortion folds over inside the image.
-    """
-    tried: list[ChosenModel] = []
-    for model in MODELS:
-        solution = solve(model)
-        if isinstance(solution, FitFailure):
-            if model == MODELS[-1] and not tried:
-                return solution
-            continue
-        reference = tried[0].solution if tried else solution
-        tried.append(ChosenModel(model, solution, validate(solution, reference), ""))
-    tested = [(c, c.cross_validation.rms_px) for c in tried if c.cross_validation is not None]
-    if not tested:
-        names = [chosen.model for chosen in tried]
-        chosen = tried[names.index(UNTESTED_MODEL)] if UNTESTED_MODEL in names else tried[0]
-        reason = f"too few views for a hold-out test: {chosen.model} without one"
-        return _with_reason(chosen, reason)
-    best = min(rms for _, rms in tested)
-    good = [(chosen, rms) for chosen, rms in tested if rms <= TOLERATED * best]
-    chosen, rms = good[0]
-    if folds(chosen.solution):
-        yielding = [(c, r) for c, r in good[1:] if r <= rms and not folds(c.solution)]
-        chosen, rms = (yielding or good)[0]
-    reason = _reason(chosen.model, rms, tested, good)
-    if chosen is tried[0]:
-        return _with_reason(chosen, reason)
-    on_own_points = validate(chosen.solution, chosen.solution)
-    return ChosenModel(chosen.model, chosen.solution, on_own_points, reason)
-
-
-def _reason(
-    model: DistortionModel,
-    rms: float,
-    tested: Sequence[tuple[ChosenModel, float]],
-    good: Sequence[tuple[ChosenModel, float]],
-) -> str:
-    if model == MODELS[0]:
-        return (
-            "all five coefficients: no smaller model predicts unseen views better by more than 1 %"
-        )
-    if model != good[0][0].model:
-        return (
-            f"{good[0][0].model} folds over inside the image, and {model} predicts unseen views "
-            "as well"
-        )
-    models = [chosen.model for chosen, _ in tested]
-    larger, larger_rms = tested[models.index(model) - 1]
-    return (
-        f"{larger.model} predicts unseen views {100.0 * (larger_rms / rms - 1.0):.1f} % worse than "
-        f"{model}: too few views, or too little of the image covered, for more coefficients"
-    )
-
-
-def _with_reason(chosen: ChosenModel, reason: str) -> ChosenModel:
-    return ChosenModel(chosen.model, chosen.solution, chosen.cross_validation, reason)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -344,28 +168,37 @@ def assemble(
 ) -> CameraFit | FitFailure:
     """Put the result together, or refuse a solution that the views do not determine."""
     used = [views[index] for index in prepared.used]
-    solution, validation = chosen.solution, chosen.cross_validation
-    if options.solve_warp:
-        bowed = with_board_warp(solution, options.max_steps)
-        if isinstance(bowed, FitFailure):
-            return bowed
-        solution = bowed
+    validation = chosen.cross_validation
+    bow = with_significant_bow(chosen.solution, options.max_steps, is_wanted=options.solve_warp)
+    if isinstance(bow, FitFailure):
+        return bow
+    solution, bow_test = bow
+    if bow_test is not None:
         sources = tuple(view.source for view in used)
         validation = cross_validate(solution, sources, options.n_folds)
     observations = solution.observations
     determined = joint_covariance(solution.equations, solution.basis)
     if isinstance(determined, FitFailure):
         return determined
+    unit, condition = determined
     found = board_residuals(solution)
     target_error = estimate_target_error(found)
-    covariance = covariance_with_target_error(
-        determined[0], solution.variance_factor, target_error, found
-    )
-    condition = determined[1]
-    refusal = _focal_refusal(solution, covariance)
+    design = design_effect(solution)
+    sigma0_squared = solution.variance_factor * design.widening
+    shift = np.zeros(len(unit))
+    if chosen.untested:
+        level = target_error.independent_share * sigma0_squared
+        left = coefficients_left_at_zero(solution, chosen.untested, level)
+        if isinstance(left, FitFailure):
+            return left
+        unit, shift = left.unit_covariance, left.shift
+    covariance = covariance_with_target_error(unit, sigma0_squared, target_error, found)
+    covariance = covariance + np.outer(shift, shift)
+    # a bent or stretched target is told by its residuals, not by the sigma that they widen
+    refusal = _focal_refusal(solution, covariance / design.widening)
     if refusal is not None:
         return refusal
-    warp = decide_board_warp(chosen.solution, solution, covariance) if options.solve_warp else None
+    warp = None if bow_test is None else board_warp(solution, bow_test, covariance)
     camera = solution.state.camera(observations.width_px, observations.height_px)
     fits, refused = _view_fits(
         views, prepared, solution, covariance=covariance, is_misfit=is_misfit, camera=camera
@@ -395,6 +228,7 @@ def assemble(
         cross_validation=validation,
         warp=warp,
         model_reason=chosen.reason,
+        design_effect=design.widening,
         warnings=(),
         options=options,
     )
@@ -632,7 +466,7 @@ def _solve_model(
         return len(camera.folded_border()) > 0
 
     if options.distortion == "auto" and options.n_folds:
-        return choose_model(solve, validate, folds)
+        return choose_model(solve, validate, folds, chance_of_coefficients)
     model: DistortionModel = options.distortion
     reason = f"{model} was asked for"
     if model == "auto":

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from armscan.calibration.cameras.calibrate import rms
+from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,

@@ -20,7 +20,7 @@ from armscan.calibration.cameras.adjustment import (
     normal_equations,
     predict,
 )
-from armscan.calibration.cameras.calibrate import rms, subset
+from armscan.calibration.cameras.distortion import rms, subset
 from armscan.calibration.cameras.pairs import MIN_PAIRS, StereoPair, views_of
 from armscan.calibration.cameras.result import CrossValidation
 from armscan.calibration.cameras.robust import (

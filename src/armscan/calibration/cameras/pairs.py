@@ -10,7 +10,8 @@ from typing import get_args
 import numpy as np
 
 from armscan.calibration.cameras.adjustment import basis_of
-from armscan.calibration.cameras.calibrate import calibrate_camera, rms
+from armscan.calibration.cameras.calibrate import calibrate_camera
+from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.result import MIN_VIEW_POINTS, CameraFit, CameraOptions
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError

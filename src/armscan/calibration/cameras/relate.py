@@ -19,7 +19,7 @@ from armscan.calibration.cameras.adjustment import (
     condition_number,
     gather,
 )
-from armscan.calibration.cameras.calibrate import NO_SHARED
+from armscan.calibration.cameras.distortion import NO_SHARED
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, SingleCamera, StereoPair
 from armscan.calibration.cameras.robust import FALSE_ALARM, MISFIT_LEVEL, WRONG_LEVEL
 from armscan.calibration.cameras.start import estimate_board_poses

@@ -52,13 +52,14 @@ class CameraOptions:
     ----------
     distortion
         Which coefficients are free; ``auto`` decides by the rule of
-        `armscan.calibration.cameras.calibrate`.
+        `armscan.calibration.cameras.distortion`.
     is_aspect_fixed
         Hold ``fy = fx`` (square pixels).
     is_principal_point_fixed
         Hold the principal point in the middle of the image.
     solve_warp
-        Solve two bow parameters of the board along with the camera.
+        Solve two bow parameters of the board along with the camera in any case; they are solved by
+        themselves where the board is significantly bowed.
     leave_out
         Sources of views that are not used.
     leave_out_misfits
@@ -208,6 +209,10 @@ class CrossValidation:
     view_rms_px: tuple[float, ...]
 
 
+BOW_P = 0.01
+"""A bow is taken for real below this probability of seeing it on a flat board."""
+
+
 class BoardWarp(ArrayRecord):
     """Bow of the board: ``z = bow_x (1 - u^2) + bow_y (1 - v^2)``.
 
@@ -239,7 +244,7 @@ class BoardWarp(ArrayRecord):
     @property
     def is_significant(self) -> bool:
         """True if a flat board would show such a bow less than once in a hundred times."""
-        return self.p_value < 0.01
+        return self.p_value < BOW_P
 
 
 class CameraFit(ArrayRecord):
@@ -251,7 +256,9 @@ class CameraFit(ArrayRecord):
         The solution.
     covariance
         (9, 9) in the order of `armscan.models.camera.PARAMETER_NAMES`; rows of parameters that
-        were held are zero.
+        were held by request are zero. Coefficients that ``auto`` left at zero count as unknown, of
+        the size that lenses usually have, where the views do not say more; and all is widened if
+        residuals of one view are alike (see `armscan.calibration.cameras.distortion`).
     free_parameters
         Names of the parameters that were solved.
     joint_covariance
@@ -283,9 +290,12 @@ class CameraFit(ArrayRecord):
     cross_validation
         Hold-out test, or None if it was switched off or too few views are left for it.
     warp
-        Bow of the board, if it was solved.
+        Bow of the board, if it was solved: asked for, or significant.
     model_reason
         Why these parameters were free.
+    design_effect
+        Factor that variances were given because residuals of one view are alike; 1 where they
+        are not.
     warnings
         Plain sentences that a person should read.
     options
@@ -308,6 +318,7 @@ class CameraFit(ArrayRecord):
     cross_validation: CrossValidation | None
     warp: BoardWarp | None
     model_reason: str
+    design_effect: float
     warnings: tuple[str, ...]
     options: CameraOptions
 
@@ -401,6 +412,8 @@ LISTED = 3
 SQUARE_PIXELS = 0.02
 SQUARE_SIGMAS = 5.0
 """Pixels are square to a part in a thousand in nearly all cameras."""
+ALIKE = 4.0
+"""Residuals of one view are alike enough to be told if variances are widened by this."""
 UNSEEN_WORSE = 1.3
 UNSEEN_BETTER = 0.9
 """Least squares fits the views that it used at least about as well as those that it did not."""
@@ -426,6 +439,7 @@ def advise(
         *_about_coverage(fit),
         *_about_pixels(fit),
         *_about_model(fit),
+        *_about_residuals(fit),
         *_about_warp(fit),
     ]
     return replace(fit, warnings=tuple(warnings))
@@ -492,6 +506,8 @@ def _about_pixels(fit: CameraFit) -> list[str]:
     camera, (sigma_fx, sigma_fy) = fit.camera, fit.sigma[:2]
     ratio = camera.fx_px / camera.fy_px
     sigma = ratio * math.hypot(sigma_fx / camera.fx_px, sigma_fy / camera.fy_px)
+    # such a target also makes residuals alike: the widening must not hide it
+    sigma /= math.sqrt(fit.design_effect)
     if abs(ratio - 1.0) < max(SQUARE_PIXELS, SQUARE_SIGMAS * sigma):
         return []
     return [
@@ -517,14 +533,24 @@ def _about_model(fit: CameraFit) -> list[str]:
     return warnings
 
 
+def _about_residuals(fit: CameraFit) -> list[str]:
+    if fit.design_effect < ALIKE:
+        return []
+    return [
+        "residuals of one view are alike, as if the board were bent or unevenly lit: the standard "
+        f"deviations were widened by {math.sqrt(fit.design_effect):.1f}; look at the residuals' "
+        "picture, and at the board's flatness"
+    ]
+
+
 def _about_warp(fit: CameraFit) -> list[str]:
     if fit.warp is None or not fit.warp.is_significant:
         return []
     bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
     largest = float(abs(fit.warp.bow_mm).sum())
     return [
-        f"the board is bowed by {bow} mm (along x, along y): the light-sheet calibration takes it "
-        f"as flat; use a flatter board there, or expect errors of up to {largest:.2g} mm in height"
+        f"the board is bowed by {bow} mm (along x, along y): that is solved along; a flatter board "
+        f"is better, for bends of other shapes are not: {largest:.2g} mm in height"
     ]
 
 

@@ -10,8 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.sheets.board_points import N_CAMERA, HeadCameras
-from armscan.calibration.sheets.checks import check_points
+from armscan.calibration.sheets.board_points import (
+    N_CAMERA,
+    BoardBow,
+    HeadCameras,
+    find_bow,
+)
+from armscan.calibration.sheets.checks import check_points, estimate_shapes_mm
 from armscan.calibration.sheets.coplanarity import (
     CommonPlane,
     fit_common_plane,
@@ -113,7 +118,8 @@ def calibrate_sheets(
     """
     options = options or SheetOptions()
     cameras = HeadCameras.of(camera)
-    vote = observe_boards(boards, cameras, options)
+    bow, bent = find_bow(boards, cameras)
+    vote = observe_boards(bent, cameras, options, bow)
     if not any(image.stripes for image in vote.images):
         return FitFailure(
             f"no straight stripe with {MIN_POINTS} accepted points lies on the board in "
@@ -126,7 +132,7 @@ def calibrate_sheets(
         case = _case_of(vote.images, assignment, cameras, options)
         fit = case if isinstance(case, _Refused) else case.solved()
         if isinstance(fit, LaserFit):
-            warnings = (*vote.warnings, *fit.warnings)
+            warnings = (*_about_bow(bow), *vote.warnings, *fit.warnings)
             boards = tuple(boards)
             return replace(fit, boards=boards, skipped=vote.outlying, warnings=warnings)
         if isinstance(fit, FitFailure):
@@ -135,6 +141,13 @@ def calibrate_sheets(
             return fit.failure
         assignment = assignment.without(fit.sheet, fit.failure.reason)
     return assignment
+
+
+def _about_bow(bow: BoardBow | None) -> tuple[str, ...]:
+    if bow is None:
+        return ()
+    along = ", ".join(f"{value:+.3f}" for value in bow.bow_mm)
+    return (f"the board is bowed by {along} mm (along x, along y); stripes were placed so",)
 
 
 def _case_of(
@@ -242,9 +255,11 @@ class _Case:
         noise = np.array([model.noise.factor for model in models])
         noise_px = used.sigma_px * noise[used.sheet]
         points = check_points(used, solution, noise_px, self.images, self.cameras)
+        independent = np.array([model.noise.sigma_factor for model in models])[used.sheet]
+        shapes = estimate_shapes_mm(used, solution, used.sigma_px * independent)
         sheets = []
         for k in range(len(models)):
-            fit = self._sheet_fit(k, used, solution, points[k])
+            fit = self._sheet_fit(k, used, solution, points[k], shapes[k])
             if isinstance(fit, FitFailure):
                 return _Refused(k, fit)
             sheets.append(fit)
@@ -252,9 +267,11 @@ class _Case:
             float(np.sqrt((self.scatter[self.kept & (self.observations.sheet == k)] ** 2).mean()))
             for k in range(len(models))
         ]
-        # From the order cameras, sheets to that of a sensor: left camera, sheets, second camera.
-        order = np.arange(len(solution.covariance))
+        # From the order cameras, bow, sheets to that of a sensor: left camera, sheets, second one.
         n_camera = self.cameras.n_parameters
+        order = np.delete(
+            np.arange(len(solution.covariance)), slice(n_camera, self.errors.n_camera)
+        )
         order = np.concatenate([order[:N_CAMERA], order[n_camera:], order[N_CAMERA:n_camera]])
         return LaserFit(
             sheets=tuple(sheets),
@@ -300,12 +317,17 @@ class _Case:
         return tuple(warnings)
 
     def _sheet_fit(
-        self, k: int, used: SheetObservations, solution: SheetSolution, points: SheetPointCheck
+        self,
+        k: int,
+        used: SheetObservations,
+        solution: SheetSolution,
+        points: SheetPointCheck,
+        shape_mm: float,
     ) -> SheetFit | FitFailure:
         name, model, sheet = self.assignment.names[k], self.models[k], solution.sheets[k]
         of_sheet = used.sheet == k
         observations = used.select(of_sheet)
-        first = self.cameras.n_parameters + N_SHEET * k
+        first = self.errors.n_camera + N_SHEET * k
         covariance = solution.covariance[first : first + N_SHEET, first : first + N_SHEET]
         geometry = sheet_geometry(sheet, observations, self.images)
         tilt_variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
@@ -334,6 +356,7 @@ class _Case:
                 n_points=len(observations),
                 depth_range_mm=geometry.depth_range_mm,
                 is_redundant=geometry.n_boards > 2,
+                shape_mm=shape_mm,
             ),
             diagnostics=SheetDiagnostics(
                 rms_px=float(np.sqrt((residual_px[of_sheet] ** 2).mean())),

@@ -6,6 +6,8 @@ they make. The stripes are reconstructed as any later stripe is: the pixel's ray
 The distance of these points from the boards' planes has a claimed standard deviation, that of the
 difference of two things that share the cameras, and, where the board took part in the fit, its
 errors. Each board is also left out: its points then rest on the other boards alone.
+
+What a sheet's model leaves of its shape shows in the same place of the sheet on every board.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from armscan.calibration.sheets.solve import (
     SheetSolution,
 )
 from armscan.calibration.sheets.stripes_on_board import BoardImage
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.models.light_sheet import LightSheet
 
 FEWEST_OTHERS = 2
@@ -107,6 +109,8 @@ class _Case:
             points, is_met = intersect_sheet_of(q, image.data.camera, sheets[k], self.cameras)
             pose = image.placed.sensor_from_board
             distance = (points - pose.translation_mm) @ pose.rotation[:, 2]
+            if image.bow is not None:
+                distance = distance - image.bow.height_mm(points, pose)
             found[of] = np.where(is_met, distance, np.nan)
         return found
 
@@ -196,3 +200,125 @@ class _Claim:
         total = noise + (by_camera**2).sum(axis=1) + (by_board**2).sum(axis=1)
         total = total + ((by_sheet @ covariance - lever) * by_sheet).sum(axis=1)
         return np.asarray(np.maximum(total, 0.0))
+
+
+CELLS = 12
+"""Pieces into which a stripe is cut, along the sheet's extent."""
+SHAPE_LENGTH = 0.2
+"""Distance over which a sheet's shape is alike, as a part of its extent: 15 mm of 75 mm."""
+SHAPE_STEPS = np.linspace(0.0, 1.0, 13) ** 2
+LARGEST_SHAPE = 2.0
+"""Shapes up to this many times the residuals' root mean square are thought of."""
+
+
+def estimate_shapes_mm(
+    observations: SheetObservations, solution: SheetSolution, noise_px: FloatArray
+) -> tuple[float, ...]:
+    """Standard deviation by which each sheet leaves its model, smoothly over the sheet.
+
+    Distances of the stripes from their sheet have four sources: noise, the boards' and the cameras'
+    errors, a course of its own that each stripe has (a bent board), and the sheet's shape, which
+    alone is the same on all boards at one place of the sheet. Their variances are told from each
+    other by restricted likelihood (Patterson and Thompson 1971): the sheet's parameters are free,
+    boards and cameras have their covariance, the last two are smooth fields of unknown size. Of the
+    shape's variance the mean over the likelihood is returned, all sizes up to the residuals' own
+    being alike beforehand: where few boards tell little, it stays as large as it may be.
+
+    Parameters
+    ----------
+    observations, solution
+        N points used, and the joint fit.
+    noise_px
+        (N,) standard deviation with which points count as independent.
+    """
+    return tuple(
+        _shape_mm(_cells(observations, solution, noise_px, k)) for k in range(len(solution.sheets))
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cells:
+    """Mean distances (C,) in mm of pieces of the stripes of one sheet, and what they rest on.
+
+    ``by_sheet`` (C, F) and ``by_others`` (C, O): derivatives by the sheet's free parameters, and by
+    boards and cameras in their own sigmas. ``noise_mm2`` (C,). ``place_mm`` (C, 2) on the sheet.
+    ``stripe`` (C,) number of the stripe.
+    """
+
+    height_mm: FloatArray
+    by_sheet: FloatArray
+    by_others: FloatArray
+    noise_mm2: FloatArray
+    place_mm: FloatArray
+    stripe: IntArray
+
+
+def _cells(
+    observations: SheetObservations, solution: SheetSolution, noise_px: FloatArray, k: int
+) -> _Cells:
+    system, sheet = solution.system, solution.sheets[k]
+    place = (observations.points_mm - sheet.origin_mm) @ sheet.axes[:2].T
+    along = place[observations.sheet == k, 0]
+    step = max(float(np.ptp(along)) / CELLS, 1e-9)
+    gradient = sheet.height_with_jacobian(observations.points_mm)[1]
+    mm_per_px = np.einsum("ni,ni->n", gradient, observations.across_mm_px)
+    height, design, noise, places, stripes = [], [], [], [], []
+    for number, stripe in enumerate(system.stripes):
+        if observations.sheet[stripe.rows[0]] != k:
+            continue
+        piece = np.floor((place[stripe.rows, 0] - along.min()) / step).astype(np.int64)
+        for cell in np.unique(piece):
+            own = piece == cell
+            rows = stripe.rows[own]
+            by_all = np.zeros(system.n_columns)
+            by_all[stripe.columns] = (mm_per_px[rows, None] * stripe.design[own]).mean(axis=0)
+            height.append(float(system.height_mm[rows].mean()))
+            design.append(by_all)
+            noise.append(float(((noise_px * mm_per_px)[rows] ** 2).mean()) / len(rows))
+            places.append(place[rows].mean(axis=0))
+            stripes.append(number)
+    by_all = np.array(design)
+    is_used = np.any(by_all != 0.0, axis=0)
+    is_sheet = np.arange(system.n_columns) < system.n_sheet
+    return _Cells(
+        np.array(height),
+        by_all[:, is_used & is_sheet],
+        by_all[:, is_used & ~is_sheet],
+        np.array(noise),
+        np.array(places),
+        np.array(stripes),
+    )
+
+
+def _shape_mm(cells: _Cells) -> float:
+    length = max(SHAPE_LENGTH * float(np.ptp(cells.place_mm[:, 0])), 1e-9)
+    apart = cells.place_mm[:, None] - cells.place_mm[None, :]
+    alike = np.exp(-0.5 * np.sum(apart**2, axis=2) / length**2)
+    own = alike * (cells.stripe[:, None] == cells.stripe[None, :])
+    known = np.diag(cells.noise_mm2) + cells.by_others @ cells.by_others.T
+    scale = np.sqrt(np.sum(cells.by_sheet**2, axis=0))
+    free = cells.by_sheet / scale
+    largest = LARGEST_SHAPE * float(np.sqrt(np.mean(cells.height_mm**2)))
+    sizes = largest * SHAPE_STEPS
+    steps = np.gradient(SHAPE_STEPS)
+    likelihood = np.array(
+        [
+            [
+                _restricted(known + s * s * alike + t * t * own, free, cells.height_mm)
+                for t in sizes[::2]
+            ]
+            for s in sizes
+        ]
+    )
+    weight = np.exp(likelihood - likelihood.max()) * steps[:, None] * np.gradient(SHAPE_STEPS[::2])
+    return float(np.sqrt(weight.sum(axis=1) @ sizes**2 / weight.sum()))
+
+
+def _restricted(covariance: FloatArray, free: FloatArray, value: FloatArray) -> float:
+    """Logarithm of the restricted likelihood of ``value`` (C,), up to a constant."""
+    root = np.linalg.cholesky(covariance)
+    white = np.linalg.solve(root, np.column_stack([free, value]))
+    q, r = np.linalg.qr(white[:, :-1])
+    left = white[:, -1] - q @ (q.T @ white[:, -1])
+    logs = np.log(np.diag(root)).sum() + np.log(np.abs(np.diag(r))).sum()
+    return float(-logs - 0.5 * left @ left)

@@ -80,13 +80,16 @@ class SmoothedCentres:
     """Centres after smoothing.
 
     ``points``: (N, 2) image pixels. ``normals``: (N, 2) unit normals. ``sigma``: (N,) standard
-    deviation along the normal. ``is_outlier``: (N,) True where the raw centre disagrees with its
-    neighbours' course.
+    deviation along the normal. ``sigma_sum``: (N,) root of a point's share in the variance of a sum
+    over its chain; a local quadratic has weights that sum to one, so that a sum over smoothed
+    centres errs as that over raw ones does, however small the smoothed ones' own sigma is.
+    ``is_outlier``: (N,) True where the raw centre disagrees with its neighbours' course.
     """
 
     points: FloatArray
     normals: FloatArray
     sigma: FloatArray
+    sigma_sum: FloatArray
     is_outlier: BoolArray
 
 
@@ -112,8 +115,10 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     course = replace(course, is_used=course.is_used & ~is_outlier)
     correlation = noise_correlation(course, half[-1])
     course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
+    alike = 1.0 + 2.0 * float(correlation[1:].sum()) / correlation[0]
+    sigma_sum = course.sigma * np.sqrt(alike)
     if largest_px <= 0.0:
-        return SmoothedCentres(course.points, course.normals, course.sigma, is_outlier)
+        return SmoothedCentres(course.points, course.normals, course.sigma, sigma_sum, is_outlier)
     result = course.fit_parabolas(half, np.array([_inflation(correlation, h) for h in half]))
     used, normals = course.is_used, course.normals
     shift = np.where(used, result[:, SHIFT], 0.0)
@@ -124,6 +129,7 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         course.points + shift[:, None] * normals,
         turned / np.linalg.norm(turned, axis=1, keepdims=True),
         np.where(used, result[:, SMOOTH_SIGMA], course.sigma),
+        sigma_sum,
         is_outlier,
     )
 

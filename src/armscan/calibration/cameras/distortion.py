@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which distortion model the views support, and what the coefficients that it leaves at zero may
+still be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from armscan.calibration.cameras.adjustment import (
+    SHARED_NAMES,
+    Observations,
+    State,
+    adjust,
+    basis_of,
+    joint_covariance,
+    linearise,
+    reduced_normal_matrix,
+)
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    MIN_VIEWS,
+    CrossValidation,
+    DistortionModel,
+)
+from armscan.calibration.cameras.robust import (
+    Solution,
+    board_residuals,
+    covariance_with_target_error,
+    estimate_target_error,
+    residuals_px,
+)
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+
+NO_SHARED = np.zeros((11, 0))
+
+
+def cross_validate(
+    solution: Solution, sources: tuple[str, ...], n_folds: int
+) -> CrossValidation | None:
+    """Hold out views fold by fold (see `CrossValidation`).
+
+    Points that the full solution rejected as outliers count neither in the folds' solutions nor
+    in the result.
+
+    Parameters
+    ----------
+    solution
+        Of all used views; it also is the folds' starting value.
+    sources
+        Names of the views.
+    n_folds
+        Wanted folds; at most one a view.
+
+    Returns
+    -------
+    result
+        None if fewer than three views would be left to solve from, or if a fold has no solution.
+    """
+    observations = solution.observations
+    n_views = observations.n_views
+    folds = min(n_folds, n_views)
+    if folds < 2 or n_views - int(np.ceil(n_views / folds)) < MIN_VIEWS:
+        return None
+    fold_of_view = np.arange(n_views) % folds
+    held_out = np.zeros_like(observations.points_px)
+    for fold in range(folds):
+        train, test = np.flatnonzero(fold_of_view != fold), np.flatnonzero(fold_of_view == fold)
+        part, weights = subset(observations, solution.weights, train)
+        trained = adjust(part, of_views(solution.state, train), solution.basis, weights)
+        if isinstance(trained, FitFailure):
+            return None
+        part, weights = subset(observations, solution.weights, test)
+        start = of_views(solution.state, test)
+        start = State(trained.state.shared, start.rotations, start.translations_mm)
+        posed = adjust(part, start, NO_SHARED, weights)
+        if isinstance(posed, FitFailure):
+            return None
+        rows = np.isin(observations.view_of_point, test)
+        held_out[rows] = residuals_px(part, posed.state)
+    in_sample = residuals_px(observations, solution.state)
+    kept = solution.weights > 0.0
+    per_view = []
+    for v in range(n_views):
+        rows_of_view = observations.rows(v)
+        per_view.append(rms(held_out[rows_of_view][kept[rows_of_view]]))
+    return CrossValidation(
+        folds, rms(held_out[kept]), rms(in_sample[kept]), sources, tuple(per_view)
+    )
+
+
+def rms(residuals: FloatArray) -> float:
+    """Root mean square over (N, 2) residuals of their length, as OpenCV defines it."""
+    return float(np.sqrt(np.mean(np.sum(residuals**2, axis=1))))
+
+
+def subset(
+    observations: Observations, weights: FloatArray, views: IntArray
+) -> tuple[Observations, FloatArray]:
+    """The observations of some views, in order, with their weights."""
+    rows = np.isin(observations.view_of_point, views)
+    counts = np.diff(observations.starts)[views]
+    part = Observations(
+        observations.points_px[rows],
+        observations.whitening[rows],
+        observations.board_mm[rows],
+        observations.board_warp_shape[rows],
+        (0, *(int(n) for n in np.cumsum(counts))),
+        observations.width_px,
+        observations.height_px,
+    )
+    return part, weights[rows]
+
+
+def of_views(state: State, views: IntArray) -> State:
+    """The poses of some views, in order, with the shared unknowns."""
+    return State(state.shared, state.rotations[views], state.translations_mm[views])
+
+
+MODELS: tuple[DistortionModel, ...] = ("k1", "k1k2", "k1k2p1p2", "k1k2p1p2k3")
+"""Smallest first."""
+
+SIGNIFICANCE = 0.01
+"""Further coefficients are kept if zero ones would look so far from zero less often than this."""
+
+GAIN_SIGMAS = 1.0
+"""...and if views that took no part are predicted better, by this many standard errors of the mean
+over the views. The test above has no mercy with noise; this one notices what is not noise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChosenModel:
+    """A distortion model with its solution and hold-out test.
+
+    Parameters
+    ----------
+    model
+        The model.
+    solution
+        Its solution.
+    cross_validation
+        Its hold-out test, None where there was none.
+    reason
+        Why this model, in words.
+    untested
+        Names of the coefficients that the choice left at zero, for lack of evidence: nobody said
+        that they are.
+    """
+
+    model: DistortionModel
+    solution: Solution
+    cross_validation: CrossValidation | None
+    reason: str
+    untested: tuple[str, ...] = ()
+
+
+def choose_model(
+    solve: Callable[[DistortionModel], Solution | FitFailure],
+    validate: Callable[[Solution, Solution], CrossValidation | None],
+    folds: Callable[[Solution], bool],
+    chance: Callable[[Solution, tuple[str, ...]], float],
+) -> ChosenModel | FitFailure:
+    """Choose the smallest model beyond which the views show nothing.
+
+    A larger model takes the place of a smaller one if its further coefficients are significant and
+    if it predicts unseen views better by more than that gain's own scatter over the views.
+
+    Parameters
+    ----------
+    solve
+        Solves with a given model.
+    validate
+        Tests a solution on held-out views, on the points that the second solution kept.
+    folds
+        Whether a solution's distortion folds over inside the image.
+    chance
+        Probability that coefficients of a solution, which in truth are zero, look as they do.
+    """
+    solved = [(model, solve(model)) for model in MODELS]
+    tried = [(model, each) for model, each in solved if not isinstance(each, FitFailure)]
+    failures = [each for _, each in solved if isinstance(each, FitFailure)]
+    if not tried:
+        return failures[0]
+    reference = tried[-1][1]
+    tested = [ChosenModel(m, each, validate(each, reference), "") for m, each in tried]
+    chosen, said = tested[0], ""
+    for larger in tested[1:]:
+        further = _further(chosen.model, larger.model)
+        is_settled = larger.solution.is_converged or not chosen.solution.is_converged
+        probability = chance(larger.solution, further) if is_settled else 1.0
+        gain = _gain_sigmas(chosen.cross_validation, larger.cross_validation)
+        names = " ".join(further)
+        if probability >= SIGNIFICANCE:
+            said = said or f"{names} not told from zero by these views"
+        elif gain is not None and gain < GAIN_SIGMAS:
+            said = said or f"unseen views are predicted no better with {names}"
+        else:
+            chosen, said = larger, ""
+    if folds(chosen.solution):
+        chosen, said = _unfolded(chosen, tested, folds) or (chosen, said)
+    validation = chosen.cross_validation
+    if chosen.solution is not reference:
+        validation = validate(chosen.solution, chosen.solution)
+    untested = _further(chosen.model, MODELS[-1])
+    reason = f"{chosen.model}: {said}" if said else "all five coefficients show in the views"
+    if not said and untested:
+        reason = f"{chosen.model}: no larger model has a solution"
+    return ChosenModel(chosen.model, chosen.solution, validation, reason, untested)
+
+
+def _further(model: DistortionModel, larger: DistortionModel) -> tuple[str, ...]:
+    has = DISTORTION_PARAMETERS[model]
+    return tuple(name for name in DISTORTION_PARAMETERS[larger] if name not in has)
+
+
+def _gain_sigmas(smaller: CrossValidation | None, larger: CrossValidation | None) -> float | None:
+    """Mean over views of the fall of held-out mean squares, over its standard error."""
+    if smaller is None or larger is None:
+        return None
+    gain = np.square(smaller.view_rms_px) - np.square(larger.view_rms_px)
+    error = float(np.std(gain, ddof=1)) / np.sqrt(len(gain)) if len(gain) > 1 else 0.0
+    return float(np.mean(gain)) / max(error, 1e-300)
+
+
+def _unfolded(
+    chosen: ChosenModel, tested: list[ChosenModel], folds: Callable[[Solution], bool]
+) -> tuple[ChosenModel, str] | None:
+    """The smallest model that does not fold over and predicts as well, if there is one."""
+    if chosen.cross_validation is None:
+        return None
+    for other in tested:
+        validation = other.cross_validation
+        if validation is None or validation.rms_px > chosen.cross_validation.rms_px:
+            continue
+        if not folds(other.solution):
+            said = (
+                f"{chosen.model} folds over inside the image, and it predicts unseen views as well"
+            )
+            return other, said
+    return None
+
+
+def chance_of_coefficients(solution: Solution, names: tuple[str, ...]) -> float:
+    """Probability that coefficients which are zero come out as far from it as these.
+
+    Wald's test with the solution's covariance, the target's own errors included, widened by
+    `design_effect`.
+
+    Parameters
+    ----------
+    solution
+        With these coefficients free.
+    names
+        Coefficients, as in `armscan.models.camera.PARAMETER_NAMES`.
+    """
+    determined = joint_covariance(solution.equations, solution.basis)
+    if isinstance(determined, FitFailure):
+        return 1.0
+    found = board_residuals(solution)
+    error = estimate_target_error(found)
+    covariance = covariance_with_target_error(determined[0], solution.variance_factor, error, found)
+    rows = [SHARED_NAMES.index(name) for name in names]
+    value = solution.state.shared[rows]
+    own = covariance[np.ix_(rows, rows)] * max(design_effect(solution).value, 1.0)
+    scale = np.sqrt(np.diag(own))
+    z = value / scale
+    square = float(z @ np.linalg.solve(own / np.outer(scale, scale), z))
+    return float(stats.chi2.sf(square, len(rows)))
+
+
+SIGNIFICANT_SIGMAS = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class DesignEffect:
+    """By how much the views' pulls on the camera scatter more than points that err on their own.
+
+    Parameters
+    ----------
+    value
+        1 where every point errs on its own.
+    sigma
+        Its standard deviation there.
+    """
+
+    value: float
+    sigma: float
+
+    @property
+    def widening(self) -> float:
+        """Factor for variances: 1 unless the value is larger by four of its deviations."""
+        return self.value if self.value > 1.0 + SIGNIFICANT_SIGMAS * self.sigma else 1.0
+
+
+def design_effect(solution: Solution) -> DesignEffect:
+    """How alike the residuals of one view are, from what the views do to the camera.
+
+    A bent board, uneven light or a detector that errs by the tilt moves neighbouring points alike;
+    the points of a view then tell less than their count. At the minimum the pulls s_v of the views
+    on the shared unknowns, poses eliminated, sum to zero. With R_v the information of view v and R
+    their sum, independent points give
+    ``E sum s_v' R^-1 s_v = sigma0^2 (F - sum tr((R^-1 R_v)^2))``; the design
+    effect (Kish; views are the clusters) is what is found over this. Errors of the
+    target's points, which are counted by themselves, are taken out before.
+    """
+    observations, basis = _without_target_error(solution), solution.basis
+    f = basis.shape[1]
+    information, pulls, chi2 = [], [], 0.0
+    for v in range(observations.n_views):
+        alone, weights = subset(observations, solution.weights, np.array([v]))
+        equations = linearise(alone, of_views(solution.state, np.array([v])), basis, weights)
+        if equations is None:
+            return DesignEffect(1.0, 0.0)
+        information.append(reduced_normal_matrix(equations))
+        carried = equations.cross[0] @ np.linalg.inv(equations.pose[0])
+        pulls.append(equations.shared_gradient - carried @ equations.pose_gradient[0])
+        chi2 += equations.chi2
+    views = np.array(information)
+    total = views.sum(axis=0)
+    scale = 1.0 / np.sqrt(np.diag(total))
+    inverse = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
+    shares = inverse @ views
+    own = float(np.einsum("vij,vji->", shares, shares))
+    s = np.array(pulls) - np.mean(pulls, axis=0)
+    found = float(np.einsum("vi,ij,vj->", s, inverse, s))
+    sigma0_squared = chi2 / max(solution.degrees_of_freedom, 1)
+    expected = max(f - own, 1e-3)
+    return DesignEffect(
+        found / max(sigma0_squared * expected, 1e-300), float(np.sqrt(2.0 * own)) / expected
+    )
+
+
+def _without_target_error(solution: Solution) -> Observations:
+    """The observations less what each point of the target misses in the mean of all views."""
+    observations, found = solution.observations, board_residuals(solution)
+    if found is None or estimate_target_error(found).sigma_mm == 0.0:
+        return observations
+    missed = np.linalg.solve(found.by_board, found.residuals_px[:, :, None])[:, :, 0]
+    point = found.point
+    total = np.stack([np.bincount(point, missed[:, k]) for k in range(2)], axis=1)
+    mean = total / np.bincount(point)[:, None]
+    points_px = observations.points_px.copy()
+    points_px[solution.weights > 0.0] -= (found.by_board @ mean[point][:, :, None])[:, :, 0]
+    return replace(observations, points_px=points_px)
+
+
+NEXT_TERM = 0.3
+"""Each radial term of a lens is about this part of the one before it, at the image's corner..."""
+LEAST_TERM = 0.003
+"""...the first one at least this part of the radius."""
+TYPICAL_TANGENTIAL = 1e-3
+"""Tangential coefficients of lenses that are centred as usual."""
+
+
+def typical_coefficients(solution: Solution, names: tuple[str, ...]) -> FloatArray:
+    """(D,) how large coefficients of a usual lens are that the solution left at zero.
+
+    Only an order of magnitude, of lenses in general: where views say more, they prevail.
+    """
+    observations, shared = solution.observations, solution.state.shared
+    half = 0.5 * np.array([observations.width_px, observations.height_px])
+    square = float(np.sum((half / shared[:2]) ** 2))
+    first = max(abs(float(shared[4])) * square, LEAST_TERM)
+    second = max(abs(float(shared[5])) * square**2, NEXT_TERM * first)
+    typical = {
+        "k2": NEXT_TERM * first / square**2,
+        "p1": TYPICAL_TANGENTIAL,
+        "p2": TYPICAL_TANGENTIAL,
+        "k3": NEXT_TERM * second / square**3,
+    }
+    return np.array([typical[name] for name in names])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LeftAtZero:
+    """What coefficients that were left at zero, and may not be, do to everything else.
+
+    Parameters
+    ----------
+    unit_covariance
+        (S + 6 V, S + 6 V) as from `joint_covariance`, with these coefficients unknown as well, but
+        of a usual lens.
+    shift
+        (S + 6 V,) by which all unknowns would move if they were solved so.
+    """
+
+    unit_covariance: FloatArray
+    shift: FloatArray
+
+
+def coefficients_left_at_zero(
+    solution: Solution, names: tuple[str, ...], sigma0_squared: float
+) -> LeftAtZero | FitFailure:
+    """Joint covariance with coefficients that the choice left at zero as further unknowns.
+
+    A coefficient that does not show in the views is not zero for that: it is what lenses usually
+    have, or less, and it moves the focal length and the principal point. Taken as a normal variable
+    about zero with `typical_coefficients`, the views' own information added (Bayes).
+
+    Parameters
+    ----------
+    solution
+        With the coefficients held at zero.
+    names
+        Which.
+    sigma0_squared
+        Variance of a point of unit weight that the covariance will be scaled with.
+    """
+    added = basis_of(names, is_aspect_fixed=False)
+    basis = np.concatenate([solution.basis, added], axis=1)
+    equations = linearise(solution.observations, solution.state, basis, solution.weights)
+    if equations is None:
+        return FitFailure("the solution puts the board behind the camera")
+    known = np.zeros(basis.shape[1])
+    known[-len(names) :] = sigma0_squared / typical_coefficients(solution, names) ** 2
+    equations = replace(equations, shared=equations.shared + np.diag(known))
+    determined = joint_covariance(equations, basis)
+    if isinstance(determined, FitFailure):
+        return determined
+    rows = [SHARED_NAMES.index(name) for name in names]
+    pull = equations.shared_gradient[-len(names) :]
+    return LeftAtZero(determined[0], np.asarray(determined[0][:, rows] @ pull))

@@ -49,7 +49,7 @@ class Waves:
 
     @staticmethod
     def draw(made: Instrument, rng: np.random.Generator, n: int, sigma_mm: float) -> Waves:
-        """n waves of about the instrument's length, of random direction and phase."""
+        """N waves of about the instrument's length, of random direction and phase."""
         length = made.references.flatness_length_mm * rng.uniform(0.6, 1.6, n)
         angle = rng.uniform(0.0, np.pi, n)
         vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * (2.0 * np.pi / length)[:, None]

@@ -236,6 +236,37 @@ def prepare_cameras(
     return prepared[0], prepared[1]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownBow:
+    """Bow of the board as both cameras found it, each by itself; see `BoardWarp`.
+
+    Parameters
+    ----------
+    bow_mm
+        (2,) along x and along y.
+    covariance_mm2
+        (2, 2).
+    """
+
+    bow_mm: FloatArray
+    covariance_mm2: FloatArray
+
+
+def common_bow(cameras: tuple[SingleCamera, SingleCamera]) -> KnownBow | None:
+    """Weighted mean of the bows that the cameras by themselves could not do without."""
+    information, weighted = np.zeros((2, 2)), np.zeros(2)
+    for camera in cameras:
+        warp = None if camera.fit is None else camera.fit.warp
+        if warp is not None and warp.is_significant:
+            own = np.linalg.inv(warp.covariance_mm2)
+            information += own
+            weighted += own @ warp.bow_mm
+    if not information.any():
+        return None
+    covariance = np.linalg.inv(information)
+    return KnownBow(np.asarray(covariance @ weighted), np.asarray(covariance))
+
+
 def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}

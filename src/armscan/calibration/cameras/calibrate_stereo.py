@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.adjustment import board_warp_shape
 from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
@@ -121,31 +120,6 @@ def _alone(
         return seen
     right_from_board: Pose[CameraRight, Board] = Pose(seen.rotation, seen.translation_mm)
     return right_from_left.inverse() @ right_from_board
-
-
-def bent(boards: Boards, cameras: Cameras) -> Boards:
-    """The boards with their points where the bow puts them that the cameras found by themselves."""
-    found = [one.fit.warp for one in cameras if one.fit is not None and one.fit.warp is not None]
-    views = [view for pair in boards.seen_by for view in pair.views if view is not None]
-    if not found or not views:
-        return boards
-    information = [np.linalg.inv(warp.covariance_mm2) for warp in found]
-    pull = sum(inverse @ warp.bow_mm for inverse, warp in zip(information, found, strict=True))
-    bow_mm = np.linalg.solve(sum(information), pull)
-    board = np.concatenate([view.points_board_mm for view in views])
-    height = board_warp_shape(board) @ bow_mm
-    ends = np.cumsum([len(view) for view in views])[:-1]
-    raised = iter(np.split(height, ends))
-
-    def bowed(view: TargetView | None) -> TargetView | None:
-        if view is None:
-            return None
-        points = view.points_board_mm.copy()
-        points[:, 2] = next(raised)
-        return replace(view, points_board_mm=points)
-
-    seen_by = tuple(StereoPair(bowed(pair.left), bowed(pair.right)) for pair in boards.seen_by)
-    return replace(boards, seen_by=seen_by)
 
 
 def starting_state(
@@ -440,7 +414,7 @@ def calibrate_stereo(
     if isinstance(relation, FitFailure):
         return relation
     while True:
-        boards = bent(boards_of(relation), cameras)
+        boards = boards_of(relation)
         solution = _solve(boards, relation, cameras, options, given)
         if isinstance(solution, FitFailure):
             return solution

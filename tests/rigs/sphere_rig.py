@@ -31,6 +31,7 @@ class SphereRig:
     n_points: int = 120
     normals: tuple[FloatArray, ...] = (SHEET_NORMAL,)
     hand_eye: Pose[Tool, Sensor] = HAND_EYE
+    lever_mm: float = LEVER_MM
 
     def base_from_tool(
         self, turn: FloatArray, height_mm: float, along_mm: float, depth_mm: float = 0.0
@@ -77,7 +78,7 @@ class SphereRig:
     def _reported(self, pose: Pose[Base, Tool], generator: np.random.Generator) -> Pose[Base, Tool]:
         """The pose with an error at the scan point, and of the orientation about it."""
         sigma = self.pose_noise_mm
-        turn = rotation_from_vector(generator.normal(0.0, sigma / LEVER_MM, 3))
+        turn = rotation_from_vector(generator.normal(0.0, sigma / self.lever_mm, 3))
         scan = (pose @ self.hand_eye).matrix[:3] @ [*SCAN_POINT_MM, 1.0]
         moved = turn @ (pose.translation_mm - scan) + scan + generator.normal(0.0, sigma, 3)
         return Pose(turn @ pose.rotation, moved)

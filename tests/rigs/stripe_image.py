@@ -121,6 +121,11 @@ class SimulatedStripe:
         ``1 + skew (u^3 - 3 u) / 6``.
     reflectance_gradient
         Relative change of reflectance per sigma across the line.
+    lopsided
+        Part by which sigma is larger on the positive side and smaller on the other; the brightest
+        place stays on the curve.
+    tail
+        Part of the peak that belongs, on the positive side, to a Gaussian twice as broad.
     """
 
     curve: Curve
@@ -130,15 +135,29 @@ class SimulatedStripe:
     modulation_px: float = 400.0
     skew: float = 0.0
     reflectance_gradient: float = 0.0
+    lopsided: float = 0.0
+    tail: float = 0.0
+
+    @property
+    def centroid_px(self) -> float:
+        """Distance of the section's centre of gravity from the curve."""
+        low, high = 1.0 - self.lopsided, 1.0 + self.lopsided
+        area = low + (1.0 - self.tail) * high + 2.0 * self.tail * high
+        moment = -(low**2) + (1.0 - self.tail) * high**2 + 4.0 * self.tail * high**2
+        return self.sigma_px * math.sqrt(2.0 / math.pi) * moment / area
 
     def profile(self, points_px: FloatArray) -> FloatArray:
         """Irradiance (N,) at points (N, 2)."""
         distance, along = self.curve.locate(points_px)
         u = distance / self.sigma_px
+        is_high = u > 0.0
+        u = u / np.where(is_high, 1.0 + self.lopsided, 1.0 - self.lopsided)
         peak = self.peak * (
             1.0 + self.modulation * np.sin(2.0 * np.pi * along / self.modulation_px)
         )
-        shape = np.exp(-0.5 * u * u) * (1.0 + self.skew * (u**3 - 3.0 * u) / 6.0)
+        section = np.exp(-0.5 * u * u)
+        section += np.where(is_high, self.tail, 0.0) * (np.exp(-0.125 * u * u) - section)
+        shape = section * (1.0 + self.skew * (u**3 - 3.0 * u) / 6.0)
         lit = shape * np.maximum(1.0 + self.reflectance_gradient * u, 0.0)
         return np.asarray(peak * np.maximum(lit, 0.0))
 

@@ -233,7 +233,7 @@ def hand_eye(
     ] = None,
     arm_rotation_deg: Annotated[
         float | None,
-        typer.Option(help="Scatter of its orientation; left out, from the position."),
+        typer.Option(help="Scatter of its orientation; left out, estimated."),
     ] = None,
     plate_flatness_mm: Annotated[
         float | None,

@@ -84,13 +84,18 @@ def accumulate(
     profile: Table,
     n: int,
     state: Floats,
+    section: Floats,
     noise: Floats,
     sums: FloatsOut,
 ) -> None:
     """Weighted sums of one Gauss-Newton step.
 
+    The line is ``A exp(-u^2 / 2) (1 + c3 (u^3 - 3 u) + c4 (u^4 - 6 u^2 + 3))`` with ``u`` the
+    distance from the centre over sigma: a Gram-Charlier series, whose centre of gravity is u = 0.
+
     ``profile``: (3, >= n) grey level less background, background, and 1 where the pixel counts.
     ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
+    ``section``: (2,) ``c3, c4``.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
     (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side, then the residual
     against the skew term, the skew term's norm, its product with the centre's derivative, and the
@@ -100,19 +105,24 @@ def accumulate(
     # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
     step = 1.0 / state[2]
     u = (-1.0 - state[0]) * step
-    m = state[1] * math.exp(-0.5 * u * u)
+    bell = state[1] * math.exp(-0.5 * u * u)
+    c3, c4 = section[0], section[1]
     ratio = math.exp(-(u + 0.5 * step) * step)
     change = math.exp(-step * step)
     for k in range(n):
         u += step
-        m *= ratio
+        bell *= ratio
         ratio *= change
+        third = u * (u * u - 3.0)
+        shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
+        m = bell * max(shape, 0.0)
+        falling = bell * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
         variance = noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2]
         w = profile[2, k] / variance
         r = profile[0, k] - m
-        j0 = m * u * step
-        j2 = m * u * u
-        q = m * u * (u * u - 3.0)
+        j0 = falling * step
+        j2 = falling * u
+        q = bell * third
         sums[0] += w * j0 * j0
         sums[1] += w * j0 * m
         sums[2] += w * j0 * j2
@@ -125,7 +135,7 @@ def accumulate(
         sums[9] += w * r * q
         sums[10] += w * q * q
         sums[11] += w * q * j0
-        sums[12] += w * j0 * m * u * u * u
+        sums[12] += w * j0 * bell * u * u * u
 
 
 @compiled()
@@ -156,6 +166,7 @@ def fit_profiles(
     sigma_px: Floats,
     sides: Table,
     noise: Floats,
+    section: Floats,
     reach: Floats,
     result: TableOut,
 ) -> None:
@@ -168,20 +179,24 @@ def fit_profiles(
     ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
     (1, 1) if none is. ``sigma_px``: (N,) start value of the sigma along the column or row.
     ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
-    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``reach``: (N,) half width of the fitted
-    window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma, variance of the centre
-    (0: the fit failed), skew score, its norm, count of clipped pixels, and by how much a term
-    ``u^3`` in the profile's exponent moves the centre, in sigmas (for the correction on bent
-    lines).
+    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
+    as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
+    half width of the fitted window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma,
+    variance of the centre (0: the fit failed), score of a skew beyond the section's, its norm,
+    count of clipped pixels, and by how much a term ``u^3`` in the profile's exponent moves the
+    centre, in sigmas (for the correction on bent lines).
     """
     height, width = image.shape
     profile = np.zeros((3, max(height, width)))
     state = np.zeros(3)
     steps = np.zeros(3)
     sums = np.zeros(13)
+    shape = np.zeros(2)
     has_clipped = clipped.shape[0] == height and clipped.shape[1] == width
     for i in range(points.shape[0]):
         is_column = int(points[i, 5]) == COLUMN
+        shape[0] = section[0] if is_column else section[2]
+        shape[1] = section[1] if is_column else section[3]
         start = points[i, 1] if is_column else points[i, 0]
         line = int(points[i, 0] if is_column else points[i, 1])
         size = height if is_column else width
@@ -215,7 +230,7 @@ def fit_profiles(
             continue
         is_done = False
         for round_ in range(ITERATIONS):
-            accumulate(profile, n, state, noise, sums)
+            accumulate(profile, n, state, shape, noise, sums)
             variance = solve_step(sums, steps)
             if variance <= 0.0:
                 break

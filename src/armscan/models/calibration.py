@@ -415,6 +415,9 @@ class HandEyeDiagnostics:
         Largest change when one posture is left out.
     chi2_probability
         Probability of residuals at least this large under the noise model.
+    region_factor
+        Factor on the usual limit of ``e' C^-1 e`` from which the joint 95 % region of the hand-eye
+        holds 95 %: above 1 where the scatter had to be estimated from few postures.
     """
 
     method: HandEyeMethod
@@ -427,6 +430,7 @@ class HandEyeDiagnostics:
     left_out_rotation_deg: float
     left_out_translation_mm: float
     chi2_probability: float
+    region_factor: float = 1.0
 
 
 class HandEyeCalibration(ArrayRecord):

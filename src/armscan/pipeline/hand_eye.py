@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,7 +135,8 @@ def observe_stripes(
                 continue
             images.append(found.labelled)
             pose = poses.pose(instant.rows[0])
-            stripes.append(posed_stripe(found, sensor, posture_of[instant], pose))
+            stripe = posed_stripe(found, sensor, posture_of[instant], pose)
+            stripes.append(replace(stripe, instant=source.rows[instant.rows[0]].source))
     if chosen and all(one.rows[0] in scan.unreadable for one in chosen):
         raise EstimationError(
             f"no exposure with a pose could be read: {scan.unreadable[chosen[-1].rows[0]]}"

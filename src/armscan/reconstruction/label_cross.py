@@ -36,7 +36,7 @@ BEND_PER_MM = 0.06
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
 SHARP_MM = 0.3
-"""Vaguer predictions err by the same all along a segment."""
+"""Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
 STUDENT = 3.0
 """Degrees of freedom of the error's distribution: edges and sharp bends have long tails."""
 
@@ -92,7 +92,7 @@ class SurfaceMemory:
             (S,) logarithm of the density of the point's depth over that of a new surface, which
             may be anywhere: 0 where nothing is known or the point does not fit.
         sharpness
-            (S,) 1 for a prediction to within `SHARP_MM`, towards 0 the vaguer it is.
+            (S,) 1 for a prediction well within `SHARP_MM`, towards 0 the vaguer it is.
         """
         n = len(points_sensor_mm)
         gain, sharpness = np.zeros(n), np.zeros(n)
@@ -114,7 +114,7 @@ class SurfaceMemory:
         share = 1.0 + (offset / sigma) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
         gain[known] = np.log1p(self.depth_span_mm * peak / share**2)
-        sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 2)
+        sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
         return gain, sharpness
 
 
@@ -159,6 +159,10 @@ class ImageMemory:
     """The last stripe of each sheet with its motion from the one before."""
 
     _last: dict[int, _Stripe] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Count of sheets whose stripe was seen."""
+        return len(self._last)
 
     def forget(self) -> None:
         """Begin anew."""
@@ -213,8 +217,11 @@ DIRECTION_RAD = np.radians(25.0)
 """Standard deviation of a stripe's direction from that on a surface that faces the camera."""
 ODD_DIRECTION = 0.1
 """Share of stripes that run in any direction: walls and edges."""
+CONVINCING = 3
+"""What misleads one piece of a segment misleads all: they count once together. A segment of fewer
+pieces than this counts for less: edges and outlines make short ones of any direction."""
 ALIKE_PIECES = 8
-"""Over so many pieces of a segment, some 5 mm, what misleads one of them misleads all."""
+"""A still has nothing but depth, direction and rays: they count again every so many pieces."""
 INDEPENDENT = 0.5
 """Of sharp predictions: neighbouring pieces share some of what they err by."""
 TAKEN = -3.0
@@ -263,19 +270,24 @@ def hypothesise(
     return Hypotheses(sheets, np.array(points), np.array(inside).T, np.array(place))
 
 
-def still_evidence(pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration) -> FloatArray:
+def still_evidence(
+    pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration, *, is_still: bool = False
+) -> FloatArray:
     """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
     depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
     usual = np.stack([frontal_direction(sensor, k) for k in hypotheses.sheets], axis=1)
     turn = np.arccos(np.clip(np.abs(pieces.direction @ usual), 0.0, 1.0))
     likelihood = (1.0 - ODD_DIRECTION) * np.exp(-0.5 * (turn / DIRECTION_RAD) ** 2) + ODD_DIRECTION
-    return np.asarray(_vote(pieces) * (depth + np.log(likelihood)))
+    return np.asarray(_vote(pieces, is_still=is_still) * (depth + np.log(likelihood)))
 
 
-def _vote(pieces: Pieces) -> FloatArray:
-    """(P, 1) weights by which the pieces of a segment do not count for more than they know."""
+def _vote(pieces: Pieces, *, is_still: bool = False) -> FloatArray:
+    """(P, 1) weights by which the pieces of a segment count once together, of a short one less."""
     count = np.bincount(pieces.segment)[pieces.segment]
-    return np.asarray(np.minimum(1.0, 1.0 / count + 1.0 / ALIKE_PIECES)[:, None])
+    vote = 1.0 / np.maximum(count, CONVINCING)
+    if is_still:
+        vote = np.minimum(1.0, vote + 1.0 / ALIKE_PIECES)
+    return np.asarray(vote[:, None])
 
 
 def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
@@ -304,7 +316,9 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
     return np.asarray(sharp + vague)
 
 
-def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses) -> FloatArray:
+def taken_evidence(
+    log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses, *, is_still: bool = False
+) -> FloatArray:
     """(P, H) penalty where another segment already holds the same rays of a sheet's light.
 
     A ray of a laser ends on the first thing that it meets, so it is seen once.
@@ -315,6 +329,8 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         (P, H) what is believed without this.
     pieces, hypotheses
         Of the profile.
+    is_still
+        True where nothing but the profile is known, see `ALIKE_PIECES`.
     """
     of_sample = pieces.of_sample
     segment = pieces.segment[of_sample]
@@ -326,7 +342,7 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (segment, ray), belief)
         penalty[:, h] = TAKEN * _most_of_others(table)[segment, ray]
-    return np.asarray(_vote(pieces) * pieces.mean(penalty))
+    return np.asarray(_vote(pieces, is_still=is_still) * pieces.mean(penalty))
 
 
 def _most_of_others(table: FloatArray) -> FloatArray:
@@ -338,19 +354,28 @@ def _most_of_others(table: FloatArray) -> FloatArray:
     return np.asarray(np.where(is_most, order[-2], order[-1]))
 
 
-SWITCH = 1e-3
-"""Probability that the sheet changes between two pieces of a segment unnoticed."""
+SWITCH, SWITCH_AT_KINK = 1e-3, 0.02
+"""Probabilities that the sheet changes unnoticed between two pieces: of a segment, and of a chain
+that has a kink or a gap between them. It mostly is an edge of the surface; two lines that end at
+one another are rare."""
 
 
-def smoothed_posterior(log_likelihood: FloatArray, segment: IntArray) -> FloatArray:
+def switch_probability(pieces: Pieces, n_sheets: int) -> FloatArray:
+    """(P,) probability that a piece is of another sheet than the one before it."""
+    is_same = np.diff(pieces.segment, prepend=-1) == 0
+    joined = np.where(is_same, SWITCH, SWITCH_AT_KINK)
+    return np.asarray(np.where(pieces.is_joined, joined, 1.0 - 1.0 / n_sheets))
+
+
+def smoothed_posterior(log_likelihood: FloatArray, switch: FloatArray) -> FloatArray:
     """Posterior log-probability of each hypothesis for each piece, by forward and backward passes.
 
     Parameters
     ----------
     log_likelihood
         (P, H) of each piece under each hypothesis.
-    segment
-        (P,) segment of each piece, not decreasing; segments are independent.
+    switch
+        (P,) from `switch_probability`; ``1 - 1 / H`` where the piece before tells nothing.
 
     Returns
     -------
@@ -360,23 +385,21 @@ def smoothed_posterior(log_likelihood: FloatArray, segment: IntArray) -> FloatAr
     n, h = log_likelihood.shape
     if h == 1 or not n:
         return np.zeros((n, h))
-    step = np.full((h, h), np.log(SWITCH / (h - 1)))
-    np.fill_diagonal(step, np.log1p(-SWITCH))
+    stay, change = np.log1p(-switch), np.log(switch / (h - 1))
+    step = np.where(np.eye(h, dtype=np.bool_), stay[:, None, None], change[:, None, None])
     ahead, behind = log_likelihood.copy(), np.zeros((n, h))
     for p in range(1, n):
-        if segment[p] == segment[p - 1]:
-            ahead[p] += np.logaddexp.reduce(ahead[p - 1][:, None] + step, axis=0)
+        ahead[p] += np.logaddexp.reduce(ahead[p - 1][:, None] + step[p], axis=0)
     for p in range(n - 2, -1, -1):
-        if segment[p] == segment[p + 1]:
-            onward = (behind[p + 1] + log_likelihood[p + 1])[:, None] + step
-            behind[p] = np.logaddexp.reduce(onward, axis=0)
+        onward = (behind[p + 1] + log_likelihood[p + 1])[:, None] + step[p + 1]
+        behind[p] = np.logaddexp.reduce(onward, axis=0)
     total = ahead + behind
     return np.asarray(total - np.logaddexp.reduce(total, axis=1, keepdims=True))
 
 
-MARGIN, REMEMBER_MARGIN = 5.5, 7.0
-"""Least log-odds of a sheet over all others, and of points from which later stripes are predicted:
-with these benchmarks/cross_naming.py finds no wrong label."""
+MARGIN = 5.0
+"""Least log-odds of a sheet over all others; later stripes are predicted from such points. Chosen
+with the other limits on the seeds that docs/explanations/naming-cross.md names."""
 UNDECIDED_SHARE, LEAST_BETWEEN = 0.2, 4
 """A larger share of points without a sheet asks for one laser alone, but not before so many
 exposures with all lasers."""
@@ -520,15 +543,17 @@ class CrossLabeller:
                 points = hypotheses.points_mm[h]
                 gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
         past = past_evidence(pieces, gain, sharpness)
-        evidence = past + still_evidence(pieces, hypotheses, self._sensor)
-        posterior = smoothed_posterior(evidence, pieces.segment)
+        is_still = pose is None and not len(self._image)
+        evidence = past + still_evidence(pieces, hypotheses, self._sensor, is_still=is_still)
+        switch = switch_probability(pieces, len(hypotheses.sheets))
+        posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):
-            taken = taken_evidence(posterior, pieces, hypotheses)
-            posterior = smoothed_posterior(evidence + taken, pieces.segment)
+            taken = taken_evidence(posterior, pieces, hypotheses, is_still=is_still)
+            posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
 
     def _learn(self, profile: Profile, found: _Assignment, pose: Pose[Base, Sensor] | None) -> None:
-        known = (found.odds >= REMEMBER_MARGIN) & (found.sheet >= 0)
+        known = found.sheet >= 0
         sheet, pixels = found.sheet[known], profile.points_px[known]
         self._image.remember(pixels, profile.normals_px[known], sheet)
         if pose is not None:

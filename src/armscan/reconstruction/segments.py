@@ -53,12 +53,17 @@ def cut_segments(profile: Profile) -> StripeSegments:
     if not len(row):
         return StripeSegments(row, row)
     points = profile.points_px[row]
-    n_beside = np.cumsum((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)[row]
+    n_beside = _count_beside(profile)[row]
     is_cut = np.hypot(*np.diff(points, axis=0).T) > GAP_PX
     is_cut |= (np.diff(profile.segment[row]) != 0) | (np.diff(n_beside) > 0)
     is_start = np.concatenate([[True], is_cut])
     is_start |= _is_kink(points, profile.normals_px[row], np.cumsum(is_start))
     return StripeSegments(row, np.cumsum(is_start) - 1)
+
+
+def _count_beside(profile: Profile) -> IntArray:
+    """(N,) points with another line beside them, up to each."""
+    return np.cumsum((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)
 
 
 def _is_kink(points: FloatArray, normals: FloatArray, segment: IntArray) -> BoolArray:
@@ -136,6 +141,9 @@ class Pieces:
         (S,) their pieces, not decreasing.
     direction
         (P, 2) unit vectors along the pieces.
+    is_joined
+        (P,) True where the piece goes on from the one before: in its segment, or in the same chain
+        beyond a kink or a gap with no other line beside it.
     """
 
     of_point: IntArray
@@ -143,6 +151,7 @@ class Pieces:
     sample: IntArray
     of_sample: IntArray
     direction: FloatArray
+    is_joined: BoolArray
 
     def __len__(self) -> int:
         """Count of pieces."""
@@ -167,7 +176,7 @@ def cut_pieces(profile: Profile) -> Pieces:
     rows, number = segments.row, segments.number
     of_point = np.full(len(profile), -1)
     if not len(rows):
-        return Pieces(of_point, rows, rows, rows, np.zeros((0, 2)))
+        return Pieces(of_point, rows, rows, rows, np.zeros((0, 2)), rows.astype(np.bool_))
     points = profile.points_px[rows]
     step = np.linalg.norm(np.diff(points, axis=0), axis=1)
     arc_px = np.concatenate([[0.0], np.cumsum(step)])
@@ -176,7 +185,15 @@ def cut_pieces(profile: Profile) -> Pieces:
     of_point[rows] = piece
     sample = np.flatnonzero(np.diff(_renumbered(piece, np.floor(along / SAMPLE_PX)), prepend=-1))
     starts = np.flatnonzero(np.diff(piece, prepend=-1))
-    return Pieces(of_point, number[starts], rows[sample], piece[sample], _directions(points, piece))
+    is_apart = (np.diff(profile.segment[rows]) != 0) | (np.diff(_count_beside(profile)[rows]) > 0)
+    return Pieces(
+        of_point=of_point,
+        segment=number[starts],
+        sample=rows[sample],
+        of_sample=piece[sample],
+        direction=_directions(points, piece),
+        is_joined=np.concatenate([[False], ~is_apart])[starts],
+    )
 
 
 def _renumbered(outer: IntArray, inner: FloatArray) -> IntArray:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,13 @@ from armscan.geometry.poses import Base, Board, Points, Pose, Sensor
 from armscan.records.exposure import Exposure, SensorWindow
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session, SessionKind
 from armscan.simulation.head import Head, MountedCamera, Window
-from armscan.simulation.objects.boards import FlatPattern, PrintedBoard, render_board
+from armscan.simulation.objects.boards import (
+    FLAT,
+    FlatPattern,
+    PrintedBoard,
+    Substrate,
+    render_board,
+)
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.objects.shapes import Placed
 from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
@@ -44,12 +51,15 @@ class Target:
         Where it is; the board's z axis points away from the viewer, into the board.
     light, dark
         Albedo of the two tones.
+    substrate
+        Paper and bow.
     """
 
     pattern: FlatPattern
     base_from_board: Pose[Base, Board]
     light: float = 0.85
     dark: float = 0.08
+    substrate: Substrate = FLAT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,7 +149,7 @@ def render_exposure(
     *,
     camera: int = 0,
 ) -> ImageArray:
-    """Image (H, W) of one exposure.
+    """Image of one exposure: (H, W), or (H, W, 3) of a colour camera.
 
     Parameters
     ----------
@@ -161,8 +171,18 @@ def render_exposure(
     """
     if not base_from_sensor:
         raise InputError("an exposure needs a pose")
-    light = exposure_light(head, station, base_from_sensor, settings, rng, camera=camera)
-    return expose_mono(light, head.imaging.detector, rng)
+    detector, colour = head.imaging.detector, head.imaging.laser_colour
+    if colour is None:
+        light = exposure_light(head, station, base_from_sensor, settings, rng, camera=camera)
+        return expose_mono(light, detector, rng)
+    dark = replace(head, imaging=replace(head.imaging, ambient=0.0))
+    in_dark = replace(settings, room_light=None)
+    line = exposure_light(dark, station, base_from_sensor, in_dark, rng, camera=camera)
+    no_laser = replace(settings, lasers=())
+    room = exposure_light(head, station, base_from_sensor, no_laser, rng, camera=camera)
+    channels = [np.float32(part) * line + room for part in colour]
+    image = np.stack([expose_mono(one, detector, rng) for one in channels], axis=-1)
+    return image.astype(np.uint8) if detector.bits <= 8 else image.astype(np.uint16)
 
 
 def exposure_light(
@@ -195,10 +215,8 @@ def exposure_light(
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    share = np.float32(brightness / len(views))
-    for pose, view in zip(poses, views, strict=True):
-        light += share * _room(eye, station, pose, view, region)[inside]
-    return light
+    room = _room(eye, station, poses, views, region)[inside]
+    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness / len(views), light))
 
 
 def true_stripes(
@@ -256,24 +274,48 @@ def _view(eye: MountedCamera, station: Station, pose: Pose[Base, Any], region: R
     return look(seen_from(station, pose), (*finishes, Material()), eye.camera, region)
 
 
-def _room(
-    eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
-) -> FloatArray:
-    """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
+def _room_nodes(scene: Scene, view: PosedView, region: Region) -> NDArray[np.float32]:
     _, (rows, columns) = region.nodes_px()
+    if view.numbers is not None and scene is view.scene:
+        light = view.numbers.room_light(view.nodes)
+    else:
+        light = scene.room_light(view.nodes)[:, 0]
+    return light.reshape(rows, columns).astype(np.float32)
+
+
+def _room(
+    eye: MountedCamera,
+    station: Station,
+    poses: Sequence[Pose[Base, Any]],
+    views: Sequence[PosedView],
+    region: Region,
+) -> NDArray[np.float32]:
+    """Light (H, W) of a region under the full room, added up over the views.
+
+    It is coarse, but a target and markers are drawn sharply.
+    """
+    if station.markers or station.target is not None:
+        both = zip(poses, views, strict=True)
+        return np.asarray(sum(_drawn(eye, station, pose, view, region) for pose, view in both))
+    return to_pixels(np.asarray(sum(_room_nodes(v.scene, v, region) for v in views)), region)
+
+
+def _drawn(
+    eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
+) -> NDArray[np.float32]:
+    """Light of one view, with the markers or the target."""
     # The nodes are too far apart for markers: they get the face's own colour.
     scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
-    nodes = scene.room_light(view.nodes)[:, 0].reshape(rows, columns).astype(np.float32)
-    coarse = to_pixels(nodes, region)
+    coarse = to_pixels(_room_nodes(scene, view, region), region)
     camera = eye.camera.cropped(region.x_px, region.y_px, region.width_px, region.height_px)
     if station.markers:
         markers = [marker.seen_from(pose) for marker in station.markers]
-        return draw_markers(coarse.astype(np.float64), markers, scene, camera)
+        drawn = draw_markers(coarse.astype(np.float64), markers, scene, camera)
+        return drawn.astype(np.float32)
     if station.target is None:
-        return np.asarray(coarse)
+        return coarse
     board = board_seen_from(station.target, pose)
-    background = np.asarray(coarse, dtype=np.float64)[..., None]
-    return render_board(board, camera, view.scene.lamp, background)[..., 0]
+    return render_board(board, camera, view.scene.lamp, np.array(coarse))
 
 
 def seen_from(station: Station, base_from_sensor: Pose[Base, Any]) -> Scene:
@@ -302,7 +344,7 @@ def _lamp_seen_from(room: RoomLight, sensor_from_base: Pose[Any, Base]) -> RoomL
 def board_seen_from(target: Target, base_from_sensor: Pose[Base, Any]) -> PrintedBoard:
     """The target in the frame of the head or of one camera."""
     pose = base_from_sensor.inverse() @ target.base_from_board
-    return PrintedBoard(target.pattern, pose, target.light, target.dark)
+    return PrintedBoard(target.pattern, pose, target.light, target.dark, substrate=target.substrate)
 
 
 def _corners(window: Window) -> tuple[int, int, int, int]:
@@ -429,6 +471,7 @@ class TwinScan:
             height_px=window.height_px,
             window=SensorWindow(window.x_px, window.y_px),
             bits_used=self.head.imaging.detector.bits,
+            colour="mono" if self.head.imaging.laser_colour is None else "rgb",
         )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from armscan.calibration.cameras.robust import Solution, decide_board_warp
+from armscan.calibration.cameras.robust import BowTest, Solution, board_warp
 
 
 def solution(chi2: float, degrees_of_freedom: int) -> Solution:
@@ -26,7 +26,8 @@ def solution(chi2: float, degrees_of_freedom: int) -> Solution:
 def test_two_parameters_that_lower_chi2_by_a_quarter() -> None:
     """(125 - 100) / 2 over 100 / 80: F is 10 with 2 and 80 degrees of freedom."""
     covariance = np.diag(np.arange(1.0, 18.0))
-    warp = decide_board_warp(solution(125.0, 82), solution(100.0, 80), covariance)
+    bowed = solution(100.0, 80)
+    warp = board_warp(bowed, BowTest.of(solution(125.0, 82), bowed), covariance)
     assert warp.f_statistic == pytest.approx(10.0)
     assert warp.p_value == pytest.approx(stats.f.sf(10.0, 2, 80))
     np.testing.assert_array_equal(warp.bow_mm, [9.0, 10.0])

@@ -325,7 +325,7 @@ def test_mirrored_images_are_refused_by_name(axis: int, name: str) -> None:
 def test_a_scatter_that_no_arm_has_is_refused_unless_it_was_given() -> None:
     """The limit on the rms, raised, does not let it pass either."""
     noise = RigNoise(posture_mm=0.6, posture_rad=0.6 / 265.0)
-    stripes, plate = PlateRig(good_postures(N, np.random.default_rng(1)), noise).draw(1)
+    stripes, plate = PlateRig(good_postures(24, np.random.default_rng(1)), noise).draw(1)
     fit = calibrate_on_plate(stripes, plate, HandEyeOptions(max_rms_mm=2.0))
     assert isinstance(fit, FitFailure)
     assert "--arm-position-mm" in fit.remedy

@@ -8,7 +8,7 @@ import pytest
 
 from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction.label_cross import (
-    ALIKE_PIECES,
+    CONVINCING,
     OUTSIDE,
     TAKEN,
     frontal_direction,
@@ -63,11 +63,10 @@ def test_points_of_the_right_hypothesis_are_the_plate() -> None:
     assert found.is_inside[:, 0].all()
     assert not found.is_inside[:, 1].all()
     evidence = still_evidence(pieces, found, SENSOR)
-    assert (evidence[:, 0] > evidence[:, 1] + 0.25).all()
+    assert (evidence[:, 0] > evidence[:, 1] + 2.0 / len(pieces)).all()
     out = pieces.mean((~found.is_inside).astype(float))[:, 1] == 1.0
     assert out.any()
-    vote = 1.0 / len(pieces) + 1.0 / ALIKE_PIECES
-    assert (evidence[out, 1] < evidence[out, 0] + vote * OUTSIDE).all()
+    assert (evidence[out, 1] < evidence[out, 0] + OUTSIDE / len(pieces)).all()
 
 
 def test_a_long_stretch_does_not_count_each_of_its_pieces() -> None:
@@ -76,10 +75,10 @@ def test_a_long_stretch_does_not_count_each_of_its_pieces() -> None:
     certain = np.ones((len(long.sample), 2)) * [0.0, 1.0]
     vague = past_evidence(long, certain, np.zeros_like(certain))[:, 1].sum()
     sharp = past_evidence(long, certain, np.ones_like(certain))[:, 1].sum()
-    assert vague == pytest.approx(1.0 + len(long) / ALIKE_PIECES)
+    assert vague == pytest.approx(1.0)
     assert sharp == pytest.approx(0.5 * len(long))
     one = np.ones((len(short.sample), 1))
-    assert past_evidence(short, one, np.zeros_like(one)).sum() == pytest.approx(1.0)
+    assert past_evidence(short, one, np.zeros_like(one)).sum() == pytest.approx(1.0 / CONVINCING)
 
 
 def test_light_that_falls_on_one_thing_does_not_fall_on_another() -> None:
@@ -92,7 +91,6 @@ def test_light_that_falls_on_one_thing_does_not_fall_on_another() -> None:
     believed[pieces.segment == 1] = np.log([1e-9, 1.0 - 1e-9])
     penalty = taken_evidence(believed, pieces, found)[:, 0]
     total = [penalty[pieces.segment == k].sum() for k in range(3)]
-    votes = 1.0 + (pieces.segment == 1).sum() / ALIKE_PIECES
-    assert total[1] == pytest.approx(TAKEN * votes, rel=0.2)
+    assert total[1] == pytest.approx(TAKEN, rel=0.2)
     assert total[0] == pytest.approx(0.0, abs=1e-6)
     assert total[2] == pytest.approx(0.0, abs=1e-6)

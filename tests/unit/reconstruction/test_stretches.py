@@ -52,7 +52,9 @@ def test_a_straight_chain_is_one_stretch_of_equal_pieces() -> None:
 
 def test_other_chains_and_gaps_are_cut() -> None:
     points = line(120)
-    assert segments(cut_pieces(profile_of(points, segment=np.repeat([0, 1], 60)))) == 2
+    chains = cut_pieces(profile_of(points, segment=np.repeat([0, 1], 60)))
+    assert segments(chains) == 2
+    assert (~chains.is_joined).sum() == 2
     gap = np.delete(points, np.arange(50, 55), axis=0)
     assert segments(cut_pieces(profile_of(gap))) == 2
 
@@ -64,6 +66,7 @@ def test_only_rejections_near_another_line_cut_a_chain() -> None:
         flags[60] = int(flag)
         pieces = cut_pieces(profile_of(points, flags))
         assert segments(pieces) == expected
+        assert (~pieces.is_joined).sum() == expected
         assert pieces.of_point[60] == -1
 
 
@@ -72,6 +75,8 @@ def test_a_chain_that_turns_onto_the_other_line_is_cut_at_the_corner() -> None:
     second = line(60, 55.0, (float(first[-1, 0]), float(first[-1, 1])))[1:]
     pieces = cut_pieces(profile_of(np.concatenate([first, second])))
     assert segments(pieces) == 2
+    # a corner where no other line was seen joins: it mostly is an edge of the surface
+    assert pieces.is_joined.tolist() == [False] + [True] * (len(pieces) - 1)
     last_of_first = np.flatnonzero(pieces.segment[pieces.of_point] == 0).max()
     assert abs(last_of_first - 59) <= 2
 

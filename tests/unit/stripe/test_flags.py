@@ -41,9 +41,35 @@ def test_background_step_is_flagged() -> None:
     assert share(scene, StripeFlag.BACKGROUND_STEP) > 0.98
 
 
-def test_leaning_profile_is_flagged() -> None:
-    scene = StripeScene((line(10.0, skew=1.2),), 320, 240)
-    assert share(scene, StripeFlag.ASYMMETRIC) > 0.9
+def test_a_profile_that_leans_otherwise_than_the_rest_is_flagged() -> None:
+    """What most have in common is the laser's own; the fourth line's lean is not."""
+    four = [StraightCurve(160.0, 40.0 + 50.0 * k, 10.0) for k in range(4)]
+    lines = [SimulatedStripe(c, skew=s) for c, s in zip(four, (0, 0, 0, 2.0), strict=True)]
+    scene = StripeScene(tuple(lines), 320, 240)
+    profile = extract_stripes(scene.expose(1))
+    leans = (profile.flags & int(StripeFlag.ASYMMETRIC)) != 0
+    nearest = scene.errors(profile.points_px)[1]
+    assert leans[nearest == 3].mean() > 0.9
+    assert leans[nearest < 3].mean() < 0.01
+
+
+@pytest.mark.parametrize("lopsided", [0.2, 0.45])
+def test_a_laser_that_leans_everywhere_is_measured_alike_dark_and_bright(lopsided: float) -> None:
+    """A Gaussian fit moves by 0.08 and 0.2 sigma between these peaks (weights follow brightness).
+
+    Without the section in the model the first case fails by four times the limit, and of the
+    second all points are rejected.
+    """
+    places = []
+    for peak in (25.0, 180.0):
+        curve = StraightCurve(160.0, 120.0, 7.0)
+        stripe = SimulatedStripe(curve, peak=peak, lopsided=lopsided)
+        scene = StripeScene((stripe,), 320, 240)
+        found = [extract_stripes(scene.expose(seed)) for seed in range(3)]
+        assert min(profile.is_accepted.mean() for profile in found) > 0.97
+        errors = [scene.errors(p.points_px[p.is_accepted])[0] for p in found]
+        places.append(float(np.concatenate(errors).mean()) / stripe.sigma_px)
+    assert abs(places[1] - places[0]) < 0.02 + 0.04 * lopsided
 
 
 def test_saturation_is_flagged_but_not_rejected() -> None:

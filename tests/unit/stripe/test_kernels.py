@@ -147,7 +147,15 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     result = np.zeros((1, 8))
     width = np.full(1, 2.5)
     fit_profiles(
-        image, np.zeros((1, 1), np.uint8), points, width, sides, noise, np.full(1, 2.7), result
+        image,
+        np.zeros((1, 1), np.uint8),
+        points,
+        width,
+        sides,
+        noise,
+        np.zeros(4),
+        np.full(1, 2.7),
+        result,
     )
     x = np.arange(41)
     use = np.abs(x - 20.0) <= 2.7 * 2.5
@@ -173,6 +181,7 @@ def test_clipped_pixels_are_left_out() -> None:
         np.full(1, 2.5),
         np.full((1, 2), 5.0),
         np.array([0.0, 0.1, 1.0]),
+        np.zeros(4),
         np.full(1, 2.7),
     )
     fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)

@@ -43,16 +43,16 @@ from armscan.calibration.cameras.robust import (
     WRONG_LEVEL,
     Solution,
     board_residuals,
+    board_warp,
     chi2_of_points,
     claimed_covariances,
     covariance_with_target_error,
-    decide_board_warp,
     estimate_target_error,
     excess_variance_px2,
     residuals_px,
     solve_robustly,
-    with_board_warp,
     with_excess,
+    with_significant_bow,
 )
 from armscan.calibration.cameras.start import (
     estimate_board_pose,
@@ -168,12 +168,12 @@ def assemble(
 ) -> CameraFit | FitFailure:
     """Put the result together, or refuse a solution that the views do not determine."""
     used = [views[index] for index in prepared.used]
-    solution, validation = chosen.solution, chosen.cross_validation
-    if options.solve_warp:
-        bowed = with_board_warp(solution, options.max_steps)
-        if isinstance(bowed, FitFailure):
-            return bowed
-        solution = bowed
+    validation = chosen.cross_validation
+    bow = with_significant_bow(chosen.solution, options.max_steps, is_wanted=options.solve_warp)
+    if isinstance(bow, FitFailure):
+        return bow
+    solution, bow_test = bow
+    if bow_test is not None:
         sources = tuple(view.source for view in used)
         validation = cross_validate(solution, sources, options.n_folds)
     observations = solution.observations
@@ -198,7 +198,7 @@ def assemble(
     refusal = _focal_refusal(solution, covariance / design.widening)
     if refusal is not None:
         return refusal
-    warp = decide_board_warp(chosen.solution, solution, covariance) if options.solve_warp else None
+    warp = None if bow_test is None else board_warp(solution, bow_test, covariance)
     camera = solution.state.camera(observations.width_px, observations.height_px)
     fits, refused = _view_fits(
         views, prepared, solution, covariance=covariance, is_misfit=is_misfit, camera=camera

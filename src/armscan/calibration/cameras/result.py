@@ -58,7 +58,8 @@ class CameraOptions:
     is_principal_point_fixed
         Hold the principal point in the middle of the image.
     solve_warp
-        Solve two bow parameters of the board along with the camera.
+        Solve two bow parameters of the board along with the camera in any case; they are solved by
+        themselves where the board is significantly bowed.
     leave_out
         Sources of views that are not used.
     leave_out_misfits
@@ -208,6 +209,10 @@ class CrossValidation:
     view_rms_px: tuple[float, ...]
 
 
+BOW_P = 0.01
+"""A bow is taken for real below this probability of seeing it on a flat board."""
+
+
 class BoardWarp(ArrayRecord):
     """Bow of the board: ``z = bow_x (1 - u^2) + bow_y (1 - v^2)``.
 
@@ -239,7 +244,7 @@ class BoardWarp(ArrayRecord):
     @property
     def is_significant(self) -> bool:
         """True if a flat board would show such a bow less than once in a hundred times."""
-        return self.p_value < 0.01
+        return self.p_value < BOW_P
 
 
 class CameraFit(ArrayRecord):
@@ -285,7 +290,7 @@ class CameraFit(ArrayRecord):
     cross_validation
         Hold-out test, or None if it was switched off or too few views are left for it.
     warp
-        Bow of the board, if it was solved.
+        Bow of the board, if it was solved: asked for, or significant.
     model_reason
         Why these parameters were free.
     design_effect
@@ -549,8 +554,8 @@ def _about_warp(fit: CameraFit) -> list[str]:
     bow = ", ".join(f"{value:+.3f}" for value in fit.warp.bow_mm)
     largest = float(abs(fit.warp.bow_mm).sum())
     return [
-        f"the board is bowed by {bow} mm (along x, along y): the light-sheet calibration takes it "
-        f"as flat; use a flatter board there, or expect errors of up to {largest:.2g} mm in height"
+        f"the board is bowed by {bow} mm (along x, along y): that is solved along; a flatter board "
+        f"is better, for bends of other shapes are not: {largest:.2g} mm in height"
     ]
 
 

@@ -20,7 +20,7 @@ from armscan.calibration.cameras.adjustment import (
     adjust,
     predict,
 )
-from armscan.calibration.cameras.result import BoardWarp
+from armscan.calibration.cameras.result import BOW_P, BoardWarp
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
 
@@ -448,24 +448,61 @@ def with_board_warp(flat: Solution, max_steps: int) -> Solution | FitFailure:
     )
 
 
-def decide_board_warp(flat: Solution, bowed: Solution, covariance: FloatArray) -> BoardWarp:
-    """Test the bow by the decrease of chi2 (F test with two parameters).
+@dataclass(frozen=True, slots=True)
+class BowTest:
+    """F test of a board's bow by the decrease of chi2, with two parameters."""
+
+    f_statistic: float
+    p_value: float
+
+    @staticmethod
+    def of(flat: Solution, bowed: Solution) -> BowTest:
+        """Compare the solutions without and with bow."""
+        n_parameters = len(WARP_NAMES)
+        decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
+        statistic = decrease / n_parameters / bowed.variance_factor
+        freedom = max(bowed.degrees_of_freedom, 1)
+        return BowTest(float(statistic), float(stats.f.sf(statistic, n_parameters, freedom)))
+
+    @property
+    def is_significant(self) -> bool:
+        """True if a flat board would show such a bow less than once in a hundred times."""
+        return self.p_value < BOW_P
+
+
+def with_significant_bow(
+    flat: Solution, max_steps: int, *, is_wanted: bool = False
+) -> tuple[Solution, BowTest | None] | FitFailure:
+    """Free the bow of the board and keep it so where it is wanted, or significant.
+
+    Returns
+    -------
+    solution, test
+        With the bow's test, or the flat one and None; a failure if a bow that is wanted has no
+        solution.
+    """
+    bowed = with_board_warp(flat, max_steps)
+    if isinstance(bowed, FitFailure):
+        return bowed if is_wanted else (flat, None)
+    test = BowTest.of(flat, bowed)
+    return (bowed, test) if is_wanted or test.is_significant else (flat, None)
+
+
+def board_warp(bowed: Solution, test: BowTest, covariance: FloatArray) -> BoardWarp:
+    """The bow of a solution in which it was free.
 
     Parameters
     ----------
-    flat, bowed
-        The solutions without and with bow.
+    bowed
+        The solution with bow.
+    test
+        Of its bow.
     covariance
         (11 + 6 V, 11 + 6 V) scaled joint covariance of the bowed solution.
     """
-    n_parameters = len(WARP_NAMES)
-    decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
-    statistic = decrease / n_parameters / bowed.variance_factor
-    p_value = float(stats.f.sf(statistic, n_parameters, max(bowed.degrees_of_freedom, 1)))
-    bow = bowed.state.shared[WARP_ROWS]
     return BoardWarp(
-        bow_mm=bow,
+        bow_mm=bowed.state.shared[WARP_ROWS],
         covariance_mm2=covariance[WARP_ROWS, WARP_ROWS],
-        f_statistic=float(statistic),
-        p_value=p_value,
+        f_statistic=test.f_statistic,
+        p_value=test.p_value,
     )

@@ -9,7 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.pairs import SIDES, SingleCamera, StereoOptions, StereoPair
+from armscan.calibration.cameras.pairs import (
+    SIDES,
+    SingleCamera,
+    StereoOptions,
+    StereoPair,
+    common_bow,
+)
 from armscan.calibration.cameras.result import (
     FEW_VIEWS,
     SMALL_TILT_DEG,
@@ -268,6 +274,7 @@ def advise(fit: StereoFit) -> StereoFit:
     warnings = [
         *_about_solution(fit),
         *_about_sides(fit),
+        *_about_board(fit),
         *_about_pairs(fit),
         *_about_epipolar(fit),
         *_about_cameras(fit),
@@ -294,6 +301,17 @@ def _about_solution(fit: StereoFit) -> list[str]:
             f"({held_out.rms_in_sample_px:.3f} px): add pairs"
         )
     return warnings
+
+
+def _about_board(fit: StereoFit) -> list[str]:
+    bow = common_bow((fit.left.single, fit.right.single))
+    if bow is None:
+        return []
+    along_x, along_y = bow.bow_mm
+    return [
+        f"the board is bowed by {along_x:+.3f}, {along_y:+.3f} mm (along x, along y), as each "
+        "camera by itself shows: the pairs are solved with it; a flatter board is better"
+    ]
 
 
 def _about_sides(fit: StereoFit) -> list[str]:

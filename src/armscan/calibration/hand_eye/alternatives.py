@@ -68,6 +68,9 @@ FIND_WHAT_MOVED = (
     "find out what moved there (a plate that slid, an arm that was referenced anew), and scan all "
     "postures again without it, or only those before or after it"
 )
+UNCHECKED_PLANE = (
+    "not checked: the postures do not tell a plate that lies elsewhere from another hand-eye"
+)
 ALIKE = 0.1
 """An offset within this part of the tip's diameter or radius is taken for it."""
 LIKELIER = 10.0
@@ -262,10 +265,10 @@ def find_contradiction(
 
 
 def plane_in_words(found: Sequence[Alternative]) -> str:
-    """How the stripes alone see the probed plane; empty where they cannot tell."""
+    """How the stripes alone see the probed plane, or that they cannot tell."""
     checks = {one.name: one for one in found}
     if "plate" not in checks or "offset" not in checks:
-        return ""
+        return UNCHECKED_PLANE
     by_offset = checks["offset"]
     shift_mm, sigma_mm = float(by_offset.values[0]), float(np.sqrt(by_offset.covariance[0, 0]))
     probability = min(checks["plate"].probability, by_offset.probability)

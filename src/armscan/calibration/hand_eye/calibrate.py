@@ -24,6 +24,7 @@ from armscan.calibration.hand_eye.checks import (
     point_warnings,
     refuse_few_postures,
     refuse_underdetermined,
+    scatter_warnings,
 )
 from armscan.calibration.hand_eye.estimate import (
     Conditioning,
@@ -194,6 +195,7 @@ def _fit_on_plate(
         *checked.warnings,
         *conditioning_warnings(conditioning, len(found.postures), cause),
         *agreement_warnings(held, plate),
+        *scatter_warnings(held),
         *influence_warnings(fit.problem.observations.postures, left, fit.covariance),
         *point_warnings(stripes, kept),
     )
@@ -426,6 +428,7 @@ def _fit_on_sphere(
     warnings = (
         *left_out,
         *conditioning_warnings(conditioning, len(found.postures), ""),
+        *scatter_warnings(held),
         *sphere_warnings(fit, held, sections, found.postures),
     )
     return replace(found, reference=sphere_facts(fit, held, given_mm), warnings=warnings)

@@ -12,6 +12,8 @@ from armscan.calibration.hand_eye.alternatives import (
     BETTER,
     FIND_WHAT_MOVED,
     PROBE_AGAIN,
+    UNCHECKED_PLANE,
+    Alternative,
     find_alternatives,
     find_contradiction,
     find_free_plane,
@@ -67,6 +69,9 @@ VARY_POSTURES = (
 LARGE_ARM_MM = 0.1
 MOST_ARM_MM = 0.25
 """An estimated scatter that is surely (two sigma) larger is no arm's. Robots reach 0.15."""
+UNKNOWN_ARM = 0.6
+"""Standard deviation of the logarithm of the arm's scatter from which it is hardly known: a factor
+of 1.8."""
 REJECTED_SHARE = 0.2
 MAX_MOVE_SIGMA = 5.0
 LEAST_TO_SPLIT = 8
@@ -215,6 +220,8 @@ def explain_misfit(problem: Problem, plate: PlateSurface, start: Start) -> FitFa
     if refusal is not None:
         return refusal
     free = find_free_plane(problem, plate)
+    if free is None:
+        fact += "; another plane could not be tried, the postures do not determine it"
     is_plate = free is not None and free[2] < FREE_PLANE_SHARE * typical_mm
     if free is not None and is_plate:
         offset_mm, tilt_deg, free_mm = free
@@ -312,7 +319,7 @@ def estimate_and_check(
         return checked
     found = find_alternatives(checked.fit)
     moved = find_contradiction(found, checked.fit, plate.reference)
-    checked = replace(checked, plane_check=plane_in_words(found))
+    checked = _with_plane_check(checked, problem, found)
     if moved is None:
         refusal = _refuse_scatter(checked.fit)
         return checked if refusal is None else refusal
@@ -320,6 +327,19 @@ def estimate_and_check(
         return moved.failure
     warnings = (*checked.warnings, moved.failure.reason)
     return replace(checked, widening=moved.widening, warnings=warnings)
+
+
+def _with_plane_check(
+    checked: CheckedFit, problem: Problem, found: Sequence[Alternative]
+) -> CheckedFit:
+    """Say what the stripes alone say of the plate, and warn if that is nothing."""
+    if problem.options.solve_plate:
+        return checked
+    words = plane_in_words(found)
+    if words != UNCHECKED_PLANE:
+        return replace(checked, plane_check=words)
+    warning = f"the probed plane was {words}"
+    return replace(checked, plane_check=words, warnings=(*checked.warnings, warning))
 
 
 def _without_wrong_postures(
@@ -399,9 +419,7 @@ def _left_out_in_words(
 
 def _refuse_scatter(fit: HandEyeSolution) -> FitFailure | None:
     """Refuse residuals that no arm explains; none where the arm's scatter was given."""
-    arm_mm = fit.sigma_of("arm")
-    k = [component.name for component in fit.components].index("arm")
-    sigma_log = float(np.sqrt(fit.noise.log_covariance[k, k]))
+    arm_mm, sigma_log = fit.sigma_of("arm"), fit.log_sigma_of("arm")
     is_given = fit.problem.options.arm_position_mm is not None
     if is_given or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
         return None
@@ -435,6 +453,17 @@ def agreement_warnings(fit: HandEyeSolution, plate: PlateSurface) -> tuple[str, 
             "sensor calibration or a plate that moved looks the same"
         )
     return tuple(warnings)
+
+
+def scatter_warnings(fit: HandEyeSolution) -> tuple[str, ...]:
+    """Warn where the stripes hardly tell how much the arm scatters."""
+    if fit.log_sigma_of("arm") < UNKNOWN_ARM:
+        return ()
+    return (
+        f"{len(fit.problem.observations.used_postures)} postures hardly tell how much the arm "
+        f"scatters: the stated sigmas rest on an expected {fit.components[0].sigma:.3f} mm an "
+        "axis; scan from more postures, or give --arm-position-mm",
+    )
 
 
 def influence_warnings(

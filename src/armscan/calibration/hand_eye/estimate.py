@@ -15,10 +15,10 @@ from numpy.linalg import LinAlgError
 from scipy.stats import chi2 as chi2_distribution
 
 from armscan.calibration.hand_eye.noise import (
-    ROTATION_LEVER_MM,
     LinearSolution,
     NoiseComponent,
     NoiseEstimate,
+    SolutionCovariance,
     covariance_over_noise,
     estimate_noise,
     noise_components,
@@ -130,7 +130,8 @@ class HandEyeSolution:
     linear
         Linearised at the minimum, in the columns solved for.
     is_settled
-        False if the steps ran out.
+        False if the steps ran out: of the least squares, of the scatter's estimate, or of the
+        rounds of both.
     """
 
     problem: Problem
@@ -175,6 +176,16 @@ class HandEyeSolution:
                 return float(sigma)
         return 0.0
 
+    def log_sigma_of(self, name: str) -> float:
+        """Standard deviation of the logarithm of that; 0 where it was given."""
+        k = [component.name for component in self.components].index(name)
+        return float(np.sqrt(self.noise.log_covariance[k, k]))
+
+    def scatter_of(self, name: str, rows: IntArray) -> FloatArray:
+        """(n, n) covariance of some residuals by one cause of scatter."""
+        own = next(component for component in self.components if component.name == name)
+        return np.asarray(self.sigma_of(name) ** 2 * own.covariance[np.ix_(rows, rows)])
+
     @property
     def covariance(self) -> FloatArray:
         """(F, F) of the unknowns, estimated scatter not taken as known, without the sensor's part.
@@ -185,7 +196,7 @@ class HandEyeSolution:
             self.placed.residual_mm, self.jacobian, self.components, self.known, self.noise
         )
         by_sensor = self.problem.sensor_covariance(self.placed)
-        return np.asarray(whole - self.linear.gain @ by_sensor @ self.linear.gain.T)
+        return np.asarray(whole.matrix - self.linear.gain @ by_sensor @ self.linear.gain.T)
 
     @property
     def surface_after(self) -> FloatArray:
@@ -237,6 +248,7 @@ def estimate(
     """
     state = start
     rounds, settled = NOISE_ROUNDS[problem.surface.method]
+    is_settled = False
     # On a sphere the typical scatter may be far from the true one, and would lead away from it.
     is_solved_first = problem.surface.method == "plate"
     for _ in range(rounds):
@@ -260,9 +272,13 @@ def estimate(
                 noise = estimate_noise(placed.residual_mm, jacobian, components, known, sigmas)
                 sigmas = noise.sigmas
         change = np.log((sigmas + 1e-12) / (before + 1e-12))
-        if float(np.abs(change).max()) < settled:
+        is_settled = noise.is_settled and float(np.abs(change).max()) < settled
+        if is_settled:
             break
-    return _solution(problem, state, components, noise, known)
+    solution = _solution(problem, state, components, noise, known)
+    if solution is None:
+        return None
+    return replace(solution, is_settled=solution.is_settled and is_settled)
 
 
 def first_sigmas(
@@ -271,7 +287,10 @@ def first_sigmas(
     """Standard deviations to begin with: typical; on a sphere all residuals count as the arm's."""
     sigmas = np.array([component.sigma for component in components])
     if not isinstance(problem.surface, PlateSurface) and components[0].is_estimated:
-        sigmas[0] = max(float(np.sqrt(np.mean(placed.residual_mm**2))), 1e-4)
+        size_mm = max(float(np.sqrt(np.mean(placed.residual_mm**2))), 1e-4)
+        if components[1].is_estimated:
+            sigmas[1] *= size_mm / sigmas[0]
+        sigmas[0] = size_mm
     return sigmas
 
 
@@ -320,8 +339,8 @@ def hold_sensor(solution: HandEyeSolution) -> HandEyeSolution | None:
     return replace(held, is_settled=held.is_settled and solution.is_settled)
 
 
-def held_covariance(checked: HandEyeSolution, held: HandEyeSolution) -> FloatArray:
-    """(F, F) covariance of a hand-eye whose sensor is held, without the sensor's errors.
+def held_covariance(checked: HandEyeSolution, held: HandEyeSolution) -> SolutionCovariance:
+    """Covariance (F, F) of a hand-eye whose sensor is held, without the sensor's errors.
 
     What the sensor's errors leave in the residuals of ``checked``, where it may err, is the part of
     `dhand_eye_dsensor`, not the scatter's.
@@ -378,8 +397,8 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
     shape = _pose_errors(solution, rows)
     weighted = block @ shape
     if weights is not None and weights[posture] < 1.0:
-        arm, sigma = solution.components[0], float(solution.noise.sigmas[0])
-        lent = (1.0 - weights[posture]) * sigma**2 * arm.covariance[np.ix_(rows, rows)]
+        arm = solution.scatter_of("arm", rows) + solution.scatter_of("arm rotation", rows)
+        lent = (1.0 - weights[posture]) * arm
         weighted = np.linalg.pinv(inverse - lent, rcond=1e-10, hermitian=True) @ shape
     weight, score = shape.T @ weighted, weighted.T @ predicted
     strength = np.linalg.eigvalsh(weight)
@@ -401,7 +420,7 @@ def _pose_errors(solution: HandEyeSolution, rows: IntArray) -> FloatArray:
     points = solution.problem.observations.points_mm[rows]
     centred = points - points.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    along = centred @ axes[0] / ROTATION_LEVER_MM
+    along = centred @ axes[0] / LEVER_MM
     return np.column_stack([np.ones(len(rows)), along - along.mean()])
 
 
@@ -429,6 +448,8 @@ def estimate_robustly(problem: Problem, start: HandEyeState) -> HandEyeSolution 
             break
         weights = updated
         solution = estimate(replace(problem, weights=weights), solution.state)
+    else:
+        return None if solution is None else replace(solution, is_settled=False)
     return solution
 
 

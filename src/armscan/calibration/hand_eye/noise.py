@@ -16,13 +16,16 @@ of every standard deviation is held near its typical value by a wide normal dist
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import brentq
+from scipy.special import ndtri
 from scipy.stats import chi2
+from scipy.stats.qmc import Sobol
 
 from armscan.calibration.hand_eye.observations import (
     CondensedObservations,
@@ -34,28 +37,35 @@ from armscan.calibration.hand_eye.surface import (
     PlateSurface,
     ReferenceSurface,
 )
+from armscan.errors import EstimationError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import SHEET_PARAMETER_NAMES, ArmNoise
 from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 
-ROTATION_LEVER_MM = 265.0
-"""Scatter of the scan point over scatter of the orientation: 0.0053 mm and 0.00115 degrees for an
-arm of 0.02 mm repeatability. Stands in where the orientation's scatter is not given: on stripes
-of some tens of mm it hardly shows."""
-TYPICAL_ARM_MM = 0.006
-TYPICAL_ARM_ON_SPHERE_MM = 0.03
-"""Robots scan spheres more often than plates, and scatter by 0.1 mm."""
-TYPICAL_EXPOSURE_MM = 0.001
-TYPICAL_FLATNESS_MM = 0.003
+TYPICAL_ARM_MM = 0.03
+"""Measuring arms scatter by 0.005 mm, robots by 0.1 to 0.2."""
+TYPICAL_LEVER_MM = 100.0
+"""Scatter of the scan point over scatter of the orientation; arms have 30 to 300 mm."""
+TYPICAL_EXPOSURE_SHARE = 0.3
+"""What is new in every exposure over what a posture's exposures share."""
+TYPICAL_FLATNESS_MM = 0.004
 TYPICAL_FORM_MM = 0.003
 TYPICAL_SHEET_SHAPE_MM = 0.001
 """What plane and bow leave of the sheets of simulated heads, root mean square."""
 SHEET_SHAPE_LENGTH_MM = 15.0
 """Half a calibrated region and less: what is longer, plane and bow take up."""
+LEAST_TOUCHES = 8
+"""Their scatter says how much the arm errs."""
+LEAST_ARM_MM = 0.001
 WIDE = 1.0
-"""Standard deviation of the logarithm of a scatter about its typical value: a factor of 2.7."""
+"""Standard deviation of the logarithm of a scatter about its typical value: a factor of 2.7. Levers
+of 30 to 300 mm lie within it."""
+ARM_WIDTH = 1.5
+"""Of arms and robots, and of plates: a factor of 4.5."""
+TOUCHED_WIDTH = 1.0
+"""Of an arm whose touches of the plate are known: a factor of 2.7."""
 VERY_WIDE = 2.0
-"""Of arms and robots, and of the form of their sensors' stripes on a sphere: a factor of 7."""
+"""Of the form of stripes on a sphere: a factor of 7."""
 NARROW = 0.5
 """Of the stripe's noise on a sphere, which the section circles have shown: a factor of 1.6."""
 LEAST_STRIPE_MM = 1e-5
@@ -65,6 +75,11 @@ SCORING_SETTLED = 1e-3
 LONGEST_STEP = 1.0
 MAX_LOG = 7.0
 """A standard deviation leaves its typical value by a factor of 1100 at most."""
+N_DRAWS = 128
+"""Of the standard deviations, over which the covariance is integrated."""
+INFLATION = 1.5
+"""They are drawn from a normal distribution that is so much wider in variance than the posterior
+is near its highest point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +87,9 @@ class NoiseComponent:
     """One cause of scatter: ``arm``, ``exposure``, each with its ``rotation``, ``flatness``, ...
 
     ``covariance`` (M, M) is that of the residuals when ``sigma`` is 1. ``sigma`` is given, or
-    typical where it is estimated; ``log_width`` is the standard deviation of its logarithm then.
+    typical where it is estimated; ``log_width`` is the standard deviation of its logarithm then,
+    about the typical value, or, where it ``follows`` another component, about the same part of that
+    one's as of the typical values.
     """
 
     name: str
@@ -80,6 +97,7 @@ class NoiseComponent:
     sigma: float
     is_estimated: bool = False
     log_width: float = WIDE
+    follows: str = ""
 
 
 def noise_components(
@@ -98,14 +116,13 @@ def noise_components(
     posture = _same(observations.posture)
     if weights is not None:
         posture = posture / weights[observations.posture][:, None]
-    is_plate = isinstance(surface, PlateSurface)
-    components = _pose_components(
-        "arm",
+    components: tuple[NoiseComponent, ...] = _pose_components(
         (posture * shift, posture * turn),
-        (options.arm_position_mm, options.arm_rotation_rad),
-        (TYPICAL_ARM_MM, WIDE) if is_plate else (TYPICAL_ARM_ON_SPHERE_MM, VERY_WIDE),
+        _component("arm", shift, options.arm_position_mm, *_expected_arm(surface)),
+        options.arm_rotation_rad,
     )
     own = np.diag(_stripe_variance_mm2(observations, placed))
+    is_plate = isinstance(surface, PlateSurface)
     stripe = _component(
         "stripe", own, options.stripe_noise_factor, 1.0, WIDE if is_plate else NARROW
     )
@@ -113,28 +130,41 @@ def noise_components(
         form = _component("form", _same(observations.stripe), None, TYPICAL_FORM_MM, VERY_WIDE)
         return (*components, form, stripe)
     if _has_exposure_part(observations, options):
-        exposure = _same(observations.stripe)
+        exposure = _same(observations.exposure)
+        typical = TYPICAL_EXPOSURE_SHARE * components[0].sigma
+        new = _component("exposure", shift, options.exposure_position_mm, typical, ARM_WIDTH)
         components += _pose_components(
-            "exposure",
             (exposure * shift, exposure * turn),
-            (options.exposure_position_mm, options.exposure_rotation_rad),
-            (TYPICAL_EXPOSURE_MM, WIDE),
+            replace(new, follows="arm"),
+            options.exposure_rotation_rad,
         )
     on_plate = (placed.points_base_mm - surface.plane.point_mm) @ surface.plane.axes[:2].T
     alike = _alike(on_plate, options.flatness_length_mm)
     return (
         *components,
-        _component("flatness", alike, options.plate_flatness_mm, TYPICAL_FLATNESS_MM),
+        _component("flatness", alike, options.plate_flatness_mm, TYPICAL_FLATNESS_MM, ARM_WIDTH),
         *_sheet_shape(observations, placed, options),
         stripe,
     )
+
+
+def _expected_arm(surface: ReferenceSurface) -> tuple[float, float]:
+    """Expected scatter of the arm's position in mm, and the width of its logarithm.
+
+    Touches of the plate scatter about their plane by what arm, tip and plate err by.
+    """
+    if isinstance(surface, PlateSurface):
+        touched_mm = surface.reference.rms_mm
+        if touched_mm is not None and surface.reference.n_points >= LEAST_TOUCHES:
+            return max(touched_mm, LEAST_ARM_MM), TOUCHED_WIDTH
+    return TYPICAL_ARM_MM, ARM_WIDTH
 
 
 def _has_exposure_part(observations: CondensedObservations, options: HandEyeOptions) -> bool:
     """True if a part that is new in every exposure was given, or can be told from the posture's."""
     if options.exposure_position_mm is not None or options.exposure_rotation_rad is not None:
         return True
-    is_repeated = len(np.unique(observations.stripe)) > len(observations.used_postures)
+    is_repeated = len(np.unique(observations.exposure)) > len(observations.used_postures)
     return is_repeated and options.arm_position_mm is None
 
 
@@ -190,20 +220,17 @@ def _component(
 
 
 def _pose_components(
-    name: str,
-    covariances: tuple[FloatArray, FloatArray],
-    given: tuple[float | None, float | None],
-    typical: tuple[float, float],
-) -> tuple[NoiseComponent, ...]:
-    """Shift and turn of one pose; the turn follows the shift unless it is given."""
-    position, rotation = given
-    if rotation is None:
-        tied = covariances[0] + covariances[1] / ROTATION_LEVER_MM**2
-        return (_component(name, tied, position, *typical),)
-    return (
-        _component(name, covariances[0], position, *typical),
-        NoiseComponent(f"{name} rotation", covariances[1], rotation),
+    covariances: tuple[FloatArray, FloatArray], shift: NoiseComponent, rotation: float | None
+) -> tuple[NoiseComponent, NoiseComponent]:
+    """Shift and turn of one pose; the turn is sought about the shift's unless it is given."""
+    turn = NoiseComponent(
+        f"{shift.name} rotation",
+        covariances[1],
+        shift.sigma / TYPICAL_LEVER_MM if rotation is None else rotation,
+        is_estimated=rotation is None and shift.sigma > 0.0,
+        follows=shift.name,
     )
+    return replace(shift, covariance=covariances[0]), turn
 
 
 def total_covariance(components: tuple[NoiseComponent, ...], sigmas: FloatArray) -> FloatArray:
@@ -217,12 +244,11 @@ def total_covariance(components: tuple[NoiseComponent, ...], sigmas: FloatArray)
 def arm_noise(components: tuple[NoiseComponent, ...], sigmas: FloatArray) -> ArmNoise:
     """What the standard deviations say about the arm."""
     known = {one.name: float(sigma) for one, sigma in zip(components, sigmas, strict=True)}
-    arm, exposure = known.get("arm", 0.0), known.get("exposure", 0.0)
     return ArmNoise(
-        position_mm=arm,
-        rotation_rad=known.get("arm rotation", arm / ROTATION_LEVER_MM),
-        exposure_position_mm=exposure,
-        exposure_rotation_rad=known.get("exposure rotation", exposure / ROTATION_LEVER_MM),
+        position_mm=known["arm"],
+        rotation_rad=known["arm rotation"],
+        exposure_position_mm=known.get("exposure", 0.0),
+        exposure_rotation_rad=known.get("exposure rotation", 0.0),
     )
 
 
@@ -284,11 +310,69 @@ def solve_linear(
 class NoiseEstimate:
     """Standard deviations (C,) of the causes of scatter, and covariance (C, C) of their logarithms.
 
-    Given ones are included, with a covariance of zero.
+    Given ones are included, with a covariance of zero. ``is_settled`` is False if the steps ran
+    out.
     """
 
     sigmas: FloatArray
     log_covariance: FloatArray
+    is_settled: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Posterior:
+    """Restricted likelihood and prior of the free standard deviations, over their logarithms.
+
+    ``typical`` (C,) are the components' own, ``free`` (F,) which of them are estimated;
+    ``precision`` (F, F) is that of the normal prior of ``logs``, log sigma over typical.
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+    components: tuple[NoiseComponent, ...]
+    known: FloatArray
+    typical: FloatArray
+    free: IntArray
+    precision: FloatArray
+
+    @staticmethod
+    def of(
+        residual: FloatArray,
+        jacobian: FloatArray,
+        components: tuple[NoiseComponent, ...],
+        known: FloatArray,
+    ) -> _Posterior:
+        """With the prior of the components: each about its typical value or what it follows."""
+        names = [component.name for component in components]
+        free = np.flatnonzero([c.is_estimated for c in components]).astype(np.int64)
+        deviation = np.eye(len(components))
+        for k, component in enumerate(components):
+            if component.follows:
+                deviation[k, names.index(component.follows)] = -1.0
+        scaled = deviation / np.array([component.log_width for component in components])[:, None]
+        own = scaled[np.ix_(free, free)]
+        typical = np.array([component.sigma for component in components])
+        return _Posterior(residual, jacobian, components, known, typical, free, own.T @ own)
+
+    def logs(self, sigmas: FloatArray) -> FloatArray:
+        """(F,) of the free ones of (C,) standard deviations."""
+        return np.asarray(np.log(sigmas[self.free] / self.typical[self.free]))
+
+    def sigmas(self, logs: FloatArray) -> FloatArray:
+        """(C,) standard deviations."""
+        sigmas = self.typical.copy()
+        sigmas[self.free] *= np.exp(np.clip(logs, -MAX_LOG, MAX_LOG))
+        return sigmas
+
+    def covariance(self, logs: FloatArray) -> FloatArray:
+        """(M, M) of the residuals."""
+        return total_covariance(self.components, self.sigmas(logs)) + self.known
+
+    def at(self, logs: FloatArray) -> tuple[float, LinearSolution | None]:
+        """Logarithm of the posterior, and the solution that it belongs to."""
+        solution = solve_linear(self.residual, self.jacobian, self.covariance(logs))
+        likelihood = -np.inf if solution is None else solution.log_likelihood
+        return likelihood - 0.5 * float(logs @ self.precision @ logs), solution
 
 
 def estimate_noise(
@@ -303,44 +387,36 @@ def estimate_noise(
     ``known`` (M, M) is added to the covariance and not estimated: of probed plane and sensor.
     ``start`` (C,) are the standard deviations to begin with; those of the components if None.
     """
-    typical = np.array([component.sigma for component in components])
-    free = np.flatnonzero([c.is_estimated for c in components]).astype(np.int64)
-    sigmas = typical.copy() if start is None else start.copy()
+    posterior = _Posterior.of(residual, jacobian, components, known)
+    free, precision = posterior.free, posterior.precision
     log_covariance = np.zeros((len(components), len(components)))
     if len(free) == 0:
-        return NoiseEstimate(sigmas, log_covariance)
-    widths = np.array([components[k].log_width for k in free])
-
-    def posterior(sigmas: FloatArray) -> tuple[float, FloatArray, LinearSolution | None]:
-        logs = np.log(sigmas[free] / typical[free])
-        solution = solve_linear(residual, jacobian, total_covariance(components, sigmas) + known)
-        likelihood = -np.inf if solution is None else solution.log_likelihood
-        return likelihood - 0.5 * float(((logs / widths) ** 2).sum()), logs, solution
-
-    value, logs, solution = posterior(sigmas)
-    information = np.diag(1.0 / widths**2)
+        return NoiseEstimate(posterior.typical, log_covariance)
+    logs = posterior.logs(posterior.typical if start is None else start)
+    value, solution = posterior.at(logs)
+    information, is_settled = precision, False
     for _ in range(MAX_SCORING_STEPS):
         if solution is None:
             break
-        score, information = _score(residual, solution, components, sigmas, free)
-        score -= logs / widths**2
-        information += np.diag(1.0 / widths**2)
+        score, information = _score(residual, solution, components, posterior.sigmas(logs), free)
+        score -= precision @ logs
+        information += precision
         step = np.linalg.solve(information, score)
         step *= min(1.0, LONGEST_STEP / float(np.abs(step).max()))
         for _ in range(6):
-            tried = sigmas.copy()
-            tried[free] = typical[free] * np.exp(np.clip(logs + step, -MAX_LOG, MAX_LOG))
-            trial = posterior(tried)
+            trial = posterior.at(logs + step)
             if trial[0] >= value - 1e-9:
                 break
             step *= 0.3
         else:
+            is_settled = float(np.abs(step).max()) < SCORING_SETTLED
             break
-        sigmas, (value, logs, solution) = tried, trial
-        if float(np.abs(step).max()) < SCORING_SETTLED:
+        logs, (value, solution) = logs + step, trial
+        is_settled = float(np.abs(step).max()) < SCORING_SETTLED
+        if is_settled:
             break
     log_covariance[np.ix_(free, free)] = np.linalg.inv(information)
-    return NoiseEstimate(sigmas, log_covariance)
+    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled)
 
 
 def _score(
@@ -366,49 +442,112 @@ def _score(
     return score, information
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SolutionCovariance:
+    """Second moments of a solution's errors, and how much longer their tails are than normal ones.
+
+    Parameters
+    ----------
+    matrix
+        (K, K) covariance.
+    region_factor
+        What the usual 95 % limit of the hand-eye's ``e' C^-1 e`` is to be multiplied with so that
+        95 % of the errors lie within it; at least 1.
+    """
+
+    matrix: FloatArray
+    region_factor: float = 1.0
+
+
 def covariance_over_noise(
     residual: FloatArray,
     jacobian: FloatArray,
     components: tuple[NoiseComponent, ...],
     known: FloatArray,
     estimate: NoiseEstimate,
-) -> FloatArray:
-    """(K, K) covariance of the solution with the estimated scatter not taken as known.
+) -> SolutionCovariance:
+    """Covariance of the solution with the estimated scatter not taken as known.
 
-    The mean covariance over the likely standard deviations, plus the covariance of the solutions
-    that they lead to, by two sigma points along each axis of ``log_covariance``. Errors of
-    uncertain scatter have longer tails than a normal distribution of the same covariance; it is
-    widened until the usual 95 % region of the hand-eye holds 95 % of them.
+    The mean covariance over the standard deviations that the residuals leave likely, plus the
+    covariance of the solutions that they lead to: an integral over their posterior by importance
+    sampling. It is what the errors' squares are on average. No covariance says more of errors whose
+    scatter is uncertain: of few postures, more than 5 % of them lie outside the usual 95 % region,
+    which therefore has its own factor.
+
+    Raises
+    ------
+    EstimationError
+        If the covariance of the residuals is not positive definite.
     """
+    posterior = _Posterior.of(residual, jacobian, components, known)
+    free = posterior.free
+    total = total_covariance(components, estimate.sigmas) + known
+    centre = _solve(residual, jacobian, total)
+    if centre is None:
+        raise EstimationError(
+            "the covariance of the hand-eye's residuals is not positive definite",
+            remedy="check the standard deviations given, and the poses",
+        )
+    spread = estimate.log_covariance[np.ix_(free, free)]
+    if len(free) == 0 or not spread.any():
+        return SolutionCovariance(centre.covariance)
+    factor = np.sqrt(INFLATION) * np.linalg.cholesky(spread)
+    mode, parts, moved, weights = posterior.logs(estimate.sigmas), [], [], []
+    for draw in _normal_draws(len(free)):
+        logs = mode + factor @ draw
+        one = _solve(residual, jacobian, posterior.covariance(logs))
+        if one is not None:
+            likelihood = one.log_likelihood - 0.5 * float(logs @ posterior.precision @ logs)
+            parts.append(one.covariance)
+            moved.append(one.step - centre.step)
+            weights.append(likelihood + 0.5 * float(draw @ draw))
+    share = np.exp(np.array(weights) - max(weights))
+    share /= share.sum()
+    steps = np.array(moved)
+    errors = np.array(parts) + steps[:, :, None] * steps[:, None, :]
+    mixed = np.einsum("m,mij->ij", share, errors)
+    return SolutionCovariance(mixed, _region_factor(mixed, errors, share))
 
-    def solved(sigmas: FloatArray) -> LinearSolution | None:
-        return solve_linear(residual, jacobian, total_covariance(components, sigmas) + known)
 
-    values, axes = np.linalg.eigh(estimate.log_covariance)
-    used = np.flatnonzero(values > 1e-12)
-    centre = solved(estimate.sigmas)
-    if centre is None or len(used) == 0:
-        return np.zeros((jacobian.shape[1],) * 2) if centre is None else centre.covariance
-    covariances, steps = [], []
-    for k in used:
-        for sign in (-1.0, 1.0):
-            logs = sign * np.sqrt(len(used) * values[k]) * axes[:, k]
-            solution = solved(estimate.sigmas * np.exp(logs))
-            if solution is not None:
-                covariances.append(solution.covariance)
-                steps.append(solution.step - centre.step)
-    if not steps:
-        return centre.covariance
-    parts, moved = np.array(covariances), np.array(steps)
-    mixed = parts.mean(axis=0) + moved.T @ moved / len(moved)
-    return np.asarray(_widening(mixed, parts + moved[:, :, None] * moved[:, None, :]) * mixed)
+@cache
+def _normal_draws(n: int) -> FloatArray:
+    """(N_DRAWS, n) evenly spread draws of a standard normal distribution."""
+    sobol = Sobol(n, rng=np.random.default_rng(0))
+    return np.asarray(ndtri(sobol.random(N_DRAWS)))
 
 
-def _widening(mixed: FloatArray, parts: FloatArray) -> float:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """``step``, ``covariance`` and ``log_likelihood`` of `LinearSolution`, for less."""
+
+    step: FloatArray
+    covariance: FloatArray
+    log_likelihood: float
+
+
+def _solve(residual: FloatArray, jacobian: FloatArray, covariance: FloatArray) -> _Solved | None:
+    """As `solve_linear`, without what only the scoring and the checks need."""
+    try:
+        lower = cholesky(covariance, lower=True, check_finite=False)
+        whitened = solve_triangular(
+            lower, np.column_stack([jacobian, residual]), lower=True, check_finite=False
+        )
+        own, right = whitened[:, :-1], whitened[:, -1]
+        factor = cholesky(own.T @ own, lower=True)
+    except LinAlgError:
+        return None
+    solved = np.asarray(cho_solve((factor, True), np.eye(len(factor))))
+    step = -solved @ (own.T @ right)
+    left = right + own @ step
+    determinants = np.log(np.diag(lower)).sum() + np.log(np.diag(factor)).sum()
+    return _Solved(step, solved, -0.5 * float(left @ left) - float(determinants))
+
+
+def _region_factor(mixed: FloatArray, parts: FloatArray, share: FloatArray) -> float:
     """Factor on a covariance that makes its joint 95 % region hold 95 % of a mixture (n, K, K).
 
-    Within one part the quadratic form is a weighted sum of chi-squares, taken as one chi-square of
-    equal mean and variance (Satterthwaite).
+    ``share`` (n,) are the parts' weights. Within one part the quadratic form is a weighted sum of
+    chi-squares, taken as one chi-square of equal mean and variance (Satterthwaite).
     """
     block = slice(0, N_HAND_EYE)
     shapes = np.linalg.solve(mixed[block, block], parts[:, block, block])
@@ -418,6 +557,6 @@ def _widening(mixed: FloatArray, parts: FloatArray) -> float:
 
     def excess(factor: float) -> float:
         held = chi2.cdf(factor * limit * mean / square, mean**2 / square)
-        return float(np.mean(held)) - REGION
+        return float(share @ held) - REGION
 
     return 1.0 if excess(1.0) >= 0.0 else float(brentq(excess, 1.0, 100.0))

@@ -62,8 +62,8 @@ class HandEyeOptions:
     arm_position_mm
         Scatter of the scan point by the arm's pose, an axis, common to a posture.
     arm_rotation_rad
-        Scatter of the arm's orientation, an axis, common to a posture. None follows the position
-        (`armscan.calibration.hand_eye.noise.ROTATION_LEVER_MM`).
+        Scatter of the arm's orientation, an axis, common to a posture. None has it estimated, about
+        what moves a point at 100 mm by as much as the position scatters.
     exposure_position_mm, exposure_rotation_rad
         The parts of both that are new in every exposure, on a plate. None: none if the arm's
         position is given; else estimated where a posture has several exposures.
@@ -124,12 +124,12 @@ class HandEyeOptions:
 
 
 class PosedStripe(RowRecord):
-    """Points of one exposure, with the pose that the arm reported for it.
+    """Points of one image, with the pose that the arm reported for it.
 
     Parameters
     ----------
     source
-        Name of the exposure.
+        Name of the image.
     posture
         Exposures of equal posture were taken without moving the arm.
     base_from_tool
@@ -144,6 +144,8 @@ class PosedStripe(RowRecord):
     dpoint_dsensor
         (N, 3, P) derivative of the points by all the sensor's parameters, or None where the
         sensor delivered points.
+    instant
+        Name that the images of several cameras taken at once have in common; empty for one.
     """
 
     source: str
@@ -153,6 +155,7 @@ class PosedStripe(RowRecord):
     noise_mm: FloatArray = floats("N", 3, "J")
     sheet: IntArray = ints("N")
     dpoint_dsensor: FloatArray | None = floats("N", 3, "P", default=None)
+    instant: str = ""
 
 
 class PlateReference(ArrayRecord):
@@ -458,9 +461,9 @@ class CondensedObservations(ArrayRecord):
         (M,) row of each observation's first point, and count of its points.
     noise_mm2
         (M, 3, 3) covariance by the stripe's own noise.
-    sheet, stripe, posture
-        (M,) light sheet; index into ``sources``, ``rotations``, ``translations_mm``; into
-        ``postures``.
+    sheet, stripe, exposure, posture
+        (M,) light sheet; index into ``sources``, ``rotations``, ``translations_mm``; number of the
+        exposure, which the images of one instant share; index into ``postures``.
     rotations, translations_mm
         (S, 3, 3) and (S, 3) ``base_from_tool`` of each stripe.
     sources, postures
@@ -477,6 +480,7 @@ class CondensedObservations(ArrayRecord):
     noise_mm2: FloatArray = floats("M", 3, 3)
     sheet: IntArray = ints("M")
     stripe: IntArray = ints("M")
+    exposure: IntArray = ints("M")
     posture: IntArray = ints("M")
     rotations: FloatArray = floats("S", 3, 3)
     translations_mm: FloatArray = floats("S", 3)
@@ -512,6 +516,7 @@ class CondensedObservations(ArrayRecord):
             noise_mm2=self.noise_mm2[kept],
             sheet=self.sheet[kept],
             stripe=self.stripe[kept],
+            exposure=self.exposure[kept],
             posture=self.posture[kept],
             dpoint_dsensor=None if by_sensor is None else by_sensor[rows],
         )
@@ -551,6 +556,7 @@ def condense_plate(
         noise_mm2=np.array(noises).reshape(-1, 3, 3),
         sheet=labelled[:, 0],
         stripe=labelled[:, 1],
+        exposure=_exposures(stripes)[labelled[:, 1]],
         posture=labelled[:, 2],
         rotations=np.array([one.base_from_tool.rotation for one in stripes]).reshape(-1, 3, 3),
         translations_mm=np.array([o.base_from_tool.translation_mm for o in stripes]).reshape(-1, 3),
@@ -558,6 +564,13 @@ def condense_plate(
         postures=names,
         dpoint_dsensor=np.array(by_sensor) if 0 < len(by_sensor) == len(points) else None,
     )
+
+
+def _exposures(stripes: Sequence[PosedStripe]) -> IntArray:
+    """(S,) number of each stripe's exposure: images of one instant are one, with one pose."""
+    keys = [(one.posture, one.instant or str(id(one))) for one in stripes]
+    numbers = {key: k for k, key in enumerate(dict.fromkeys(keys))}
+    return np.array([numbers[key] for key in keys], dtype=np.int64)
 
 
 def _pieces(points_mm: FloatArray, n_pieces: int) -> list[IntArray]:
@@ -620,6 +633,7 @@ def condense_sphere(sections: Sequence[CircleSection], per_stripe: int) -> Conde
         noise_mm2=np.concatenate(variances)[:, None, None] * np.eye(3),
         sheet=np.array(sheets)[owner],
         stripe=owner,
+        exposure=_exposures([section.stripe for section in sections])[owner],
         posture=posture_of[owner],
         rotations=np.array([pose.rotation for pose in poses]),
         translations_mm=np.array([pose.translation_mm for pose in poses]),

@@ -149,6 +149,7 @@ def hand_eye_calibration(
     used = {posture.posture for posture in postures}
     distances = np.concatenate([one.residual_mm for one in stripes if one.posture in used])
     components, plane = held.components, plane_after(held)
+    covariance = held_covariance(checked.fit, held)
     is_estimated = [component.is_estimated for component in components]
     diagnostics = HandEyeDiagnostics(
         method=held.problem.surface.method,
@@ -162,11 +163,11 @@ def hand_eye_calibration(
         left_out_rotation_deg=max(one.left_out_rotation_deg for one in postures),
         left_out_translation_mm=max(one.left_out_translation_mm for one in postures),
         chi2_probability=checked.fit.probability,
+        region_factor=covariance.region_factor,
     )
-    covariance = held_covariance(checked.fit, held)
     return HandEyeCalibration(
         tool_from_sensor=held.state.tool_from_sensor,
-        covariance=covariance[:N_HAND_EYE, :N_HAND_EYE] + checked.widening,
+        covariance=covariance.matrix[:N_HAND_EYE, :N_HAND_EYE] + checked.widening,
         dhand_eye_dsensor=dhand_eye_dsensor(held),
         arm_noise=arm_noise(components, held.noise.sigmas),
         rms_mm=float(np.sqrt((distances**2).mean())),
@@ -236,7 +237,7 @@ def posture_results(
         results.append(
             PostureResult(
                 posture=name,
-                n_exposures=len(of_posture),
+                n_exposures=len(np.unique(observations.exposure[rows])),
                 n_points=len(distances),
                 mean_mm=float(distances.mean()),
                 rms_mm=float(np.sqrt((distances**2).mean())),
@@ -289,7 +290,7 @@ def sphere_facts(
     """What the sphere was, as (label, value)."""
     by_sensor = held.problem.sensor_covariance(held.placed)
     gain = held.linear.gain
-    covariance = held_covariance(fit, held) + gain @ by_sensor @ gain.T
+    covariance = held_covariance(fit, held).matrix + gain @ by_sensor @ gain.T
     sigma = dict(zip(held.problem.columns.tolist(), np.sqrt(np.diag(covariance)), strict=True))
     x, y, z, radius_mm = held.state.surface
     rows = [

@@ -8,14 +8,18 @@ All derivatives by the cameras' parameters are in one order: the 9 of camera 0, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.sheets.result import PlacedBoard
+from armscan.calibration.cameras.adjustment import State, gather, linearise
+from armscan.calibration.cameras.result import MAX_STEPS
+from armscan.calibration.cameras.robust import solve_robustly, with_significant_bow
+from armscan.calibration.cameras.start import estimate_board_pose
+from armscan.calibration.sheets.result import BoardStripes, PlacedBoard
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, homogeneous
-from armscan.geometry.estimate import Estimate
+from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
 from armscan.geometry.rotations import skew, vector_from_rotation
 from armscan.models.calibration import CameraCalibration, SecondCamera, SensorCalibration
@@ -29,6 +33,10 @@ LEFT_CAMERA, RIGHT_CAMERA = slice(0, 9), slice(9, 18)
 RIGHT_POSE = slice(18, 24)
 GRAZING = 1e-6
 """Rays within this sine of the board's plane do not meet it."""
+
+LEAST_BOW_VIEWS = 3
+"""Of fewer views, the poses take up a bow."""
+BOW_STEPS = 3
 
 SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
 """Camera, target, and the board's pose in that camera's own frame."""
@@ -211,31 +219,42 @@ def intersect_sheet_of(
 
 
 def dpose_dcamera(
-    view: TargetView, sensor_from_board: Pose[Sensor, Board], camera: CameraModel
+    view: TargetView,
+    sensor_from_board: Pose[Sensor, Board],
+    camera: CameraModel,
+    bow: BoardBow | None = None,
 ) -> FloatArray:
     """(6, 9) derivative of the board's pose, as estimated from ``view``, by the camera.
 
     The pose minimises the weighted reprojection error, so at the optimum a change of the camera
     moves it by ``-(Jp' W Jp)^-1 Jp' W Jc`` (Gauss-Newton form of the implicit function theorem).
+    (6, 11) with the derivative by the board's bow, if there is one.
     """
     rotated = view.points_board_mm @ sensor_from_board.rotation.T
     _, dq_dpoint, dq_dcamera = camera.project_with_jacobian(
         rotated + sensor_from_board.translation_mm
     )
     dq_dpose = np.concatenate([-dq_dpoint @ skew(rotated), dq_dpoint], axis=2)
+    if bow is not None:
+        by_height = dq_dpoint @ sensor_from_board.rotation[:, 2]
+        by_bow = by_height[:, :, None] * bow.shape(view.points_board_mm)[:, None, :]
+        dq_dcamera = np.concatenate([dq_dcamera, by_bow], axis=2)
     weight = np.linalg.inv(view.covariance_px2)
     weighted = np.einsum("nki,nkl->nil", dq_dpose, weight)
     normal = np.einsum("nik,nkj->ij", weighted, dq_dpose)
     return np.asarray(-np.linalg.solve(normal, np.einsum("nik,nkj->ij", weighted, dq_dcamera)))
 
 
-def place_board(seen: Sequence[SeenBoard], cameras: HeadCameras) -> PlacedBoard:
+def place_board(
+    seen: Sequence[SeenBoard], cameras: HeadCameras, bow: BoardBow | None = None
+) -> PlacedBoard:
     """Pose of a board in Sensor from what one or both cameras saw of it, one entry a camera.
 
     The mean of the poses weighted by their covariances, the cameras being held; the derivative
-    tells how it follows the cameras' errors, which the two views do not share.
+    tells how it follows the cameras' errors, which the two views do not share, and, last, the
+    error of the bow, if the board has one.
     """
-    poses = [_in_sensor(one, cameras) for one in seen]
+    poses = [_in_sensor(one, cameras, bow) for one in seen]
     first = poses[0]
     if len(poses) == 1:
         return first
@@ -258,7 +277,7 @@ def poses_chi2(left: SeenBoard, right: SeenBoard, cameras: HeadCameras) -> float
     return float(step @ np.linalg.solve(covariance, step))
 
 
-def _in_sensor(seen: SeenBoard, cameras: HeadCameras) -> PlacedBoard:
+def _in_sensor(seen: SeenBoard, cameras: HeadCameras, bow: BoardBow | None = None) -> PlacedBoard:
     camera, view, found = seen
     place = cameras.camera_from_sensor(camera)
     back, offset = place.rotation.T, found.value.translation_mm - place.translation_mm
@@ -266,9 +285,10 @@ def _in_sensor(seen: SeenBoard, cameras: HeadCameras) -> PlacedBoard:
     by_pose = np.zeros((6, 6))
     by_pose[:3, :3] = by_pose[3:, 3:] = -back
     by_pose[3:, :3] = back @ skew(offset)
-    by_camera = turned @ dpose_dcamera(view, found.value, cameras.model(camera))
+    follow = turned @ dpose_dcamera(view, found.value, cameras.model(camera), bow)
     pose: Pose[Sensor, Board] = Pose(back @ found.value.rotation, back @ offset)
-    by_cameras = cameras.by_parameters(camera, by_camera, by_pose)
+    by_cameras = cameras.by_parameters(camera, follow[:, :N_CAMERA], by_pose)
+    by_cameras = np.concatenate([by_cameras, follow[:, N_CAMERA:]], axis=1)
     return PlacedBoard(pose, turned @ found.covariance @ turned.T, by_cameras)
 
 
@@ -281,4 +301,136 @@ def _step(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
     """(6,) step from pose a to pose b: rotation vector from the left, then translation."""
     return np.concatenate(
         [vector_from_rotation(b.rotation @ a.rotation.T), b.translation_mm - a.translation_mm]
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardBow:
+    """The common bow of a target, as its views show it where that is significant.
+
+    Parameters
+    ----------
+    bow_mm
+        (2,) as of `armscan.calibration.cameras.result.BoardWarp`.
+    covariance_mm2
+        (2, 2) by the noise of the target's points, the cameras being held.
+    by_cameras
+        (2, P) derivative by the cameras' parameters.
+    low_mm, high_mm
+        (2,) the target's extent.
+    """
+
+    bow_mm: FloatArray
+    covariance_mm2: FloatArray
+    by_cameras: FloatArray
+    low_mm: FloatArray
+    high_mm: FloatArray
+
+    def shape(self, board_mm: FloatArray) -> FloatArray:
+        """(N, 2) factors ``1 - u^2`` and ``1 - v^2`` of the bow at places (N, 2 or 3)."""
+        half = 0.5 * (self.high_mm - self.low_mm)
+        unit = (board_mm[:, :2] - 0.5 * (self.low_mm + self.high_mm)) / half
+        return np.asarray(1.0 - unit**2)
+
+    def bent(self, view: TargetView) -> TargetView:
+        """The view with its target's points where the bow puts them."""
+        board = view.points_board_mm.copy()
+        board[:, 2] = self.shape(board) @ self.bow_mm
+        return replace(view, points_board_mm=board)
+
+    def height_mm(self, points_mm: FloatArray, pose: Pose[Sensor, Board]) -> FloatArray:
+        """(N,) height of the bowed board over its plane below points (N, 3) in Sensor."""
+        local = (points_mm - pose.translation_mm) @ pose.rotation
+        return np.asarray(self.shape(local) @ self.bow_mm)
+
+    def carried(
+        self, points_mm: FloatArray, pose: Pose[Sensor, Board], centre_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points (N, 3) of the plane moved along their rays to the bowed board.
+
+        With their derivative (N, 3, 2) by the bow, the pose being held.
+        """
+        rays = points_mm - centre_mm
+        rays = rays / (rays @ pose.rotation[:, 2])[:, None]
+        points = points_mm
+        for _ in range(BOW_STEPS):
+            points = points_mm + self.height_mm(points, pose)[:, None] * rays
+        local = (points - pose.translation_mm) @ pose.rotation
+        return points, rays[:, :, None] * self.shape(local)[:, None, :]
+
+
+def find_bow(
+    boards: Sequence[BoardStripes], cameras: HeadCameras
+) -> tuple[BoardBow | None, Sequence[BoardStripes]]:
+    """The target's bow, and the boards with their poses estimated anew with it."""
+    bow = find_board_bow(
+        list({board.view.source: board.view for board in boards if board.camera == 0}.values()),
+        cameras,
+    )
+    if bow is None:
+        return None, boards
+    found: dict[tuple[int, str], SeenBoard] = {}
+    placements: dict[str, dict[int, SeenBoard]] = {}
+    for board in boards:
+        key = board.camera, board.view.source
+        if key not in found:
+            view = bow.bent(board.view)
+            pose = estimate_board_pose(view, cameras.model(board.camera), allow_ambiguous=True)
+            if isinstance(pose, FitFailure):
+                return None, boards
+            found[key] = board.camera, view, pose
+        placements.setdefault(board.place, {})[board.camera] = found[key]
+    placed = {
+        place: place_board([seen[camera] for camera in sorted(seen)], cameras, bow)
+        for place, seen in placements.items()
+    }
+    return bow, [
+        replace(
+            board,
+            view=found[board.camera, board.view.source][1],
+            sensor_from_board=found[board.camera, board.view.source][2],
+            placed=placed[board.place],
+        )
+        for board in boards
+    ]
+
+
+def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBow | None:
+    """Bow of the target that camera 0 saw in several views, the camera being held.
+
+    None where fewer than `LEAST_BOW_VIEWS` views show it, or none is significant.
+    """
+    if len(views) < LEAST_BOW_VIEWS:
+        return None
+    model, observations = cameras.model(0), gather(views)
+    poses = [estimate_board_pose(view, model, allow_ambiguous=True) for view in views]
+    known = [pose.value for pose in poses if not isinstance(pose, FitFailure)]
+    if len(known) < len(views):
+        return None
+    start = State.from_poses(np.append(model.parameters, np.zeros(2)), known)
+    trusted = np.ones(len(views), dtype=np.bool_)
+    held = np.zeros((N_CAMERA + 2, 0))
+    flat = solve_robustly(observations, start, held, trusted, MAX_STEPS)
+    if isinstance(flat, FitFailure):
+        return None
+    found = with_significant_bow(flat, MAX_STEPS)
+    if isinstance(found, FitFailure) or found[1] is None:
+        return None
+    bowed = found[0]
+    equations = linearise(bowed.observations, bowed.state, np.eye(N_CAMERA + 2), bowed.weights)
+    if equations is None:
+        return None
+    reduced = equations.shared - np.einsum(
+        "vij,vjk,vlk->il", equations.cross, np.linalg.inv(equations.pose), equations.cross
+    )
+    of_bow = np.linalg.inv(reduced[N_CAMERA:, N_CAMERA:])
+    by_cameras = np.zeros((2, cameras.n_parameters))
+    by_cameras[:, :N_CAMERA] = -of_bow @ reduced[N_CAMERA:, :N_CAMERA]
+    board = np.concatenate([view.points_board_mm[:, :2] for view in views])
+    return BoardBow(
+        bowed.state.shared[N_CAMERA:],
+        bowed.variance_factor * of_bow,
+        by_cameras,
+        board.min(axis=0),
+        board.max(axis=0),
     )

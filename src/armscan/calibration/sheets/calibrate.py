@@ -10,7 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.sheets.board_points import N_CAMERA, HeadCameras
+from armscan.calibration.sheets.board_points import (
+    N_CAMERA,
+    BoardBow,
+    HeadCameras,
+    find_bow,
+)
 from armscan.calibration.sheets.checks import check_points, estimate_shapes_mm
 from armscan.calibration.sheets.coplanarity import (
     CommonPlane,
@@ -113,7 +118,8 @@ def calibrate_sheets(
     """
     options = options or SheetOptions()
     cameras = HeadCameras.of(camera)
-    vote = observe_boards(boards, cameras, options)
+    bow, bent = find_bow(boards, cameras)
+    vote = observe_boards(bent, cameras, options, bow)
     if not any(image.stripes for image in vote.images):
         return FitFailure(
             f"no straight stripe with {MIN_POINTS} accepted points lies on the board in "
@@ -126,7 +132,7 @@ def calibrate_sheets(
         case = _case_of(vote.images, assignment, cameras, options)
         fit = case if isinstance(case, _Refused) else case.solved()
         if isinstance(fit, LaserFit):
-            warnings = (*vote.warnings, *fit.warnings)
+            warnings = (*_about_bow(bow), *vote.warnings, *fit.warnings)
             boards = tuple(boards)
             return replace(fit, boards=boards, skipped=vote.outlying, warnings=warnings)
         if isinstance(fit, FitFailure):
@@ -135,6 +141,13 @@ def calibrate_sheets(
             return fit.failure
         assignment = assignment.without(fit.sheet, fit.failure.reason)
     return assignment
+
+
+def _about_bow(bow: BoardBow | None) -> tuple[str, ...]:
+    if bow is None:
+        return ()
+    along = ", ".join(f"{value:+.3f}" for value in bow.bow_mm)
+    return (f"the board is bowed by {along} mm (along x, along y); stripes were placed so",)
 
 
 def _case_of(
@@ -254,9 +267,11 @@ class _Case:
             float(np.sqrt((self.scatter[self.kept & (self.observations.sheet == k)] ** 2).mean()))
             for k in range(len(models))
         ]
-        # From the order cameras, sheets to that of a sensor: left camera, sheets, second camera.
-        order = np.arange(len(solution.covariance))
+        # From the order cameras, bow, sheets to that of a sensor: left camera, sheets, second one.
         n_camera = self.cameras.n_parameters
+        order = np.delete(
+            np.arange(len(solution.covariance)), slice(n_camera, self.errors.n_camera)
+        )
         order = np.concatenate([order[:N_CAMERA], order[n_camera:], order[N_CAMERA:n_camera]])
         return LaserFit(
             sheets=tuple(sheets),
@@ -312,7 +327,7 @@ class _Case:
         name, model, sheet = self.assignment.names[k], self.models[k], solution.sheets[k]
         of_sheet = used.sheet == k
         observations = used.select(of_sheet)
-        first = self.cameras.n_parameters + N_SHEET * k
+        first = self.errors.n_camera + N_SHEET * k
         covariance = solution.covariance[first : first + N_SHEET, first : first + N_SHEET]
         geometry = sheet_geometry(sheet, observations, self.images)
         tilt_variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)

@@ -109,6 +109,8 @@ class _Case:
             points, is_met = intersect_sheet_of(q, image.data.camera, sheets[k], self.cameras)
             pose = image.placed.sensor_from_board
             distance = (points - pose.translation_mm) @ pose.rotation[:, 2]
+            if image.bow is not None:
+                distance = distance - image.bow.height_mm(points, pose)
             found[of] = np.where(is_met, distance, np.nan)
         return found
 

@@ -463,30 +463,41 @@ class _OneSheet:
         """Fit a bowed sheet, and find from the bow itself how its light spreads.
 
         Where the rays come from shows in how the bow along the stripe changes with depth: to first
-        order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2``.
+        order a fan adds ``-2 lean u v - spread u^2 v`` to ``u^2``. A bow too weak to show it can
+        lead astray: the fan is followed as long as the stripes fit no worse for it.
         """
-        solution = self.solve(start, sigma_factor, is_bowed=True)
+        best: SheetSolution | None = None
+        least = np.inf
         for _ in range(FAN_ROUNDS):
+            solution = self.solve(start, sigma_factor, is_bowed=True)
             if isinstance(solution, FitFailure):
-                return solution
+                return solution if best is None else best
             sheet = solution.sheets[0]
-            bow = sheet.bow_mm[U2]
-            variance = np.diag(solution.covariance)[self.errors.n_camera + N_PLANE :]
-            lean, spread = sheet.fan
-            sideways = 2.0 * lean * bow - sheet.bow_mm[UV]
-            weaker = spread * bow - sheet.bow_mm[U2V]
-            fan = np.array(
-                [
-                    0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2),
-                    bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2),
-                ]
-            )
-            fan = np.clip(fan, -MAX_FAN, MAX_FAN)
+            cost = solution.chi2 + float(((sheet.fan / USUAL_FAN) ** 2).sum())
+            if cost >= least:
+                break
+            best, least = solution, cost
+            fan = self._fan_of(solution)
             if float(np.abs(fan - sheet.fan).max()) < FAN_SETTLED:
                 break
             start = replace(start, fan=fan)
-            solution = self.solve(start, sigma_factor, is_bowed=True)
-        return solution
+        return best if best is not None else solution
+
+    def _fan_of(self, solution: SheetSolution) -> FloatArray:
+        """(2,) the fan by which a bow's terms ``u v`` and ``u^2 v`` would vanish."""
+        sheet = solution.sheets[0]
+        bow = sheet.bow_mm[U2]
+        variance = np.diag(solution.covariance)[self.errors.n_camera + N_PLANE :]
+        lean, spread = sheet.fan
+        sideways = 2.0 * lean * bow - sheet.bow_mm[UV]
+        weaker = spread * bow - sheet.bow_mm[U2V]
+        fan = np.array(
+            [
+                0.5 * bow * sideways / (bow**2 + 0.25 * variance[UV] / USUAL_FAN**2),
+                bow * weaker / (bow**2 + variance[U2V] / USUAL_FAN**2),
+            ]
+        )
+        return np.asarray(np.clip(fan, -MAX_FAN, MAX_FAN))
 
     def charged_to_boards(self, model: SheetModel, board_factor: float) -> SheetModel | FitFailure:
         """Charge to the boards what they scatter, and to the stripes what is then left."""

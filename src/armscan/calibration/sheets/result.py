@@ -136,7 +136,8 @@ class PlacedBoard:
         (6, 6) by the noise of the target's points: rotation-vector increment (rad, Sensor frame,
         from the left), then translation (mm).
     by_cameras
-        (6, P) derivative by the P parameters of `HeadCameras`.
+        (6, P) derivative by the P parameters of `HeadCameras`; then by the two of the target's
+        bow, if it has one.
     """
 
     sensor_from_board: Pose[Sensor, Board]

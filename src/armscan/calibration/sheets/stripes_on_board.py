@@ -12,9 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from armscan.calibration.sheets.board_points import (
+    BoardBow,
     BoardPoints,
     HeadCameras,
     intersect_board_of,
@@ -254,7 +256,9 @@ class BoardImage:
     use
         (N,) `PointUse` so far: `PointUse.UNNAMED` for points on a straight stripe.
     camera_covariance
-        (P, P) of the cameras' parameters.
+        (P, P) of the cameras' parameters, and, last, of the target's bow, if it has one.
+    bow
+        Of the target; None where it is flat.
     stripes
         In their order across the image.
     """
@@ -266,6 +270,7 @@ class BoardImage:
     sigma_mm: FloatArray
     use: IntArray
     camera_covariance: FloatArray
+    bow: BoardBow | None = None
     stripes: tuple[StripeObservation, ...] = ()
 
     def mm_per_px(self, rows: IntArray) -> float:
@@ -288,7 +293,11 @@ def printed_margin_mm(view: TargetView) -> float:
 
 
 def observe_board_stripes(
-    data: BoardStripes, cameras: HeadCameras, margin_mm: float | None = None, n_lines: int = 0
+    data: BoardStripes,
+    cameras: HeadCameras,
+    margin_mm: float | None = None,
+    n_lines: int = 0,
+    bow: BoardBow | None = None,
 ) -> BoardImage:
     """Carry the stripe points of one image to its board and sort them into straight stripes.
 
@@ -301,22 +310,10 @@ def observe_board_stripes(
     """
     if margin_mm is None:
         margin_mm = printed_margin_mm(data.view)
-    placed = data.placed or place_board(
-        ((data.camera, data.view, data.sensor_from_board),), cameras
-    )
     profile = data.profile
-    points = intersect_board_of(profile.points_px, data.camera, placed.sensor_from_board, cameras)
     use = np.full(len(profile), int(PointUse.OFF_LINE))
-    across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
-    image = BoardImage(
-        data,
-        placed,
-        points,
-        points.dpoint_dcamera + points.dpoint_dpose @ placed.by_cameras,
-        np.linalg.norm(across, axis=1) * profile.sigma_px,
-        use,
-        cameras.covariance,
-    )
+    image = _on_board(data, cameras, use, bow)
+    points = image.points
     corners = data.view.points_board_mm[:, :2]
     low, high = corners.min(axis=0) - margin_mm, corners.max(axis=0) + margin_mm
     on_board = image.on_board_mm()
@@ -334,6 +331,30 @@ def observe_board_stripes(
         return found
     is_open = points.is_valid & is_within & (pulled | (use == PointUse.OFF_LINE))
     return _with_stripes(_with_pull(image, pulled), is_open, n_lines)
+
+
+def _on_board(
+    data: BoardStripes, cameras: HeadCameras, use: IntArray, bow: BoardBow | None
+) -> BoardImage:
+    """The points on the board, bowed or not, before any is sorted."""
+    placed = data.placed or place_board(
+        ((data.camera, data.view, data.sensor_from_board),), cameras, bow
+    )
+    profile, pose = data.profile, placed.sensor_from_board
+    points = intersect_board_of(profile.points_px, data.camera, pose, cameras)
+    covariance, dpoint_dcamera = cameras.covariance, points.dpoint_dcamera
+    if bow is not None:
+        carried, by_bow = bow.carried(points.points_mm, pose, cameras.centre_mm(data.camera))
+        points = replace(points, points_mm=carried)
+        dpoint_dcamera = np.concatenate([dpoint_dcamera, by_bow], axis=2)
+        covariance = block_diag(covariance, bow.covariance_mm2)
+    dpoint_dcamera = dpoint_dcamera + points.dpoint_dpose @ placed.by_cameras
+    if bow is not None:
+        n = cameras.n_parameters
+        dpoint_dcamera[:, :, :n] += dpoint_dcamera[:, :, n:] @ bow.by_cameras
+    across = np.einsum("nij,nj->ni", points.dpoint_dq, profile.normals_px)
+    sigma_mm = np.linalg.norm(across, axis=1) * profile.sigma_px
+    return BoardImage(data, placed, points, dpoint_dcamera, sigma_mm, use, covariance, bow)
 
 
 def _with_pull(image: BoardImage, pulled: BoolArray) -> BoardImage:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.sheets.board_points import HeadCameras
+from armscan.calibration.sheets.board_points import BoardBow, HeadCameras
 from armscan.calibration.sheets.coplanarity import MIN_SPREAD_RATIO
 from armscan.calibration.sheets.labels import LEAST_FAN, board_numbers
 from armscan.calibration.sheets.result import BoardStripes, PointUse, SheetOptions, SkippedImage
@@ -69,7 +69,10 @@ class SheetVote:
 
 
 def observe_boards(
-    boards: Sequence[BoardStripes], cameras: HeadCameras, options: SheetOptions
+    boards: Sequence[BoardStripes],
+    cameras: HeadCameras,
+    options: SheetOptions,
+    bow: BoardBow | None = None,
 ) -> SheetVote:
     """Straight stripes on the boards, less the lines on which the boards do not agree.
 
@@ -87,7 +90,7 @@ def observe_boards(
     can_vote = len({board.place for board in boards}) >= LEAST_BOARDS
     n_lines = 0 if can_vote else options.n_sheets
     on_print = [
-        observe_board_stripes(board, cameras, options.margin_mm, n_lines) for board in boards
+        observe_board_stripes(board, cameras, options.margin_mm, n_lines, bow) for board in boards
     ]
     if not can_vote:
         return SheetVote(tuple(on_print))
@@ -95,7 +98,7 @@ def observe_boards(
     if options.margin_mm is None:
         lengths = [float(np.ptp(board.view.points_board_mm, axis=0).max()) for board in boards]
         around = [
-            observe_board_stripes(board, cameras, length)
+            observe_board_stripes(board, cameras, length, bow=bow)
             for board, length in zip(boards, lengths, strict=True)
         ]
     images: list[BoardImage] = list(on_print)

@@ -6,6 +6,7 @@ supersampled at the edges.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import cv2
@@ -15,9 +16,16 @@ from numpy.typing import NDArray
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Board, Pose, Sensor
-from armscan.simulation.optics.camera import RenderCamera, blur_image
+from armscan.simulation.kernels import (
+    SAMPLES,
+    SUBPIXELS,
+    blur_where,
+    disc_cells,
+    lay_over,
+)
+from armscan.simulation.optics.camera import RenderCamera, blur_image, blur_kernel
 from armscan.simulation.optics.render import camera_rays
-from armscan.simulation.optics.scene import MISS, Floor, RoomLight, Scene
+from armscan.simulation.optics.scene import MISS, RoomLight
 
 
 class FlatPattern(Protocol):
@@ -116,9 +124,82 @@ class CirclePattern:
         return np.array(self.misplaced_mm)
 
 
+@dataclass(frozen=True, slots=True)
+class Substrate:
+    """What a print is made on: paper in which light spreads, a board that is bowed.
+
+    Parameters
+    ----------
+    spread_mm
+        Length over which light that enters the paper fades sideways. It darkens the paper beside
+        the ink more than it brightens the ink, so that an edge is no error function (optical dot
+        gain; Yule and Nielsen, TAGA Proc. 1951).
+    ink
+        Part of the light that passes the ink once.
+    bow_mm
+        By how much the middle stands out, away from the viewer, over the two ends along x and
+        along y: a parabola each.
+    """
+
+    spread_mm: float = 0.0
+    ink: float = 0.3
+    bow_mm: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if self.spread_mm < 0.0 or not 0.0 <= self.ink < 1.0:
+            raise InputError("light spreads over a positive length, under ink that is not clear")
+
+    @property
+    def reach_mm(self) -> float:
+        """Distance from an edge beyond which the tones are pure."""
+        return _SPREAD_REACH * self.spread_mm
+
+    def reflectance(self, is_light: BoolArray, edge_mm: FloatArray) -> FloatArray:
+        """Share (N,) of the light tone at a distance (N,) from a straight edge of tone (N,).
+
+        Light passes the print, spreads in the paper by ``exp(-|x| / spread)`` and passes the print
+        again; it is scaled so that the pure tones are 0 and 1.
+        """
+        if self.spread_mm == 0.0:
+            return is_light.astype(np.float64)
+        fading = 0.5 * np.exp(-edge_mm / self.spread_mm) / (1.0 + self.ink)
+        return np.where(is_light, 1.0 - fading, self.ink * fading)
+
+    def height_mm(self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+        """Place (N,) of the print along the board's z axis."""
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return np.asarray(bow_x * (1.0 - along_x**2) + bow_y * (1.0 - along_y**2))
+
+    def slopes(
+        self, pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Change (N,) of the height with x and with y."""
+        x_min, y_min, x_max, y_max = pattern.extent_board_mm
+        along_x, along_y = _from_middle(pattern, x_mm, y_mm)
+        bow_x, bow_y = self.bow_mm
+        return -4.0 * bow_x * along_x / (x_max - x_min), -4.0 * bow_y * along_y / (y_max - y_min)
+
+
+_SPREAD_REACH = 6.0
+_BOW_STEPS = 4
+FLAT = Substrate()
+
+
+def _from_middle(
+    pattern: FlatPattern, x_mm: FloatArray, y_mm: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Places along x and y, from -1 to 1 on the print."""
+    x_min, y_min, x_max, y_max = pattern.extent_board_mm
+    return (
+        (2.0 * x_mm - x_min - x_max) / (x_max - x_min),
+        (2.0 * y_mm - y_min - y_max) / (y_max - y_min),
+    )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PrintedBoard:
-    """A flat print somewhere in the scene, seen from its front only.
+    """A print somewhere in the scene, seen from its front only.
 
     Parameters
     ----------
@@ -130,6 +211,8 @@ class PrintedBoard:
         Albedo of the two tones, for every colour.
     edge_mm
         Width over which a sample averages the two tones: about the size of a sample's footprint.
+    substrate
+        Paper and bow.
     """
 
     pattern: FlatPattern
@@ -137,6 +220,7 @@ class PrintedBoard:
     light: float = 0.85
     dark: float = 0.08
     edge_mm: float = 0.1
+    substrate: Substrate = FLAT
 
     def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
         """As for `Surface`."""
@@ -145,20 +229,33 @@ class PrintedBoard:
         height = (origins_mm - self.sensor_from_board.translation_mm) @ normal
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = np.where((along < 0.0) & (height > 0.0), -height / along, np.nan)
-        points = origins_mm + distance[:, None] * directions
-        return np.where(self._is_on_print(self._on_board(points)), distance, MISS)
+        points = self._on_board(origins_mm + distance[:, None] * directions)
+        if any(self.substrate.bow_mm):
+            for _ in range(_BOW_STEPS):
+                height = self.substrate.height_mm(self.pattern, points[:, 0], points[:, 1])
+                distance = distance - (height - points[:, 2]) / along
+                points = self._on_board(origins_mm + distance[:, None] * directions)
+        return np.where(self._is_on_print(points), distance, MISS)
 
     def normals(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
-        return np.broadcast_to(-self.sensor_from_board.rotation[:, 2], points_mm.shape)
+        rotation = self.sensor_from_board.rotation
+        if not any(self.substrate.bow_mm):
+            return np.broadcast_to(-rotation[:, 2], points_mm.shape)
+        board = self._on_board(points_mm)
+        slope_x, slope_y = self.substrate.slopes(self.pattern, board[:, 0], board[:, 1])
+        away = np.stack([slope_x, slope_y, -np.ones(len(board))], axis=1)
+        return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True) @ rotation.T)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """As for `Surface`."""
         board = self._on_board(points_mm)
         x, y = board[:, 0], board[:, 1]
-        side = np.where(self.pattern.is_light(x, y), 1.0, -1.0)
-        signed = side * self.pattern.edge_distance_mm(x, y)
-        share = np.clip(0.5 + signed / self.edge_mm, 0.0, 1.0)
+        is_light, edge = self.pattern.is_light(x, y), self.pattern.edge_distance_mm(x, y)
+        if self.substrate.spread_mm > self.edge_mm:
+            share = self.substrate.reflectance(is_light, edge)
+        else:
+            share = np.clip(0.5 + np.where(is_light, edge, -edge) / self.edge_mm, 0.0, 1.0)
         albedo = self.dark + (self.light - self.dark) * share
         return np.repeat(albedo[:, None], 3, axis=1)
 
@@ -172,12 +269,12 @@ class PrintedBoard:
         return np.asarray((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max))
 
 
-SUBPIXELS = 2
-"""Fine-grid cells per pixel along each axis, on which the lens's blur acts."""
-SAMPLES = 8
-"""Samples per fine-grid cell along each axis, where an edge may cross it."""
 _COARSE_STEP_PX = 16
 _CHUNK = 1_000
+_BLUR_REACH = 6.0
+_RIM_STEPS = 24
+_KNOT_STEP_PX = 8
+_KNOT_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,6 +322,8 @@ def render_flat_target(
     rotation: FloatArray,
     translation_mm: FloatArray,
     lighting: Lighting | None = None,
+    *,
+    substrate: Substrate = FLAT,
 ) -> RenderedTarget:
     """Render a print seen by a camera.
 
@@ -238,6 +337,8 @@ def render_flat_target(
         (3, 3) and (3,): ``camera_from_board``.
     lighting
         Grey levels and illumination.
+    substrate
+        Paper and bow.
 
     Raises
     ------
@@ -245,19 +346,16 @@ def render_flat_target(
         If the camera looks at the back of the print.
     """
     light = Lighting() if lighting is None else lighting
-    fine = _fine_reflectance(camera, pattern, rotation, translation_mm, light.surround)
-    reflectance = _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
-    levels = light.dark_level + (light.light_level - light.dark_level) * reflectance
+    board = _BoardPlane.of(camera, rotation, translation_mm, _Print(pattern, substrate))
+    span = light.light_level - light.dark_level
+    reflectance = _reflectance(board, light.surround)
+    levels = light.dark_level + span * reflectance.astype(np.float64)
+    marks = pattern.marks_board_mm.copy()
+    marks[:, 2] += substrate.height_mm(pattern, marks[:, 0], marks[:, 1])
     return RenderedTarget(
-        levels * illumination(camera, light), marks_px(camera, pattern, rotation, translation_mm)
+        levels * illumination(camera, light),
+        camera.project(marks @ np.asarray(rotation).T + translation_mm),
     )
-
-
-def marks_px(
-    camera: RenderCamera, pattern: FlatPattern, rotation: FloatArray, translation_mm: FloatArray
-) -> FloatArray:
-    """Return the true projections (N, 2) of the pattern's marks."""
-    return camera.project(pattern.marks_board_mm @ np.asarray(rotation).T + translation_mm)
 
 
 def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
@@ -271,54 +369,118 @@ def illumination(camera: RenderCamera, lighting: Lighting) -> FloatArray:
     return np.asarray(1.0 - lighting.gradient * (along + 0.5))
 
 
-def _fine_reflectance(
-    camera: RenderCamera,
-    pattern: FlatPattern,
-    rotation: FloatArray,
-    translation_mm: FloatArray,
-    surround: float,
-) -> NDArray[np.float32]:
-    board = _BoardPlane.of(camera, rotation, translation_mm)
+@dataclass(frozen=True, slots=True)
+class _Print:
+    """A pattern on its substrate."""
+
+    pattern: FlatPattern
+    substrate: Substrate
+
+
+def _reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
+    """(H, W) part of the light tone in each pixel, blurred by the lens."""
+    camera, pattern = board.camera, board.print_.pattern
+    if isinstance(pattern, CirclePattern) and board.print_.substrate == FLAT:
+        is_endless = surround == float(not pattern.is_light_on_dark)
+        if is_endless:
+            return _discs(camera, pattern, board)
+    fine = _fine_reflectance(board, surround)
+    return _bin(blur_image(fine, SUBPIXELS * camera.blur_sigma_px))
+
+
+def _discs(camera: RenderCamera, pattern: CirclePattern, board: _BoardPlane) -> NDArray[np.float32]:
+    """As `_reflectance`, disc by disc, of a print whose ground goes on beyond its border."""
+    tone = np.full((camera.height_px, camera.width_px), not pattern.is_light_on_dark, np.float32)
+    sign = np.float32(1.0 if pattern.is_light_on_dark else -1.0)
+    margin = int(np.ceil(_BLUR_REACH * camera.blur_sigma_px)) + 2
+    lens, knots_x, knots_y = _lens_knots(camera)
+    angle = 2.0 * np.pi * np.arange(_RIM_STEPS) / _RIM_STEPS
+    radius = 0.5 * pattern.diameter_mm
+    rim = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(_RIM_STEPS)], axis=1)
+    for centre in pattern.marks_board_mm:
+        pixels = board.project(centre + rim)
+        if not np.isfinite(pixels).all():
+            continue
+        left, top = np.floor(pixels.min(axis=0)).astype(int) - margin
+        right, bottom = np.ceil(pixels.max(axis=0)).astype(int) + margin + 1
+        left, top = max(int(left), 0), max(int(top), 0)
+        right, bottom = min(int(right), camera.width_px), min(int(bottom), camera.height_px)
+        if left >= right or top >= bottom:
+            continue
+        cells = np.zeros((SUBPIXELS * (bottom - top), SUBPIXELS * (right - left)), np.float32)
+        disc = np.array([centre[0], centre[1], radius])
+        disc_cells(disc, left, top, lens, knots_x, knots_y, board.board_from_ray, cells)
+        cover = _bin(blur_image(cells, SUBPIXELS * camera.blur_sigma_px))
+        tone[top:bottom, left:right] += sign * cover
+    return tone
+
+
+@lru_cache(maxsize=8)
+def _lens_knots(camera: RenderCamera) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(12,) numbers of a lens for `disc_cells`, and (K, L) x and y of its knots' rays."""
+    first = -_KNOT_STEP_PX
+    u = np.arange(first, camera.width_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    v = np.arange(first, camera.height_px + 2 * _KNOT_STEP_PX, _KNOT_STEP_PX, dtype=np.float64)
+    rays = camera.rays(np.stack(np.meshgrid(u, v), axis=-1), _KNOT_TOLERANCE)
+    c = camera
+    lens = [c.fx, c.fy, c.cx, c.cy, c.k1, c.k2, c.p1, c.p2, c.k3, _KNOT_STEP_PX, first, first]
+    x, y = (np.ascontiguousarray(rays[..., k]) for k in (0, 1))
+    return np.array(lens), x, y
+
+
+def _fine_reflectance(board: _BoardPlane, surround: float) -> NDArray[np.float32]:
+    camera, pattern = board.camera, board.print_.pattern
     x, y = board.coarse_mm()
     reach_mm = _reach_mm(x, y)
     beyond_mm = _beyond_border_mm(pattern, x, y)
     is_on_print = beyond_mm <= 0.0
     near_edge = np.abs(beyond_mm) < reach_mm
-    near_edge[is_on_print] |= pattern.edge_distance_mm(x[is_on_print], y[is_on_print]) < reach_mm
+    edge_mm = pattern.edge_distance_mm(x[is_on_print], y[is_on_print])
+    near_edge[is_on_print] |= edge_mm < reach_mm
+    in_halo = np.zeros_like(near_edge)
+    in_halo[is_on_print] = edge_mm < reach_mm + board.print_.substrate.reach_mm
     tone = np.full(x.shape, surround, dtype=np.float32)
     tone[is_on_print] = pattern.is_light(x[is_on_print], y[is_on_print])
     size = (SUBPIXELS * camera.width_px, SUBPIXELS * camera.height_px)
     fine = np.asarray(cv2.resize(tone, size, interpolation=cv2.INTER_NEAREST), dtype=np.float32)
-    rows, columns = (index.astype(np.int64) for index in np.nonzero(near_edge))
-    for start in range(0, len(rows), _CHUNK):
-        v, u = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
-        cells = _sample(board, pattern, u, v, surround)
-        for b in range(SUBPIXELS):
-            for a in range(SUBPIXELS):
-                fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
+    for chosen, samples in ((near_edge, SAMPLES), (in_halo & ~near_edge, 1)):
+        rows, columns = (index.astype(np.int64) for index in np.nonzero(chosen))
+        chunk = _CHUNK * (SAMPLES // samples) ** 2
+        for start in range(0, len(rows), chunk):
+            v, u = rows[start : start + chunk], columns[start : start + chunk]
+            cells = _sample(board, np.stack([u, v], axis=-1), samples, surround)
+            for b in range(SUBPIXELS):
+                for a in range(SUBPIXELS):
+                    fine[SUBPIXELS * v + b, SUBPIXELS * u + a] = cells[:, b, a]
     return fine
 
 
 def _sample(
-    board: _BoardPlane, pattern: FlatPattern, u: IntArray, v: IntArray, surround: float
+    board: _BoardPlane, pixels_px: IntArray, samples: int, surround: float
 ) -> NDArray[np.float32]:
-    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of each pixel's fine cells (row, column)."""
-    centre, d_du, d_dv = board.linearised_mm(np.stack([u, v], axis=-1).astype(np.float64))
-    n = SUBPIXELS * SAMPLES
+    """Mean reflectance (N, SUBPIXELS, SUBPIXELS) of the fine cells (row, column) of pixels (N, 2).
+
+    Each cell has ``samples`` x ``samples`` samples.
+    """
+    centre, d_du, d_dv = board.linearised_mm(pixels_px.astype(np.float64))
+    n = SUBPIXELS * samples
     offset = (np.arange(n) + 0.5) / n - 0.5
     step_u = d_du[:, :, None] * offset
     step_v = d_dv[:, :, None] * offset
     points = centre[:, :, None, None] + step_v[:, :, :, None] + step_u[:, :, None, :]
-    tones = _tones(pattern, points[:, 0], points[:, 1], surround)
-    cells = tones.reshape(-1, SUBPIXELS, SAMPLES, SUBPIXELS, SAMPLES).mean(axis=(2, 4))
+    tones = _tones(board.print_, points[:, 0], points[:, 1], surround)
+    cells = tones.reshape(-1, SUBPIXELS, samples, SUBPIXELS, samples).mean(axis=(2, 4))
     return np.asarray(cells, dtype=np.float32)
 
 
-def _tones(
-    pattern: FlatPattern, x: FloatArray, y: FloatArray, surround: float
-) -> NDArray[np.float32]:
-    light = pattern.is_light(x, y).astype(np.float32)
-    return np.where(_beyond_border_mm(pattern, x, y) <= 0.0, light, np.float32(surround))
+def _tones(print_: _Print, x: FloatArray, y: FloatArray, surround: float) -> NDArray[np.float32]:
+    light = print_.pattern.is_light(x, y)
+    if print_.substrate.spread_mm > 0.0:
+        edge_mm = print_.pattern.edge_distance_mm(x, y)
+        tones = print_.substrate.reflectance(light, edge_mm).astype(np.float32)
+    else:
+        tones = light.astype(np.float32)
+    return np.where(_beyond_border_mm(print_.pattern, x, y) <= 0.0, tones, np.float32(surround))
 
 
 def _beyond_border_mm(pattern: FlatPattern, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -336,21 +498,26 @@ def _reach_mm(x: FloatArray, y: FloatArray) -> float:
     return 1.05 * 0.5 * float(along_u + along_v)
 
 
-def _bin(fine: NDArray[np.float32]) -> FloatArray:
+def _bin(fine: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = fine.shape[0] // SUBPIXELS, fine.shape[1] // SUBPIXELS
     binned = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    return np.asarray(binned, dtype=np.float64)
+    return np.asarray(binned, dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoardPlane:
-    """Where pixels meet the board's plane."""
+    """Where pixels meet the board."""
 
     camera: RenderCamera
     board_from_ray: FloatArray
+    rotation: FloatArray
+    translation_mm: FloatArray
+    print_: _Print
 
     @staticmethod
-    def of(camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray) -> _BoardPlane:
+    def of(
+        camera: RenderCamera, rotation: FloatArray, translation_mm: FloatArray, print_: _Print
+    ) -> _BoardPlane:
         r = np.asarray(rotation, dtype=np.float64)
         t = np.asarray(translation_mm, dtype=np.float64)
         if float(r[:, 2] @ t) <= 0.0:
@@ -358,14 +525,38 @@ class _BoardPlane:
                 "the camera looks at the back of the print",
                 remedy="turn the board: its z axis points away from the camera",
             )
-        return _BoardPlane(camera, np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t])))
+        plane = np.linalg.inv(np.column_stack([r[:, 0], r[:, 1], t]))
+        return _BoardPlane(camera, plane, r, t, print_)
+
+    def project(self, points_board_mm: FloatArray) -> FloatArray:
+        """(N, 2) pixels of points (N, 3) of the board; NaN behind the camera."""
+        return self.camera.project(points_board_mm @ self.rotation.T + self.translation_mm)
 
     def exact_mm(self, pixels_px: FloatArray) -> FloatArray:
         """(..., 2) board coordinates seen by (..., 2) pixels; far away if the ray misses."""
         rays = self.camera.rays(pixels_px)
         h = rays @ self.board_from_ray[:, :2].T + self.board_from_ray[:, 2]
         # The third component is 1 / depth: rays that never meet the plane see the surround.
-        return np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        flat = np.asarray(h[..., :2] / np.maximum(h[..., 2:], 1e-9))
+        if not any(self.print_.substrate.bow_mm):
+            return flat
+        return self._on_bow_mm(flat)
+
+    def _on_bow_mm(self, flat_mm: FloatArray) -> FloatArray:
+        """Where rays that meet the flat board at (..., 2) meet the bowed one."""
+        x_min, y_min, x_max, y_max = self.print_.pattern.extent_board_mm
+        size = np.array([x_max - x_min, y_max - y_min])
+        low, high = np.array([x_min, y_min]) - size, np.array([x_max, y_max]) + size
+        eye = -self.rotation.T @ self.translation_mm
+        met = flat_mm
+        for _ in range(_BOW_STEPS):
+            # far beyond the print the parabola is not followed
+            near = np.clip(met, low, high)
+            height = self.print_.substrate.height_mm(
+                self.print_.pattern, near[..., 0], near[..., 1]
+            )
+            met = flat_mm + (height / eye[2])[..., None] * (eye[:2] - flat_mm)
+        return np.asarray(met)
 
     def coarse_mm(self) -> tuple[FloatArray, FloatArray]:
         """Board coordinates (H, W) of every pixel, by linear interpolation on a coarse grid."""
@@ -397,8 +588,8 @@ _OUTLINE_BITS = 6
 
 
 def render_board(
-    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: FloatArray
-) -> FloatArray:
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight, background: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """Render a board under room light over a background image.
 
     Parameters
@@ -406,23 +597,19 @@ def render_board(
     board, camera, lamp
         What is seen, by what, under which light.
     background
-        (H, W, 3) parts of full scale.
+        (H, W) parts of full scale; written over.
 
     Returns
     -------
-    (H, W, 3) parts of full scale, blurred by the lens, without noise.
+    (H, W) parts of full scale, blurred by the lens, without noise.
     """
     pose = board.sensor_from_board
-    print_ = render_flat_target(
-        camera,
-        board.pattern,
-        pose.rotation,
-        pose.translation_mm,
-        Lighting(light_level=board.light, dark_level=board.dark),
-    ).image
-    lit = (print_ * _lamp_on_board(board, camera, lamp))[..., None]
-    cover = _coverage(board, camera)[..., None]
-    return np.asarray(cover * lit + (1.0 - cover) * background)
+    print_ = _Print(board.pattern, board.substrate)
+    plane = _BoardPlane.of(camera, pose.rotation, pose.translation_mm, print_)
+    tone = _reflectance(plane, 1.0)
+    lit, cover = _lamp_on_board(board, camera, lamp), _coverage(board, camera)
+    lay_over(background, tone, lit, cover, board.dark, board.light)
+    return background
 
 
 def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
@@ -436,24 +623,34 @@ def outline_px(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
     return camera.project(rim @ pose.rotation[:, :2].T + pose.translation_mm)
 
 
-def _coverage(board: PrintedBoard, camera: RenderCamera) -> FloatArray:
+def _coverage(board: PrintedBoard, camera: RenderCamera) -> NDArray[np.float32]:
     """(H, W) part of each pixel that the board covers, blurred by the lens."""
-    mask = np.zeros((camera.height_px, camera.width_px), np.uint8)
+    shape = (camera.height_px, camera.width_px)
+    mask, rim = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
     outline = np.rint(outline_px(board, camera) * (1 << _OUTLINE_BITS)).astype(np.int32)
     cv2.fillPoly(mask, [outline], (255,), lineType=cv2.LINE_AA, shift=_OUTLINE_BITS)
-    return blur_image(mask.astype(np.float64) / 255.0, camera.blur_sigma_px)
+    kernel = blur_kernel(camera.blur_sigma_px)
+    cv2.polylines(rim, [outline], True, (1,), thickness=len(kernel) + 5, shift=_OUTLINE_BITS)
+    cover = np.zeros(shape, np.float32)
+    blur_where(mask, rim, kernel, cover)
+    return cover
 
 
-def _lamp_on_board(board: PrintedBoard, camera: RenderCamera, lamp: RoomLight) -> FloatArray:
+def _lamp_on_board(
+    board: PrintedBoard, camera: RenderCamera, lamp: RoomLight
+) -> NDArray[np.float32]:
     """(H, W) light on the board's plane, from a coarse grid: it changes slowly."""
-    pose = board.sensor_from_board
-    plane = Floor(pose.translation_mm, -pose.rotation[:, 2], (1.0, 1.0, 1.0))
+    pose, up = board.sensor_from_board, -board.sensor_from_board.rotation[:, 2]
     height, width = camera.height_px // _COARSE_STEP_PX, camera.width_px // _COARSE_STEP_PX
     rows, columns = np.indices((height, width))
     cells = np.stack([columns.ravel(), rows.ravel()], axis=1).astype(np.float64)
-    pixels = (cells + 0.5) * _COARSE_STEP_PX - 0.5
-    scene = Scene((plane,), lamp=lamp)
-    light = scene.room_light(scene.trace(np.zeros(3), camera_rays(camera, pixels)))
-    coarse = light[:, 0].reshape(height, width)
+    rays = camera_rays(camera, (cells + 0.5) * _COARSE_STEP_PX - 0.5, _KNOT_TOLERANCE)
+    with np.errstate(divide="ignore"):
+        away = (pose.translation_mm @ up) / (rays @ up)
+    to_lamp = lamp.position_mm - np.where(away > 0.0, away, 0.0)[:, None] * rays
+    facing = np.maximum(to_lamp @ up / np.linalg.norm(to_lamp, axis=1), 0.0)
+    light = lamp.even * (2.0 + up @ np.asarray(lamp.up)) / 3.0 + lamp.direct * facing
+    coarse = np.where(away > 0.0, light, 0.0).reshape(height, width).astype(np.float32)
     size = (camera.width_px, camera.height_px)
-    return np.asarray(cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR))
+    fine = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
+    return np.asarray(fine, dtype=np.float32)

@@ -37,7 +37,7 @@ _CROSSED_SIGNATURE = (
     types.float64(types.float64, types.float64, types.float64, _INPUT, types.int64[::1]),
     cache=True,
 )
-def _distance(
+def distance(
     x: float, y: float, z: float, limbs: NDArray[np.float64], chosen: NDArray[np.int64]
 ) -> float:
     """Signed distance of one point from the chosen limbs, joined in order."""
@@ -69,7 +69,7 @@ def distances(
     """Write the signed distances (N,) of points (N, 3), mm, from the body into ``result``."""
     every = np.arange(limbs.shape[0])
     for i in range(points.shape[0]):
-        result[i] = _distance(points[i, 0], points[i, 1], points[i, 2], limbs, every)
+        result[i] = distance(points[i, 0], points[i, 1], points[i, 2], limbs, every)
 
 
 @njit(_CROSSED_SIGNATURE, cache=True)
@@ -106,6 +106,41 @@ def _stride(gap: float, slope: float) -> float:
     return max(2.0 * gap, LEAST_STRIDE_MM)
 
 
+@njit(
+    "float64(Array(float64, 1, 'C', True), Array(float64, 2, 'C', True), "
+    "Array(float64, 2, 'C', True), float64, int64[::1])",
+    cache=True,
+)
+def marched(
+    ray: NDArray[np.float64],
+    limbs: NDArray[np.float64],
+    balls: NDArray[np.float64],
+    tolerance: float,
+    room: NDArray[np.int64],
+) -> float:
+    """Distance along a ray (6,), origin and unit direction, to the body; infinite for none.
+
+    ``balls`` (K, 4), centre and radius, hold each limb and all that its blend reaches: a ray that
+    misses a ball need not ask that limb. ``room`` (K,) is written over.
+    """
+    count, t, far = _crossed(ray, limbs, balls, room)
+    crossed = room[:count]
+    t = max(t, 0.0)
+    step, last_gap = 0.0, np.inf
+    for _ in range(MAX_STEPS):
+        if t > far:
+            break
+        x, y, z = ray[0] + t * ray[3], ray[1] + t * ray[4], ray[2] + t * ray[5]
+        gap = distance(x, y, z, limbs, crossed)
+        slope = (last_gap - gap) / step if step != 0.0 else 0.0
+        last_gap = gap
+        if abs(gap) < tolerance or (gap < 0.0 and step == 0.0):
+            return float(t + gap)
+        step = _stride(gap, slope)
+        t += step
+    return np.inf
+
+
 @njit(types.void(_INPUT, _INPUT, _INPUT, types.float64, _RESULT), cache=True)
 def march(
     rays: NDArray[np.float64],
@@ -114,33 +149,10 @@ def march(
     tolerance: float,
     travelled: NDArray[np.float64],
 ) -> None:
-    """Walk along rays until the body is ``tolerance`` near.
-
-    ``rays`` (N, 6) are origins and unit directions; ``balls`` (K, 4), centre and radius, hold
-    each limb and all that its blend reaches: a ray that misses a ball need not ask that limb.
-    ``travelled`` (N,) receives the distance to the hit; infinite for none.
-    """
+    """Walk along rays (N, 6) until the body is ``tolerance`` near; see `marched`."""
     room = np.zeros(limbs.shape[0], np.int64)
     for i in range(rays.shape[0]):
-        count, t, far = _crossed(rays[i], limbs, balls, room)
-        crossed = room[:count]
-        t = max(t, 0.0)
-        travelled[i] = np.inf
-        step, last_gap = 0.0, np.inf
-        for _ in range(MAX_STEPS):
-            if t > far:
-                break
-            x = rays[i, 0] + t * rays[i, 3]
-            y = rays[i, 1] + t * rays[i, 4]
-            z = rays[i, 2] + t * rays[i, 5]
-            gap = _distance(x, y, z, limbs, crossed)
-            slope = (last_gap - gap) / step if step != 0.0 else 0.0
-            last_gap = gap
-            if abs(gap) < tolerance or (gap < 0.0 and step == 0.0):
-                travelled[i] = t + gap
-                break
-            step = _stride(gap, slope)
-            t += step
+        travelled[i] = marched(rays[i], limbs, balls, tolerance, room)
 
 
 HIT_MM = 1e-5
@@ -232,13 +244,21 @@ class Body(OneColour):
         balls[:, 3] += BLEND_REACH * np.maximum.accumulate(later_blends)[::-1]
         object.__setattr__(self, "_balls", frozen_floats(balls, (None, 4), "balls"))
 
+    @property
+    def rows(self) -> FloatArray:
+        """(K, 12) numbers of the limbs."""
+        return self._rows
+
+    @property
+    def balls(self) -> FloatArray:
+        """(K, 4) centre and radius of a ball about each limb and what its blend reaches."""
+        return self._balls
+
     def distance_mm(self, points_mm: FloatArray) -> FloatArray:
         """(N,) distance of points (N, 3) in the Sensor frame from the surface; negative inside.
 
         It vanishes on the surface and is true to first order close to it.
         """
-        pass
-
         points = self._in_part(points_mm)
         result = np.zeros(len(points))
         distances(points, self._rows, result)
@@ -246,8 +266,6 @@ class Body(OneColour):
 
     def intersect(self, origins_mm: FloatArray, directions: FloatArray) -> FloatArray:
         """As for `Surface`: walk along each ray by the distance to the body, until it vanishes."""
-        pass
-
         directions_part = directions @ self.sensor_from_part.rotation
         origins_part = np.broadcast_to(self._in_part(origins_mm), directions_part.shape)
         rays = np.concatenate([origins_part, directions_part], axis=1)

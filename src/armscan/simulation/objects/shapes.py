@@ -168,6 +168,11 @@ class FlatPlate(HeightField):
         tilt = np.linalg.lstsq(basis, self.height_mm(x, y), rcond=None)[0]
         object.__setattr__(self, "_tilt", frozen_floats(tilt, (3,), "tilt"))
 
+    @property
+    def tilt(self) -> FloatArray:
+        """(3,) height and slopes of the best plane through the waves alone."""
+        return self._tilt
+
     @staticmethod
     def draw(
         size_mm: tuple[float, float],

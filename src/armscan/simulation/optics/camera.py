@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, ImageArray
+from armscan.simulation.kernels import expose
 
 Float = TypeVar("Float", np.float32, np.float64)
 
@@ -121,18 +122,22 @@ def blur_image(image: NDArray[Float], sigma_px: float) -> NDArray[Float]:
     """Convolve a (H, W) or (H, W, 3) image with a Gaussian of ``sigma_px``, repeating borders."""
     if sigma_px <= 0.0:
         return image
-    reach = int(np.ceil(_KERNEL_SIGMAS * sigma_px))
-    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
-    kernel /= kernel.sum()
+    kernel = blur_kernel(sigma_px)
     blurred = cv2.sepFilter2D(image, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(blurred, dtype=image.dtype)
 
 
+def blur_kernel(sigma_px: float) -> FloatArray:
+    """(2 R + 1,) weights of a Gaussian of ``sigma_px`` along a line; a single 1 without blur."""
+    if sigma_px <= 0.0:
+        return np.ones(1)
+    reach = int(np.ceil(_KERNEL_SIGMAS * sigma_px))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
+    return np.asarray(kernel / kernel.sum())
+
+
 def _largest(values: FloatArray) -> float:
     return float(np.abs(values).max(initial=0.0))
-
-
-LEVELS = 255.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +176,7 @@ def with_halo(light: Image32, share: float, sigma_px: float) -> Image32:
     """Move a share of light (H, W) into a wide halo; the sum is kept up to the border."""
     if share == 0.0:
         return light
-    return np.asarray(light * np.float32(1.0 - share) + np.float32(share) * _wide(light, sigma_px))
+    return np.asarray(cv2.addWeighted(light, 1.0 - share, _wide(light, sigma_px), share, 0.0))
 
 
 def with_ghost(light: Image32, share: float, sigma_px: float) -> Image32:
@@ -179,24 +184,16 @@ def with_ghost(light: Image32, share: float, sigma_px: float) -> Image32:
     if share == 0.0:
         return light
     mirrored = np.ascontiguousarray(light[::-1, ::-1])
-    return np.asarray(light + np.float32(share) * _wide(mirrored, sigma_px))
+    return np.asarray(cv2.addWeighted(light, 1.0, _wide(mirrored, sigma_px), share, 0.0))
 
 
 def expose_mono(light: Image32, detector: Detector, rng: np.random.Generator) -> ImageArray:
     """Grey levels of light (H, W), parts of full scale: shot and read noise, clipping, bits."""
     if not 1 <= detector.bits <= 16:
         raise InputError(f"{detector.bits} bits do not fit into 16")
-    levels = light * np.float32(LEVELS)
-    sigma = np.maximum(levels, 0.0, dtype=np.float32)
-    sigma *= np.float32(1.0 / detector.electrons_per_level)
-    sigma += np.float32(detector.read_noise**2)
-    np.sqrt(sigma, out=sigma)
-    sigma *= rng.standard_normal(light.shape, dtype=np.float32)
-    levels += sigma
-    full_scale = (1 << detector.bits) - 1
-    levels *= np.float32(full_scale / LEVELS)
-    np.rint(levels, out=levels)
-    np.clip(levels, 0, full_scale, out=levels)
+    levels = light.astype(np.float32)
+    noise, full_scale = rng.standard_normal(light.shape, np.float32), (1 << detector.bits) - 1
+    expose(levels, noise, 1.0 / detector.electrons_per_level, detector.read_noise**2, full_scale)
     return levels.astype(np.uint8) if detector.bits <= 8 else levels.astype(np.uint16)
 
 

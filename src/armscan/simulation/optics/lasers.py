@@ -16,6 +16,56 @@ from armscan.geometry.arrays import FloatArray, IntArray, frozen_floats
 from armscan.geometry.poses import Pose
 
 
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Brightness across a sheet: Gaussian unless said, its peak on the sheet's centre.
+
+    Parameters
+    ----------
+    skew
+        Part by which sigma is larger on the side of the sheet's normal, and smaller on the other.
+    tail_low, tail_high
+        Part of the peak that belongs to a broader Gaussian, on the side against the normal and on
+        that of the normal.
+    tail_sigmas
+        Sigma of that Gaussian, in sigmas of its side.
+    """
+
+    skew: float = 0.0
+    tail_low: float = 0.0
+    tail_high: float = 0.0
+    tail_sigmas: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not abs(self.skew) < 1.0 or not self.tail_sigmas >= 1.0:
+            raise InputError("a section's skew is below 1 and its tail no narrower than the rest")
+        if min(self.tail_low, self.tail_high) < 0.0 or max(self.tail_low, self.tail_high) >= 1.0:
+            raise InputError("a tail is a part of the peak")
+
+    @property
+    def widest(self) -> float:
+        """By how much farther than a Gaussian's its light may reach."""
+        has_tail = max(self.tail_low, self.tail_high) > 0.0
+        return (1.0 + abs(self.skew)) * (self.tail_sigmas if has_tail else 1.0)
+
+    def gaussian_reach(self, reach: FloatArray) -> FloatArray:
+        """Reach (N,) at which a Gaussian is as bright as this section is at a reach (N,)."""
+        if self == GAUSSIAN:
+            return reach
+        is_high = reach > 0.0
+        own = reach / np.where(is_high, 1.0 + self.skew, 1.0 - self.skew)
+        tail = np.where(is_high, self.tail_high, self.tail_low)
+        half = 0.5 * own**2
+        # log of (1 - tail) exp(-half) + tail exp(-half / w^2), safe for large reach
+        excess = np.minimum(half * (1.0 - self.tail_sigmas**-2), _MOST_EXPONENT)
+        level = half - np.log1p(tail * np.expm1(excess))
+        return np.asarray(np.sign(reach) * np.sqrt(2.0 * np.maximum(level, 0.0)))
+
+
+_MOST_EXPONENT = 600.0
+GAUSSIAN = Section()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LineLaser:
     """A source from which a fan of rays spreads.
@@ -49,6 +99,8 @@ class LineLaser:
         Name of the light source that it is switched with; by default that of the sheet.
     cubic_rad
         Bends the sheet further: its centre at the fan angle a is raised by this times ``a**3``.
+    section
+        Shape of the brightness across the sheet.
     """
 
     name: str
@@ -64,6 +116,7 @@ class LineLaser:
     falloff: float = 0.4
     source: str = ""
     cubic_rad: float = 0.0
+    section: Section = GAUSSIAN
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source_mm", frozen_floats(self.source_mm, (3,), "source_mm"))
@@ -115,9 +168,12 @@ class LineLaser:
         return np.asarray(np.hypot(self.waist_mm, growth))
 
     def reach_mm(self, points_mm: FloatArray) -> FloatArray:
-        """Distance (N,) of points (N, 3) from the sheet's centre, in sigmas of its thickness."""
+        """Distance (N,) of points (N, 3) from the sheet's centre, in sigmas of its thickness.
+
+        With another section than a Gaussian: the reach at which a Gaussian is as bright.
+        """
         distance = np.linalg.norm(points_mm - self.source_mm, axis=1)
-        return self.offset_mm(points_mm) / self.thickness_mm(distance)
+        return self.section.gaussian_reach(self.offset_mm(points_mm) / self.thickness_mm(distance))
 
     def irradiance_at(self, points_mm: FloatArray, normals: FloatArray) -> FloatArray:
         """Irradiance (N,) on surface points (N, 3) with unit normals (N, 3); shadows not counted.
@@ -130,12 +186,14 @@ class LineLaser:
     def reach_and_peak(
         self, points_mm: FloatArray, normals: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Distance (N,) from the sheet's centre, in sigmas, and irradiance (N,) if it were zero."""
+        """Reach (N,) as of `reach_mm`, and irradiance (N,) if it were zero."""
         forward, across, up, distance = self._local(points_mm)
         elevation = np.arctan2(up, np.hypot(forward, across))
         sigma = self.thickness_mm(distance)
         angle = np.arctan2(across, forward)
-        reach = distance * (elevation - self._centre_rad(angle)) / sigma
+        reach = self.section.gaussian_reach(
+            distance * (elevation - self._centre_rad(angle)) / sigma
+        )
         spread = self.waist_mm * self.waist_distance_mm / (sigma * distance)
         fan = angle / self.half_angle_rad
         along = np.where(np.abs(fan) <= 1.0, 1.0 - self.falloff * fan**2, 0.0)
@@ -156,15 +214,12 @@ class LineLaser:
         return v @ self.forward, v @ self.across, v @ self.normal, distance
 
 
-NARROW_RIM_PX, WIDE_RIM_PX = 1, 4
-
-
 class TracedLight(Protocol):
     """Light whose brightness is ``peak * exp(-reach**2 / 2)``, both smooth along a surface."""
 
     @property
-    def rim_px(self) -> int:
-        """How far around it nodes are traced, so that its rim is not taken for an edge."""
+    def section(self) -> Section:
+        """From which the reach follows."""
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """Distance (N,) from the nearest centre, in sigmas, and the number of centres below."""
@@ -209,9 +264,19 @@ class LaserSource:
         object.__setattr__(self, "_between_rad", 0.5 * (angles[1:] + angles[:-1]))
 
     @property
-    def rim_px(self) -> int:
-        """As for `TracedLight`: it saves a third of the rays of many sheets, little of one."""
-        return NARROW_RIM_PX if len(self.sheets) == 1 else WIDE_RIM_PX
+    def section(self) -> Section:
+        """As for `TracedLight`: that of the middle sheet; all of a source are alike."""
+        return self._middle.section
+
+    @property
+    def sense(self) -> float:
+        """1 if angles about the middle sheet's source grow with the sheets' order, else -1."""
+        return self._sense
+
+    @property
+    def between_rad(self) -> FloatArray:
+        """(K - 1,) angles, times the sense, midway between neighbouring sheets."""
+        return self._between_rad
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

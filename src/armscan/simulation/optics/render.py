@@ -282,6 +282,9 @@ class Imaging:
     stray_share
         Brightness, over that of the lines, of those that a glossy plate throws back to the head
         and the head back to the plate, for a plate of gloss 1; projectors of several lines only.
+    laser_colour
+        (3,) of a colour camera: what its red, green and blue pixels see of the laser's light, all
+        three of each pixel; the room's light is white. None for a mono camera.
     """
 
     laser_level: float = 0.8
@@ -296,6 +299,7 @@ class Imaging:
     spot_level: float = 6.0
     spot_mm: float = 0.6
     stray_share: float = 0.12
+    laser_colour: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         least = min(self.ambient, self.gloss, self.texture, self.ghost_share)

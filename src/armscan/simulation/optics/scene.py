@@ -113,8 +113,8 @@ class Sphere(OneColour):
 
 
 _TEXTURE_CELLS = 1024
-_CELLS_PER_GRAIN = 4.0
-_SLANT = (0.6180, 0.4142)
+CELLS_PER_GRAIN = 4.0
+SLANT = (0.6180, 0.4142)
 DARKEST = 0.05
 
 
@@ -190,17 +190,17 @@ class SceneObject:
 
     def texture_factor(self, points_mm: FloatArray) -> FloatArray:
         """(N,) reflectance over its mean at points (N, 3) in Base."""
-        cells = points_mm * (_CELLS_PER_GRAIN / self.finish.texture_mm)
-        x = (cells[:, 0] + _SLANT[0] * cells[:, 2]).astype(np.int64) % _TEXTURE_CELLS
-        y = (cells[:, 1] + _SLANT[1] * cells[:, 2]).astype(np.int64) % _TEXTURE_CELLS
-        return np.maximum(1.0 + self.finish.texture * _pattern()[y, x], DARKEST)
+        cells = points_mm * (CELLS_PER_GRAIN / self.finish.texture_mm)
+        x = (cells[:, 0] + SLANT[0] * cells[:, 2]).astype(np.int64) % _TEXTURE_CELLS
+        y = (cells[:, 1] + SLANT[1] * cells[:, 2]).astype(np.int64) % _TEXTURE_CELLS
+        return np.maximum(1.0 + self.finish.texture * texture_pattern()[y, x], DARKEST)
 
 
 @cache
-def _pattern() -> FloatArray:
+def texture_pattern() -> FloatArray:
     """Smooth random field of unit variance that every skin takes its texture from."""
     noise = np.random.default_rng(405).standard_normal((_TEXTURE_CELLS, _TEXTURE_CELLS))
-    smooth = blur_image(noise, 0.5 * _CELLS_PER_GRAIN)
+    smooth = blur_image(noise, 0.5 * CELLS_PER_GRAIN)
     return np.asarray(smooth / smooth.std())
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose
 from armscan.simulation.objects.shapes import FlatPlate, Placed
-from armscan.simulation.optics.lasers import WIDE_RIM_PX, LaserSource, LineLaser, TracedLight
+from armscan.simulation.optics.lasers import GAUSSIAN, LaserSource, LineLaser, Section, TracedLight
 from armscan.simulation.optics.render import Imaging
 from armscan.simulation.optics.scene import SceneObject
 
@@ -48,9 +48,9 @@ class CentreSpot:
     irradiance: float
 
     @property
-    def rim_px(self) -> int:
+    def section(self) -> Section:
         """As for `TracedLight`."""
-        return WIDE_RIM_PX
+        return GAUSSIAN
 
     def reach_and_rank(self, points_mm: FloatArray) -> tuple[FloatArray, IntArray]:
         """As for `TracedLight`."""

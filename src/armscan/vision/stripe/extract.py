@@ -42,6 +42,9 @@ from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
 """What pixel locking and the shape of the profile leave without any noise."""
+FLANKS_PER_LEAN = 1.0
+"""Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
+its section's third-order term: what sections leave that are no Gram-Charlier series."""
 
 
 def extract_stripes(
@@ -52,8 +55,9 @@ def extract_stripes(
     """Find every laser line in an exposure and return its centre points with their sigma.
 
     Candidates are runs above the local background; the Hessian at each candidate gives point and
-    direction (eq. 2.41); a Gaussian profile (eq. 2.40) is fitted with weights from the image's own
-    noise; the centres are smoothed along the line where its course allows.
+    direction (eq. 2.41); a Gaussian profile (eq. 2.40), with the skew and the tails that all
+    profiles of the image have in common, is fitted with weights from the image's own noise; the
+    centres are smoothed along the line where its course allows.
 
     Parameters
     ----------
@@ -162,6 +166,8 @@ def to_profile(
     course = straighten(Polyline(points, normals, sigma, stretch, usable), fits)
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
+    is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
+    beside = FLANKS_PER_LEAN * np.abs(fits.lean) * width * is_on_flanks
     if fits.is_noise_assumed and not smoothed.is_noise_measured:
         flags |= int(StripeFlag.NOISE_ASSUMED)
     binning = exposure.window.binning
@@ -170,7 +176,7 @@ def to_profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(smoothed.points),
         normals_px=smoothed.normals,
-        sigma_px=sigma * binning,
+        sigma_px=np.hypot(sigma, beside) * binning,
         width_px=width * binning,
         intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
         flags=flags,

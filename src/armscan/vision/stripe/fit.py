@@ -25,7 +25,6 @@ from armscan.kernels.profile_fit import (
 from armscan.vision.stripe.image import StripePlane
 from armscan.vision.stripe.ridge import (
     SHORTEST_PX,
-    FloatImage,
     RidgePoints,
     chain_bounds,
     chain_lengths_px,
@@ -46,26 +45,18 @@ def start_noise(background_noise: float) -> FloatArray:
 
 
 def estimate_noise(
-    image: FloatImage,
-    points: FloatArray,
-    sides: FloatArray,
-    fits: FloatArray,
-    fallback: FloatArray,
+    seen: _Profiles, section: FloatArray, peak: float, fallback: FloatArray
 ) -> FloatArray:
     """Fit ``v = C^2 m^2 + (m + background) / gain + read^2`` to squared residuals.
 
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``image``: (H, W) float32. ``points``: (N, 6) ridge points. ``sides``: (N, 2) background on both
-    sides. ``fits``: (N, 8) from the profile fit with any sensible weights. ``fallback``: (3,) what
-    to return if there are too few residuals.
+    ``seen``: profiles fitted with any sensible weights. ``section``: (4,) that they were fitted
+    with. ``peak``: amplitude of the bright ones. ``fallback``: (3,) what to return if there are too
+    few residuals.
     """
-    good = fits[:, VARIANCE] > 0.0
-    if good.sum() < LEAST_PER_BIN:
-        return fallback
-    level, total, residual = _residuals(image, points[good], sides[good], fits[good])
-    peak = float(np.quantile(fits[good, AMPLITUDE], 0.9))
+    level, total, residual = _residuals(seen, _lines(seen, section)[0])
     bins = np.digitize(level / peak, BIN_EDGES)
     rows, variances, counts = [], [], []
     for b in range(1, len(BIN_EDGES)):
@@ -87,10 +78,28 @@ def estimate_noise(
     return np.asarray(terms)
 
 
-def _residuals(
-    image: FloatImage, points: FloatArray, sides: FloatArray, fits: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Model level, model plus background, and residual of every pixel of the fitted profiles."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Profiles:
+    """Pixels (N, K) of fitted profiles.
+
+    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian. ``background``: beside the
+    line. ``above``: grey level over it. ``is_inside``: in the image. ``is_known``: and not clipped.
+    ``is_column``: (N,).
+    """
+
+    u: FloatArray
+    bell: FloatArray
+    background: FloatArray
+    above: FloatArray
+    is_inside: BoolArray
+    is_known: BoolArray
+    is_column: BoolArray
+
+
+def _profiles(
+    plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
+) -> _Profiles:
+    image = plane.image
     height, width = image.shape
     is_column = points[:, 5] == 0
     line = np.where(is_column, points[:, 0], points[:, 1]).astype(np.int64)
@@ -103,21 +112,140 @@ def _residuals(
     y = np.where(is_column[:, None], safe, line[:, None])
     x = np.where(is_column[:, None], line[:, None], safe)
     u = (k - fits[:, CENTRE][:, None]) / sigma[:, None]
-    model = fits[:, AMPLITUDE][:, None] * np.exp(-0.5 * u * u)
+    bell = fits[:, AMPLITUDE][:, None] * np.exp(-0.5 * u * u)
     ramp = (sides[:, 1] - sides[:, 0]) / (SIDE_SPAN * sigma)
     background = sides.mean(axis=1)[:, None] + ramp[:, None] * (k - start[:, None])
-    residual = image[y, x] - background - model
-    pixels = (np.abs(u) < REACH_SIGMAS) & (k == safe)
+    is_inside = k == safe
+    is_known = is_inside
+    if plane.clipped.shape == image.shape:
+        is_known = is_inside & (plane.clipped[y, x] == 0)
+    above = image[y, x] - background
+    return _Profiles(u, bell, background, above, is_inside, is_known, is_column)
+
+
+def _lines(seen: _Profiles, section: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(N, K) line's own grey level, and how it falls with u: eq. of `kernels.profile_fit`."""
+    of_axis = np.where(seen.is_column[:, None], section[:2], section[2:])
+    c3, c4 = of_axis[:, :1], of_axis[:, 1:]
+    u = seen.u
+    third = u * (u * u - 3.0)
+    shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
+    falling = u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third
+    return seen.bell * np.maximum(shape, 0.0), seen.bell * falling
+
+
+def _residuals(seen: _Profiles, model: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Model level, model plus background, and residual of every pixel of the fitted profiles."""
+    residual = seen.above - model
+    pixels = (np.abs(seen.u) < REACH_SIGMAS) & seen.is_inside
     n = pixels.sum(axis=1, keepdims=True)
     freedom = np.sqrt(n / np.maximum(n - FIT_PARAMETERS, 1.0))
-    is_side = (np.abs(u) > 3.4) & (np.abs(u) < 4.2) & (k == safe)
+    is_side = (np.abs(seen.u) > 3.4) & (np.abs(seen.u) < 4.2) & seen.is_inside
     residual = np.where(pixels, residual * freedom, residual)
     use = pixels | is_side
-    return model[use], (model + background)[use], residual[use]
+    return model[use], (model + seen.background)[use], residual[use]
+
+
+MOST_SECTION = np.array([0.12, 0.03])
+"""Larger terms would turn the flank of the section negative."""
+ROBUST_ROUNDS = 8
+CLIPPED_SCORE = 0.7
+"""Of one profile, in scatters: next to a median, so that a minority at edges hardly counts."""
+CORE_SIGMAS = 1.3
+"""Profiles that are clipped farther out say nothing of the section: their flanks alone are left."""
+
+
+def estimate_section(
+    seen: _Profiles,
+    noise: FloatArray,
+    section: FloatArray,
+    is_alone: BoolArray,
+    chain: IntArray,
+) -> FloatArray:
+    """Shape (4,) of the line's own section: what all fitted profiles of an axis have in common.
+
+    A laser whose light leans to one side moves the centre of a Gaussian fit by an amount that
+    follows the weights, and with them the brightness. Terms of third and fourth order that all
+    profiles share are therefore made part of the model; what single profiles have beside them
+    stays the sign of an edge.
+
+    ``seen``: pixels of the fitted profiles. ``noise``: (3,). ``section``: (4,) of the fit.
+    ``is_alone``: (N,) profiles that no other line is near. ``chain``: (N,) increasing numbers.
+    """
+    model, falling = _lines(seen, section)
+    variance = noise[0] * model**2 + noise[1] * np.maximum(model + seen.background, 0.0) + noise[2]
+    u = seen.u
+    weight = ((np.abs(u) < REACH_SIGMAS) & seen.is_known) / variance
+    has_core = ~((np.abs(u) < REACH_SIGMAS) & (np.abs(u) > CORE_SIGMAS) & ~seen.is_known).any(
+        axis=1
+    )
+    fitted = np.stack([falling, model, falling * u], axis=2)
+    third, fourth = seen.bell * u * (u * u - 3.0), seen.bell * (u * u * (u * u - 6.0) + 3.0)
+    terms = np.stack([third, fourth], axis=2)
+    weighted = weight[:, :, None] * fitted
+    # beside what centre, amplitude and width take up already
+    taken = np.linalg.pinv(np.einsum("nki,nkj->nij", weighted, fitted))
+    taken = taken @ np.einsum("nki,nkj->nij", weighted, terms)
+    rest = terms - fitted @ taken
+    weighted = weight[:, :, None] * rest
+    normal = np.einsum("nki,nkj->nij", weighted, rest)
+    score = np.einsum("nki,nk->ni", weighted, seen.above - model)
+    found = section.copy()
+    for axis, is_own in enumerate((seen.is_column, ~seen.is_column)):
+        rows = np.flatnonzero(is_own & has_core & is_alone)
+        blocks = _blocks(chain[rows])
+        if len(blocks) >= LEAST_BLOCKS:
+            own = slice(2 * axis, 2 * axis + 2)
+            found[own] = _common_terms(normal[rows], score[rows], section[own], blocks)
+    return found
+
+
+def _blocks(chain: IntArray) -> list[IntArray]:
+    """Rows of each stretch of `BLOCK` neighbours on one chain."""
+    inner = np.flatnonzero(np.diff(chain) != 0) + 1
+    return [
+        rows[first : first + BLOCK]
+        for rows in np.split(np.arange(len(chain)), inner)
+        for first in range(0, len(rows) - BLOCK + 1, BLOCK)
+    ]
+
+
+def _common_terms(
+    normal: FloatArray, score: FloatArray, start: FloatArray, blocks: list[IntArray]
+) -> FloatArray:
+    """(2,) terms that profiles share, of their normal matrices (N, 2, 2) and scores (N, 2).
+
+    They are shrunk by how far stretches of the line differ from each other: what comes and goes
+    along the line is the surface's.
+    """
+    size = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
+    step, scatter = np.zeros(2), np.ones(2)
+    keep = np.ones(score.shape)
+    for _ in range(ROBUST_ROUNDS):
+        total = np.einsum("ni,nij->ij", keep, normal)
+        step = np.linalg.lstsq(total, (keep * score).sum(axis=0), rcond=None)[0]
+        ratio = (score - normal @ step) / size
+        scatter = np.maximum([robust_sigma(one) for one in ratio.T], 1.0)
+        keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
+    terms = np.clip(start + step, -MOST_SECTION, MOST_SECTION)
+    rest = score - normal @ step
+    diagonal = np.einsum("nii->ni", normal)
+    apart = np.array([rest[b].sum(axis=0) / diagonal[b].sum(axis=0) for b in blocks])
+    differ = np.array([robust_sigma(one) for one in apart.T])
+    sigma = CERTAIN_SIGMAS * differ / np.sqrt(len(blocks))
+    certain = np.maximum(1.0 - (sigma / np.maximum(np.abs(terms), 1e-12)) ** 2, 0.0)
+    return np.asarray(terms * certain * terms**2 / np.maximum(terms**2 + differ**2, 1e-12))
+
+
+BLOCK = 16
+LEAST_BLOCKS = 4
+CERTAIN_SIGMAS = 2.0
 
 
 NOISE_SAMPLE = 1500
 NOISE_ROUNDS = 2
+SECTION_ROUNDS = 2
+"""More of them where the section is no Gaussian."""
 SIDE_HALF = 8
 """Neighbours over which the background beside the line is averaged."""
 CLEAR_SIGMAS = 11.0
@@ -136,8 +264,9 @@ class ProfileFits:
     in `armscan.kernels.profile_fit`. ``sides``: (N, 2) background on the lower and upper side,
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
-    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``is_noise_assumed``: True if there were
-    too few residuals to estimate it, so that it is the first guess.
+    px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
+    section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
+    estimate the noise, so that it is the first guess.
     """
 
     ridge: RidgePoints
@@ -146,7 +275,14 @@ class ProfileFits:
     side_sigma: FloatArray
     neighbour: FloatArray
     noise: FloatArray
+    section: FloatArray
     is_noise_assumed: bool
+
+    @property
+    def lean(self) -> FloatArray:
+        """(N,) third-order term of the line's own section."""
+        is_column = self.ridge.table[:, 5] == 0
+        return np.asarray(np.where(is_column, self.section[0], self.section[2]))
 
 
 def axis_component(table: FloatArray) -> FloatArray:
@@ -161,9 +297,10 @@ def fit_ridge(
     line_sigma_px: float,
     background_noise: float,
 ) -> ProfileFits:
-    """Fit a Gaussian with weights from the noise model at every ridge point.
+    """Fit the line's section with weights from the noise model at every ridge point.
 
-    The noise model is estimated from a sample of the points first. Chains shorter than
+    The noise model and the section's departure from a Gaussian are estimated from a sample of the
+    points first. Chains shorter than
     `SHORTEST_PX` are fitted, but do not count as lines beside others.
     """
     table = ridge.table
@@ -174,8 +311,11 @@ def fit_ridge(
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     guess = noise = start_noise(background_noise)
+    section = np.zeros(4)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
-    for _ in range(NOISE_ROUNDS):
+    for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
+        if round_ >= NOISE_ROUNDS and not section.any():
+            break
         sample = np.zeros((len(pick), FIT_COLUMNS))
         fit_profiles(
             plane.image,
@@ -184,12 +324,21 @@ def fit_ridge(
             sigma[pick],
             sides[pick],
             noise,
+            section,
             reach[pick],
             sample,
         )
-        noise = estimate_noise(plane.image, table[pick], sides[pick], sample, noise)
+        good = sample[:, VARIANCE] > 0.0
+        if good.sum() < LEAST_PER_BIN:
+            continue
+        at = pick[good]
+        seen = _profiles(plane, table[at], sides[at], sample[good])
+        peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
+        noise = estimate_noise(seen, section, peak, noise)
+        is_alone = reach[at] >= REACH_SIGMAS
+        section = estimate_section(seen, noise, section, is_alone, ridge.chain[at])
     values = np.zeros((len(table), FIT_COLUMNS))
-    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, reach, values)
+    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, section, reach, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
         ridge.select(good),
@@ -198,6 +347,7 @@ def fit_ridge(
         side_sigma[good],
         neighbour[good],
         noise,
+        section,
         is_noise_assumed=noise is guess,
     )
 

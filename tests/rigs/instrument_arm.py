@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hand-eye of a drawn instrument on a plate and on a sphere, judged against the truth.
+
+The arm's errors turn the head about its scan point and shift it; the plate is a sum of waves. The
+stripes reach the hand-eye through the sensor as it was calibrated.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate, calibrate_on_sphere
+from armscan.calibration.hand_eye.observations import HandEyeOptions, PlateReference, PosedStripe
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.errors import ArmscanError
+from armscan.geometry.arrays import FloatArray
+from armscan.geometry.estimate import Estimate, FitFailure
+from armscan.geometry.poses import Pose
+from armscan.geometry.shapes import Plane, fit_plane
+from armscan.models.calibration import SensorCalibration
+from armscan.reconstruction.triangulate import sensor_columns, triangulate_stripe
+from rigs.instrument_stages import Outcome, judged
+from rigs.instruments import DEGENERATE, Instrument, Light, Placement, seen_stripe
+from rigs.sheet_rig import make_profile
+
+PLATE = Placement(
+    Rotation.from_euler("xyz", [12.0, -9.0, 30.0], degrees=True).as_matrix(),
+    np.array([420.0, 130.0, 60.0]),
+)
+N_WAVES = 24
+NODES = 8
+HOPELESS_MM, HOPELESS_RAD = 1.0, 0.01
+"""A hand-eye that the bound itself knows no better than this may be refused."""
+LARGEST_SCATTER_MM = 0.2
+"""Of an arm at the ends of a stripe, from which a refusal is right: 0.25 mm is the software's."""
+GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Heights over the plate's plane."""
+
+    vectors: FloatArray
+    amplitudes: FloatArray
+
+    @staticmethod
+    def draw(made: Instrument, rng: np.random.Generator, n: int, sigma_mm: float) -> Waves:
+        """N waves of about the instrument's length, of random direction and phase."""
+        length = made.references.flatness_length_mm * rng.uniform(0.6, 1.6, n)
+        angle = rng.uniform(0.0, np.pi, n)
+        vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * (2.0 * np.pi / length)[:, None]
+        return Waves(vectors, sigma_mm / np.sqrt(n) * rng.normal(size=(n, 2)))
+
+    def height(self, places: FloatArray) -> FloatArray:
+        """(N,) at places (N, 2 or 3) on the plate."""
+        angle = places[:, :2] @ self.vectors.T
+        return np.asarray(
+            np.cos(angle) @ self.amplitudes[:, 0] + np.sin(angle) @ self.amplitudes[:, 1]
+        )
+
+    def features(self, places: FloatArray) -> FloatArray:
+        """(N, 2 n) what random amplitudes of one sigma multiply."""
+        angle = places[:, :2] @ self.vectors.T
+        both = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        return np.asarray(both / np.sqrt(len(self.vectors)))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One exposure: its posture, where the head truly was, and the true points in its frame."""
+
+    posture: int
+    head: Placement
+    points: FloatArray
+    stripe: PosedStripe
+
+
+def run_hand_eye(
+    made: Instrument, sensor: SensorCalibration, lights: dict[int, Light], on_sphere: bool
+) -> Outcome:
+    """Calibrate the hand-eye; ``lights`` are the true lines by the number of their sheet."""
+    rng = made.rng(20 + on_sphere)
+    waves = Waves.draw(made, rng, N_WAVES, made.references.flatness_mm)
+    heads = sphere_heads(made, rng) if on_sphere else plate_heads(made, rng)
+    seen = observed(made, sensor, lights, heads, waves, rng, on_sphere)
+    stripes = [one.stripe for one in seen]
+    begun = time.process_time()
+    try:
+        found = _calibrated(made, stripes, sensor, waves, rng, on_sphere)
+    except ArmscanError as error:
+        found = FitFailure(str(error))
+    seconds = time.process_time() - begun
+    best = hand_eye_bound(made, seen, sensor, on_sphere)
+    stage = "hand-eye on sphere" if on_sphere else "hand-eye on plate"
+    if isinstance(found, FitFailure):
+        result = "rightly" if _may_be_refused(made, best, seen) else "wrongly"
+        return Outcome(stage, f"{result} refused", found.reason, seconds=seconds)
+    calibration = found.calibration
+    covariance, follow = calibration.covariance, calibration.dhand_eye_dsensor
+    if follow is not None:
+        covariance = covariance + follow @ sensor.covariance @ follow.T
+    pose, truth = calibration.tool_from_sensor, made.tool_from_sensor
+    turn = Rotation.from_matrix(pose.rotation @ truth.rotation.T).as_rotvec()
+    error = np.concatenate([turn, pose.translation_mm - truth.shift])
+    ratio = np.nan
+    if best is not None:
+        ratio = float(np.exp(0.5 * np.log(np.diag(covariance) / np.diag(best)).mean()))
+    return judged(
+        stage,
+        error,
+        covariance,
+        GROUPS,
+        over_bound=ratio,
+        warnings=found.warnings,
+        seconds=seconds,
+    )
+
+
+def _calibrated(
+    made: Instrument,
+    stripes: list[PosedStripe],
+    sensor: SensorCalibration,
+    waves: Waves,
+    rng: np.random.Generator,
+    on_sphere: bool,
+) -> HandEyeFit | FitFailure:
+    if on_sphere:
+        diameter = made.references.diameter_mm
+        return calibrate_on_sphere(stripes, diameter, sensor_covariance=sensor.covariance)
+    plate = probed(made, waves, rng)
+    return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
+
+
+def _may_be_refused(made: Instrument, best: FloatArray | None, seen: list[Seen]) -> bool:
+    """Degenerate by construction, or beyond what the software says that it refuses."""
+    if made.fault in DEGENERATE["handeye"] or best is None or not seen:
+        return True
+    sigma = np.sqrt(np.diag(best))
+    half = 0.35 * made.field_mm
+    scatter = made.arm.position_mm * np.hypot(1.0, half / made.arm.lever_mm)
+    return bool(
+        sigma[3:].max() > HOPELESS_MM
+        or sigma[:3].max() > HOPELESS_RAD
+        or scatter > LARGEST_SCATTER_MM
+        or len({one.posture for one in seen}) < 3
+    )
+
+
+def plate_heads(made: Instrument, rng: np.random.Generator) -> list[Placement]:
+    """Base from Sensor of each posture, aimed at the plate."""
+    arm, n = made.arm, made.arm.n_postures
+    tilt, azimuth = np.radians(rng.uniform(10.0, 40.0, n)), rng.uniform(0.0, 2.0 * np.pi, n)
+    roll = rng.uniform(-np.pi, np.pi, n)
+    if arm.spread == "one side":
+        azimuth = rng.uniform(0.0, 2.0 * np.pi) + np.radians(rng.uniform(-30.0, 30.0, n))
+    if arm.spread == "nearly parallel":
+        tilt = np.radians(rng.uniform(0.0, 6.0, n))
+    if made.fault == "pure translation":
+        tilt, azimuth, roll = (np.full(n, value[0]) for value in (tilt, azimuth, roll))
+    span = min(0.12 * made.stand_off_mm, 0.15 * made.field_mm)
+    away = made.stand_off_mm + rng.uniform(-span, span, n)
+    place = rng.uniform(-0.4, 0.4, (n, 2)) * made.references.plate_half_mm
+    heads = []
+    for k in range(n):
+        leaning = np.array([np.cos(azimuth[k]), np.sin(azimuth[k]), 0.0])
+        if made.fault == "turns about the plate's normal only":
+            leaning, tilt[k], roll[k] = np.array([1.0, 0.0, 0.0]), tilt[0], roll[0]
+        z = -(np.cos(tilt[k]) * np.array([0.0, 0.0, 1.0]) + np.sin(tilt[k]) * leaning)
+        x = np.cross([0.3, 1.0, 0.2], z)
+        x /= np.linalg.norm(x)
+        turned = np.column_stack([x, np.cross(z, x), z])
+        turned = turned @ Rotation.from_rotvec([0.0, 0.0, roll[k]]).as_matrix()
+        if made.fault == "turns about the plate's normal only":
+            spin = Rotation.from_rotvec([0.0, 0.0, azimuth[k]]).as_matrix()
+            turned = spin @ turned
+            away[k] = away[0]
+        at = np.array([*place[k], 0.0]) - turned[:, 2] * away[k]
+        heads.append(Placement(PLATE.rotation @ turned, PLATE.apply(at[None])[0]))
+    return heads
+
+
+SPHERE_MM = np.array([650.0, -170.0, 35.0])
+
+
+def sphere_heads(made: Instrument, rng: np.random.Generator) -> list[Placement]:
+    """Base from Sensor of postures whose first sheet cuts the sphere at various heights."""
+    n, radius = made.arm.n_postures, 0.5 * made.references.diameter_mm
+    facing = Rotation.from_rotvec([np.pi, 0.0, 0.2])
+    axis = rng.normal(size=3) / np.sqrt(3.0)
+    span = min(0.12 * made.stand_off_mm, 0.15 * made.field_mm)
+    normal = made.lights[0].normal
+    held = Rotation.from_rotvec(0.5 * rng.uniform(-1.0, 1.0, 3))
+    heads = []
+    for _ in range(n):
+        turn = Rotation.from_rotvec(rng.uniform(-0.7, 0.7, 3))
+        if made.arm.spread == "one side":
+            turn = Rotation.from_rotvec(0.5 * axis + rng.uniform(-0.3, 0.3, 3))
+        if made.arm.spread == "nearly parallel":
+            turn = Rotation.from_rotvec(rng.uniform(-0.1, 0.1, 3))
+        if made.fault in DEGENERATE["handeye"] and made.fault != "two postures":
+            turn = held
+        rotation = (turn * facing).as_matrix()
+        centre = np.array([0.0, 0.0, made.stand_off_mm + 0.6 * radius + rng.uniform(-span, span)])
+        centre[:2] += 0.15 * made.field_mm * rng.uniform(-1.0, 1.0, 2)
+        off = made.lights[0].height(centre[None])[0]
+        centre = centre - (off - rng.uniform(-0.6, 0.6) * radius) * normal
+        heads.append(Placement(rotation, SPHERE_MM - rotation @ centre))
+    return heads
+
+
+def lit(
+    made: Instrument, light: Light, head: Placement, waves: Waves, on_sphere: bool
+) -> FloatArray:
+    """(N, 3) points of one line on the plate or the sphere, in the head's frame."""
+    rays = light.rays(400)
+    if on_sphere:
+        radius = 0.5 * made.references.diameter_mm
+        centre = head.back(SPHERE_MM[None])[0]
+        unit = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        towards = centre - light.source
+        along = unit @ towards
+        inside = radius**2 - (towards @ towards - along**2)
+        is_met = inside > 0.0
+        points = light.source + (along - np.sqrt(np.maximum(inside, 0.0)))[:, None] * unit
+        outward = (points - centre) / radius
+        facing = -np.einsum("ni,ni->n", outward, points) / np.linalg.norm(points, axis=1)
+        return np.asarray(points[is_met & (facing > 0.3)])
+    source = PLATE.back(head.apply(light.source[None]))[0]
+    unit = rays @ head.rotation.T @ PLATE.rotation
+    distance = -source[2] / unit[:, 2]
+    for _ in range(6):
+        at = source + distance[:, None] * unit
+        distance = distance + (waves.height(at) - at[:, 2]) / unit[:, 2]
+    at = source + distance[:, None] * unit
+    inside = (np.abs(at[:, :2]) < made.references.plate_half_mm).all(axis=1) & (distance > 0.0)
+    return head.back(PLATE.apply(at[inside]))
+
+
+def observed(
+    made: Instrument,
+    sensor: SensorCalibration,
+    lights: dict[int, Light],
+    heads: list[Placement],
+    waves: Waves,
+    rng: np.random.Generator,
+    on_sphere: bool,
+) -> list[Seen]:
+    """What every exposure gives, through the sensor as it was calibrated."""
+    found = []
+    share = made.arm.exposure_share
+    for k, head in enumerate(heads):
+        common = np.sqrt(1.0 - share**2) * _pose_error(made, rng)
+        for number in range(made.arm.n_exposures):
+            reported = _reported(made, head, common + share * _pose_error(made, rng))
+            stripes, sheets, truth = [], [], []
+            for sheet, light in lights.items():
+                points = lit(made, light, head, waves, on_sphere)
+                q, normal, true = seen_stripe(made, points, 0, 45, rng)
+                if len(q):
+                    stripes.append((q, normal))
+                    sheets.append(np.full(len(q), sheet))
+                    truth.append(true)
+            if not stripes:
+                continue
+            name = f"image{k:02d}-{number}"
+            profile = make_profile(name, stripes, made.claimed[1] * made.stripe_px)
+            points = triangulate_stripe(profile, np.concatenate(sheets), sensor)
+            if len(points) < len(profile):
+                continue
+            by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
+            for sheet in lights:
+                rows = np.flatnonzero(points.sheet == sheet)
+                columns = sensor_columns(sensor, sheet)
+                by_all[np.ix_(rows, np.arange(3), columns)] = points.by_sensor[rows]
+            stripe = PosedStripe(
+                source=name,
+                posture=f"posture{k:02d}",
+                base_from_tool=reported,
+                points_mm=points.points_mm,
+                noise_mm=points.noise_mm,
+                sheet=points.sheet,
+                dpoint_dsensor=by_all,
+            )
+            found.append(Seen(k, head, np.concatenate(truth), stripe))
+    return found
+
+
+def _pose_error(made: Instrument, rng: np.random.Generator) -> FloatArray:
+    sigma = made.arm.position_mm
+    return rng.normal(size=6) * np.repeat([sigma / made.arm.lever_mm, sigma], 3)
+
+
+def _reported(made: Instrument, head: Placement, error: FloatArray) -> Pose:
+    scan_point = head.apply(np.array([[0.0, 0.0, made.stand_off_mm]]))[0]
+    turn = Rotation.from_rotvec(error[:3]).as_matrix()
+    rotation = turn @ head.rotation
+    shift = turn @ (head.shift - scan_point) + scan_point + error[3:]
+    tool = made.tool_from_sensor.rotation
+    return Pose(rotation @ tool.T, shift - rotation @ tool.T @ made.tool_from_sensor.shift)
+
+
+def probed_places(made: Instrument) -> FloatArray:
+    """(K, 2) touched places all over the plate."""
+    rng = made.rng(30)
+    size = 0.95 * made.references.plate_half_mm
+    return rng.uniform(-size, size, (made.references.n_probed, 2))
+
+
+def probed(made: Instrument, waves: Waves, rng: np.random.Generator) -> PlateReference:
+    """The plate as touches show it."""
+    places = probed_places(made)
+    heights = waves.height(places) + made.references.probing_mm * rng.normal(size=len(places))
+    fitted = fit_plane(PLATE.apply(np.column_stack([places, heights])))
+    assert isinstance(fitted, Estimate)
+    plane = fitted.value
+    if plane.normal @ PLATE.rotation[:, 2] < 0.0:
+        plane = Plane(plane.point_mm, plane.axes * np.array([[1.0], [-1.0], [-1.0]]))
+    return PlateReference(
+        plane=plane,
+        covariance=fitted.covariance,
+        rms_mm=float(np.sqrt((fitted.residuals**2).mean())),
+        n_points=len(places),
+        source="rig",
+    )
+
+
+def hand_eye_bound(
+    made: Instrument, seen: list[Seen], sensor: SensorCalibration, on_sphere: bool
+) -> FloatArray | None:
+    """(6, 6) smallest covariance given the sensor as it is known; None where there is none.
+
+    Some points of each stripe stand for all, their noise lowered accordingly.
+    """
+    if not seen:
+        return None
+    rows, noise, lever, owner, known, places = [], [], [], [], [], []
+    for number, one in enumerate(seen):
+        n = len(one.points)
+        chosen = np.linspace(0, n - 1, min(NODES, n)).astype(int)
+        points, head = one.points[chosen], one.head
+        base = head.apply(points)
+        if on_sphere:
+            gradient = (base - SPHERE_MM) / np.linalg.norm(base - SPHERE_MM, axis=1)[:, None]
+            by_surface = -gradient
+            place = base[:, :2]
+        else:
+            place = PLATE.back(base)[:, :2]
+            gradient = np.tile(PLATE.rotation[:, 2], (len(base), 1))
+            by_surface = np.column_stack(
+                [place / made.references.plate_half_mm, np.ones(len(place))]
+            )
+        in_tool = points @ made.tool_from_sensor.rotation.T
+        in_tool_gradient = gradient @ head.rotation @ made.tool_from_sensor.rotation.T
+        rows.append(
+            np.column_stack([np.cross(in_tool, in_tool_gradient), in_tool_gradient, by_surface])
+        )
+        scan_point = head.apply(np.array([[0.0, 0.0, made.stand_off_mm]]))[0]
+        lever.append(np.column_stack([np.cross(base - scan_point, gradient), gradient]))
+        in_sensor = gradient @ head.rotation
+        size = np.einsum("ni,ni->n", in_sensor, one.stripe.noise_mm[chosen, :, 0])
+        noise.append((size / made.claimed[1]) ** 2 * len(chosen) / n)
+        known.append(np.einsum("ni,nip->np", in_sensor, one.stripe.dpoint_dsensor[chosen]))
+        owner.append(
+            np.column_stack([np.full(len(chosen), one.posture), np.full(len(chosen), number)])
+        )
+        places.append(place)
+    design, who = np.concatenate(rows), np.concatenate(owner)
+    sigma, share = made.arm.position_mm, made.arm.exposure_share
+    scale = np.repeat([sigma / made.arm.lever_mm, sigma], 3)
+    pulled = np.concatenate(lever) * scale
+    alike = pulled @ pulled.T
+    same = [who[:, k][:, None] == who[:, k][None, :] for k in (0, 1)]
+    covariance = alike * ((1.0 - share**2) * same[0] + share**2 * same[1])
+    by_sensor = np.concatenate(known)
+    covariance += by_sensor @ sensor.covariance @ by_sensor.T
+    covariance += np.diag(np.concatenate(noise))
+    if not on_sphere:
+        touched = probed_places(made)
+        by_touch = np.column_stack([touched / made.references.plate_half_mm, np.ones(len(touched))])
+        # A touch lies where the plate is: the plane is met by both with one sign.
+        design = np.concatenate([design, np.column_stack([np.zeros((len(touched), 6)), by_touch])])
+        whole = np.zeros((len(design), len(design)))
+        whole[: len(covariance), : len(covariance)] = covariance
+        whole[len(covariance) :, len(covariance) :] = (
+            np.eye(len(touched)) * made.references.probing_mm**2
+        )
+        waves = Waves.draw(made, np.random.default_rng(12345), 300, 1.0)
+        shape = waves.features(np.concatenate([*places, touched]))
+        covariance = whole + made.references.flatness_mm**2 * shape @ shape.T
+    information = design.T @ np.linalg.solve(covariance, design)
+    size = np.sqrt(np.diag(information))
+    scaled = information / np.outer(size, size)
+    if not np.linalg.eigvalsh(scaled)[0] > 1e-12:
+        return None
+    return np.asarray((np.linalg.inv(scaled) / np.outer(size, size))[:6, :6])

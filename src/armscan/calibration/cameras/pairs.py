@@ -271,10 +271,15 @@ def common_design_effect(cameras: tuple[SingleCamera, SingleCamera]) -> float:
 def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}
-    basis = basis_of(fit.free_parameters, is_aspect_fixed=options.camera.is_aspect_fixed)
+    names = fit.free_parameters
+    if fit.warp is not None and fit.warp.is_significant:
+        # chosen on a flat board: the pair frees all that the camera's sigmas allow for
+        known = np.diag(fit.covariance) > 0.0
+        names = tuple(name for name, is_in in zip(PARAMETER_NAMES, known, strict=True) if is_in)
+    basis = basis_of(names, is_aspect_fixed=options.camera.is_aspect_fixed)
     return SingleCamera(
         fit.camera,
-        fit.free_parameters,
+        names,
         basis[: len(PARAMETER_NAMES)],
         {view.source: view.is_outlier for view in fit.used_views},
         left_out,

@@ -33,6 +33,7 @@ from armscan.calibration.cameras.pairs import (
     StereoPair,
     check_pairs,
     common_bow,
+    common_design_effect,
     prepare_cameras,
     views_of,
 )
@@ -505,13 +506,15 @@ def _result(
         return covariance
     steps = options.camera.max_steps
     bow = common_bow(evidence.cameras)
+    matrix = covariance.matrix.copy()
+    if held is None:
+        matrix *= common_design_effect(evidence.cameras)
     if bow is not None:
         by_bow = covariance_of_bow(evidence.solution, bow.covariance_mm2, steps)
         if isinstance(by_bow, FitFailure):
             return by_bow
-        matrix = covariance.matrix.copy()
         matrix[:N_SHARED, :N_SHARED] += by_bow
-        covariance = replace(covariance, matrix=matrix)
+    covariance = replace(covariance, matrix=matrix)
     hold_out = (
         hold_out_pairs(evidence.solution, options.n_folds, steps) if options.n_folds else None
     )

@@ -237,7 +237,8 @@ def camera_error(
         step[k] = h
         by[:, k] = (made.left.moved(step).project(points) - made.left.project(points)).ravel() / h
     miss = by @ error
-    nearest = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0] * steps[0]
+    scaled = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0]
+    nearest = np.asarray(scaled * steps[0], dtype=np.float64)
     rest = miss - by[:, free] @ nearest
     sigma = np.sqrt(np.einsum("ni,ij,nj->n", by[:, free], covariance, by[:, free]))
     return nearest, covariance, free, float(np.abs(rest / sigma).max())

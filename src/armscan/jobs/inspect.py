@@ -220,8 +220,8 @@ def _finished(
     is_simulated = cloud.is_simulated or are_simulated(inputs)
     if cloud.noise_length is None and cloud.sigma_noise_mm.any():
         assumed = (
-            "the cloud does not say how far neighbours share the stripe's noise: it is taken as new "
-            "in every point, as if nothing had been smoothed along the stripe; reconstruct again"
+            "the cloud does not say how far neighbours share the stripe's noise: it is taken as "
+            "new in every point, as if nothing had been smoothed along it; reconstruct again"
         )
         report = replace(report, warnings=(*report.warnings, assumed))
     written: tuple[Path, ...] = ()

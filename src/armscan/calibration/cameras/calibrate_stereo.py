@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.adjustment import board_warp_shape
 from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
@@ -34,6 +33,7 @@ from armscan.calibration.cameras.pairs import (
     StereoPair,
     check_pairs,
     common_bow,
+    common_design_effect,
     prepare_cameras,
     views_of,
 )
@@ -121,31 +121,6 @@ def _alone(
         return seen
     right_from_board: Pose[CameraRight, Board] = Pose(seen.rotation, seen.translation_mm)
     return right_from_left.inverse() @ right_from_board
-
-
-def bent(boards: Boards, cameras: Cameras) -> Boards:
-    """The boards with their points where the bow puts them that the cameras found by themselves."""
-    found = [one.fit.warp for one in cameras if one.fit is not None and one.fit.warp is not None]
-    views = [view for pair in boards.seen_by for view in pair.views if view is not None]
-    if not found or not views:
-        return boards
-    information = [np.linalg.inv(warp.covariance_mm2) for warp in found]
-    pull = sum(inverse @ warp.bow_mm for inverse, warp in zip(information, found, strict=True))
-    bow_mm = np.linalg.solve(sum(information), pull)
-    board = np.concatenate([view.points_board_mm for view in views])
-    height = board_warp_shape(board) @ bow_mm
-    ends = np.cumsum([len(view) for view in views])[:-1]
-    raised = iter(np.split(height, ends))
-
-    def bowed(view: TargetView | None) -> TargetView | None:
-        if view is None:
-            return None
-        points = view.points_board_mm.copy()
-        points[:, 2] = next(raised)
-        return replace(view, points_board_mm=points)
-
-    seen_by = tuple(StereoPair(bowed(pair.left), bowed(pair.right)) for pair in boards.seen_by)
-    return replace(boards, seen_by=seen_by)
 
 
 def starting_state(
@@ -440,7 +415,7 @@ def calibrate_stereo(
     if isinstance(relation, FitFailure):
         return relation
     while True:
-        boards = bent(boards_of(relation), cameras)
+        boards = boards_of(relation)
         solution = _solve(boards, relation, cameras, options, given)
         if isinstance(solution, FitFailure):
             return solution
@@ -531,13 +506,15 @@ def _result(
         return covariance
     steps = options.camera.max_steps
     bow = common_bow(evidence.cameras)
+    matrix = covariance.matrix.copy()
+    if held is None:
+        matrix *= common_design_effect(evidence.cameras)
     if bow is not None:
         by_bow = covariance_of_bow(evidence.solution, bow.covariance_mm2, steps)
         if isinstance(by_bow, FitFailure):
             return by_bow
-        matrix = covariance.matrix.copy()
         matrix[:N_SHARED, :N_SHARED] += by_bow
-        covariance = replace(covariance, matrix=matrix)
+    covariance = replace(covariance, matrix=matrix)
     hold_out = (
         hold_out_pairs(evidence.solution, options.n_folds, steps) if options.n_folds else None
     )

@@ -267,6 +267,12 @@ def common_bow(cameras: tuple[SingleCamera, SingleCamera]) -> KnownBow | None:
     return KnownBow(np.asarray(covariance @ weighted), np.asarray(covariance))
 
 
+def common_design_effect(cameras: tuple[SingleCamera, SingleCamera]) -> float:
+    """Mean factor by which the cameras' own variances are widened for residuals that are alike."""
+    found = [camera.fit.design_effect for camera in cameras if camera.fit is not None]
+    return float(np.mean(found)) if found else 1.0
+
+
 def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}

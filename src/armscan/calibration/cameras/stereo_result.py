@@ -15,8 +15,10 @@ from armscan.calibration.cameras.pairs import (
     StereoOptions,
     StereoPair,
     common_bow,
+    common_design_effect,
 )
 from armscan.calibration.cameras.result import (
+    ALIKE,
     FEW_VIEWS,
     SMALL_TILT_DEG,
     THIN_COVERAGE,
@@ -304,13 +306,21 @@ def _about_solution(fit: StereoFit) -> list[str]:
 
 
 def _about_board(fit: StereoFit) -> list[str]:
-    bow = common_bow((fit.left.single, fit.right.single))
+    cameras = fit.left.single, fit.right.single
+    bow, widening = common_bow(cameras), np.sqrt(common_design_effect(cameras))
+    warnings = []
+    if widening > ALIKE**0.5 and fit.options.intrinsics != "fixed":
+        warnings.append(
+            "residuals of one view are alike, as if the board were bent or unevenly lit: the "
+            f"standard deviations were widened by {widening:.1f}; look at the board's flatness"
+        )
     if bow is None:
-        return []
+        return warnings
     along_x, along_y = bow.bow_mm
     return [
+        *warnings,
         f"the board is bowed by {along_x:+.3f}, {along_y:+.3f} mm (along x, along y), as each "
-        "camera by itself shows: the pairs are solved with it; a flatter board is better"
+        "camera by itself shows: the pairs are solved with it; a flatter board is better",
     ]
 
 

@@ -49,8 +49,10 @@ _AROUND = np.ones((2 * _RIM_PX + 1, 2 * _RIM_PX + 1), np.uint8)
 Bytes = NDArray[np.uint8]
 
 
-def lit_pixels(nodes: Hits, light: TracedLight, region: Region) -> Bytes:
-    """(H, W) 1 for pixels of a region that a light may reach.
+def lit_pixels(
+    nodes: Hits, light: TracedLight, region: Region, sigmas: float = BAND_SIGMAS
+) -> Bytes:
+    """(H, W) 1 for pixels of a region whose reach may be within some sigmas: that a light reaches.
 
     Where the coarse grid meets one surface smoothly, the reach is interpolated to tell; elsewhere
     all pixels of cells next to the sheet are taken.
@@ -63,7 +65,7 @@ def lit_pixels(nodes: Hits, light: TracedLight, region: Region) -> Bytes:
     coarse = np.where(is_hit, reach, 0.0).reshape(shape).astype(np.float32)
     rough = _rough_cells(coarse, nodes.surface.reshape(shape))
     is_lit = np.zeros((region.height_px, region.width_px), np.uint8)
-    most = BAND_SIGMAS + _SLACK_SIGMAS
+    most = sigmas + _SLACK_SIGMAS
     mark_lit(coarse, cells.astype(np.uint8), rough.astype(np.uint8), most, is_lit)
     return is_lit
 

@@ -10,7 +10,7 @@ which never lies beside the photographs. Of each stage it says
 
 * right: the error is within 4 of its own sigma,
 * refused: by the command, with its sentence; rightly if the set was degenerate by construction,
-* wrong: beyond 4 sigma, and whether any command warned.
+* wrong: beyond 4 sigma, silently or with a warning of this or an earlier stage that bears on it.
 
 Points are wrong if more than 2 % lie farther from the true surface than 4 of their own sigma.
 A line of JSON is written for each instrument, with the commit; a seed that has its line at this
@@ -72,6 +72,17 @@ REFUSED_BY = {
     "laser": {"parallel boards", "boards at one depth"},
     "hand-eye": {"parallel boards", "boards at one depth", "parallel postures"},
 }
+HARMLESS = (
+    "to the LEFT of the left one",
+    "looks the same when it is turned",
+    "too far outside the calibrated depths",
+    "calibrated depth range",
+    "have no normal",
+    "did not see the target",
+    "were not used",
+    "gave no point",
+)
+"""Parts of warnings that say nothing of an error of what is written."""
 STAGES = ("camera", "laser", "sensor points", "probe", "hand-eye", "plate", "ball", "diameter")
 
 
@@ -125,10 +136,12 @@ class Chain:
         return str(self.folder / name)
 
 
-def judge(stage: Stage, ratio: float, limit: float) -> None:
-    """Right or wrong by an error in units of its sigma."""
+def judge(chain: Chain, stage: Stage, ratio: float, limit: float) -> None:
+    """Right or wrong by an error in units of its sigma; a stage before may have warned."""
     if not ratio <= limit:
-        stage.outcome = "wrong, warned" if stage.warnings else "silently wrong"
+        told = [word for one in chain.stages for word in one.warnings]
+        told = [word for word in told if not any(part in word for part in HARMLESS)]
+        stage.outcome = "wrong, warned" if told else "silently wrong"
 
 
 def length_limit(n_parameters: int) -> float:
@@ -137,7 +150,7 @@ def length_limit(n_parameters: int) -> float:
 
 
 def camera_figures(found: CameraCalibration, true: RenderCamera) -> dict[str, Any]:
-    """Error of a camera's rays over its valid region in their own sigmas; parameters too."""
+    """Error of a camera's rays in their own sigmas; of its parameters too."""
     parameters = np.array(
         [getattr(true, name) for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")]
     )
@@ -155,11 +168,7 @@ def camera_figures(found: CameraCalibration, true: RenderCamera) -> dict[str, An
 
 
 def ray_ratio(found: CameraCalibration, true_parameters: FloatArray) -> float:
-    """Rms, over the covered region, of the rays' error in their own sigma after the best turn.
-
-    A turn of all rays is a turn of the Sensor frame: no measurement can tell it, so that it is
-    taken out of the error; the covariance keeps it, which makes the ratio smaller by little.
-    """
+    """Rms, over most of the image, of the rays' errors in their own sigmas."""
     camera = found.camera
     width, height = camera.width_px, camera.height_px
     u, v = np.meshgrid(np.linspace(0.12, 0.88, 9) * width, np.linspace(0.12, 0.88, 7) * height)
@@ -219,7 +228,7 @@ def calibrate_cameras(chain: Chain, shoot: Photographer, views: int) -> bool:
             return False
         found = read_camera_calibration(folder / "camera.json")
         stage.figures = camera_figures(found, drawn.head.camera)
-        judge(stage, stage.figures["rays"], LIMIT_SIGMAS)
+        judge(chain, stage, stage.figures["rays"], LIMIT_SIGMAS)
         return True
     stage, report = chain.command(
         "camera", "calibrate", "stereo", chain.path("camera/left"), chain.path("camera/right"),
@@ -233,7 +242,7 @@ def calibrate_cameras(chain: Chain, shoot: Photographer, views: int) -> bool:
         for found, eye in zip((stereo.left, stereo.right), drawn.head.cameras, strict=True)
     ]
     stage.figures = max(both, key=lambda one: one["rays"])
-    judge(stage, stage.figures["rays"], LIMIT_SIGMAS)
+    judge(chain, stage, stage.figures["rays"], LIMIT_SIGMAS)
     return True
 
 
@@ -257,7 +266,7 @@ def calibrate_lasers(chain: Chain, shoot: Photographer, boards: int) -> bool:
         document = json.loads((chain.folder / "sensor.json").read_text())
         stage.figures = {"sheets": len(document["sheets"])}
         if len(document["sheets"]) != len(drawn.head.lasers):
-            judge(stage, np.inf, 1.0)
+            judge(chain, stage, np.inf, 1.0)
     return bool(report)
 
 
@@ -279,7 +288,7 @@ def measure_in_sensor(chain: Chain, held: Held) -> None:
         normal = pose.rotation.T @ drawn.base_from_plate.rotation[:, 2]
         sigma[on] = np.sqrt(np.einsum("i,nij,j->n", normal, cloud.covariance_mm2[on], normal))
     stage.figures = point_figures(distance, sigma, cloud.exposure)
-    judge(stage, stage.figures["beyond"], MOST_BEYOND)
+    judge(chain, stage, stage.figures["beyond"], MOST_BEYOND)
 
 
 def calibrate_hand_eye(chain: Chain) -> bool:
@@ -306,7 +315,7 @@ def calibrate_hand_eye(chain: Chain) -> bool:
         "rotation_deg": round(errors.rotation_deg, 5),
         "arm_mm": round(float(np.hypot(noise.position_mm, noise.exposure_position_mm)), 4),
     }
-    judge(stage, errors.normalised, length_limit(6))
+    judge(chain, stage, errors.normalised, length_limit(6))
     return True
 
 
@@ -324,7 +333,7 @@ def measure_plate(chain: Chain) -> None:
     sigma = np.sqrt(np.einsum("i,nij,j->n", normal, cloud.covariance_mm2, normal))
     distance = plate_distance_mm(drawn, cloud.points_mm)
     stage.figures = point_figures(distance, sigma, cloud.exposure)
-    judge(stage, stage.figures["beyond"], MOST_BEYOND)
+    judge(chain, stage, stage.figures["beyond"], MOST_BEYOND)
     chain.command(
         "inspect plane", "inspect", "plane", chain.path("plate.ply"), "--plate",
         chain.path("plate.csv"), "-o", chain.path("plate-inspection.html"),
@@ -344,7 +353,7 @@ def measure_ball(chain: Chain) -> None:
     normal = ball.normals(cloud.points_mm)
     sigma = np.sqrt(np.einsum("ni,nij,nj->n", normal, cloud.covariance_mm2, normal))
     stage.figures = point_figures(ball.distance_mm(cloud.points_mm), sigma, cloud.exposure)
-    judge(stage, stage.figures["beyond"], MOST_BEYOND)
+    judge(chain, stage, stage.figures["beyond"], MOST_BEYOND)
     diameter = 2.0 * ball.radius_mm
     stage, report = chain.command(
         "diameter", "inspect", "sphere", chain.path("ball.ply"), "--diameter", f"{diameter:.6f}",
@@ -353,7 +362,7 @@ def measure_ball(chain: Chain) -> None:
     if report:
         error, sigma_mm = diameter_error(report, diameter)
         stage.figures = {"error_mm": round(error, 5), "sigma_mm": round(sigma_mm, 5)}
-        judge(stage, abs(error) / sigma_mm, LIMIT_SIGMAS)
+        judge(chain, stage, abs(error) / sigma_mm, LIMIT_SIGMAS)
 
 
 def diameter_error(report: dict[str, Any], diameter_mm: float) -> tuple[float, float]:

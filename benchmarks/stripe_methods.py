@@ -7,7 +7,8 @@ images are those of the folder ``ciclop`` below ``ARMSCAN_DATA``; without it tha
 Rendered: bias and noise are mean and standard deviation across the line of the accepted points;
 completeness is the share of the line's 2 px pieces that have an accepted point; false are accepted
 points more than 1 px (or 2 px for the close pair) from any line. Real: the truth is unknown, so
-noise is the scatter about a cubic through each line on the flat board.
+noise is the scatter about a cubic through each line on the flat board. Of lopsided sections the
+bias is that against the brightest place: what matters is that it is the same at every peak.
 """
 
 from __future__ import annotations
@@ -66,6 +67,18 @@ def scenes() -> dict[str, list[StripeScene]]:
         "speckle with grain 1 px": [StripeScene((one,), noise=coarse)],
         "weak, peak 15": [StripeScene((straight(8.0, peak=15.0),))],
         "thin, sigma 0.8": [StripeScene((straight(8.0, sigma_px=0.8),))],
+        **{
+            f"lopsided {part:g}, peak {peak:g}": [
+                StripeScene((straight(8.0, lopsided=part, peak=peak),))
+            ]
+            for part in (0.15, 0.3, 0.45)
+            for peak in (20.0, 150.0, 500.0)
+        },
+        **{
+            f"one-sided tail, peak {peak:g}": [StripeScene((straight(8.0, tail=0.15, peak=peak),))]
+            for peak in (20.0, 150.0, 500.0)
+        },
+        "wide, sigma 8": [StripeScene((straight(8.0, sigma_px=8.0),))],
         "saturated, peak 700": [StripeScene((straight(8.0, peak=700.0),))],
         "reflectance 5 % / sigma": [StripeScene((straight(8.0, reflectance_gradient=0.05),))],
         "background step 50": [StripeScene((one,), background_step=50.0)],

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -175,7 +175,7 @@ def run_camera(made: Instrument, options: CameraOptions | None = None) -> Camera
     outcome = _judge_camera(made, fit, best, seconds, len(views.found))
     if isinstance(fit, CameraFit) and outcome.result == "right":
         return CameraResult(outcome, camera_calibration(fit, PROVENANCE), information)
-    return CameraResult(outcome, drawn_camera(made, information), information)
+    return CameraResult(outcome, drawn_camera(made), information)
 
 
 def _judge_camera(
@@ -243,14 +243,13 @@ def camera_error(
     return nearest, covariance, free, float(np.abs(rest / sigma).max())
 
 
-def drawn_camera(made: Instrument, information: FloatArray) -> CameraCalibration:
+def drawn_camera(made: Instrument) -> CameraCalibration:
     """A camera as an ideal calibration with enough views would return it."""
     lens, rng = made.left, made.rng(7)
     views = views_of(made, board_placements_of_ten(made), 0, 7)
     best = bound(camera_information(made, views.seen, 9), 9)
     root = np.linalg.cholesky(best + 1e-30 * np.eye(9))
     values = lens.parameters + root @ rng.normal(size=9)
-    del information
     return CameraCalibration(
         camera=CameraModel.from_parameters(values, lens.width_px, lens.height_px),
         covariance=best,
@@ -266,8 +265,6 @@ def drawn_camera(made: Instrument, information: FloatArray) -> CameraCalibration
 
 def board_placements_of_ten(made: Instrument) -> list[Placement]:
     """Ten sound placements, whatever the instrument's own fault is."""
-    from dataclasses import replace
-
     return board_placements(replace(made, fault=""), made.rng(8), 10, for_sheets=False)
 
 
@@ -387,7 +384,8 @@ def _judge_sheets(
     first = size + np.concatenate([[0], np.cumsum([8 if one else 3 for one in bowed])])
     used = np.concatenate([np.arange(size)] + [np.arange(first[k], first[k + 1]) for k in kept])
     best = bound(whole[np.ix_(used, used)][::-1, ::-1], len(used) - size)[::-1, ::-1]
-    at = {k: n for k, n in zip(kept, np.cumsum([0] + [8 if bowed[k] else 3 for k in kept]))}
+    widths = [8 if bowed[k] else 3 for k in kept]
+    at = dict(zip(kept, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
     squares, freedom, ratios, is_wrong, groups = 0.0, 0, [], False, {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)

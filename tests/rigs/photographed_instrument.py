@@ -342,7 +342,7 @@ def _draw_lasers(
 
 def _side_by_side(laser: LineLaser, count: int, room_mm: float) -> list[LineLaser]:
     """Sheets about the line through the source along which the fan spreads."""
-    step = np.arctan(0.75 * room_mm / (count * laser.waist_distance_mm))
+    step = np.arctan(0.45 * room_mm / (count * laser.waist_distance_mm))
     lines = []
     for k in range(count):
         turn = rotation_from_vector((k - 0.5 * (count - 1)) * step * laser.across)

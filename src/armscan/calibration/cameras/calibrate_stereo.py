@@ -6,7 +6,7 @@ and the result.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,12 +14,14 @@ from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.joint import (
     N_INTRINSICS,
     N_SHARED,
+    JointObservations,
     JointProblem,
     JointSolution,
     PointWeights,
     Prior,
     StereoCovariance,
     StereoState,
+    adjust_both,
     hold_out_pairs,
     solve_both,
     stack_pair_observations,
@@ -30,6 +32,8 @@ from armscan.calibration.cameras.pairs import (
     StereoOptions,
     StereoPair,
     check_pairs,
+    common_bow,
+    common_design_effect,
     prepare_cameras,
     views_of,
 )
@@ -59,6 +63,7 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Board, CameraRight, Pose, Sensor
+from armscan.geometry.rotations import vector_from_rotation
 from armscan.models.calibration import CameraCalibration
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import TwoViews, epipolar_distances_px
@@ -365,7 +370,8 @@ def calibrate_stereo(
     Levenberg-Marquardt solution over both cameras, ``right_from_left`` and one board pose a pair,
     each point weighted by its covariance at the level of its camera's residuals. A view without
     partner counts for its camera alone. Targets that look the same when turned are numbered so
-    that all pairs agree. Pairs that contradict the others are named and taken apart.
+    that all pairs agree. Pairs that contradict the others are named and taken apart. A bow of the
+    board that a camera by itself cannot do without is taken over from there.
 
     Parameters
     ----------
@@ -429,14 +435,53 @@ def _solve(
     options: StereoOptions,
     given: Given | None,
 ) -> JointSolution | FitFailure:
+    observations = stack_pair_observations(boards.seen_by)
+    bow = common_bow(cameras)
     problem = JointProblem(
-        stack_pair_observations(boards.seen_by),
+        observations if bow is None else on_bowed_board(observations, bow.bow_mm),
         joint_basis(cameras),
         starting_weights(boards.seen_by, cameras),
         prior_of(given) if given is not None and options.intrinsics == "prior" else None,
     )
     start = starting_state(boards, cameras, relation.right_from_left)
     return solve_both(boards.seen_by, problem, start, options.camera.max_steps)
+
+
+def on_bowed_board(observations: JointObservations, bow_mm: FloatArray) -> JointObservations:
+    """The same points on a board that is bowed by so much (2,) more; see `BoardWarp`."""
+    left, right = (
+        replace(
+            seen,
+            board_mm=seen.board_mm
+            + (seen.board_warp_shape @ bow_mm)[:, None] * np.array([0.0, 0.0, 1.0]),
+        )
+        for seen in (observations.left, observations.right)
+    )
+    return JointObservations(left, right)
+
+
+def covariance_of_bow(
+    solution: JointSolution, covariance_mm2: FloatArray, max_steps: int
+) -> FloatArray | FitFailure:
+    """(24, 24) what the uncertainty (2, 2) of a board's bow does to the shared unknowns.
+
+    The solution is repeated with the board bowed by one standard deviation more along each axis of
+    the covariance.
+    """
+    found = np.zeros((N_SHARED, N_SHARED))
+    for change_mm in np.linalg.cholesky(covariance_mm2).T:
+        observations = on_bowed_board(solution.observations, change_mm)
+        moved = adjust_both(
+            replace(solution.problem, observations=observations), solution.state, max_steps
+        )
+        if isinstance(moved, FitFailure):
+            return moved
+        old, new = solution.state.right_from_left, moved.state.right_from_left
+        turn = vector_from_rotation(new.rotation @ old.rotation.T)
+        shift = new.translation_mm - old.translation_mm
+        by = np.concatenate([moved.state.intrinsics - solution.state.intrinsics, turn, shift])
+        found += np.outer(by, by)
+    return found
 
 
 def _own_poses(boards: Boards, relation: Relation, solution: JointSolution) -> list[RelativePose]:
@@ -460,6 +505,16 @@ def _result(
     if isinstance(covariance, FitFailure):
         return covariance
     steps = options.camera.max_steps
+    bow = common_bow(evidence.cameras)
+    matrix = covariance.matrix.copy()
+    if held is None:
+        matrix *= common_design_effect(evidence.cameras)
+    if bow is not None:
+        by_bow = covariance_of_bow(evidence.solution, bow.covariance_mm2, steps)
+        if isinstance(by_bow, FitFailure):
+            return by_bow
+        matrix[:N_SHARED, :N_SHARED] += by_bow
+    covariance = replace(covariance, matrix=matrix)
     hold_out = (
         hold_out_pairs(evidence.solution, options.n_folds, steps) if options.n_folds else None
     )

@@ -12,7 +12,12 @@ import numpy as np
 from armscan.calibration.cameras.adjustment import basis_of
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.distortion import rms
-from armscan.calibration.cameras.result import MIN_VIEW_POINTS, CameraFit, CameraOptions
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    MIN_VIEW_POINTS,
+    CameraFit,
+    CameraOptions,
+)
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
@@ -231,18 +236,61 @@ def prepare_cameras(
     return prepared[0], prepared[1]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownBow:
+    """Bow of the board as both cameras found it, each by itself; see `BoardWarp`.
+
+    Parameters
+    ----------
+    bow_mm
+        (2,) along x and along y.
+    covariance_mm2
+        (2, 2).
+    """
+
+    bow_mm: FloatArray
+    covariance_mm2: FloatArray
+
+
+def common_bow(cameras: tuple[SingleCamera, SingleCamera]) -> KnownBow | None:
+    """Weighted mean of the bows that the cameras by themselves could not do without."""
+    information, weighted = np.zeros((2, 2)), np.zeros(2)
+    for camera in cameras:
+        warp = None if camera.fit is None else camera.fit.warp
+        if warp is not None and warp.is_significant:
+            own = np.linalg.inv(warp.covariance_mm2)
+            information += own
+            weighted += own @ warp.bow_mm
+    if not information.any():
+        return None
+    covariance = np.linalg.inv(information)
+    return KnownBow(np.asarray(covariance @ weighted), np.asarray(covariance))
+
+
+def common_design_effect(cameras: tuple[SingleCamera, SingleCamera]) -> float:
+    """Mean factor by which the cameras' own variances are widened for residuals that are alike."""
+    found = [camera.fit.design_effect for camera in cameras if camera.fit is not None]
+    return float(np.mean(found)) if found else 1.0
+
+
 def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}
-    basis = basis_of(fit.free_parameters, is_aspect_fixed=options.camera.is_aspect_fixed)
+    free, reason = fit.free_parameters, fit.model_reason
+    if options.camera.distortion == "auto":
+        # A coefficient held at zero because one camera says little of it would bend the pair.
+        coefficients = DISTORTION_PARAMETERS["k1k2p1p2k3"]
+        free = (*(name for name in free if name not in coefficients), *coefficients)
+        reason = "all five coefficients: what the pairs say little of, the sigmas tell"
+    basis = basis_of(free, is_aspect_fixed=options.camera.is_aspect_fixed)
     return SingleCamera(
         fit.camera,
-        fit.free_parameters,
+        free,
         basis[: len(PARAMETER_NAMES)],
         {view.source: view.is_outlier for view in fit.used_views},
         left_out,
         fit,
-        fit.model_reason,
+        reason,
     )
 
 

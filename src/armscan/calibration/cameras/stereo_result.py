@@ -9,8 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from armscan.calibration.cameras.pairs import SIDES, SingleCamera, StereoOptions, StereoPair
+from armscan.calibration.cameras.pairs import (
+    SIDES,
+    SingleCamera,
+    StereoOptions,
+    StereoPair,
+    common_bow,
+    common_design_effect,
+)
 from armscan.calibration.cameras.result import (
+    ALIKE,
     FEW_VIEWS,
     SMALL_TILT_DEG,
     THIN_COVERAGE,
@@ -268,6 +276,7 @@ def advise(fit: StereoFit) -> StereoFit:
     warnings = [
         *_about_solution(fit),
         *_about_sides(fit),
+        *_about_board(fit),
         *_about_pairs(fit),
         *_about_epipolar(fit),
         *_about_cameras(fit),
@@ -294,6 +303,25 @@ def _about_solution(fit: StereoFit) -> list[str]:
             f"({held_out.rms_in_sample_px:.3f} px): add pairs"
         )
     return warnings
+
+
+def _about_board(fit: StereoFit) -> list[str]:
+    cameras = fit.left.single, fit.right.single
+    bow, widening = common_bow(cameras), np.sqrt(common_design_effect(cameras))
+    warnings = []
+    if widening > ALIKE**0.5 and fit.options.intrinsics != "fixed":
+        warnings.append(
+            "residuals of one view are alike, as if the board were bent or unevenly lit: the "
+            f"standard deviations were widened by {widening:.1f}; look at the board's flatness"
+        )
+    if bow is None:
+        return warnings
+    along_x, along_y = bow.bow_mm
+    return [
+        *warnings,
+        f"the board is bowed by {along_x:+.3f}, {along_y:+.3f} mm (along x, along y), as each "
+        "camera by itself shows: the pairs are solved with it; a flatter board is better",
+    ]
 
 
 def _about_sides(fit: StereoFit) -> list[str]:

@@ -148,7 +148,6 @@ def _residuals(seen: _Profiles, model: FloatArray) -> tuple[FloatArray, FloatArr
 
 MOST_SECTION = np.array([0.12, 0.03])
 """Larger terms would turn the flank of the section negative."""
-LEAST_PROFILES = 40
 ROBUST_ROUNDS = 8
 CLIPPED_SCORE = 0.7
 """Of one profile, in scatters: next to a median, so that a minority at edges hardly counts."""
@@ -157,18 +156,21 @@ CORE_SIGMAS = 1.3
 
 
 def estimate_section(
-    seen: _Profiles, noise: FloatArray, section: FloatArray, is_alone: BoolArray
+    seen: _Profiles,
+    noise: FloatArray,
+    section: FloatArray,
+    is_alone: BoolArray,
+    chain: IntArray,
 ) -> FloatArray:
     """Shape (4,) of the line's own section: what all fitted profiles of an axis have in common.
 
     A laser whose light leans to one side moves the centre of a Gaussian fit by an amount that
     follows the weights, and with them the brightness. Terms of third and fourth order that all
     profiles share are therefore made part of the model; what single profiles have beside them
-    stays the sign of an edge. Profiles that differ from the rest count for little, and a term that
-    is not certain is shrunk towards zero.
+    stays the sign of an edge.
 
     ``seen``: pixels of the fitted profiles. ``noise``: (3,). ``section``: (4,) of the fit.
-    ``is_alone``: (N,) profiles that no other line is near.
+    ``is_alone``: (N,) profiles that no other line is near. ``chain``: (N,) increasing numbers.
     """
     model, falling = _lines(seen, section)
     variance = noise[0] * model**2 + noise[1] * np.maximum(model + seen.background, 0.0) + noise[2]
@@ -190,15 +192,32 @@ def estimate_section(
     score = np.einsum("nki,nk->ni", weighted, seen.above - model)
     found = section.copy()
     for axis, is_own in enumerate((seen.is_column, ~seen.is_column)):
-        chosen = is_own & has_core & is_alone
-        if chosen.sum() >= LEAST_PROFILES:
+        rows = np.flatnonzero(is_own & has_core & is_alone)
+        blocks = _blocks(chain[rows])
+        if len(blocks) >= LEAST_BLOCKS:
             own = slice(2 * axis, 2 * axis + 2)
-            found[own] = _common_terms(normal[chosen], score[chosen], section[own])
+            found[own] = _common_terms(normal[rows], score[rows], section[own], blocks)
     return found
 
 
-def _common_terms(normal: FloatArray, score: FloatArray, start: FloatArray) -> FloatArray:
-    """(2,) terms that profiles share, of their normal matrices (N, 2, 2) and scores (N, 2)."""
+def _blocks(chain: IntArray) -> list[IntArray]:
+    """Rows of each stretch of `BLOCK` neighbours on one chain."""
+    inner = np.flatnonzero(np.diff(chain) != 0) + 1
+    return [
+        rows[first : first + BLOCK]
+        for rows in np.split(np.arange(len(chain)), inner)
+        for first in range(0, len(rows) - BLOCK + 1, BLOCK)
+    ]
+
+
+def _common_terms(
+    normal: FloatArray, score: FloatArray, start: FloatArray, blocks: list[IntArray]
+) -> FloatArray:
+    """(2,) terms that profiles share, of their normal matrices (N, 2, 2) and scores (N, 2).
+
+    They are shrunk by how far stretches of the line differ from each other: what comes and goes
+    along the line is the surface's.
+    """
     size = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
     step, scatter = np.zeros(2), np.ones(2)
     keep = np.ones(score.shape)
@@ -209,11 +228,17 @@ def _common_terms(normal: FloatArray, score: FloatArray, start: FloatArray) -> F
         scatter = np.maximum([robust_sigma(one) for one in ratio.T], 1.0)
         keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
     terms = np.clip(start + step, -MOST_SECTION, MOST_SECTION)
-    sigma = scatter * np.sqrt(np.maximum(np.diag(np.linalg.pinv(normal.sum(axis=0))), 0.0))
-    certain = 1.0 - (CERTAIN_SIGMAS * sigma / np.maximum(np.abs(terms), 1e-12)) ** 2
-    return np.asarray(terms * np.maximum(certain, 0.0))
+    rest = score - normal @ step
+    diagonal = np.einsum("nii->ni", normal)
+    apart = np.array([rest[b].sum(axis=0) / diagonal[b].sum(axis=0) for b in blocks])
+    differ = np.array([robust_sigma(one) for one in apart.T])
+    sigma = CERTAIN_SIGMAS * differ / np.sqrt(len(blocks))
+    certain = np.maximum(1.0 - (sigma / np.maximum(np.abs(terms), 1e-12)) ** 2, 0.0)
+    return np.asarray(terms * certain * terms**2 / np.maximum(terms**2 + differ**2, 1e-12))
 
 
+BLOCK = 16
+LEAST_BLOCKS = 4
 CERTAIN_SIGMAS = 2.0
 
 
@@ -240,7 +265,8 @@ class ProfileFits:
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
-    section: see `estimate_section`.
+    section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
+    estimate the noise, so that it is the first guess.
     """
 
     ridge: RidgePoints
@@ -250,6 +276,7 @@ class ProfileFits:
     neighbour: FloatArray
     noise: FloatArray
     section: FloatArray
+    is_noise_assumed: bool
 
     @property
     def lean(self) -> FloatArray:
@@ -283,7 +310,8 @@ def fit_ridge(
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
-    noise, section = start_noise(background_noise), np.zeros(4)
+    guess = noise = start_noise(background_noise)
+    section = np.zeros(4)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
         if round_ >= NOISE_ROUNDS and not section.any():
@@ -307,7 +335,8 @@ def fit_ridge(
         seen = _profiles(plane, table[at], sides[at], sample[good])
         peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
         noise = estimate_noise(seen, section, peak, noise)
-        section = estimate_section(seen, noise, section, reach[at] >= REACH_SIGMAS)
+        is_alone = reach[at] >= REACH_SIGMAS
+        section = estimate_section(seen, noise, section, is_alone, ridge.chain[at])
     values = np.zeros((len(table), FIT_COLUMNS))
     fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, section, reach, values)
     good = values[:, VARIANCE] > 0.0
@@ -319,6 +348,7 @@ def fit_ridge(
         neighbour[good],
         noise,
         section,
+        is_noise_assumed=noise is guess,
     )
 
 

@@ -14,12 +14,13 @@ from armscan.simulation.optics.camera import RenderCamera, blur_image
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.render import (
     BLUR_REACH,
+    COARSE_STEP_PX,
     SUBPIXELS,
     Speckle,
     StripeTruth,
     camera_rays,
+    cells_near_sheet,
     find_stripe,
-    laser_bands,
 )
 from armscan.simulation.optics.scene import Scene
 
@@ -103,7 +104,18 @@ def laser_band(scene: Scene, camera: RenderCamera, laser: LineLaser) -> BoolArra
     A coarse grid of rays is traced; a cell belongs to the band if the sheet lies, within its
     thickness, between the nearest and the farthest of the cell's corners; so do its neighbours.
     """
-    return next(laser_bands(scene, camera, (laser,)))
+    u = np.arange(0, camera.width_px + COARSE_STEP_PX, COARSE_STEP_PX)
+    v = np.arange(0, camera.height_px + COARSE_STEP_PX, COARSE_STEP_PX)
+    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(np.float64)
+    hits = scene.trace(np.zeros(3), camera_rays(camera, grid))
+    is_hit = hits.surface >= 0
+    reach = np.full(len(grid), np.nan)
+    reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
+    nodes = reach.reshape(len(v), len(u))
+    cells = cells_near_sheet(nodes, (nodes > 0.0).astype(np.float64)).astype(np.uint8)
+    size = (COARSE_STEP_PX * cells.shape[1], COARSE_STEP_PX * cells.shape[0])
+    band = cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST) > 0
+    return np.asarray(band[: camera.height_px, : camera.width_px])
 
 
 def _speckle_field(

@@ -5,7 +5,7 @@ image regions, and the true stripes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -175,32 +175,6 @@ class Speckle:
     def __post_init__(self) -> None:
         if self.contrast < 0.0 or self.grain_px < 0.0:
             raise InputError("speckle contrast and grain cannot be negative")
-
-
-def laser_bands(
-    scene: Scene, camera: RenderCamera, lasers: Sequence[LineLaser]
-) -> Iterator[BoolArray]:
-    """The band of each laser; the coarse grid is traced once."""
-    u = np.arange(0, camera.width_px + COARSE_STEP_PX, COARSE_STEP_PX)
-    v = np.arange(0, camera.height_px + COARSE_STEP_PX, COARSE_STEP_PX)
-    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2).astype(np.float64)
-    hits = scene.trace(np.zeros(3), camera_rays(camera, grid))
-    is_hit = hits.surface >= 0
-    for laser in lasers:
-        reach = np.full(len(grid), np.nan)
-        reach[is_hit] = laser.reach_mm(hits.points_mm[is_hit])
-        band = pixels_near_sheet(reach.reshape(len(v), len(u)))
-        yield np.asarray(band[: camera.height_px, : camera.width_px])
-
-
-def pixels_near_sheet(reach: FloatArray) -> BoolArray:
-    """(8 (H - 1), 8 (W - 1)) True for pixels next to the sheet, whose reach (H, W) is known.
-
-    The reach, in sigmas, is given on the coarse grid; NaN where nothing is met.
-    """
-    cells = cells_near_sheet(reach, (reach > 0.0).astype(np.float64)).astype(np.uint8)
-    size = (COARSE_STEP_PX * cells.shape[1], COARSE_STEP_PX * cells.shape[0])
-    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def cells_near_sheet(reach: FloatArray, rank: FloatArray) -> BoolArray:

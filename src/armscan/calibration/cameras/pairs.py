@@ -12,7 +12,12 @@ import numpy as np
 from armscan.calibration.cameras.adjustment import basis_of
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.distortion import rms
-from armscan.calibration.cameras.result import MIN_VIEW_POINTS, CameraFit, CameraOptions
+from armscan.calibration.cameras.result import (
+    ALIKE,
+    MIN_VIEW_POINTS,
+    CameraFit,
+    CameraOptions,
+)
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray
@@ -272,8 +277,9 @@ def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}
     names = fit.free_parameters
-    if fit.warp is not None and fit.warp.is_significant:
-        # chosen on a flat board: the pair frees all that the camera's sigmas allow for
+    is_bowed = fit.warp is not None and fit.warp.is_significant
+    if is_bowed or fit.design_effect >= ALIKE:
+        # chosen on a board that is not as it was taken for: all that the sigmas allow for is free
         known = np.diag(fit.covariance) > 0.0
         names = tuple(name for name, is_in in zip(PARAMETER_NAMES, known, strict=True) if is_in)
     basis = basis_of(names, is_aspect_fixed=options.camera.is_aspect_fixed)

@@ -3,6 +3,7 @@
 
     python benchmarks/cross_naming.py [--seeds 20] [--first 1] [--preset harsh] [--no-arm]
                                       [--scenes plate,ball] [--rules ours] [--drop 3]
+                                      [--head flat]
 
 The head of the thesis's printed numbers (two sheets, camera of 5.1.2, window 2658 x 800, 80
 exposures a second) is moved by an unsteady hand over analytic height fields, 48 exposures a stroke,
@@ -27,7 +28,8 @@ least in part; strokes with one wrong point or more; and the upper limits (95 %,
 Pearson) of both shares. Stretches of a stroke are not independent, for each is named by those
 before it; strokes are.
 
-``--drop 3`` loses every third image: its lasers were on, but the namer never sees it.
+``--head`` turns the two sheets about the line in which they meet. ``--drop 3`` loses every third
+image: its lasers were on, but the namer never sees it.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from scipy.special import betaincinv
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeLabeller
 from armscan.thesis.row_rule import RowLabeller
-from rigs.cross_rig import HARSH, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
+from rigs.cross_rig import HARSH, HEADS, NAMES, SCENES, THESIS, CrossExposure, CrossStroke
 
 LEAST_POINTS = 20
 RULES = {"thesis": RowLabeller, "ours": CrossLabeller}
@@ -166,12 +168,14 @@ def main() -> None:
     parser.add_argument("--drop", type=int, default=0)
     parser.add_argument("--rules", default=",".join(RULES))
     parser.add_argument("--preset", choices=("thesis", "harsh"), default="thesis")
+    parser.add_argument("--head", choices=tuple(HEADS), default="thesis")
     parser.add_argument("--no-arm", action="store_true")
     parser.add_argument("--scenes", default=",".join(SCENES))
     options = parser.parse_args()
     disturbance = {"thesis": THESIS, "harsh": HARSH}[options.preset]
     print(
-        f"preset {options.preset}, seeds {options.first}-{options.first + options.seeds - 1}, "
+        f"head {options.head}, preset {options.preset}, "
+        f"seeds {options.first}-{options.first + options.seeds - 1}, "
         f"{'without' if options.no_arm else 'with'} the arm's pose"
         + (f", every image number {options.drop} lost" if options.drop else "")
     )
@@ -182,7 +186,7 @@ def main() -> None:
     for scene in options.scenes.split(","):
         found: dict[str, list[Tally]] = {rule: [] for rule in rules}
         for seed in range(options.first, options.first + options.seeds):
-            stroke = CrossStroke(scene, seed, disturbance)
+            stroke = CrossStroke(scene, seed, disturbance, head=options.head)
             alone = seen_alone(stroke)
             for rule, kind in rules.items():
                 namer = kind(stroke.sensor)

@@ -2,10 +2,10 @@
 """Certainty of the hand-eye over instruments at random: chi2, coverage, and sigma over the bound.
 
     python benchmarks/hand_eye_coverage.py [--runs 400] [--seed 1] [--reference plate sphere]
-        [--typical 0.2 1 5] [--whole]
+        [--postures 3 6] [--typical 0.2 1 5] [--whole]
 
 Each run draws an instrument and its errors: an arm of 0.005 to 0.2 mm with a lever (scatter of its
-scan point over that of its orientation) of 30 to 300 mm, 3 to 24 postures, one to three exposures
+scan point over that of its orientation) of 30 to 300 mm, 4 to 24 postures, one to three exposures
 each, a plate uneven by 0.5 to 30 um over waves of 70 to 220 mm, touches that scatter by 0.3 to 3
 times what the arm does, stripes of 2 um noise; or a sphere. From points, without images: the
 estimate begins at the truth, unless ``--whole`` runs search and checks too. Nothing of the scatter
@@ -60,7 +60,7 @@ from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, Postures, RigNoise
 from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
 
 REGION = float(chi2.ppf(0.95, 6))
-COUNTS = (3, 4, 5, 6, 8, 12, 18, 24)
+COUNTS = (4, 5, 6, 8, 12, 18, 24)
 ON_SPHERE = (5, 6, 8, 12, 18, 24)
 EXPOSURES = (1, 1, 2, 3)
 STRIPE_MM = 0.002
@@ -297,10 +297,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--reference", nargs="+", default=["plate", "sphere"])
     parser.add_argument("--typical", type=float, nargs="+", default=[1.0])
+    parser.add_argument("--postures", type=int, nargs="+", help="counts to draw from")
     parser.add_argument("--whole", action="store_true", help="with search and checks")
     given = parser.parse_args()
     for reference in given.reference:
-        study, counts = (on_plate, COUNTS) if reference == "plate" else (on_sphere, ON_SPHERE)
+        study, usual = (on_plate, COUNTS) if reference == "plate" else (on_sphere, ON_SPHERE)
+        counts = given.postures or usual
         for factor in given.typical:
             begun = time.perf_counter()
             with typical_times(factor):

@@ -45,7 +45,9 @@ def study(name: str, poses: list[Pose[Base, Tool]], runs: int, seed: int) -> Non
         if isinstance(fit, HandEyeFit):
             error = error_of(fit.calibration.tool_from_sensor)
             one.append(error)
-            inside += int(error @ np.linalg.solve(fit.calibration.covariance, error) < REGION)
+            known = fit.calibration.diagnostics
+            limit = REGION * (1.0 if known is None else known.region_factor)
+            inside += int(error @ np.linalg.solve(fit.calibration.covariance, error) < limit)
         steps = calibrate_in_two_steps(stripes, DIAMETER_MM)
         if isinstance(steps, TwoStepHandEye):
             two.append(error_of(steps.tool_from_sensor))

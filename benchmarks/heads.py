@@ -1,26 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole chain of simulated arm scanners over many seeds, against their limits.
 
-    python benchmarks/heads.py --head thesis-single --seeds 20 --preset thesis --processes 2
+    python benchmarks/heads.py --head thesis-single --seeds 20 --first 101 --folder DIR
+    python benchmarks/heads.py --folder DIR --table
 
 Each seed draws another instrument, fixtures, hand and noise; images are rendered, calibrated from,
-measured and inspected, command by command. A row a seed, then the median and the 95th percentile of
-each figure (of the 5th where more is better), beside the limit that the project demands of it. A
-seed that comes to no end counts as infinitely bad in every figure. Names are compared with the
-truth over eight instants of each scene. Everything here is simulated.
+measured and inspected, command by command, by two processes that take seed after seed. Each seed
+that is done is a line of ``DIR/HEAD-PRESET.jsonl`` with the commit that it was run at: what is
+killed goes on where it was when it is started again. It is refused if the tree holds changes that
+are not committed, or if the lines that are there are of another commit.
+
+The table, Markdown, is made from the lines alone: of each figure the limit that the project demands
+(of preset ``thesis`` only), the median, the 95th percentile (the 5th where more is better) and the
+seeds that miss the limit. A seed that comes to no end counts as infinitely bad in every figure; its
+reason stands below. Names are compared with the truth over all instants of all scenes. Everything
+here is simulated.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
-from collections.abc import Callable, Iterable
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import cast
+from typing import Any, cast, get_args
 
 import cv2
 import numpy as np
@@ -36,12 +47,18 @@ HUGE = 1e30
 
 @dataclass(frozen=True)
 class Figure:
-    """One figure of a demo: its limit, and whether that is the most or the least."""
+    """One figure of a demo: its limit, whether that is the most or the least, and the median's."""
 
     name: str
     value: Callable[[HeadDemo], float]
     limit: float | None = None
     is_most: bool = True
+    median_limit: float | None = None
+
+    def misses(self, value: float) -> bool:
+        if self.limit is None:
+            return False
+        return not (value <= self.limit if self.is_most else value >= self.limit)
 
     @property
     def failed(self) -> float:
@@ -111,8 +128,9 @@ PLATE = (
 CALIBRATION = (
     Figure("part rms um", lambda demo: 1000.0 * demo.part.rms_mm),
     Figure("hand-eye deg", lambda demo: demo.hand_eye.rotation_deg),
-    Figure("um", lambda demo: 1000.0 * demo.hand_eye.translation_mm),
-    Figure("in sigmas", lambda demo: demo.hand_eye.normalised),
+    Figure("hand-eye um", lambda demo: 1000.0 * demo.hand_eye.translation_mm),
+    Figure("hand-eye in sigmas", lambda demo: demo.hand_eye.normalised),
+    Figure("sheets calibrated", lambda demo: float(len(demo.sheets)), None, False),
     Figure("sheet um", lambda demo: 1000.0 * max(s.rms_mm for s in demo.sheets)),
     Figure("seconds", lambda demo: sum(demo.seconds.values())),
 )
@@ -123,12 +141,12 @@ NAMES = (
 FIGURES: dict[str, tuple[Figure, ...]] = {
     "thesis-single": (
         *PLATE,
-        Figure("ball diameter um", ball_error, 15.0),
+        Figure("ball diameter um", ball_error, 15.0, median_limit=10.0),
         Figure("ball in 0.05 %", ball_within, 99.0, False),
         Figure("still step um", still_error, 3.0),
-        Figure("its std um", still_std, 6.0),
+        Figure("still step std um", still_std, 6.0),
         Figure("20 mm step um", step_error(20.0), 5.0),
-        Figure("its std um", step_std, 8.0),
+        Figure("20 mm step std um", step_std, 8.0),
         Figure("5 mm step um", step_error(5.0), 5.0),
         *CALIBRATION,
     ),
@@ -137,9 +155,9 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
         Figure("ball diameter um", ball_error, 10.0),
         Figure("ball in 0.05 %", ball_within, 99.0, False),
         Figure("still step um", still_error),
-        Figure("its std um", still_std),
+        Figure("still step std um", still_std),
         Figure("20 mm step um", step_error(20.0), 5.0),
-        Figure("its std um", step_std),
+        Figure("20 mm step std um", step_std),
         Figure("5 mm step um", step_error(5.0)),
         Figure("stripes an exposure", stripes, 1.9, False),
         *NAMES,
@@ -147,12 +165,12 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
     ),
     "thesis-multi": (
         *PLATE,
-        Figure("ball diameter um", ball_error, 15.0),
+        Figure("ball diameter um", ball_error, 15.0, median_limit=10.0),
         Figure("ball in 0.05 %", ball_within, 99.0, False),
         Figure("still step um", still_error, 3.0),
-        Figure("its std um", still_std, 10.0),
+        Figure("still step std um", still_std, 10.0),
         Figure("20 mm step um", step_error(20.0)),
-        Figure("its std um", step_std),
+        Figure("20 mm step std um", step_std),
         Figure("5 mm step um", step_error(5.0)),
         Figure("lines in view used %", lines_used, None, False),
         Figure("shared points named %", lambda d: 100.0 * names(d).named_share, 97.0, False),
@@ -163,55 +181,157 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 """Limits are those of the project for the preset thesis; sizes of errors."""
 
 
-def row_of(head: str, preset: str, seed: int) -> list[float]:
+Line = dict[str, Any]
+
+
+def line_of(head: str, preset: str, seed: int, commit: str) -> Line:
+    """What is stored of one seed."""
     # as many workers as cores: threads inside them would only wait for each other
     cv2.setNumThreads(1)
-    with TemporaryDirectory() as folder:
-        request = DemoRequest(Path(folder), head, seed, cast(Preset, preset), processes=1)
-        _, demo = make_head_demo(request, Path(folder))
-    return [figure.value(demo) for figure in FIGURES[head]]
+    line: Line = {"commit": commit, "head": head, "preset": preset, "seed": seed}
+    try:
+        with TemporaryDirectory() as folder:
+            request = DemoRequest(Path(folder), head, seed, cast(Preset, preset), processes=1)
+            summary, demo = make_head_demo(request, Path(folder))
+    except Exception as error:  # a seed may end in any way: that is what the table is for
+        return line | {"failed": f"{type(error).__name__}: {error}"}
+    figures = {figure.name: figure.value(demo) for figure in FIGURES[head]}
+    return line | {"figures": figures, "warnings": len(summary.warnings)}
 
 
-def print_row(name: str, values: Iterable[float]) -> None:
-    print(" | ".join([f"{name:>10}", *(f"{value:.5g}" for value in values)]), flush=True)
+def lines_in(path: Path) -> list[Line]:
+    """Lines of a file; the last one is left out if it was cut off."""
+    lines = []
+    for text in path.read_text("utf-8").splitlines() if path.exists() else []:
+        try:
+            lines.append(json.loads(text))
+        except json.JSONDecodeError:
+            continue
+    return lines
 
 
-def quantiles(head: str, rows: list[list[float]], percent: float) -> list[float]:
-    """Of each figure over all seeds, from good to bad; infinite from the first failed seed on."""
-    signs = np.array([1.0 if figure.is_most else -1.0 for figure in FIGURES[head]])
-    # numpy's interpolation makes nan of infinities
-    table = np.clip(np.array(rows) * signs, -HUGE, HUGE)
-    found = np.percentile(table, percent, axis=0)
-    return list(signs * np.where(found > 1e-3 * HUGE, math.inf, found))
+def add_line(path: Path, line: Line) -> None:
+    whole = path.read_bytes() if path.exists() else b""
+    with path.open("ab") as file:
+        if whole and not whole.endswith(b"\n"):
+            file.write(b"\n")
+        file.write(json.dumps(line).encode() + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
-def study(head: str, n_seeds: int, first: int, preset: str, processes: int) -> None:
-    figures = FIGURES[head]
-    print(" | ".join(["      seed", *(figure.name for figure in figures)]), flush=True)
-    rows: list[list[float]] = []
-    n_done = 0
+def commit_of_tree() -> str:
+    """The commit that is checked out; ends the program if files differ from it."""
+    here = Path(__file__).parent
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=here, check=True, capture_output=True, text=True
+        ).stdout.strip()
+
+    if changed := git("status", "--porcelain"):
+        sys.exit(f"the tree is not that of a commit:\n{changed}")
+    return git("rev-parse", "HEAD")
+
+
+def study(path: Path, head: str, preset: str, seeds: range, processes: int) -> None:
+    """Run the seeds that the file lacks."""
+    commit = commit_of_tree()
+    lines = lines_in(path)
+    if others := {line["commit"] for line in lines} - {commit}:
+        sys.exit(f"{path} holds seeds of {', '.join(sorted(others))}; this is {commit}")
+    done = {line["seed"] for line in lines}
+    missing = [seed for seed in seeds if seed not in done]
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        waiting = {pool.submit(row_of, head, preset, first + k): first + k for k in range(n_seeds)}
+        waiting = {pool.submit(line_of, head, preset, seed, commit): seed for seed in missing}
         for future in as_completed(waiting):
-            if error := future.exception():
-                print(f"{waiting[future]:>10} | failed: {error}", flush=True)
-                rows.append([figure.failed for figure in figures])
-                continue
-            n_done += 1
-            rows.append(future.result())
-            print_row(str(waiting[future]), rows[-1])
-    print_row("median", quantiles(head, rows, 50.0))
-    print_row("95 %", quantiles(head, rows, 95.0))
-    print_row("limit", [math.nan if f.limit is None else f.limit for f in figures])
-    print(f"{n_done} of {n_seeds} seeds came to an end, head {head}, preset {preset}")
+            line = future.result()
+            add_line(path, line)
+            print(line["seed"], line.get("failed") or line["figures"], flush=True)
+
+
+def percentile(figure: Figure, values: list[float], percent: float) -> float:
+    """Of a figure over all seeds, from good to bad; infinite from the first failed seed on."""
+    sign = 1.0 if figure.is_most else -1.0
+    # numpy's interpolation makes nan of infinities
+    found = float(np.percentile(np.clip(sign * np.array(values), -HUGE, HUGE), percent))
+    return sign * (math.inf if found > 1e-3 * HUGE else found)
+
+
+def missed_text(figure: Figure, values: dict[int, float], is_judged: bool) -> str:
+    if figure.limit is None or not is_judged:
+        return ""
+    named = [
+        f"{seed} ({values[seed]:.4g})" for seed in sorted(values) if figure.misses(values[seed])
+    ]
+    return ", ".join(named) or "none"
+
+
+def print_table(path: Path) -> None:
+    """Markdown of one file."""
+    lines = sorted(lines_in(path), key=lambda line: line["seed"])
+    if not lines:
+        sys.exit(f"{path} holds no seed")
+    if len(commits := {line["commit"] for line in lines}) > 1:
+        sys.exit(f"{path} holds seeds of {', '.join(sorted(commits))}")
+    head, preset = lines[0]["head"], lines[0]["preset"]
+    done = [line for line in lines if "figures" in line]
+    seeds = [line["seed"] for line in lines]
+    print(
+        f"Head {head}, preset {preset}, simulated: {len(done)} of {len(lines)} seeds came to an "
+        f"end ({spans(seeds)}), commit {lines[0]['commit'][:7]}\n"
+    )
+    print("| | limit | median | 95th percentile | seeds that miss the limit |")
+    print("|---|---|---|---|---|")
+    is_judged = preset == "thesis"
+    for figure in FIGURES[head]:
+        values = {
+            line["seed"]: line["figures"][figure.name] if "figures" in line else figure.failed
+            for line in lines
+        }
+        limit = "" if figure.limit is None or not is_judged else f"{figure.limit:g}"
+        if limit and figure.median_limit is not None:
+            limit += f", median {figure.median_limit:g}"
+        both = [percentile(figure, list(values.values()), percent) for percent in (50.0, 95.0)]
+        missed = missed_text(figure, values, is_judged)
+        print(f"| {figure.name} | {limit} | {both[0]:.4g} | {both[1]:.4g} | {missed} |")
+    for line in lines:
+        if "failed" in line:
+            print(f"\nSeed {line['seed']}: {line['failed']}")
+    print()
+
+
+def spans(seeds: list[int]) -> str:
+    """Seeds in words: runs as first-last."""
+    runs: list[list[int]] = []
+    for seed in seeds:
+        if runs and seed == runs[-1][1] + 1:
+            runs[-1][1] = seed
+        else:
+            runs.append([seed, seed])
+    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in runs)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--head", choices=tuple(FIGURES), default="thesis-single")
+    parser.add_argument("--preset", choices=get_args(Preset), default="thesis")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=1)
+    parser.add_argument("--folder", type=Path, required=True)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--table", action="store_true", help="print the files of the folder")
+    given = parser.parse_args()
+    if given.table:
+        for path in sorted(given.folder.glob("*.jsonl")):
+            print_table(path)
+        return
+    given.folder.mkdir(parents=True, exist_ok=True)
+    path = given.folder / f"{given.head}-{given.preset}.jsonl"
+    seeds = range(given.first, given.first + given.seeds)
+    study(path, given.head, given.preset, seeds, given.processes)
+    print_table(path)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--head", choices=tuple(FIGURES), default="thesis-single")
-    parser.add_argument("--seeds", type=int, default=20)
-    parser.add_argument("--first", type=int, default=1)
-    parser.add_argument("--preset", default="thesis")
-    parser.add_argument("--processes", type=int, default=2)
-    given = parser.parse_args()
-    study(given.head, given.seeds, given.first, given.preset, given.processes)
+    main()

@@ -24,6 +24,7 @@ PLANES = {
     "B": np.array([0.76417, -0.543156, 0.34787, -49.616]),
 }
 """Printed cross sheets a b c D, camera frame, mm."""
+Planes = dict[str, FloatArray]
 NAMES = ("A", "B")
 WINDOW = (207.0, 624.0, 207.0 + 2658.0, 624.0 + 800.0)
 MIDDLE_DEPTH_MM = 138.0
@@ -111,26 +112,46 @@ def camera() -> CameraModel:
     return CameraModel.from_parameters([*CAMERA, *DISTORTION], *IMAGE_PX)
 
 
-def _at_depth(depth_mm: float) -> FloatArray:
+def _at_depth(depth_mm: float, planes: Planes = PLANES) -> FloatArray:
     """Point of the line in which the two sheets meet."""
-    a, b = (plane / np.linalg.norm(plane[:3]) for plane in PLANES.values())
+    a, b = (plane / np.linalg.norm(plane[:3]) for plane in planes.values())
     level = np.array([0.0, 0.0, 1.0])
     right = np.array([-a[3], -b[3], depth_mm])
     return np.asarray(np.linalg.solve(np.stack([a[:3], b[:3], level]), right))
 
 
-def light_sheet(name: str) -> LightSheet:
-    """One printed sheet without bow, its depth along e_v."""
-    n = PLANES[name][:3] / np.linalg.norm(PLANES[name][:3])
+def _turned(*directions_deg: float) -> Planes:
+    """Sheets through the same line, whose stripes run so in the image of a wall."""
+    foot, middle = _at_depth(0.0), _at_depth(MIDDLE_DEPTH_MM)
+    planes = {}
+    for name, angle in zip(NAMES, np.radians(directions_deg), strict=True):
+        n = np.cross(middle - foot, [np.cos(angle), np.sin(angle), 0.0])
+        n /= np.linalg.norm(n)
+        planes[name] = np.array([*n, -float(n @ foot)])
+    return planes
+
+
+HEADS: dict[str, Planes] = {
+    "thesis": PLANES,
+    "flat": _turned(-25.0, 30.0),
+    "skew": _turned(-15.0, 65.0),
+    "steep": _turned(-62.0, 60.0),
+}
+"""Heads whose stripes cross at 105 degrees (printed), 55, 80 and 122; the laser lies at 97."""
+
+
+def light_sheet(name: str, planes: Planes = PLANES) -> LightSheet:
+    """One sheet without bow, its depth along e_v; the printed one unless planes are given."""
+    n = planes[name][:3] / np.linalg.norm(planes[name][:3])
     along = np.cross(n, [0.0, 0.0, 1.0])
     along /= np.linalg.norm(along)
     axes = np.stack([along, np.cross(n, along), n])
     return LightSheet(
-        origin_mm=_at_depth(MIDDLE_DEPTH_MM), axes=axes, scale_mm=20.0, bow_mm=np.zeros(5)
+        origin_mm=_at_depth(MIDDLE_DEPTH_MM, planes), axes=axes, scale_mm=20.0, bow_mm=np.zeros(5)
     )
 
 
-def sensor(sheet_error_mm: FloatArray | None = None) -> SensorCalibration:
+def sensor(sheet_error_mm: FloatArray | None = None, planes: Planes = PLANES) -> SensorCalibration:
     """The head's calibration, each sheet shifted along its normal by an error."""
     error = np.zeros(2) if sheet_error_mm is None else sheet_error_mm
     box = np.array([0.0, 0.0, IMAGE_PX[0] - 1.0, IMAGE_PX[1] - 1.0])
@@ -148,7 +169,7 @@ def sensor(sheet_error_mm: FloatArray | None = None) -> SensorCalibration:
     sheets = []
     for k, name in enumerate(NAMES):
         shift = np.array([0.0, 0.0, error[k], 0.0, 0.0, 0.0, 0.0, 0.0])
-        sheet = light_sheet(name).updated(shift)
+        sheet = light_sheet(name, planes).updated(shift)
         sheets.append(
             SheetCalibration(
                 name=name,
@@ -178,12 +199,14 @@ class CrossStroke:
     n_exposures: int = 48
     lowest_mm_s: float = 50.0
     highest_mm_s: float = 150.0
+    head: str = "thesis"
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([self.seed, list(SCENES).index(self.scene)])
         self.field = SCENES[self.scene]
         self.camera = camera()
-        self.sensor = sensor(self.disturbance.sheet_mm * rng.standard_normal(2))
+        self.planes = HEADS[self.head]
+        self.sensor = sensor(self.disturbance.sheet_mm * rng.standard_normal(2), self.planes)
         self.poses = self._walk(rng)
         self._cache: dict[tuple[int, int], list[FloatArray]] = {}
 
@@ -206,7 +229,7 @@ class CrossStroke:
             spot = way[k] * along + stray[4][k] * across + [0.0, 0.0, lift]
             depth = MIDDLE_DEPTH_MM + stray[3][k]
             aim = HeadOrientation(tilt + stray[0][k], lean + stray[1][k], roll + stray[2][k], depth)
-            poses.append(sensor_over(np.eye(3), spot, aim, _at_depth(depth)))
+            poses.append(sensor_over(np.eye(3), spot, aim, _at_depth(depth, self.planes)))
         return poses
 
     def t_ns(self, index: int) -> int:
@@ -221,10 +244,10 @@ class CrossStroke:
 
     def _draw(self, index: int, sheet: int) -> list[FloatArray]:
         pose = self.poses[index]
-        plane = PLANES[NAMES[sheet]]
+        plane = self.planes[NAMES[sheet]]
         n = plane[:3] / np.linalg.norm(plane[:3])
-        source = _at_depth(0.0)
-        forward = _at_depth(MIDDLE_DEPTH_MM) - source
+        source = _at_depth(0.0, self.planes)
+        forward = _at_depth(MIDDLE_DEPTH_MM, self.planes) - source
         forward /= np.linalg.norm(forward)
         fan = np.linspace(-HALF_ANGLE_RAD, HALF_ANGLE_RAD, N_RAYS)[:, None]
         rays = np.cos(fan) * forward + np.sin(fan) * np.cross(n, forward)

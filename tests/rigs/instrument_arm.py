@@ -49,7 +49,7 @@ class Waves:
 
     @staticmethod
     def draw(made: Instrument, rng: np.random.Generator, n: int, sigma_mm: float) -> Waves:
-        """n waves of about the instrument's length, of random direction and phase."""
+        """N waves of about the instrument's length, of random direction and phase."""
         length = made.references.flatness_length_mm * rng.uniform(0.6, 1.6, n)
         angle = rng.uniform(0.0, np.pi, n)
         vectors = np.column_stack([np.cos(angle), np.sin(angle)]) * (2.0 * np.pi / length)[:, None]
@@ -132,9 +132,7 @@ def _calibrated(
         diameter = made.references.diameter_mm
         return calibrate_on_sphere(stripes, diameter, sensor_covariance=sensor.covariance)
     plate = probed(made, waves, rng)
-    return calibrate_on_plate(
-        stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance
-    )
+    return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
 
 
 def _may_be_refused(made: Instrument, best: FloatArray | None, seen: list[Seen]) -> bool:
@@ -270,21 +268,21 @@ def observed(
                 continue
             name = f"image{k:02d}-{number}"
             profile = make_profile(name, stripes, made.claimed[1] * made.stripe_px)
-            points = triangulate_stripe(profile, np.concatenate(sheets), sensor)
-            if len(points) < len(profile):
+            placed = triangulate_stripe(profile, np.concatenate(sheets), sensor)
+            if len(placed) < len(profile):
                 continue
-            by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
+            by_all = np.zeros((len(placed), 3, len(sensor.parameter_names)))
             for sheet in lights:
-                rows = np.flatnonzero(points.sheet == sheet)
+                rows = np.flatnonzero(placed.sheet == sheet)
                 columns = sensor_columns(sensor, sheet)
-                by_all[np.ix_(rows, np.arange(3), columns)] = points.by_sensor[rows]
+                by_all[np.ix_(rows, np.arange(3), columns)] = placed.by_sensor[rows]
             stripe = PosedStripe(
                 source=name,
                 posture=f"posture{k:02d}",
                 base_from_tool=reported,
-                points_mm=points.points_mm,
-                noise_mm=points.noise_mm,
-                sheet=points.sheet,
+                points_mm=placed.points_mm,
+                noise_mm=placed.noise_mm,
+                sheet=placed.sheet,
                 dpoint_dsensor=by_all,
             )
             found.append(Seen(k, head, np.concatenate(truth), stripe))
@@ -352,7 +350,9 @@ def hand_eye_bound(
         else:
             place = PLATE.back(base)[:, :2]
             gradient = np.tile(PLATE.rotation[:, 2], (len(base), 1))
-            by_surface = np.column_stack([place / made.references.plate_half_mm, np.ones(len(place))])
+            by_surface = np.column_stack(
+                [place / made.references.plate_half_mm, np.ones(len(place))]
+            )
         in_tool = points @ made.tool_from_sensor.rotation.T
         in_tool_gradient = gradient @ head.rotation @ made.tool_from_sensor.rotation.T
         rows.append(
@@ -364,7 +364,9 @@ def hand_eye_bound(
         size = np.einsum("ni,ni->n", in_sensor, one.stripe.noise_mm[chosen, :, 0])
         noise.append((size / made.claimed[1]) ** 2 * len(chosen) / n)
         known.append(np.einsum("ni,nip->np", in_sensor, one.stripe.dpoint_dsensor[chosen]))
-        owner.append(np.column_stack([np.full(len(chosen), one.posture), np.full(len(chosen), number)]))
+        owner.append(
+            np.column_stack([np.full(len(chosen), one.posture), np.full(len(chosen), number)])
+        )
         places.append(place)
     design, who = np.concatenate(rows), np.concatenate(owner)
     sigma, share = made.arm.position_mm, made.arm.exposure_share

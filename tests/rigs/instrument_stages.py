@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -175,7 +175,7 @@ def run_camera(made: Instrument, options: CameraOptions | None = None) -> Camera
     outcome = _judge_camera(made, fit, best, seconds, len(views.found))
     if isinstance(fit, CameraFit) and outcome.result == "right":
         return CameraResult(outcome, camera_calibration(fit, PROVENANCE), information)
-    return CameraResult(outcome, drawn_camera(made, information), information)
+    return CameraResult(outcome, drawn_camera(made), information)
 
 
 def _judge_camera(
@@ -237,20 +237,20 @@ def camera_error(
         step[k] = h
         by[:, k] = (made.left.moved(step).project(points) - made.left.project(points)).ravel() / h
     miss = by @ error
-    nearest = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0] * steps[0]
+    scaled = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0]
+    nearest = np.asarray(scaled * steps[0], dtype=np.float64)
     rest = miss - by[:, free] @ nearest
     sigma = np.sqrt(np.einsum("ni,ij,nj->n", by[:, free], covariance, by[:, free]))
     return nearest, covariance, free, float(np.abs(rest / sigma).max())
 
 
-def drawn_camera(made: Instrument, information: FloatArray) -> CameraCalibration:
+def drawn_camera(made: Instrument) -> CameraCalibration:
     """A camera as an ideal calibration with enough views would return it."""
     lens, rng = made.left, made.rng(7)
     views = views_of(made, board_placements_of_ten(made), 0, 7)
     best = bound(camera_information(made, views.seen, 9), 9)
     root = np.linalg.cholesky(best + 1e-30 * np.eye(9))
     values = lens.parameters + root @ rng.normal(size=9)
-    del information
     return CameraCalibration(
         camera=CameraModel.from_parameters(values, lens.width_px, lens.height_px),
         covariance=best,
@@ -266,8 +266,6 @@ def drawn_camera(made: Instrument, information: FloatArray) -> CameraCalibration
 
 def board_placements_of_ten(made: Instrument) -> list[Placement]:
     """Ten sound placements, whatever the instrument's own fault is."""
-    from dataclasses import replace
-
     return board_placements(replace(made, fault=""), made.rng(8), 10, for_sheets=False)
 
 
@@ -387,8 +385,11 @@ def _judge_sheets(
     first = size + np.concatenate([[0], np.cumsum([8 if one else 3 for one in bowed])])
     used = np.concatenate([np.arange(size)] + [np.arange(first[k], first[k + 1]) for k in kept])
     best = bound(whole[np.ix_(used, used)][::-1, ::-1], len(used) - size)[::-1, ::-1]
-    at = {k: n for k, n in zip(kept, np.cumsum([0] + [8 if bowed[k] else 3 for k in kept]))}
-    squares, freedom, ratios, is_wrong, groups = 0.0, 0, [], False, {}
+    widths = [8 if bowed[k] else 3 for k in kept]
+    at = dict(zip(kept, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
+    squares, freedom, is_wrong = 0.0, 0, False
+    ratios: list[float] = []
+    groups: dict[str, float] = {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)
         n = 8 if bowed[k] else 3
@@ -397,8 +398,8 @@ def _judge_sheets(
             "sheet", error, sheet.covariance[:n, :n], {"plane": (0, 1, 2), "bow": (3, 4, 5, 6, 7)}
         )
         is_wrong |= one.result != "right"
-        for name, value in one.groups.items():
-            groups[name] = max(groups.get(name, 0.0), value)
+        for group, value in one.groups.items():
+            groups[group] = max(groups.get(group, 0.0), value)
         squares, freedom = squares + one.chi2, freedom + n
         own = best[at[k] : at[k] + n, at[k] : at[k] + n]
         terms = light_terms(made, made.lights[k], points, n)
@@ -445,5 +446,5 @@ def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> in
 def sheet_error(sheet: SheetFit, points: FloatArray, n: int) -> tuple[FloatArray, float]:
     """(n,) error of a sheet's parameters over true points, and the rms height that they leave."""
     height, _, by = sheet.sheet.height_with_jacobian(points)
-    error = np.linalg.lstsq(by[:, :n], height, rcond=None)[0]
+    error: FloatArray = np.asarray(np.linalg.lstsq(by[:, :n], height, rcond=None)[0], np.float64)
     return error, float(np.sqrt(((height - by[:, :n] @ error) ** 2).mean()))

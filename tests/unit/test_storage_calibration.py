@@ -262,6 +262,16 @@ def test_a_scanner_keeps_its_second_camera(tmp_path: Path) -> None:
     assert described["baseline_mm"] == pytest.approx(np.linalg.norm([117.4, 1 / 3, 63.2]), abs=1e-4)
 
 
+def test_a_scanner_keeps_the_factor_of_its_region(tmp_path: Path) -> None:
+    scanner = scanner_calibration()
+    assert scanner.hand_eye.diagnostics is not None
+    few = replace(scanner.hand_eye.diagnostics, region_factor=1.5)
+    scanner = replace(scanner, hand_eye=replace(scanner.hand_eye, diagnostics=few))
+    path = tmp_path / "scanner.json"
+    path.write_bytes(scanner_document(scanner))
+    assert_same(read_scanner_calibration(path), scanner)
+
+
 def test_a_covariance_of_another_count_of_cameras_is_refused(tmp_path: Path) -> None:
     content = unsigned(sensor_document(stereo_sensor_calibration()))
     del content["second"]

@@ -36,6 +36,7 @@ def cloud(n: int = 50, has_normals: bool = True) -> PointCloud:
         segment=rng.integers(0, 9, n),
         intensity=rng.uniform(0, 255, n),
         normals=normals / np.linalg.norm(normals, axis=1)[:, None] if has_normals else None,
+        noise_length=rng.uniform(1.0, 12.0, n) if has_normals else None,
     )
 
 
@@ -51,9 +52,12 @@ def test_ply_round_trip_is_exact(tmp_path: Path, n: int, has_normals: bool) -> N
     )  # fmt: skip
     for name in ARRAYS:
         np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
-    if before.normals is None:
+    if before.normals is None or before.noise_length is None:
         assert after.normals is None
+        assert after.noise_length is None
     else:
+        assert after.noise_length is not None
+        np.testing.assert_array_equal(before.noise_length, after.noise_length)
         np.testing.assert_array_equal(before.normals, after.normals)
 
 

@@ -30,6 +30,8 @@ the pose leads to, and the translation."""
 
 MAX_ROUNDS = 30
 SETTLED = 1e-12
+NOTED_MOVE = 1e-4
+"""Square of a last step, in sigmas, from which on a fit counts as not settled."""
 LEAST_SPREAD_SIGMAS = 10.0
 """Points whose second extent is within this many standard deviations lie on a line: the turn about
 it would be uncertain by more than a tenth of a radian."""
@@ -131,8 +133,14 @@ def register_points(pairs: PointPairs) -> Estimate[Pose[A, B]] | FitFailure:
         normal = np.einsum("nij,njk->ik", weighted, jacobian)
         step = np.linalg.solve(normal, np.einsum("nij,nj->i", weighted, residuals))
         pose = pose.retract(step)
-        if float(step @ normal @ step) < SETTLED:
+        moved = float(step @ normal @ step)
+        if moved < SETTLED:
             break
+    if not moved < NOTED_MOVE:
+        return FitFailure(
+            f"the registration did not settle in {MAX_ROUNDS} steps",
+            "check that these are the same points, in the same order",
+        )
     residuals, jacobian, weights = _linearised(pairs, pose)
     normal = np.einsum("nji,njk,nkl->il", jacobian, weights, jacobian)
     squares = float(np.einsum("ni,nij,nj->", residuals, weights, residuals))

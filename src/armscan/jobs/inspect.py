@@ -218,6 +218,12 @@ def _finished(
     options: Sequence[Any],
 ) -> Summary:
     is_simulated = cloud.is_simulated or are_simulated(inputs)
+    if cloud.noise_length is None and cloud.sigma_noise_mm.any():
+        assumed = (
+            "the cloud does not say how far neighbours share the stripe's noise: it is taken as "
+            "new in every point, as if nothing had been smoothed along it; reconstruct again"
+        )
+        report = replace(report, warnings=(*report.warnings, assumed))
     written: tuple[Path, ...] = ()
     if job.output is not None:
         provenance = job.provenance(inputs, options, warnings=report.warnings, forced=cloud.forced)

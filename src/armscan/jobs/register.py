@@ -476,6 +476,11 @@ def _views_warnings(
     assumed = [item for item in lists if item.is_sigma_assumed]
     if assumed:
         found.append(f"{len(assumed)} lists give no covariance: {_assumed_sigma(assumed)}")
+    if not joined.map.is_settled:
+        found.append(
+            "the map of all views was stopped before it reached the best fit; do not rely on it: "
+            "leave out the views with the largest residuals"
+        )
     if n := int((~joined.map.is_used).sum()):
         found.append(f"{n} sightings do not fit the others and were left out")
     if joined.n_contradictions:

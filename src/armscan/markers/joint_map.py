@@ -24,6 +24,8 @@ from armscan.geometry.rotations import skew
 
 MAX_ROUNDS = 30
 SETTLED = 1e-10
+NOTED_GAIN = 1e-2
+"""Fall of chi2 at the last step, a sighting, from which on a map counts as not settled."""
 OUTLIER_LEVEL = 1e-3
 """Chance that any observation of a whole map without a moved marker is left out."""
 
@@ -63,6 +65,8 @@ class JointMap(ArrayRecord):
         (K,) False where a sighting did not fit and was left out: its marker moved, or was mistaken.
     chi2, degrees_of_freedom
         Of the sightings used.
+    is_settled
+        False if the adjustment was stopped before the minimum.
     """
 
     part_from_view: tuple[Pose[Part, Sensor], ...]
@@ -73,6 +77,7 @@ class JointMap(ArrayRecord):
     is_used: BoolArray = bools("K")
     chi2: float
     degrees_of_freedom: int
+    is_settled: bool
 
 
 def adjust_jointly(
@@ -98,7 +103,7 @@ def adjust_jointly(
     is_used = np.ones(len(sightings), dtype=bool)
     problem = _Problem(sightings, tuple(start), np.array(markers_mm))
     while True:
-        problem = replace(problem, sightings=sightings.select(is_used)).solved()
+        problem, is_settled = replace(problem, sightings=sightings.select(is_used)).solved()
         worst = problem.worst()
         if worst is None:
             break
@@ -115,6 +120,7 @@ def adjust_jointly(
         is_used=is_used,
         chi2=problem.squares(),
         degrees_of_freedom=3 * len(used) - 6 * (len(start) - 1) - 3 * len(covariance),
+        is_settled=is_settled,
     )
 
 
@@ -180,8 +186,11 @@ class _Problem:
         np.add.at(result.right_markers, seen.marker, np.einsum("kij,kj->ki", weights, residual))
         return result
 
-    def solved(self) -> _Problem:
-        """Gauss-Newton with the markers eliminated block by block (Schur complement)."""
+    def solved(self) -> tuple[_Problem, bool]:
+        """Gauss-Newton with the markers eliminated block by block (Schur complement).
+
+        Also returns whether it settled.
+        """
         problem = self
         n = 6 * (len(self.poses) - 1)
         for _ in range(MAX_ROUNDS):
@@ -198,7 +207,7 @@ class _Problem:
             gain = float(step @ right) + float((shift * normal.right_markers).sum())
             if abs(gain) < SETTLED * max(1.0, len(problem.sightings)):
                 break
-        return problem
+        return problem, abs(gain) < NOTED_GAIN * max(1.0, len(problem.sightings))
 
     def moved(self, steps: FloatArray, shift_mm: FloatArray) -> _Problem:
         """The problem after a step of the poses (V - 1, 6) and the markers (M, 3)."""

@@ -41,7 +41,7 @@ from armscan.reconstruction.triangulate import (
 )
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
+from armscan.records.profile import Profile, StripeFlag
 from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import LaserColour, StripeOptions
@@ -431,6 +431,16 @@ def measurement_warnings(
         warnings.append(
             f"less than half of what looked like a stripe could be measured in "
             f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line"
+        )
+    assumed = [
+        profile.source
+        for profile, n in both
+        if n and (profile.flags & int(StripeFlag.NOISE_ASSUMED)).any()
+    ]
+    if assumed:
+        warnings.append(
+            f"in {len(assumed)} images the stripe is too short to show its noise: the sigmas of "
+            f"their points are assumed ({', '.join(assumed[:LISTED])})"
         )
     n_outside = sum(image.count(PointStatus.OUT_OF_DEPTH) for image in images)
     if n_outside:

@@ -293,8 +293,8 @@ def carry_cloud(
     -------
     PointCloud
         Points' covariances are turned and get the registration's part, which is common to all
-        points; a cloud of another program, with none, keeps none. ``sigma_noise_mm``, the part
-        that is independent from point to point, stays.
+        points; a cloud of another program, with none, keeps none. ``sigma_noise_mm``, the
+        stripes' own noise, stays.
     """
     points = cloud.points_mm @ a_from_b.rotation.T + a_from_b.translation_mm
     own = cloud.covariance_mm2

@@ -321,25 +321,24 @@ def normalised_length(error: FloatArray, covariance: FloatArray, is_free: BoolAr
 
 
 ON_STRIPE_PX = 2.0
-"""An extracted point belongs to the nearest true stripe if that is nearer than this."""
+"""An extracted point belongs to the nearest true stripe if that is nearer than this; else it is
+stray light's."""
 CROSSING_PX = 2.0
 """Where the true stripe of the name given is as near as this, both names are right."""
 SEEN_MM = 0.25
 """A true point is seen by the other camera if that one has a true point so near."""
 LEAST_POINTS = 20
 """A sheet counts as in view if so many accepted points of it are seen by all cameras."""
-MOST_CHECKED = 8
-"""Instants of a scan whose truth is computed, evenly chosen."""
 
 
 @dataclass(frozen=True, slots=True)
 class NamingErrors:
-    """Names of stripe points against the truth; counts over the instants checked.
+    """Names of stripe points against the truth; counts over all instants of a scan.
 
     Parameters
     ----------
     n_instants
-        Instants checked.
+        Instants, with all their images.
     n_named
         Points that were measured and lie on a true stripe; one that two cameras see counts in both
         images.
@@ -407,12 +406,11 @@ def naming_errors(
         for instant in group_instants(rows, truth.name)
         if all(row in image_of for row in instant.rows)
     ]
-    places = np.linspace(0, len(instants) - 1, min(MOST_CHECKED, len(instants))).round()
     total = NamingErrors()
-    for k in places.astype(int):
-        own = [rows[row] for row in instants[k].rows]
+    for instant in instants:
+        own = [rows[row] for row in instant.rows]
         true = [_lit(truth.true_stripes(row.index), row.lasers) for row in own]
-        images = [image_of[row] for row in instants[k].rows]
+        images = [image_of[row] for row in instant.rows]
         names = tuple(true_names[name] for name in scan.cloud.sheet_names)
         total += _of_instant(images, true, names)
     return total

@@ -160,6 +160,10 @@ class ImageMemory:
 
     _last: dict[int, _Stripe] = field(default_factory=dict)
 
+    def __len__(self) -> int:
+        """Count of sheets whose stripe was seen."""
+        return len(self._last)
+
     def forget(self) -> None:
         """Begin anew."""
         self._last.clear()
@@ -216,6 +220,8 @@ ODD_DIRECTION = 0.1
 CONVINCING = 3
 """What misleads one piece of a segment misleads all: they count once together. A segment of fewer
 pieces than this counts for less: edges and outlines make short ones of any direction."""
+ALIKE_PIECES = 8
+"""A still has nothing but depth, direction and rays: they count again every so many pieces."""
 INDEPENDENT = 0.5
 """Of sharp predictions: neighbouring pieces share some of what they err by."""
 TAKEN = -3.0
@@ -264,19 +270,24 @@ def hypothesise(
     return Hypotheses(sheets, np.array(points), np.array(inside).T, np.array(place))
 
 
-def still_evidence(pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration) -> FloatArray:
+def still_evidence(
+    pieces: Pieces, hypotheses: Hypotheses, sensor: SensorCalibration, *, is_still: bool = False
+) -> FloatArray:
     """(P, H) log-likelihood of the pieces' depths and directions, in this exposure alone."""
     depth = OUTSIDE * pieces.mean((~hypotheses.is_inside).astype(np.float64))
     usual = np.stack([frontal_direction(sensor, k) for k in hypotheses.sheets], axis=1)
     turn = np.arccos(np.clip(np.abs(pieces.direction @ usual), 0.0, 1.0))
     likelihood = (1.0 - ODD_DIRECTION) * np.exp(-0.5 * (turn / DIRECTION_RAD) ** 2) + ODD_DIRECTION
-    return np.asarray(_vote(pieces) * (depth + np.log(likelihood)))
+    return np.asarray(_vote(pieces, is_still=is_still) * (depth + np.log(likelihood)))
 
 
-def _vote(pieces: Pieces) -> FloatArray:
+def _vote(pieces: Pieces, *, is_still: bool = False) -> FloatArray:
     """(P, 1) weights by which the pieces of a segment count once together, of a short one less."""
     count = np.bincount(pieces.segment)[pieces.segment]
-    return np.asarray((1.0 / np.maximum(count, CONVINCING))[:, None])
+    vote = 1.0 / np.maximum(count, CONVINCING)
+    if is_still:
+        vote = np.minimum(1.0, vote + 1.0 / ALIKE_PIECES)
+    return np.asarray(vote[:, None])
 
 
 def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
@@ -305,7 +316,9 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
     return np.asarray(sharp + vague)
 
 
-def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses) -> FloatArray:
+def taken_evidence(
+    log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses, *, is_still: bool = False
+) -> FloatArray:
     """(P, H) penalty where another segment already holds the same rays of a sheet's light.
 
     A ray of a laser ends on the first thing that it meets, so it is seen once.
@@ -316,6 +329,8 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         (P, H) what is believed without this.
     pieces, hypotheses
         Of the profile.
+    is_still
+        True where nothing but the profile is known, see `ALIKE_PIECES`.
     """
     of_sample = pieces.of_sample
     segment = pieces.segment[of_sample]
@@ -327,7 +342,7 @@ def taken_evidence(log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypoth
         table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (segment, ray), belief)
         penalty[:, h] = TAKEN * _most_of_others(table)[segment, ray]
-    return np.asarray(_vote(pieces) * pieces.mean(penalty))
+    return np.asarray(_vote(pieces, is_still=is_still) * pieces.mean(penalty))
 
 
 def _most_of_others(table: FloatArray) -> FloatArray:
@@ -528,11 +543,12 @@ class CrossLabeller:
                 points = hypotheses.points_mm[h]
                 gain[:, h], sharpness[:, h] = self._surface.evidence(points, pose)
         past = past_evidence(pieces, gain, sharpness)
-        evidence = past + still_evidence(pieces, hypotheses, self._sensor)
+        is_still = pose is None and not len(self._image)
+        evidence = past + still_evidence(pieces, hypotheses, self._sensor, is_still=is_still)
         switch = switch_probability(pieces, len(hypotheses.sheets))
         posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):
-            taken = taken_evidence(posterior, pieces, hypotheses)
+            taken = taken_evidence(posterior, pieces, hypotheses, is_still=is_still)
             posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
 

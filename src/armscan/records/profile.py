@@ -31,6 +31,8 @@ class StripeFlag(IntFlag):
     """Along an edge of a calibration target's marks: set by the calibration, not the extraction."""
     END = 128
     """Where something cuts the line at a slant: the fitted column or row reaches past its end."""
+    NOISE_ASSUMED = 256
+    """Too few points to measure their noise: the sigma rests on an assumption."""
 
 
 REJECTING = (

@@ -377,7 +377,7 @@ def head_demo_page(
     )
     names = (
         Text(
-            "Which light sheet drew each stripe, against the truth, over some instants of each "
+            "Which light sheet drew each stripe, against the truth, over all instants of each "
             "scene. What is in doubt is dropped and counted, not guessed. Stray light is what lies "
             "more than 2 px from every true stripe: faint light along a silhouette or an edge, or "
             "a reflection."

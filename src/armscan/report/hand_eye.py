@@ -179,9 +179,10 @@ def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
     )
     if known.is_noise_estimated:
         position = float(np.hypot(arm.position_mm, arm.exposure_position_mm))
+        turn_deg = float(np.degrees(np.hypot(arm.rotation_rad, arm.exposure_rotation_rad)))
         noise = fact(
             "Arm's scatter",
-            f"{significant(position, digits=2)} mm",
+            f"{significant(position, digits=2)} mm, {significant(turn_deg, digits=2)}°",
             "an axis at the scan point, estimated from the residuals, which therefore test "
             "nothing: compare it with the arm's certificate",
         )
@@ -202,6 +203,13 @@ def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
         Quantity("weakest", "Known least", known.weakest),
         fact("Largest change without one posture", change),
         noise,
+        Quantity(
+            "region_factor",
+            "Joint 95 % region",
+            known.region_factor,
+            shown=f"{np.sqrt(known.region_factor):.2f} times the usual one of the covariance",
+            meaning="errors have longer tails where the scatter is known from few postures",
+        ),
         Quantity("chi2_probability", "", known.chi2_probability),
         Quantity("plate_flatness_mm", "", known.plate_flatness_mm),
         Quantity("is_noise_estimated", "", known.is_noise_estimated),

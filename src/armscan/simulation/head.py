@@ -5,8 +5,10 @@ manufacture.
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -19,8 +21,9 @@ from armscan.geometry.rotations import nearest_rotation, rotation_from_vector
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.simulation.optics.lasers import LineLaser
 from armscan.simulation.optics.render import IMAGING, Imaging
-from armscan.simulation.plans import PRINTED
 
+PRINTED: dict[str, Any] = tomllib.loads((files(__package__) / "heads.toml").read_text("utf-8"))
+"""The table of the printed heads that lies beside the simulator."""
 _BLUR_PX = 0.8
 _AIM_MM = 140.0
 

@@ -15,6 +15,7 @@ from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.records.recording import ArmTrack
 from armscan.simulation.arm.arm import COMFORTABLE_RAD, reach
 from armscan.simulation.arm.hand import (
+    PLANS,
     HeadOrientation,
     SweptScene,
     aim_point_mm,
@@ -29,7 +30,6 @@ from armscan.simulation.instrument import Instrument, track_of_readings, track_o
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.objects.fixtures import Fixtures
 from armscan.simulation.optics.scene import Floor, RoomLight, SceneObject
-from armscan.simulation.plans import PLANS
 from armscan.simulation.station import Light, Moment, RenderRequest, Station, Target, instant_shots
 from armscan.simulation.targets import camera_targets, laser_targets
 

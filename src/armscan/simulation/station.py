@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -29,12 +30,15 @@ from armscan.simulation.objects.boards import (
 from armscan.simulation.objects.rings import Marked, RingMarker, draw_markers
 from armscan.simulation.objects.shapes import Placed
 from armscan.simulation.optics.camera import expose_mono, with_ghost, with_halo
-from armscan.simulation.optics.lasers import LineLaser, in_sources
-from armscan.simulation.optics.render import Imaging, Region, find_stripe, laser_bands, to_pixels
+from armscan.simulation.optics.lasers import LaserSource, LineLaser, in_sources
+from armscan.simulation.optics.render import Imaging, Region, find_stripe, to_pixels
 from armscan.simulation.optics.scene import Material, RoomLight, Scene, SceneObject, Surface
 from armscan.simulation.optics.stray_light import stray_lights
-from armscan.simulation.optics.stripe_light import PosedView, band_light, look
+from armscan.simulation.optics.stripe_light import PosedView, band_light, lit_pixels, look
 
+_RAY_TOLERANCE = 1e-10
+_CENTRE_SIGMAS = 2.0
+"""A sheet's centre is looked for among pixels so near to it; at edges among all."""
 ROOM = RoomLight(even=0.6, direct=0.4, position_mm=(350.0, -400.0, 900.0), up=(0.0, 0.0, 1.0))
 """Light of the room around the arm: white that faces up sees about full scale; scaled later."""
 
@@ -201,10 +205,7 @@ def exposure_light(
     poses = [_eye_pose(eye, pose) for pose in base_from_sensor]
     views = [_view(eye, station, pose, region) for pose in poses]
     light = np.zeros((window.height_px, window.width_px), np.float32)
-    inside = (
-        slice(window.y_px - region.y_px, window.y_px - region.y_px + window.height_px),
-        slice(window.x_px - region.x_px, window.x_px - region.x_px + window.width_px),
-    )
+    inside = _inside(window, region)
     middle = len(views) // 2
     for source in in_sources(_seen_lasers(head, eye, settings.lasers)):
         stray = stray_lights(source, station.things, poses[middle], imaging)
@@ -215,9 +216,8 @@ def exposure_light(
     light = with_halo(light, imaging.detector.halo_share, imaging.detector.halo_sigma_px)
     light = with_ghost(light, imaging.ghost_share, imaging.ghost_sigma_px)
     brightness = imaging.ambient if settings.room_light is None else settings.room_light
-    # Its grid is coarser than any motion over the exposure.
-    room = _room(eye, station, poses[middle], views[middle], region)[inside]
-    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness, light))
+    room = _room(eye, station, poses, views, region)[inside]
+    return np.asarray(cv2.scaleAdd(np.ascontiguousarray(room), brightness / len(views), light))
 
 
 def true_stripes(
@@ -233,11 +233,16 @@ def true_stripes(
     pose = _eye_pose(eye, base_from_sensor)
     sensor_from_eye = eye.camera_from_sensor.inverse()
     lens = eye.camera.cropped(*_corners(window))
-    scene = seen_from(station, pose)
+    region = Region.around(*_corners(window))
+    view = _view(eye, station, pose, region)
+    numbers, tracer = view.numbers, None
+    if numbers is not None:
+        tracer = partial(numbers.trace, lens, tolerance=_RAY_TOLERANCE)
     stripes = []
-    lasers = _seen_lasers(head, eye, settings.lasers)
-    for laser, band in zip(lasers, laser_bands(scene, lens, lasers), strict=True):
-        found = find_stripe(scene, lens, laser, band)
+    for laser in _seen_lasers(head, eye, settings.lasers):
+        near = lit_pixels(view.nodes, LaserSource((laser,)), region, _CENTRE_SIGMAS)
+        band = near[_inside(window, region)] > 0
+        found = find_stripe(view.scene, lens, laser, band, tracer)
         in_sensor = found.points_mm if camera == 0 else sensor_from_eye.apply(found.points_mm)
         stripes.append(
             TrueStripe(
@@ -285,9 +290,26 @@ def _room_nodes(scene: Scene, view: PosedView, region: Region) -> NDArray[np.flo
 
 
 def _room(
+    eye: MountedCamera,
+    station: Station,
+    poses: Sequence[Pose[Base, Any]],
+    views: Sequence[PosedView],
+    region: Region,
+) -> NDArray[np.float32]:
+    """Light (H, W) of a region under the full room, added up over the views.
+
+    It is coarse, but a target and markers are drawn sharply.
+    """
+    if station.markers or station.target is not None:
+        both = zip(poses, views, strict=True)
+        return np.asarray(sum(_drawn(eye, station, pose, view, region) for pose, view in both))
+    return to_pixels(np.asarray(sum(_room_nodes(v.scene, v, region) for v in views)), region)
+
+
+def _drawn(
     eye: MountedCamera, station: Station, pose: Pose[Base, Any], view: PosedView, region: Region
 ) -> NDArray[np.float32]:
-    """Light (H, W) of a region under the full room: coarse, but a target is drawn sharply."""
+    """Light of one view, with the markers or the target."""
     # The nodes are too far apart for markers: they get the face's own colour.
     scene = seen_from(replace(station, markers=()), pose) if station.markers else view.scene
     coarse = to_pixels(_room_nodes(scene, view, region), region)
@@ -329,6 +351,12 @@ def board_seen_from(target: Target, base_from_sensor: Pose[Base, Any]) -> Printe
     """The target in the frame of the head or of one camera."""
     pose = base_from_sensor.inverse() @ target.base_from_board
     return PrintedBoard(target.pattern, pose, target.light, target.dark, substrate=target.substrate)
+
+
+def _inside(window: Window, region: Region) -> tuple[slice, slice]:
+    """Rows and columns of a window within a region around it."""
+    top, left = window.y_px - region.y_px, window.x_px - region.x_px
+    return slice(top, top + window.height_px), slice(left, left + window.width_px)
 
 
 def _corners(window: Window) -> tuple[int, int, int, int]:

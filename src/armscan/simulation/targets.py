@@ -12,10 +12,9 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
-from armscan.simulation.arm.hand import overlap_middle_mm, viewing_axes
+from armscan.simulation.arm.hand import PLANS, overlap_middle_mm, viewing_axes
 from armscan.simulation.head import Head, MountedCamera, sheet_middle_mm
 from armscan.simulation.objects.boards import CirclePattern
-from armscan.simulation.plans import PLANS
 from armscan.simulation.station import Target
 
 PATTERN = CirclePattern(columns=11, rows=9, pitch_mm=3.75, diameter_mm=1.875)

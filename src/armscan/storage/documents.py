@@ -304,7 +304,7 @@ LAYOUTS: Mapping[type, Layout] = {
     CameraDiagnostics: EVIDENCE,
     SheetDiagnostics: EVIDENCE,
     SensorDiagnostics: EVIDENCE,
-    HandEyeDiagnostics: EVIDENCE,
+    HandEyeDiagnostics: Layout(is_evidence=True, optional=("region_factor",)),
     FTest: EVIDENCE,
     ScanTransform: Layout(covariance_names=lambda _: REGISTRATION_PARAMETERS),
     Provenance: Layout(codecs={"options": FieldCodec(dict, _texts)}, optional=("forced",)),

@@ -52,17 +52,20 @@ def test_errors_reach_the_bound_and_the_stated_covariance() -> None:
     assert plain @ np.linalg.solve(stated, plain) > 10.0 * chi2.ppf(0.95, 6)
 
 
-def test_estimated_scatter_is_right_and_so_is_the_covariance() -> None:
-    rig = PlateRig(good_postures(12, np.random.default_rng(3)))
-    _, squares = _runs(rig, HandEyeOptions(), 500)
-    n_inside = int((squares < chi2.ppf(0.95, 6)).sum())
-    assert n_inside >= 24, "fewer than 1 in 1000 draws of 30 with 95 % each"
-    fit = calibrate_on_plate(*rig.draw(1))
-    assert isinstance(fit, HandEyeFit)
-    diagnostics = fit.calibration.diagnostics
-    assert diagnostics is not None and diagnostics.is_noise_estimated
-    arm_mm = float(np.hypot(NOISE.posture_mm, NOISE.exposure_mm))
-    assert 0.4 * arm_mm < fit.calibration.arm_noise.position_mm < 2.5 * arm_mm
+def test_estimated_scatter_is_right() -> None:
+    """Within a factor of 2; of six postures the region is wider than the usual one, which is told.
+
+    What the covariance says is judged in `test_stated_certainty`.
+    """
+    for n_postures, region in ((12, (1.02, 1.3)), (6, (1.2, 2.5))):
+        rig = PlateRig(good_postures(n_postures, np.random.default_rng(3)))
+        fit = calibrate_on_plate(*rig.draw(1))
+        assert isinstance(fit, HandEyeFit)
+        diagnostics = fit.calibration.diagnostics
+        assert diagnostics is not None and diagnostics.is_noise_estimated
+        assert region[0] < diagnostics.region_factor < region[1]
+        arm_mm = float(np.hypot(NOISE.posture_mm, NOISE.exposure_mm))
+        assert 0.5 * arm_mm < fit.calibration.arm_noise.position_mm < 2.0 * arm_mm
 
 
 def test_the_means_of_the_postures_scatter_as_predicted() -> None:

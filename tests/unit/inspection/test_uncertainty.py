@@ -4,17 +4,26 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.estimate import FitFailure
+from armscan.geometry.shapes import Plane, fit_sphere
+from armscan.inspection.plane import inspect_plane
 from armscan.inspection.results import MeasuredLength
-from armscan.inspection.sphere import inspect_sphere
+from armscan.inspection.sphere import inspect_sphere, linearised_sphere
 from armscan.inspection.step import inspect_step
+from armscan.inspection.uncertainty import measured_length
+from armscan.records.cloud import PointCloud
+from armscan.vision.stripe.smooth import Polyline, smooth
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, block_stripes, cloud_of
 
 ARM_MM = 0.008
 NOISE_MM = 0.004
+MM_PER_PX = 0.05
 N_RUNS = 40
 SPREAD_LIMIT = 1.0 + 3.3 / math.sqrt(2 * N_RUNS)
 """Ratio of a standard deviation from 40 runs to the true one: 99.9 % below (normal errors)."""
@@ -133,3 +142,72 @@ def test_too_few_exposures_say_nothing_of_their_scatter() -> None:
     assert not isinstance(found, FitFailure)
     assert math.isnan(found.diameter.sigma_scatter_mm)
     assert math.isfinite(found.diameter.sigma_mm)
+
+
+def smoothed_stripe(
+    height_mm: FloatArray, chain: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Heights, their sigma and correlation length after the real smoothing of white noise."""
+    n, sigma = len(height_mm), NOISE_MM / MM_PER_PX
+    points = np.stack([np.arange(n, dtype=float), height_mm / MM_PER_PX], axis=1)
+    points[:, 1] += rng.normal(0.0, sigma, n)
+    course = Polyline(
+        points,
+        np.tile([0.0, 1.0], (n, 1)),
+        np.full(n, sigma),
+        chain,
+        np.ones(n, dtype=np.bool_),
+    )
+    found = smooth(course, 12.0)
+    length = np.maximum((found.sigma_sum / found.sigma) ** 2, 1.0)
+    return found.points[:, 1] * MM_PER_PX, found.sigma * MM_PER_PX, length
+
+
+def smoothed_cloud(kind: str, seed: int) -> PointCloud:
+    """Ten stripes, 1 mm apart, over a plane, a step of 5 mm or a ball; the noise acts along z."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(-10.0, 10.0, 400)
+    points, sigma, length = [], [], []
+    for k in range(10):
+        y = k - 4.5
+        is_upper = (x > 0.0) & (kind == "step")
+        height = np.sqrt(RADIUS_MM**2 - x * x - y * y) if kind == "ball" else 5.0 * is_upper
+        z, own, alike = smoothed_stripe(height, is_upper.astype(np.int64), rng)
+        points.append(np.stack([x, np.full_like(x, y), z], axis=1))
+        sigma.append(own)
+        length.append(alike)
+    noise = np.concatenate(sigma)
+    up = noise[:, None] * np.array([0.0, 0.0, 1.0])
+    return replace(
+        cloud_of(np.concatenate(points), np.repeat(np.arange(10), len(x))),
+        covariance_mm2=up[:, :, None] * up[:, None, :],
+        sigma_noise_mm=noise,
+        noise_length=np.concatenate(length),
+    )
+
+
+def length_of(kind: str, cloud: PointCloud) -> MeasuredLength:
+    if kind == "plane":
+        flat = inspect_plane(cloud, Plane(np.zeros(3), np.eye(3)))
+        assert not isinstance(flat, FitFailure)
+        assert flat.offset is not None
+        return flat.offset
+    if kind == "step":
+        step = inspect_step(cloud, 5.0)
+        assert not isinstance(step, FitFailure)
+        return step.height
+    ball = fit_sphere(cloud.points_mm)
+    assert not isinstance(ball, FitFailure)
+    linear = linearised_sphere(ball.value, cloud.points_mm)
+    return measured_length(2.0 * ball.value.radius_mm, linear, cloud, np.arange(len(cloud)))
+
+
+@pytest.mark.parametrize("kind", ["plane", "step", "ball"])
+def test_noise_that_the_smoothing_left_counts_as_it_scatters(kind: str) -> None:
+    """Real smoothing of white noise: summed as if independent, sigma would be 3 times too small."""
+    found = [length_of(kind, smoothed_cloud(kind, seed)) for seed in range(N_RUNS)]
+    scatter = float(np.std([item.value_mm for item in found], ddof=1))
+    stated = float(np.mean([item.sigma_propagated_mm for item in found]))
+    assert 1.0 / SPREAD_LIMIT < scatter / stated < SPREAD_LIMIT
+    bare = length_of(kind, replace(smoothed_cloud(kind, 0), noise_length=None))
+    assert stated > 2.5 * bare.sigma_propagated_mm

@@ -127,6 +127,8 @@ def test_a_hand_eye_scan_names_the_image_without_partner(
     found = observe_stripes(two_camera_scan(3, lost=LOST), device.sensor)
     assert found.not_used == (("images/1l.png", PARTNER_MISSING),)
     assert {item.source for item in found.stripes} >= {"images/0l.png", "images/2l.png"}
+    instants = {item.source: item.instant for item in found.stripes}
+    assert instants["images/0l.png"] == instants["images/0r.png"] != instants["images/2l.png"]
     assert any(PARTNER_MISSING in text for text in found.warnings)
 
 

@@ -198,6 +198,18 @@ def test_without_the_arm_stripes_are_predicted_in_the_image(
     assert "continues the surface" in with_arm.named[-1].reason
 
 
+def test_in_a_still_long_stripes_are_named_by_their_direction(
+    strokes: dict[str, CrossStroke],
+) -> None:
+    """Nothing else tells them, and no laser can be asked for."""
+    stroke = strokes["plate"]
+    still = stroke.expose(0, BOTH)
+    named = label(CrossLabeller(stroke.sensor), still, None, 0)
+    is_named = named.sheet >= 0
+    assert is_named.sum() > 0.9 * still.profile.is_accepted.sum()
+    assert np.array_equal(named.sheet[is_named], still.true_sheet[is_named])
+
+
 def test_a_stripe_that_vanishes_for_a_while_is_found_again(
     strokes: dict[str, CrossStroke],
 ) -> None:

@@ -104,6 +104,27 @@ def test_points_on_boards_come_back_through_a_distorting_lens() -> None:
         np.testing.assert_allclose(board[:, 2], 0.0, atol=1e-6)
 
 
+def test_the_sheets_own_shape_moves_a_point_along_its_ray_and_is_no_noise() -> None:
+    """A sheet that lies higher by its shape meets the ray elsewhere (eq. 2.21 with D moved)."""
+    place, zero = np.array([[620.0, 330.0]]), np.array([0])
+    flat = sensor(PINHOLE, printed_sheet())
+    waved = replace(flat, sheets=tuple(replace(one, shape_mm=0.004) for one in flat.sheets))
+    offset = np.zeros(8)
+    offset[2] = 0.004
+    moved = replace(
+        flat, sheets=tuple(replace(one, sheet=one.sheet.updated(offset)) for one in flat.sheets)
+    )
+    at, there = (intersect_sheets(place, zero, one)[0] for one in (flat, moved))
+    shift = (there - at)[0]
+    found, bare = (
+        triangulate(profile_at(place), zero, waved),
+        triangulate(profile_at(place), zero, flat),
+    )
+    added = found.covariance_mm2[0] - bare.covariance_mm2[0]
+    np.testing.assert_allclose(added, np.outer(shift, shift), rtol=1e-3, atol=1e-12)
+    np.testing.assert_array_equal(found.sigma_noise_mm, bare.sigma_noise_mm)
+
+
 def test_stripe_noise_alone_is_one_direction_by_hand() -> None:
     """On the axis of a pinhole, noise sigma * n: dX/dq by differences of eq. 2.21."""
     place = np.array([[500.0, 400.0]])

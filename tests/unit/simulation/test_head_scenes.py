@@ -16,6 +16,7 @@ from armscan.pipeline.simulate import fewer_views
 from armscan.simulation.arm.arm import reach
 from armscan.simulation.arm.hand import (
     CAMERA_CLOCK_NS,
+    PLANS,
     HeadOrientation,
     SweptScene,
     aim_point_mm,
@@ -24,7 +25,6 @@ from armscan.simulation.arm.hand import (
 )
 from armscan.simulation.head import MountedCamera
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.plans import PLANS
 from armscan.simulation.scenes import hand_eye_poses, marker_poses
 from armscan.simulation.station import RenderRequest, TwinScan
 from armscan.simulation.twin import build_twin

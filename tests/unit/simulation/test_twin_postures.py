@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from armscan.simulation.arm.hand import PLANS
 from armscan.simulation.instrument import Instrument
-from armscan.simulation.plans import PLANS
 from armscan.simulation.station import TwinScan
 from armscan.simulation.twin import build_twin
 

@@ -518,6 +518,8 @@ def stereo_covariance(
     matrix = covariance_with_target_error(unit, widening * solution.variance_factor, error, found)
     if held is not None:
         lever = _followed(solution, unit)
+        if isinstance(lever, FitFailure):
+            return lever
         matrix = matrix + lever @ held @ lever.T
     return StereoCovariance(0.5 * (matrix + matrix.T), condition, error)
 
@@ -551,16 +553,20 @@ def _board_residuals(solution: JointSolution) -> BoardResiduals | None:
     return BoardResiduals.joined(parts)
 
 
-def _followed(solution: JointSolution, unit: FloatArray) -> FloatArray:
+def _followed(solution: JointSolution, unit: FloatArray) -> FloatArray | FitFailure:
     """(24 + 6 U, 18) how all unknowns follow held intrinsics (implicit function)."""
     unbound = replace(solution.problem, basis=np.eye(N_SHARED), prior=None)
     equations = linearise_both(unbound, solution.state)
-    lever = np.zeros((len(unit), N_INTRINSICS))
-    if equations is not None:
-        cross = equations.cross.transpose(0, 2, 1)[:, :, :N_INTRINSICS].reshape(-1, N_INTRINSICS)
-        lever = -unit @ np.concatenate([equations.shared[:, :N_INTRINSICS], cross])
+    if equations is None:
+        return FitFailure(
+            "how the cameras' places follow the given intrinsics cannot be told: at the solution a "
+            "board lies behind a camera",
+            "check that the given calibrations are of these cameras",
+        )
+    cross = equations.cross.transpose(0, 2, 1)[:, :, :N_INTRINSICS].reshape(-1, N_INTRINSICS)
+    lever = -unit @ np.concatenate([equations.shared[:, :N_INTRINSICS], cross])
     lever[:N_INTRINSICS] += np.eye(N_INTRINSICS)
-    return lever
+    return np.asarray(lever)
 
 
 NO_SHARED = np.zeros((N_SHARED, 0))

@@ -13,7 +13,7 @@ from armscan.calibration.cameras.adjustment import basis_of
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.distortion import rms
 from armscan.calibration.cameras.result import (
-    ALIKE,
+    DISTORTION_PARAMETERS,
     MIN_VIEW_POINTS,
     CameraFit,
     CameraOptions,
@@ -276,21 +276,21 @@ def common_design_effect(cameras: tuple[SingleCamera, SingleCamera]) -> float:
 def _solved(fit: CameraFit, options: StereoOptions) -> SingleCamera:
     left_out = {view.source: view.note for view in fit.views if not view.is_used}
     left_out |= {view.source: view.reason for view in fit.refused_views}
-    names = fit.free_parameters
-    is_bowed = fit.warp is not None and fit.warp.is_significant
-    if is_bowed or fit.design_effect >= ALIKE:
-        # chosen on a board that is not as it was taken for: all that the sigmas allow for is free
-        known = np.diag(fit.covariance) > 0.0
-        names = tuple(name for name, is_in in zip(PARAMETER_NAMES, known, strict=True) if is_in)
-    basis = basis_of(names, is_aspect_fixed=options.camera.is_aspect_fixed)
+    free, reason = fit.free_parameters, fit.model_reason
+    if options.camera.distortion == "auto":
+        # A coefficient held at zero because one camera says little of it would bend the pair.
+        coefficients = DISTORTION_PARAMETERS["k1k2p1p2k3"]
+        free = (*(name for name in free if name not in coefficients), *coefficients)
+        reason = "all five coefficients: what the pairs say little of, the sigmas tell"
+    basis = basis_of(free, is_aspect_fixed=options.camera.is_aspect_fixed)
     return SingleCamera(
         fit.camera,
-        names,
+        free,
         basis[: len(PARAMETER_NAMES)],
         {view.source: view.is_outlier for view in fit.used_views},
         left_out,
         fit,
-        fit.model_reason,
+        reason,
     )
 
 

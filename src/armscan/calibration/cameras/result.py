@@ -525,6 +525,11 @@ def _about_model(fit: CameraFit) -> list[str]:
             "covered part"
         )
     validation = fit.cross_validation
+    if validation is None and fit.options.n_folds and fit.n_views > MIN_VIEWS:
+        warnings.append(
+            "there is no hold-out test: without some of the views the others determine no camera; "
+            "add views"
+        )
     if validation is not None and validation.rms_px > UNSEEN_WORSE * validation.rms_in_sample_px:
         warnings.append(
             f"views not used in the solution fit worse ({validation.rms_px:.3f} px) than those "

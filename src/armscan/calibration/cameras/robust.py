@@ -199,6 +199,8 @@ def solve_robustly(
                 result.is_settled,
             )
     state = _reweighted(observations, start, basis, trusted)
+    if isinstance(state, FitFailure):
+        return state
     chi2 = chi2_of_points(observations, state)
     levels, outlier = judge(observations, chi2)
     shares = _outlier_shares(observations, chi2)
@@ -217,14 +219,14 @@ def solve_robustly(
 
 def _reweighted(
     observations: Observations, state: State, basis: FloatArray, trusted: BoolArray
-) -> State:
+) -> State | FitFailure:
     """Iterate with Cauchy weights at the level of the typical view."""
     weights = np.where(trusted[observations.view_of_point], 1.0, NO_SAY)
     for round_number in range(ROBUST_ROUNDS):
         steps = STEPS_PER_ROUND if round_number else FIRST_STEPS
         result = adjust(observations, state, basis, weights, steps)
         if isinstance(result, FitFailure):
-            return state
+            return result
         state = result.state
         chi2 = chi2_of_points(observations, state)
         typical = _typical(_view_levels(observations, chi2))

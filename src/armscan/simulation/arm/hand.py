@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -22,8 +24,11 @@ from armscan.simulation.objects.fixtures import (
     STEP_HEIGHTS_MM,
     Fixtures,
 )
-from armscan.simulation.plans import PLANS
 
+PLANS: dict[str, Any] = tomllib.loads(
+    (files("armscan.simulation") / "scenes.toml").read_text("utf-8")
+)
+"""The table that lies beside the simulator: what the hand does in each scene."""
 FACE_DOWN = np.diag([1.0, -1.0, -1.0])
 """Sensor axes over a face with x to the right and z up: it looks down on it, upright."""
 _JITTER = np.array([2.0, 2.0, 6.0, 2.0])

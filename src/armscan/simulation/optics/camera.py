@@ -192,8 +192,7 @@ def expose_mono(light: Image32, detector: Detector, rng: np.random.Generator) ->
     if not 1 <= detector.bits <= 16:
         raise InputError(f"{detector.bits} bits do not fit into 16")
     levels = light.astype(np.float32)
-    noise = rng.standard_normal(light.shape, dtype=np.float32)
-    full_scale = (1 << detector.bits) - 1
+    noise, full_scale = rng.standard_normal(light.shape, np.float32), (1 << detector.bits) - 1
     expose(levels, noise, 1.0 / detector.electrons_per_level, detector.read_noise**2, full_scale)
     return levels.astype(np.uint8) if detector.bits <= 8 else levels.astype(np.uint16)
 

@@ -12,11 +12,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Pose
+from armscan.simulation.kernels import (
+    Floats,
+    Three,
+    compiled,
+    meet_box,
+    meet_floor,
+    meet_plate,
+    meet_print,
+    meet_sphere,
+    meet_waves,
+    plate_slopes,
+    waves_over,
+)
 from armscan.simulation.objects.boards import FLAT, CirclePattern, PrintedBoard
 from armscan.simulation.objects.body import GRADIENT_STEP_MM, HIT_MM, Body, distance, marched
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, WavyPlate
@@ -38,9 +50,6 @@ from armscan.simulation.optics.scene import (
 )
 from armscan.simulation.optics.stray_light import CentreSpot
 
-Floats = NDArray[np.float64]
-Three = tuple[float, float, float]
-
 _BOX, _PLATE, _SPHERE, _WAVES, _BODY, _PRINT, _FLOOR = range(7)
 _KIND, _TEXTURE, _CELLS, _GLOSS, _GLOSS_WIDTH, _COLOUR, _START, _STOP = (
     0,
@@ -53,12 +62,9 @@ _KIND, _TEXTURE, _CELLS, _GLOSS, _GLOSS_WIDTH, _COLOUR, _START, _STOP = (
     19,
 )
 """Columns of a surface's row; 1 to 9 are its rotation in the scene, 10 to 12 its place there."""
-_WALK_STEPS, _NEWTON_STEPS, _WALK_CLOSE_MM, _STEEP = 200, 4, 1e-3, 1e-3
 _FIXED_POINT_STEPS = 400
 _SLANT_X, _SLANT_Y = SLANT
 _N_LENS, _N_SHEET = 9, 22
-
-compiled = njit(cache=True, error_model="numpy")
 
 
 @compiled
@@ -82,140 +88,6 @@ def _out_of(row: Floats, x: float, y: float, z: float) -> Three:
 
 
 @compiled
-def _plate_height(data: Floats, at: int, x: float, y: float) -> float:
-    """Height of a plate: size, tilt, a count, and a polynomial in two cosines."""
-    n = int(data[at + 5])
-    cos_x = math.cos(math.pi * (x / data[at] + 0.5))
-    cos_y = math.cos(math.pi * (y / data[at + 1] + 0.5))
-    height = 0.0
-    for k in range(n - 1, -1, -1):
-        first, along = at + 6 + k * n, 0.0
-        for m in range(n - 1, -1, -1):
-            along = along * cos_y + data[first + m]
-        height = height * cos_x + along
-    return float(height - data[at + 2] - data[at + 3] * x - data[at + 4] * y)
-
-
-@compiled
-def _plate_slopes(data: Floats, at: int, x: float, y: float) -> tuple[float, float]:
-    """Slopes of a plate."""
-    n = int(data[at + 5])
-    angle_x, angle_y = math.pi * (x / data[at] + 0.5), math.pi * (y / data[at + 1] + 0.5)
-    cos_x, cos_y = math.cos(angle_x), math.cos(angle_y)
-    height, by_x, by_y = 0.0, 0.0, 0.0
-    for k in range(n - 1, -1, -1):
-        first, along, rise = at + 6 + k * n, 0.0, 0.0
-        for m in range(n - 1, -1, -1):
-            rise = rise * cos_y + along
-            along = along * cos_y + data[first + m]
-        by_x = by_x * cos_x + height
-        height = height * cos_x + along
-        by_y = by_y * cos_x + rise
-    by_x *= -math.pi / data[at] * math.sin(angle_x)
-    by_y *= -math.pi / data[at + 1] * math.sin(angle_y)
-    return by_x - data[at + 3], by_y - data[at + 4]
-
-
-@compiled
-def _waves(data: Floats, at: int, x: float, y: float) -> Three:
-    """Height and slopes of a wavy plate: size, highest, steepest, count, then four a wave."""
-    height, slope_x, slope_y = 0.0, 0.0, 0.0
-    for k in range(int(data[at + 4])):
-        w = at + 5 + 4 * k
-        angle = data[w] * x + data[w + 1] * y + data[w + 2]
-        height += data[w + 3] * math.sin(angle)
-        rise = data[w + 3] * math.cos(angle)
-        slope_x += rise * data[w]
-        slope_y += rise * data[w + 1]
-    return height, slope_x, slope_y
-
-
-@compiled
-def _meet_plate(data: Floats, at: int, start: Three, ray: Three) -> float:
-    if ray[2] >= 0.0 or start[2] <= 0.0:
-        return np.inf
-    reach = -start[2] / ray[2]
-    x, y = start[0] + reach * ray[0], start[1] + reach * ray[1]
-    if abs(x) > 0.5 * data[at] or abs(y) > 0.5 * data[at + 1]:
-        return np.inf
-    if data[at + 5] == 0.0:
-        return reach
-    return float(reach + _plate_height(data, at, x, y) / ray[2])
-
-
-@compiled
-def _meet_waves(data: Floats, at: int, start: Three, ray: Three) -> float:
-    highest = data[at + 2]
-    if ray[2] >= 0.0 or start[2] <= highest:
-        return np.inf
-    reach = (highest - start[2]) / ray[2]
-    rate = -ray[2] + data[at + 3] * math.hypot(ray[0], ray[1])
-    is_close = False
-    for _ in range(_WALK_STEPS):
-        x, y = start[0] + reach * ray[0], start[1] + reach * ray[1]
-        above = start[2] + reach * ray[2] - _waves(data, at, x, y)[0]
-        reach += above / rate
-        if above <= _WALK_CLOSE_MM:
-            is_close = True
-            break
-    if not is_close:
-        return np.inf
-    for _ in range(_NEWTON_STEPS):
-        x, y = start[0] + reach * ray[0], start[1] + reach * ray[1]
-        height, slope_x, slope_y = _waves(data, at, x, y)
-        falling = slope_x * ray[0] + slope_y * ray[1] - ray[2]
-        step = (start[2] + reach * ray[2] - height) / falling if falling > _STEEP else 0.0
-        reach += min(max(step, -10.0 * _WALK_CLOSE_MM), 10.0 * _WALK_CLOSE_MM)
-    x, y = start[0] + reach * ray[0], start[1] + reach * ray[1]
-    is_on = abs(x) <= 0.5 * data[at] and abs(y) <= 0.5 * data[at + 1]
-    return float(reach) if is_on else np.inf
-
-
-@compiled
-def _meet_box(data: Floats, at: int, start: Three, ray: Three) -> float:
-    enter, leave = -np.inf, np.inf
-    for axis in range(3):
-        half = 0.5 * data[at + axis]
-        from_middle = start[axis] - (half if axis == 2 else 0.0)
-        if ray[axis] == 0.0:
-            if abs(from_middle) > half:
-                return np.inf
-            continue
-        a, b = (-half - from_middle) / ray[axis], (half - from_middle) / ray[axis]
-        enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
-    return enter if enter < leave and enter > 0.0 else np.inf
-
-
-@compiled
-def _meet_sphere(data: Floats, at: int, start: Three, ray: Three) -> float:
-    x, y, z = start[0] - data[at], start[1] - data[at + 1], start[2] - data[at + 2]
-    b = x * ray[0] + y * ray[1] + z * ray[2]
-    root = b * b - (x * x + y * y + z * z - data[at + 3] ** 2)
-    reach = -b - math.sqrt(max(root, 0.0))
-    return float(reach) if root > 0.0 and reach > 0.0 else np.inf
-
-
-@compiled
-def _meet_print(data: Floats, at: int, start: Three, ray: Three) -> float:
-    if ray[2] <= 0.0 or start[2] >= 0.0:
-        return np.inf
-    reach = -start[2] / ray[2]
-    x, y = start[0] + reach * ray[0], start[1] + reach * ray[1]
-    is_on = data[at] <= x <= data[at + 2] and data[at + 1] <= y <= data[at + 3]
-    return float(reach) if is_on else np.inf
-
-
-@compiled
-def _meet_floor(data: Floats, at: int, start: Three, ray: Three) -> float:
-    nx, ny, nz = data[at + 3], data[at + 4], data[at + 5]
-    along = ray[0] * nx + ray[1] * ny + ray[2] * nz
-    height = (
-        (start[0] - data[at]) * nx + (start[1] - data[at + 1]) * ny + (start[2] - data[at + 2]) * nz
-    )
-    return float(-height / along) if along < 0.0 and height > 0.0 else np.inf
-
-
-@compiled
 def _meet(
     row: Floats, data: Floats, limbs: Floats, balls: Floats, start: Three, ray: Three
 ) -> float:
@@ -224,17 +96,17 @@ def _meet(
     own, along = (sx, sy, sz), _into(row, ray[0], ray[1], ray[2])
     kind, at = int(row[_KIND]), int(row[_START])
     if kind == _PLATE:
-        return _meet_plate(data, at, own, along)
+        return meet_plate(data, at, own, along)
     if kind == _WAVES:
-        return _meet_waves(data, at, own, along)
+        return meet_waves(data, at, own, along)
     if kind == _BOX:
-        return _meet_box(data, at, own, along)
+        return meet_box(data, at, own, along)
     if kind == _SPHERE:
-        return _meet_sphere(data, at, own, along)
+        return meet_sphere(data, at, own, along)
     if kind == _PRINT:
-        return _meet_print(data, at, own, along)
+        return meet_print(data, at, own, along)
     if kind == _FLOOR:
-        return _meet_floor(data, at, own, along)
+        return meet_floor(data, at, own, along)
     line = np.array([own[0], own[1], own[2], along[0], along[1], along[2]])
     stop = int(row[_STOP])
     room = np.zeros(stop - at, np.int64)
@@ -261,10 +133,10 @@ def _normal(row: Floats, data: Floats, limbs: Floats, x: float, y: float, z: flo
     kind, at = int(row[_KIND]), int(row[_START])
     nx, ny, nz = 0.0, 0.0, 1.0
     if kind == _PLATE:
-        slope_x, slope_y = _plate_slopes(data, at, px, py)
+        slope_x, slope_y = plate_slopes(data, at, px, py)
         nx, ny = -slope_x, -slope_y
     elif kind == _WAVES:
-        _, slope_x, slope_y = _waves(data, at, px, py)
+        _, slope_x, slope_y = waves_over(data, at, px, py)
         nx, ny = -slope_x, -slope_y
     elif kind == _SPHERE:
         nx, ny, nz = px - data[at], py - data[at + 1], pz - data[at + 2]
@@ -468,7 +340,7 @@ def _shade(
     pattern: Floats,
     lights: Floats,
     borders: Floats,
-    lit_sigmas: float,
+    far_sigmas: float,
     reach: Floats,
     peak: Floats,
 ) -> None:
@@ -487,8 +359,8 @@ def _shade(
             near, strength = _lit_by_spot(sheet, point, normal)
         else:
             near, strength = _lit_by_sheet(sheet, point, normal)
-        reach[i] = near
-        if abs(near) >= lit_sigmas or strength <= FAINTEST:
+        reach[i] = min(max(near, -far_sigmas), far_sigmas)
+        if abs(near) >= far_sigmas or strength <= FAINTEST:
             continue
         source = (sheet[0], sheet[1], sheet[2])
         if _is_seen(rows, data, limbs, balls, source, point):
@@ -598,13 +470,12 @@ class SceneNumbers:
         light: LightNumbers,
         *,
         tolerance: float,
-        lit_sigmas: float,
         far_sigmas: float,
     ) -> tuple[FloatArray, FloatArray]:
         """Reach and peak (N,) of a light at pixels (N, 2)."""
         reach, peak = np.full(len(pixels), far_sigmas), np.zeros(len(pixels))
         own = (self.rows, self.base, self.data, self.limbs, self.balls, texture_pattern())
-        shone = (light.rows, light.borders, lit_sigmas)
+        shone = (light.rows, light.borders, far_sigmas)
         _shade(_own(pixels), lens_of(camera), tolerance, *own, *shone, reach, peak)
         return reach, peak
 

@@ -37,7 +37,7 @@ from armscan.vision.stripe.ridge import (
     measure_level,
     trace_ridges,
 )
-from armscan.vision.stripe.smooth import Polyline, curvature, scatter, smooth
+from armscan.vision.stripe.smooth import UNKNOWN_SCATTER_PX, Polyline, curvature, scatter, smooth
 from armscan.vision.stripe.thesis import THESIS_METHODS, link_centres
 
 LEAST_SIGMA_PX = 0.002
@@ -122,7 +122,10 @@ def thesis_profile(
     flags = np.zeros(len(points), np.int64)
     flags[is_saturated(points, plane.saturated)] |= int(StripeFlag.SATURATED)
     flags[is_short(points, chain)] |= int(StripeFlag.SHORT_SEGMENT)
-    sigma = np.full(len(points), max(scatter(points, normals, chain), LEAST_SIGMA_PX))
+    own = scatter(points, normals, chain)
+    if own is None:
+        flags |= int(StripeFlag.NOISE_ASSUMED)
+    sigma = np.full(len(points), max(UNKNOWN_SCATTER_PX if own is None else own, LEAST_SIGMA_PX))
     return Profile(
         source=exposure.source,
         points_px=exposure.window.to_full_sensor(points),
@@ -165,6 +168,8 @@ def to_profile(
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
     beside = FLANKS_PER_LEAN * np.abs(fits.lean) * width * is_on_flanks
+    if fits.is_noise_assumed and not smoothed.is_noise_measured:
+        flags |= int(StripeFlag.NOISE_ASSUMED)
     binning = exposure.window.binning
     sigma = np.maximum(smoothed.sigma, LEAST_SIGMA_PX)
     return Profile(

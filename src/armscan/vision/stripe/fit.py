@@ -265,7 +265,8 @@ class ProfileFits:
     averaged along the line. ``side_sigma``: (N,) standard deviation of the difference of the two
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
-    section: see `estimate_section`.
+    section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
+    estimate the noise, so that it is the first guess.
     """
 
     ridge: RidgePoints
@@ -275,6 +276,7 @@ class ProfileFits:
     neighbour: FloatArray
     noise: FloatArray
     section: FloatArray
+    is_noise_assumed: bool
 
     @property
     def lean(self) -> FloatArray:
@@ -308,7 +310,8 @@ def fit_ridge(
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
-    noise, section = start_noise(background_noise), np.zeros(4)
+    guess = noise = start_noise(background_noise)
+    section = np.zeros(4)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
         if round_ >= NOISE_ROUNDS and not section.any():
@@ -345,6 +348,7 @@ def fit_ridge(
         neighbour[good],
         noise,
         section,
+        is_noise_assumed=noise is guess,
     )
 
 

@@ -26,10 +26,12 @@ SMALLEST_WINDOW_PX = 3.2
 WINDOW_RATIO = 1.6
 CONFIDENCE = 2.2
 LAGS = 6
+WHITE = np.eye(LAGS)[0]
+"""Covariances at distances 0, 1, ... of points that err on their own."""
 SCATTER_HALVES = (30, 16, 8)
 """Wide windows show slow noise too, but need long chains."""
 UNKNOWN_SCATTER_PX = 0.5
-"""Assumed where chains are too short to show their scatter."""
+"""Assumed, and flagged, where chains are too short to show their scatter."""
 SIGNIFICANT_CORRELATION = 2.5
 BEND_WINDOWS_PX = np.array([7.5, 12.0, 19.0, 30.0])
 LEAST_PAIRS = 200
@@ -84,6 +86,8 @@ class SmoothedCentres:
     over its chain; a local quadratic has weights that sum to one, so that a sum over smoothed
     centres errs as that over raw ones does, however small the smoothed ones' own sigma is.
     ``is_outlier``: (N,) True where the raw centre disagrees with its neighbours' course.
+    ``is_noise_measured``: False if the chains were too short to show their noise, so that the
+    sigmas are those given.
     """
 
     points: FloatArray
@@ -91,6 +95,7 @@ class SmoothedCentres:
     sigma: FloatArray
     sigma_sum: FloatArray
     is_outlier: BoolArray
+    is_noise_measured: bool
 
 
 def windows(largest_px: float) -> FloatArray:
@@ -113,12 +118,16 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     scale = max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
     is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
     course = replace(course, is_used=course.is_used & ~is_outlier)
-    correlation = noise_correlation(course, half[-1])
+    found = noise_correlation(course, half[-1])
+    is_measured = found is not None
+    correlation = WHITE if found is None else found
     course = replace(course, sigma=course.sigma * np.sqrt(correlation[0]))
     alike = 1.0 + 2.0 * float(correlation[1:].sum()) / correlation[0]
     sigma_sum = course.sigma * np.sqrt(alike)
     if largest_px <= 0.0:
-        return SmoothedCentres(course.points, course.normals, course.sigma, sigma_sum, is_outlier)
+        return SmoothedCentres(
+            course.points, course.normals, course.sigma, sigma_sum, is_outlier, is_measured
+        )
     result = course.fit_parabolas(half, np.array([_inflation(correlation, h) for h in half]))
     used, normals = course.is_used, course.normals
     shift = np.where(used, result[:, SHIFT], 0.0)
@@ -131,6 +140,7 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         np.where(used, result[:, SMOOTH_SIGMA], course.sigma),
         sigma_sum,
         is_outlier,
+        is_measured,
     )
 
 
@@ -161,8 +171,11 @@ def _inflation(correlation: FloatArray, half_px: float) -> float:
     return max(float((factor * overlap * shape).sum() / overlap[0]), 0.3)
 
 
-def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
-    """Standard deviation of the points across a smooth course of their own, in px."""
+def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float | None:
+    """Standard deviation of the points across a smooth course of their own, in px.
+
+    None where the chains are too short to show it.
+    """
     n = len(points)
     course = Polyline(points, normals, np.ones(n), chain, np.ones(n, dtype=np.bool_))
     for half in SCATTER_HALVES:
@@ -170,18 +183,17 @@ def scatter(points: FloatArray, normals: FloatArray, chain: IntArray) -> float:
         if np.isfinite(residual).sum() >= LEAST_PAIRS:
             share = 1.0 - _weights(half)[half]
             return float(np.sqrt(np.nanmean(residual**2) / share))
-    return UNKNOWN_SCATTER_PX
+    return None
 
 
-def noise_correlation(course: Polyline, half_px: float) -> FloatArray:
+def noise_correlation(course: Polyline, half_px: float) -> FloatArray | None:
     """Covariance (LAGS,) of normalised raw centres at distances 0, 1, ... along the chain.
 
     Measured on the residuals from a local quadratic; as the quadratic takes part of the noise with
     it, the measured covariances are a known linear mixture of the true ones, which is inverted.
-    Without a significant correlation of nearest neighbours the noise is taken as white.
+    Without a significant correlation of nearest neighbours the noise is taken as white. None where
+    the chains are too short to tell.
     """
-    white = np.zeros(LAGS)
-    white[0] = 1.0
     half = max(int(RESIDUAL_WIDENING * half_px), LEAST_HALF)
     residual = _filter_residuals(course, half)
     measured = _lag_products(residual, course.chain)
@@ -191,7 +203,7 @@ def noise_correlation(course: Polyline, half_px: float) -> FloatArray:
         residual = _filter_residuals(course, half)
         measured = _lag_products(residual, course.chain)
     if measured is None:
-        return white
+        return None
     kernel = -_weights(half)
     kernel[half] += 1.0
     autocorrelation = np.correlate(kernel, kernel, "full")
@@ -207,7 +219,7 @@ def noise_correlation(course: Polyline, half_px: float) -> FloatArray:
     surplus = measured[1:] - scale * mixture[1:, 0]
     limit = SIGNIFICANT_CORRELATION * scale / np.sqrt(np.isfinite(residual).sum())
     if (surplus[:2] < limit).all():
-        return np.asarray(scale * white)
+        return np.asarray(scale * WHITE)
     solved, _ = nnls(mixture, measured)
     solved[0] = max(solved[0], 0.05)
     return np.asarray(solved)

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Is the hand-eye as uncertain as is stated, on arms that no prior expects? From both sides.
+
+Linear problems, drawn beforehand: residuals of condensed stripes under errors of the arm's poses, a
+wavy plate and the stripes' noise, none of them by way of the noise model. The hand-eye's true error
+is then the solution's step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from armscan.calibration.hand_eye import estimate as estimate_module
+from armscan.calibration.hand_eye import noise as noise_module
+from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
+from armscan.calibration.hand_eye.estimate import Problem
+from armscan.calibration.hand_eye.noise import (
+    NoiseEstimate,
+    covariance_over_noise,
+    estimate_noise,
+    noise_components,
+    solve_linear,
+    total_covariance,
+)
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    condense_plate,
+    straight_stripes,
+)
+from armscan.calibration.hand_eye.result import HandEyeFit
+from armscan.calibration.hand_eye.surface import Placed, PlateSurface
+from armscan.errors import EstimationError
+from armscan.geometry.arrays import FloatArray, IntArray
+from rigs.plate_rig import (
+    PLATE_CENTRE,
+    SILENT,
+    TOOL_FROM_SENSOR,
+    PlateRig,
+    RigNoise,
+    Surface,
+    good_postures,
+)
+
+REGION = float(chi2.ppf(0.95, 6))
+STRIPE_MM = 0.002
+PLANE_SIGMA = np.array([1e-5, 1e-5, 0.001])
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What errs: an arm (mm) with a lever (mm), and a plate (mm)."""
+
+    arm_mm: float
+    lever_mm: float
+    flatness_mm: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """Instruments of one kind: ranges to draw from, evenly in the logarithm, and postures."""
+
+    n_postures: int
+    arm_mm: tuple[float, float]
+    lever_mm: tuple[float, float]
+    n_geometries: int
+    n_each: int
+
+    def draw(self, rng: np.random.Generator) -> Truth:
+        ranges = (self.arm_mm, self.lever_mm, (0.0005, 0.03))
+        return Truth(*(float(np.exp(rng.uniform(*np.log(one)))) for one in ranges))
+
+
+CASES = {
+    "few postures, any arm": Case(6, (0.005, 0.2), (30.0, 300.0), 12, 25),
+    "large arm, short lever": Case(12, (0.05, 0.2), (30.0, 60.0), 6, 25),
+}
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A problem placed at the truth."""
+
+    problem: Problem
+    placed: Placed
+    places: FloatArray
+    posture: IntArray
+
+    @staticmethod
+    def of(n_postures: int, seed: int) -> Linear:
+        rig = PlateRig(good_postures(n_postures, np.random.default_rng(seed)), SILENT)
+        stripes, plate = rig.draw(seed)
+        own = [replace(one, noise_mm=one.noise_mm * (STRIPE_MM / 1e-4)) for one in stripes]
+        surface = PlateSurface(replace(plate, covariance=np.diag(PLANE_SIGMA**2), rms_mm=None))
+        observations = condense_plate(own, straight_stripes(own), 5)
+        problem = Problem(observations, surface, HandEyeOptions())
+        placed = problem.place(problem.start(TOOL_FROM_SENSOR))
+        places = (placed.points_base_mm - PLATE_CENTRE) @ rig.plate_axes[:2].T
+        return Linear(problem, placed, places, observations.posture)
+
+    def draw(self, truth: Truth, rng: np.random.Generator) -> FloatArray:
+        """(M,) residuals of one calibration."""
+        by_pose = self.placed.dresidual_dpose
+        sigma = truth.arm_mm * np.array([1.0] * 3 + [1.0 / truth.lever_mm] * 3)
+        errors = sigma * rng.normal(size=(int(self.posture.max()) + 1, 6))
+        residual = np.einsum("mk,mk->m", by_pose, errors[self.posture])
+        residual += Surface.draw(rng, truth.flatness_mm).height(self.places)
+        residual += self.placed.by_surface @ (PLANE_SIGMA * rng.normal(size=3))
+        own = noise_components(
+            self.problem.observations, self.problem.surface, self.placed, self.problem.options
+        )[-1]
+        return np.asarray(
+            residual + np.sqrt(np.diag(own.covariance)) * rng.normal(size=len(own.covariance))
+        )
+
+
+def _draws(case: Case) -> Iterator[tuple[float, float]]:
+    """Normalised square of the error, and the limit of the 95 % region, of each draw."""
+    rng = np.random.default_rng(case.n_postures)
+    for seed in range(case.n_geometries):
+        linear = Linear.of(case.n_postures, seed)
+        problem, placed = linear.problem, linear.placed
+        jacobian, components = placed.jacobian[:, problem.columns], problem.components(placed)
+        known = problem.surface_covariance(placed)
+        for _ in range(case.n_each):
+            residual = linear.draw(case.draw(rng), rng)
+            noise = estimate_noise(residual, jacobian, components, known)
+            stated = covariance_over_noise(residual, jacobian, components, known, noise)
+            total = total_covariance(components, noise.sigmas) + known
+            solution = solve_linear(residual, jacobian, total)
+            assert solution is not None
+            error = solution.step[:6]
+            square = float(error @ np.linalg.solve(stated.matrix[:6, :6], error))
+            yield square, REGION * stated.region_factor
+
+
+@cache
+def _studied(case: str) -> FloatArray:
+    """(N, 2) squares and limits."""
+    return np.array(list(_draws(CASES[case])))
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_squares_of_the_errors_are_as_stated(case: str) -> None:
+    """Mean of e' C^-1 e over 6: half of it if C is doubled, 1.67 of it if C is taken times 0.6.
+
+    150 and 300 draws of heavy tails, up to 1.1 each: a standard deviation of 0.06; priors that
+    expect another arm, and waves that are none of the model's, may add 0.1.
+    """
+    mean = float(_studied(case)[:, 0].mean()) / 6.0
+    assert 0.75 < mean < 1.25
+
+
+def test_the_region_holds_what_it_says_and_the_usual_one_does_not() -> None:
+    """450 draws: 95 % within 3 (three standard deviations).
+
+    Errors of few postures have long tails: without the region's own factor one in twelve lies
+    outside.
+    """
+    squares, limits = np.concatenate([_studied(case) for case in CASES]).T
+    inside, usual = float((squares < limits).mean()), float((squares < REGION).mean())
+    assert 0.92 < inside < 0.98
+    assert usual < inside - 0.015
+
+
+def test_the_lever_is_found() -> None:
+    """Both scatters come out of the stripes, each within what 24 postures let it be off by."""
+    for lever_mm in (30.0, 300.0):
+        truth, linear = Truth(0.03, lever_mm, 0.001), Linear.of(24, 1)
+        residual = linear.draw(truth, np.random.default_rng(4))
+        problem, placed = linear.problem, linear.placed
+        components = problem.components(placed)
+        found = estimate_noise(
+            residual,
+            placed.jacobian[:, problem.columns],
+            components,
+            problem.surface_covariance(placed),
+        )
+        arm = dict(zip((one.name for one in components), found.sigmas, strict=True))
+        off = np.log(arm["arm"] / arm["arm rotation"] / lever_mm)
+        own = np.diag(found.log_covariance)[:2].sum()
+        assert abs(off) < 3.0 * np.sqrt(own) < 1.0
+
+
+def test_images_of_one_instant_are_one_exposure() -> None:
+    """Four postures with one instant each: no part of the pose can be new in every exposure."""
+    rig = PlateRig(good_postures(4, np.random.default_rng(2)), exposures_per_posture=2)
+    stripes, plate = rig.draw(1)
+    pairs = [replace(one, instant=one.posture) for one in stripes]
+    for images, n_exposures in ((stripes, 8), (pairs, 4)):
+        observations = condense_plate(images, straight_stripes(images), 5)
+        problem = Problem(observations, PlateSurface(plate), HandEyeOptions())
+        components = problem.components(problem.place(problem.start(TOOL_FROM_SENSOR)))
+        names = [component.name for component in components]
+        assert len(np.unique(observations.exposure)) == n_exposures
+        assert ("exposure" in names) == (n_exposures > 4)
+
+
+def test_an_estimate_that_has_not_settled_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the scatter, and of the rounds of scatter and hand-eye."""
+    stripes, plate = PlateRig(
+        good_postures(6, np.random.default_rng(2)), RigNoise().scaled(4.0)
+    ).draw(3)
+    for module, name, value in (
+        (noise_module, "MAX_SCORING_STEPS", 1),
+        (estimate_module, "NOISE_ROUNDS", {"plate": (1, 1e-9)}),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, value)
+            fit = calibrate_on_plate(stripes, plate)
+        assert isinstance(fit, HandEyeFit)
+        assert any("had not settled" in warning for warning in fit.warnings)
+
+
+def test_no_covariance_is_made_up() -> None:
+    """Where the residuals' covariance is none, an error says so."""
+    linear = Linear.of(4, 0)
+    problem, placed = linear.problem, linear.placed
+    components, known = problem.components(placed), -np.eye(len(placed.residual_mm))
+    sigmas = np.array([component.sigma for component in components])
+    noise = NoiseEstimate(sigmas, np.zeros((len(sigmas),) * 2))
+    jacobian = placed.jacobian[:, problem.columns]
+    with pytest.raises(EstimationError, match="not positive definite"):
+        covariance_over_noise(placed.residual_mm, jacobian, components, known, noise)

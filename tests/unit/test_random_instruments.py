@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What calibrations state of themselves, on instruments drawn at random: neither twice as wide in
+variance nor 0.6 times.
+
+The seeds are fixed and drawn beforehand; `benchmarks/random_instruments.py` is the study.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+
+from armscan.calibration.cameras.result import CameraOptions
+from rigs.instrument_stages import Outcome, run_camera, run_sheets
+from rigs.instrument_stereo import run_stereo
+from rigs.instruments import Instrument, draw_instrument
+
+OPTIONS = CameraOptions(distortion="k1k2p1p2k3", n_folds=0)
+
+
+def drawn(first: int, n: int, *, has_right: bool = False) -> list[Instrument]:
+    """The next n instruments that are not degenerate, small enough to be quick."""
+    found: list[Instrument] = []
+    while len(found) < n:
+        made = draw_instrument(first)
+        first += 1
+        if not made.fault and len(made.lights) < 4 and (made.right is not None or not has_right):
+            found.append(replace(made, n_views=min(made.n_views, 9)))
+    return found
+
+
+def assert_certain(outcomes: Sequence[Outcome]) -> None:
+    """Pooled chi2 over its degrees of freedom: half and 1.67 times the variance lie outside."""
+    judged = [one for one in outcomes if one.freedom]
+    assert all(one.result in ("right", "rightly refused") for one in outcomes)
+    freedom = sum(one.freedom for one in judged)
+    level = sum(one.chi2 for one in judged) / freedom
+    assert freedom > 80
+    assert 0.7 < level < 1.35
+
+
+def test_cameras_and_sheets() -> None:
+    cameras, sheets = [], []
+    for made in drawn(7000, 17):
+        camera = run_camera(made, OPTIONS)
+        cameras.append(camera.outcome)
+        if camera.outcome.result == "right":
+            sheets.append(run_sheets(made, camera.calibration, camera.information).outcome)
+    assert_certain(cameras)
+    assert_certain(sheets)
+
+
+def test_stereo_pairs() -> None:
+    assert_certain([run_stereo(made) for made in drawn(7100, 4, has_right=True)])
+
+
+@pytest.mark.parametrize("fault", ["two views", "all boards fronto-parallel", "parallel boards"])
+def test_degenerate_cameras_are_refused(fault: str) -> None:
+    for made in drawn(7200, 2):
+        assert run_camera(replace(made, fault=fault), OPTIONS).outcome.result == "rightly refused"

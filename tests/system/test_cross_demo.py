@@ -25,7 +25,7 @@ FEW: dict[TwinScene, int] = {
     "hand-eye": 6,
     "plate": 5,
     "ball": 4,
-    "steps": 6,
+    "steps": 12,
     "part": 3,
     "waves": 5,
 }

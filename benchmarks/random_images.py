@@ -49,11 +49,10 @@ from armscan.storage.documents import (
     read_scanner_calibration,
     read_stereo_calibration,
 )
-from rigs.photographed_instrument import (
-    DrawnInstrument,
+from rigs.photographed_instrument import DrawnInstrument, draw_instrument
+from rigs.photographed_sets import (
     Held,
     Photographer,
-    draw_instrument,
     photograph_camera_set,
     photograph_laser_set,
     plate_distance_mm,

@@ -182,7 +182,11 @@ def print_tables(rows: list[Row]) -> None:
 
 def print_outcomes(found: dict[str, list[tuple[Row, Row]]], n_draws: int) -> None:
     """Counts and rates, chi2 over its degrees of freedom, stated sigma over the bound."""
-    print("\n| stage | judged | " + " | ".join(RESULTS) + " | chi2 / f | median | sigma / bound |")
+    print(
+        "\n| stage | judged | "
+        + " | ".join(RESULTS)
+        + " | chi2 / f | of the right | sigma / bound |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     whole: Counter[str] = Counter()
     for stage, pairs in found.items():
@@ -191,10 +195,10 @@ def print_outcomes(found: dict[str, list[tuple[Row, Row]]], n_draws: int) -> Non
         cells = [
             f"{count[result]} ({100 * count[result] / len(pairs):.1f} %)" for result in RESULTS
         ]
-        mean, median = certainty(pairs)
+        mean, right = certainty(pairs), certainty(_right(pairs))
         over = np.array([o["over_bound"] for _, o in pairs if o["over_bound"]], dtype=float)
         bound = f"{np.nanmedian(over):.2f}" if np.isfinite(over).any() else "-"
-        print(f"| {stage} | {len(pairs)} | {' | '.join(cells)} | {mean} | {median} | {bound} |")
+        print(f"| {stage} | {len(pairs)} | {' | '.join(cells)} | {mean} | {right} | {bound} |")
     total = sum(whole.values())
     for result in RESULTS[2:]:
         n = sum(any(o["result"] == result for o in row) for row in _by_draw(found))
@@ -210,36 +214,39 @@ def _by_draw(found: dict[str, list[tuple[Row, Row]]]) -> list[list[Row]]:
     return list(draws.values())
 
 
-def certainty(pairs: list[tuple[Row, Row]]) -> tuple[str, str]:
-    """Mean chi2 over degrees of freedom with its standard error, and the median of the ratios.
+def _right(pairs: list[tuple[Row, Row]]) -> list[tuple[Row, Row]]:
+    return [pair for pair in pairs if pair[1]["result"] == "right"]
 
-    Of what is right: the wrong ones stand in the column before.
-    """
-    judged = [o for _, o in pairs if o["freedom"] and o["result"] == "right"]
+
+def certainty(pairs: list[tuple[Row, Row]]) -> str:
+    """Mean chi2 over its degrees of freedom, with its standard error."""
+    judged = [o for _, o in pairs if o["freedom"]]
     if not judged:
-        return "-", "-"
+        return "-"
     square = np.array([o["chi2"] for o in judged])
     freedom = np.array([o["freedom"] for o in judged], dtype=float)
     mean = square.sum() / freedom.sum()
     error = np.sqrt(np.sum((square - mean * freedom) ** 2)) / freedom.sum()
-    return f"{mean:.2f} +- {error:.2f}", f"{np.median(square / freedom):.2f}"
+    return f"{mean:.2f} +- {error:.2f}"
 
 
 def print_strata(found: dict[str, list[tuple[Row, Row]]]) -> None:
-    """Chi2 over its degrees of freedom in the lower, middle and upper third of each stratum."""
+    """Chi2 over its degrees of freedom in thirds of each stratum, of the right results.
+
+    One result that is wrong would be all that its third shows; these are counted above.
+    """
     stages = [s for s, pairs in found.items() if any(o["freedom"] for _, o in pairs)]
     print("\n| chi2 / f in thirds of | " + " | ".join(stages) + " |")
     print("|---|" + "---|" * len(stages))
     for name in next(iter(found.values()))[0][0]["strata"]:
         cells = []
         for stage in stages:
-            pairs = [pair for pair in found[stage] if pair[1]["freedom"]]
+            pairs = [pair for pair in _right(found[stage]) if pair[1]["freedom"]]
             value = np.array([row["strata"][name] for row, _ in pairs])
             low, high = np.quantile(value, [1 / 3, 2 / 3])
             parts = [value <= low, (value > low) & (value <= high), value > high]
             thirds = [
-                certainty([pairs[k] for k in np.flatnonzero(part)])[0].split(" ")[0]
-                for part in parts
+                certainty([pairs[k] for k in np.flatnonzero(part)]).split(" ")[0] for part in parts
             ]
             cells.append(" ".join(thirds))
         print(f"| {name} | " + " | ".join(cells) + " |")

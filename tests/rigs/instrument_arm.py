@@ -268,21 +268,21 @@ def observed(
                 continue
             name = f"image{k:02d}-{number}"
             profile = make_profile(name, stripes, made.claimed[1] * made.stripe_px)
-            points = triangulate_stripe(profile, np.concatenate(sheets), sensor)
-            if len(points) < len(profile):
+            placed = triangulate_stripe(profile, np.concatenate(sheets), sensor)
+            if len(placed) < len(profile):
                 continue
-            by_all = np.zeros((len(points), 3, len(sensor.parameter_names)))
+            by_all = np.zeros((len(placed), 3, len(sensor.parameter_names)))
             for sheet in lights:
-                rows = np.flatnonzero(points.sheet == sheet)
+                rows = np.flatnonzero(placed.sheet == sheet)
                 columns = sensor_columns(sensor, sheet)
-                by_all[np.ix_(rows, np.arange(3), columns)] = points.by_sensor[rows]
+                by_all[np.ix_(rows, np.arange(3), columns)] = placed.by_sensor[rows]
             stripe = PosedStripe(
                 source=name,
                 posture=f"posture{k:02d}",
                 base_from_tool=reported,
-                points_mm=points.points_mm,
-                noise_mm=points.noise_mm,
-                sheet=points.sheet,
+                points_mm=placed.points_mm,
+                noise_mm=placed.noise_mm,
+                sheet=placed.sheet,
                 dpoint_dsensor=by_all,
             )
             found.append(Seen(k, head, np.concatenate(truth), stripe))

@@ -124,11 +124,11 @@ def _exposed(
         empty = np.zeros((0, 2))
         none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
         return Profile(source, empty, empty, none, none, none, numbers, numbers), numbers
-    q, sheet = np.concatenate(points), np.concatenate(truth)
+    q, of_sheet = np.concatenate(points), np.concatenate(truth)
     near = np.full(len(q), np.inf)
-    for k in np.unique(sheet):
-        if (sheet != k).any():
-            near[sheet == k] = cKDTree(q[sheet != k]).query(q[sheet == k])[0]
+    for k in np.unique(of_sheet):
+        if (of_sheet != k).any():
+            near[of_sheet == k] = cKDTree(q[of_sheet != k]).query(q[of_sheet == k])[0]
     segment = np.unique(np.concatenate(segments), return_inverse=True)[1].astype(np.int64)
     n = len(q)
     profile = Profile(
@@ -141,4 +141,4 @@ def _exposed(
         flags=np.where(near < 4.5 * WIDTH_PX, int(StripeFlag.NEIGHBOUR), 0),
         segment=segment,
     )
-    return profile, sheet.astype(np.int64)
+    return profile, of_sheet.astype(np.int64)

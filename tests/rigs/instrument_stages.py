@@ -237,7 +237,8 @@ def camera_error(
         step[k] = h
         by[:, k] = (made.left.moved(step).project(points) - made.left.project(points)).ravel() / h
     miss = by @ error
-    nearest = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0] * steps[0]
+    scaled = np.linalg.lstsq(by[:, free] * steps[0], miss, rcond=None)[0]
+    nearest = np.asarray(scaled * steps[0], dtype=np.float64)
     rest = miss - by[:, free] @ nearest
     sigma = np.sqrt(np.einsum("ni,ij,nj->n", by[:, free], covariance, by[:, free]))
     return nearest, covariance, free, float(np.abs(rest / sigma).max())
@@ -386,7 +387,9 @@ def _judge_sheets(
     best = bound(whole[np.ix_(used, used)][::-1, ::-1], len(used) - size)[::-1, ::-1]
     widths = [8 if bowed[k] else 3 for k in kept]
     at = dict(zip(kept, np.cumsum([0, *widths[:-1]]).tolist(), strict=True))
-    squares, freedom, ratios, is_wrong, groups = 0.0, 0, [], False, {}
+    squares, freedom, is_wrong = 0.0, 0, False
+    ratios: list[float] = []
+    groups: dict[str, float] = {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)
         n = 8 if bowed[k] else 3
@@ -395,8 +398,8 @@ def _judge_sheets(
             "sheet", error, sheet.covariance[:n, :n], {"plane": (0, 1, 2), "bow": (3, 4, 5, 6, 7)}
         )
         is_wrong |= one.result != "right"
-        for name, value in one.groups.items():
-            groups[name] = max(groups.get(name, 0.0), value)
+        for group, value in one.groups.items():
+            groups[group] = max(groups.get(group, 0.0), value)
         squares, freedom = squares + one.chi2, freedom + n
         own = best[at[k] : at[k] + n, at[k] : at[k] + n]
         terms = light_terms(made, made.lights[k], points, n)
@@ -443,5 +446,5 @@ def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> in
 def sheet_error(sheet: SheetFit, points: FloatArray, n: int) -> tuple[FloatArray, float]:
     """(n,) error of a sheet's parameters over true points, and the rms height that they leave."""
     height, _, by = sheet.sheet.height_with_jacobian(points)
-    error = np.linalg.lstsq(by[:, :n], height, rcond=None)[0]
+    error: FloatArray = np.asarray(np.linalg.lstsq(by[:, :n], height, rcond=None)[0], np.float64)
     return error, float(np.sqrt(((height - by[:, :n] @ error) ** 2).mean()))

@@ -42,8 +42,8 @@ def wavy_rig(shape_mm: float, rng: np.random.Generator) -> SheetRig:
         for a, (p, q), f in zip(sizes, vectors, phases, strict=True)
     )
     poses = tuple(
-        placed(*rng.uniform(-28.0, 28.0, 2), rng.uniform(125.0, 146.0), (16.0, 12.0))
-        for _ in range(N_BOARDS)
+        placed(x, y, rng.uniform(125.0, 146.0), (16.0, 12.0))
+        for x, y in rng.uniform(-28.0, 28.0, (N_BOARDS, 2)).tolist()
     )
     return replace(thesis_rig(), sheets=(WavySheet(THESIS_PLANE, waves=waves),), poses=poses)
 

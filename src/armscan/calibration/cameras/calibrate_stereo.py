@@ -501,14 +501,13 @@ def _result(
     evidence: Evidence, options: StereoOptions, given: Given | None
 ) -> StereoFit | FitFailure:
     held = held_covariance(given) if given is not None and options.intrinsics == "fixed" else None
-    covariance = stereo_covariance(evidence.solution, held)
+    widening = common_design_effect(evidence.cameras) if held is None else 1.0
+    covariance = stereo_covariance(evidence.solution, held, widening)
     if isinstance(covariance, FitFailure):
         return covariance
     steps = options.camera.max_steps
     bow = common_bow(evidence.cameras)
     matrix = covariance.matrix.copy()
-    if held is None:
-        matrix *= common_design_effect(evidence.cameras)
     if bow is not None:
         by_bow = covariance_of_bow(evidence.solution, bow.covariance_mm2, steps)
         if isinstance(by_bow, FitFailure):

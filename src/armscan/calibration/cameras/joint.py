@@ -495,7 +495,7 @@ class StereoCovariance:
 
 
 def stereo_covariance(
-    solution: JointSolution, held: FloatArray | None
+    solution: JointSolution, held: FloatArray | None, widening: float = 1.0
 ) -> StereoCovariance | FitFailure:
     """Invert the normal equations.
 
@@ -506,6 +506,8 @@ def stereo_covariance(
     held
         (18, 18) covariance of intrinsics that were held at given values, or None: what was solved
         follows them, so that their uncertainty is carried into it.
+    widening
+        Factor on the variance of the points' noise, for residuals that are alike.
     """
     determined = joint_covariance(solution.equations, solution.problem.basis)
     if isinstance(determined, FitFailure):
@@ -513,7 +515,7 @@ def stereo_covariance(
     unit, condition = determined
     found = _board_residuals(solution)
     error = estimate_target_error(found)
-    matrix = covariance_with_target_error(unit, solution.variance_factor, error, found)
+    matrix = covariance_with_target_error(unit, widening * solution.variance_factor, error, found)
     if held is not None:
         lever = _followed(solution, unit)
         if isinstance(lever, FitFailure):

@@ -31,6 +31,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import perf_counter
 from typing import Any, cast, get_args
 
 import cv2
@@ -132,7 +133,6 @@ CALIBRATION = (
     Figure("hand-eye in sigmas", lambda demo: demo.hand_eye.normalised),
     Figure("sheets calibrated", lambda demo: float(len(demo.sheets)), None, False),
     Figure("sheet um", lambda demo: 1000.0 * max(s.rms_mm for s in demo.sheets)),
-    Figure("seconds", lambda demo: sum(demo.seconds.values())),
 )
 NAMES = (
     Figure("wrong names %", lambda demo: 100.0 * names(demo).wrong_share, 0.1),
@@ -189,6 +189,7 @@ def line_of(head: str, preset: str, seed: int, commit: str) -> Line:
     # as many workers as cores: threads inside them would only wait for each other
     cv2.setNumThreads(1)
     line: Line = {"commit": commit, "head": head, "preset": preset, "seed": seed}
+    start = perf_counter()
     try:
         with TemporaryDirectory() as folder:
             request = DemoRequest(Path(folder), head, seed, cast(Preset, preset), processes=1)
@@ -196,7 +197,8 @@ def line_of(head: str, preset: str, seed: int, commit: str) -> Line:
     except Exception as error:  # a seed may end in any way: that is what the table is for
         return line | {"failed": f"{type(error).__name__}: {error}"}
     figures = {figure.name: figure.value(demo) for figure in FIGURES[head]}
-    return line | {"figures": figures, "warnings": len(summary.warnings)}
+    seconds = round(perf_counter() - start, 1)
+    return line | {"figures": figures, "warnings": list(summary.warnings), "seconds": seconds}
 
 
 def lines_in(path: Path) -> list[Line]:
@@ -295,6 +297,10 @@ def print_table(path: Path) -> None:
         both = [percentile(figure, list(values.values()), percent) for percent in (50.0, 95.0)]
         missed = missed_text(figure, values, is_judged)
         print(f"| {figure.name} | {limit} | {both[0]:.4g} | {both[1]:.4g} | {missed} |")
+    if done:
+        seconds = float(np.median([line["seconds"] for line in done]))
+        warned = [str(line["seed"]) for line in done if line["warnings"]]
+        print(f"\n{seconds:.0f} s a seed in the median. Seeds with warnings: {', '.join(warned)}")
     for line in lines:
         if "failed" in line:
             print(f"\nSeed {line['seed']}: {line['failed']}")

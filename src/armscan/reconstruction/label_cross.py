@@ -24,6 +24,10 @@ from armscan.reconstruction.segments import Pieces, cut_pieces
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange, intersect_sheets
 from armscan.records.profile import Profile
 
+FIELD_MM = 85.0
+"""The lengths in mm hold for fields of view up to this. Wider ones see coarser points of larger
+things: there all lengths grow with the field. Smaller ones do not have a better arm, nor a slower
+hand."""
 SPACING_MM = 0.5
 """Remembered points of one stripe are thinned to about this."""
 N_NEAR = 32
@@ -51,10 +55,13 @@ class SurfaceMemory:
         How many exposures are remembered.
     depth_span_mm
         Width of the range over which a new surface is as likely at any depth.
+    scale
+        By which all lengths in mm grow, see `FIELD_MM`.
     """
 
     n_exposures: int = 40
     depth_span_mm: float = 60.0
+    scale: float = 1.0
     _kept: deque[FloatArray] = field(default_factory=deque)
     _tree: cKDTree | None = None
 
@@ -69,10 +76,11 @@ class SurfaceMemory:
 
     def remember(self, points_base_mm: FloatArray) -> None:
         """Add the points (N, 3) of an exposure, in the order of their stripes."""
-        step = np.linalg.norm(np.diff(points_base_mm, axis=0, prepend=points_base_mm[:1]), axis=1)
+        points = points_base_mm / self.scale
+        step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
         # a jump between stripes counts for one step, so that each stripe's first point is kept
         arc = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
-        kept = points_base_mm[np.diff(arc, prepend=-1.0) != 0]
+        kept = points[np.diff(arc, prepend=-1.0) != 0]
         self._kept.append(kept)
         while len(self._kept) > self.n_exposures:
             self._kept.popleft()
@@ -101,7 +109,7 @@ class SurfaceMemory:
         if self._tree is None or not n:
             return gain, sharpness
         in_sensor: Points[Sensor] = Points(points_sensor_mm)
-        places = (base_from_sensor @ in_sensor).xyz_mm
+        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
         found = self._tree.query(places, k=N_NEAR, distance_upper_bound=REACH_MM)
         distance, index = np.asarray(found[0]), np.asarray(found[1])
         known = np.flatnonzero(np.isfinite(distance[:, 0]))
@@ -113,7 +121,7 @@ class SurfaceMemory:
         offset, sigma = _continued(near @ base_from_sensor.rotation, distance, is_near)
         share = 1.0 + (offset / sigma) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
-        gain[known] = np.log1p(self.depth_span_mm * peak / share**2)
+        gain[known] = np.log1p(self.depth_span_mm / self.scale * peak / share**2)
         sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
         return gain, sharpness
 
@@ -290,6 +298,13 @@ def _vote(pieces: Pieces, *, is_still: bool = False) -> FloatArray:
     return np.asarray(vote[:, None])
 
 
+def field_mm(sensor: SensorCalibration) -> float:
+    """Width of the field of view in the middle of the depths of all sheets."""
+    camera = sensor.camera.camera
+    depth = float(np.mean([sheet.depth_range_mm for sheet in sensor.sheets]))
+    return camera.width_px * depth / camera.fx_px
+
+
 def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
     """(2,) direction, in the image, of a sheet's stripe on a surface that faces the camera."""
     model = sensor.sheets[sheet].sheet
@@ -317,7 +332,12 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
 
 
 def taken_evidence(
-    log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses, *, is_still: bool = False
+    log_posterior: FloatArray,
+    pieces: Pieces,
+    hypotheses: Hypotheses,
+    ray_mm: float = RAY_MM,
+    *,
+    is_still: bool = False,
 ) -> FloatArray:
     """(P, H) penalty where another segment already holds the same rays of a sheet's light.
 
@@ -329,6 +349,8 @@ def taken_evidence(
         (P, H) what is believed without this.
     pieces, hypotheses
         Of the profile.
+    ray_mm
+        Along the sheet, light within this counts as one ray of the laser.
     is_still
         True where nothing but the profile is known, see `ALIKE_PIECES`.
     """
@@ -337,7 +359,7 @@ def taken_evidence(
     penalty = np.zeros(hypotheses.is_inside.shape)
     for h in range(len(hypotheses.sheets)):
         belief = np.where(hypotheses.is_inside[:, h], np.exp(log_posterior[of_sample, h]), 0.0)
-        ray = np.floor(hypotheses.place_mm[h] / RAY_MM).astype(np.int64)
+        ray = np.floor(hypotheses.place_mm[h] / ray_mm).astype(np.int64)
         ray -= ray.min(initial=0)
         table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (segment, ray), belief)
@@ -442,7 +464,9 @@ class CrossLabeller:
         self._source_of = tuple(sheet.name.partition(".")[0] for sheet in sensor.sheets)
         self._sources = tuple(dict.fromkeys(self._source_of))
         limits = [depths.limits_mm(sheet) for sheet in sensor.sheets]
-        self._surface = SurfaceMemory(depth_span_mm=max(high - low for low, high in limits))
+        self._scale = max(1.0, field_mm(sensor) / FIELD_MM)
+        span = max(high - low for low, high in limits)
+        self._surface = SurfaceMemory(depth_span_mm=span, scale=self._scale)
         self._image = ImageMemory()
         self.reset()
 
@@ -548,7 +572,9 @@ class CrossLabeller:
         switch = switch_probability(pieces, len(hypotheses.sheets))
         posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):
-            taken = taken_evidence(posterior, pieces, hypotheses, is_still=is_still)
+            taken = taken_evidence(
+                posterior, pieces, hypotheses, RAY_MM * self._scale, is_still=is_still
+            )
             posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
 

@@ -39,6 +39,8 @@ BEND_PER_MM = 0.06
 """Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
+EDGE_ON = 0.05
+"""Least cosine between a surface and the direction of view."""
 SHARP_MM = 0.3
 """Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
 STUDENT = 3.0
@@ -129,18 +131,27 @@ class SurfaceMemory:
 def _continued(
     near_mm: FloatArray, distance_mm: FloatArray, is_near: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma."""
+    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma.
+
+    The plane of least squared distances, so that a wall seen edge-on is a plane like any other: to
+    depths over the image plane, noise across the wall would be a slope, and the plane beside it.
+    """
     bend = BEND_PER_MM * np.where(is_near, distance_mm, 0.0) ** 2
     weight = is_near / (NOISE_MM**2 + bend**2)
-    x, y, z = np.moveaxis(np.where(is_near[..., None], near_mm, 0.0), 2, 0)
-    design = np.stack([np.ones_like(x), x, y], axis=2)
-    weighted = design * weight[..., None]
-    normal = weighted.transpose(0, 2, 1) @ design
-    normal[:, [1, 2], [1, 2]] += SLOPE**-2
-    right = (weighted.transpose(0, 2, 1) @ z[..., None])[..., 0]
-    covariance = np.linalg.inv(normal)
-    offset = np.einsum("si,si->s", covariance[:, 0], right)
-    return offset, np.sqrt(covariance[:, 0, 0] + NOISE_MM**2)
+    total = weight.sum(axis=1)
+    near = np.where(is_near[..., None], near_mm, 0.0)
+    middle = np.einsum("sk,ski->si", weight, near) / total[:, None]
+    off = near - middle[:, None]
+    scatter = (off * weight[..., None]).transpose(0, 2, 1) @ off
+    scatter[:, [0, 1], [0, 1]] += SLOPE**-2
+    size, axes = np.linalg.eigh(scatter)
+    normal = axes[:, :, 0]
+    along = np.einsum("sij,si->sj", axes, middle)
+    # what scatters across the plane scatters along it too, and tells nothing of its slope
+    spread = np.maximum(size[:, 1:] - size[:, :1], SLOPE**-2)
+    variance = NOISE_MM**2 + 1.0 / total + (along[:, 1:] ** 2 / spread).sum(axis=1)
+    facing = np.maximum(np.abs(normal[:, 2]), EDGE_ON)
+    return along[:, 0] / facing, np.sqrt(variance) / facing
 
 
 REACH_PX = 60.0

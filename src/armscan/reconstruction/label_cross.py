@@ -370,8 +370,9 @@ def taken_evidence(
     penalty = np.zeros(hypotheses.is_inside.shape)
     for h in range(len(hypotheses.sheets)):
         belief = np.where(hypotheses.is_inside[:, h], np.exp(log_posterior[of_sample, h]), 0.0)
-        ray = np.floor(hypotheses.place_mm[h] / ray_mm).astype(np.int64)
-        ray -= ray.min(initial=0)
+        # only rays that occur: those nearly along the sheet meet it far away
+        occurring = np.floor(hypotheses.place_mm[h] / ray_mm)
+        ray = np.unique(occurring, return_inverse=True)[1]
         table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (segment, ray), belief)
         penalty[:, h] = TAKEN * _most_of_others(table)[segment, ray]

@@ -22,6 +22,7 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     likeliest_start,
     point_warnings,
+    refuse_few_facts,
     refuse_few_postures,
     refuse_underdetermined,
     scatter_warnings,
@@ -165,7 +166,7 @@ def _refuse_start(
     refusal = refuse_underdetermined(conditioning, cause, VARY_POSTURES)
     if refusal is None and not start.typical_mm <= problem.options.max_rms_mm:
         return explain_misfit(problem, plate, start)
-    return refusal
+    return refuse_few_facts(problem, VARY_POSTURES) if refusal is None else refusal
 
 
 def _fit_on_plate(
@@ -328,6 +329,8 @@ def _search(
     refused = _refuse_far(few, kept[0])
     if refused is None:
         refused = _refuse_open(conditioning_at(few, kept[0]), 2.0 * radius_mm)
+    if refused is None:
+        refused = refuse_few_facts(few, TURN_THE_TOOL)
     return tuple(kept) if refused is None else refused
 
 

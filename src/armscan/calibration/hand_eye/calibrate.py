@@ -84,8 +84,8 @@ LEAST_RESIDUAL_MM = 1e-4
 LIKELY_DIAMETER = 0.2
 """Part of the diameter by which it may have been mistaken."""
 NAMED_STRIPES = 3
-UNDERDETERMINED_PART = 0.2
-"""A combination known less well than this part of the diameter is not determined."""
+UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 5.0
+"""A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
     "at another height"
@@ -343,8 +343,8 @@ def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure |
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
     refused = refuse_underdetermined(conditioning, cause, TURN_THE_TOOL)
-    least_part = UNDERDETERMINED_PART * diameter_mm
-    if refused is None and conditioning.singular_values[-1] * least_part < 1.0:
+    least_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
+    if refused is None and conditioning.singular_values[-1] * least_mm < 1.0:
         return FitFailure(
             f"the postures hardly determine the hand-eye{cause} (least known: "
             f"{conditioning.weakest})",

@@ -57,7 +57,7 @@ LEAST_FREEDOM, LEAST_TO_ESTIMATE = 2, 4
 FACTS_ON_SPHERE = 3
 """Of a section circle: its centre."""
 AS_AREA = 0.2
-"""Stripes of a posture whose second extent is this part of the first show two slopes of the plate."""
+"""Second extent over the first from which stripes of a posture show two slopes of the plate."""
 LIKELIER = 6.0
 """Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
 MOST_ALTERNATIVES = 4

@@ -84,7 +84,7 @@ LEAST_RESIDUAL_MM = 1e-4
 LIKELY_DIAMETER = 0.2
 """Part of the diameter by which it may have been mistaken."""
 NAMED_STRIPES = 3
-UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 5.0
+UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 2.0
 """A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "

@@ -50,6 +50,8 @@ FOUR_SIGMA = 6.334e-5
 """Probability beyond four standard deviations, both sides."""
 HOPELESS_FOCAL = 0.02
 """Relative sigma of the focal length, by the bound, from which a refusal is right."""
+LEAST_REST_MM = 1e-6
+"""Of true heights that a sheet's parameters explain."""
 
 
 @dataclass(frozen=True)
@@ -400,7 +402,10 @@ def _judge_sheets(
         is_wrong |= one.result != "right"
         for group, value in one.groups.items():
             groups[group] = max(groups.get(group, 0.0), value)
-        squares, freedom = squares + one.chi2, freedom + n
+        light = made.lights[k]
+        is_plane = not (light.cone or light.skew or sheet.sheet.is_bowed)
+        # A true plane, kept as one, has no error in what a bow might be.
+        squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
         own = best[at[k] : at[k] + n, at[k] : at[k] + n]
         terms = light_terms(made, made.lights[k], points, n)
         _, _, by = sheet.sheet.height_with_jacobian(points)
@@ -444,7 +449,14 @@ def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> in
 
 
 def sheet_error(sheet: SheetFit, points: FloatArray, n: int) -> tuple[FloatArray, float]:
-    """(n,) error of a sheet's parameters over true points, and the rms height that they leave."""
+    """(n,) error of a sheet's parameters over true points, and the rms height that they leave.
+
+    Of all errors that explain the heights as well as any, the most probable one: a bow along the
+    depth does not show on two boards.
+    """
     height, _, by = sheet.sheet.height_with_jacobian(points)
-    error: FloatArray = np.asarray(np.linalg.lstsq(by[:, :n], height, rcond=None)[0], np.float64)
-    return error, float(np.sqrt(((height - by[:, :n] @ error) ** 2).mean()))
+    design, stated = by[:, :n], sheet.covariance[:n, :n]
+    best = np.linalg.lstsq(design, height, rcond=None)[0]
+    rest = float(np.sqrt(((height - design @ best) ** 2).mean()))
+    total = design @ stated @ design.T + max(rest, LEAST_REST_MM) ** 2 * np.eye(len(height))
+    return np.asarray(stated @ design.T @ np.linalg.solve(total, height)), rest

@@ -24,6 +24,10 @@ from armscan.reconstruction.segments import Pieces, cut_pieces
 from armscan.reconstruction.triangulate import LABEL_DEPTHS, DepthRange, intersect_sheets
 from armscan.records.profile import Profile
 
+FIELD_MM = 85.0
+"""The lengths in mm hold for fields of view up to this. Wider ones see coarser points of larger
+things: there all lengths grow with the field. Smaller ones do not have a better arm, nor a slower
+hand."""
 SPACING_MM = 0.5
 """Remembered points of one stripe are thinned to about this."""
 N_NEAR = 32
@@ -35,6 +39,8 @@ BEND_PER_MM = 0.06
 """Half the curvature of surfaces, 1/mm: a plane is off by this times the distance squared."""
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
+EDGE_ON = 0.05
+"""Least cosine between a surface and the direction of view."""
 SHARP_MM = 0.3
 """Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
 STUDENT = 3.0
@@ -51,10 +57,13 @@ class SurfaceMemory:
         How many exposures are remembered.
     depth_span_mm
         Width of the range over which a new surface is as likely at any depth.
+    scale
+        By which all lengths in mm grow, see `FIELD_MM`.
     """
 
     n_exposures: int = 40
     depth_span_mm: float = 60.0
+    scale: float = 1.0
     _kept: deque[FloatArray] = field(default_factory=deque)
     _tree: cKDTree | None = None
 
@@ -69,10 +78,11 @@ class SurfaceMemory:
 
     def remember(self, points_base_mm: FloatArray) -> None:
         """Add the points (N, 3) of an exposure, in the order of their stripes."""
-        step = np.linalg.norm(np.diff(points_base_mm, axis=0, prepend=points_base_mm[:1]), axis=1)
+        points = points_base_mm / self.scale
+        step = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1]), axis=1)
         # a jump between stripes counts for one step, so that each stripe's first point is kept
         arc = np.floor(np.cumsum(np.minimum(step, SPACING_MM)) / SPACING_MM)
-        kept = points_base_mm[np.diff(arc, prepend=-1.0) != 0]
+        kept = points[np.diff(arc, prepend=-1.0) != 0]
         self._kept.append(kept)
         while len(self._kept) > self.n_exposures:
             self._kept.popleft()
@@ -101,7 +111,7 @@ class SurfaceMemory:
         if self._tree is None or not n:
             return gain, sharpness
         in_sensor: Points[Sensor] = Points(points_sensor_mm)
-        places = (base_from_sensor @ in_sensor).xyz_mm
+        places = (base_from_sensor @ in_sensor).xyz_mm / self.scale
         found = self._tree.query(places, k=N_NEAR, distance_upper_bound=REACH_MM)
         distance, index = np.asarray(found[0]), np.asarray(found[1])
         known = np.flatnonzero(np.isfinite(distance[:, 0]))
@@ -113,7 +123,7 @@ class SurfaceMemory:
         offset, sigma = _continued(near @ base_from_sensor.rotation, distance, is_near)
         share = 1.0 + (offset / sigma) ** 2 / STUDENT
         peak = 2.0 / (np.pi * np.sqrt(STUDENT)) / sigma
-        gain[known] = np.log1p(self.depth_span_mm * peak / share**2)
+        gain[known] = np.log1p(self.depth_span_mm / self.scale * peak / share**2)
         sharpness[known] = 1.0 / (1.0 + (sigma / SHARP_MM) ** 4)
         return gain, sharpness
 
@@ -121,18 +131,27 @@ class SurfaceMemory:
 def _continued(
     near_mm: FloatArray, distance_mm: FloatArray, is_near: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma."""
+    """Depth (S,) of the surface over each place, from its neighbours (S, K, 3), and its sigma.
+
+    The plane of least squared distances, so that a wall seen edge-on is a plane like any other: to
+    depths over the image plane, noise across the wall would be a slope, and the plane beside it.
+    """
     bend = BEND_PER_MM * np.where(is_near, distance_mm, 0.0) ** 2
     weight = is_near / (NOISE_MM**2 + bend**2)
-    x, y, z = np.moveaxis(np.where(is_near[..., None], near_mm, 0.0), 2, 0)
-    design = np.stack([np.ones_like(x), x, y], axis=2)
-    weighted = design * weight[..., None]
-    normal = weighted.transpose(0, 2, 1) @ design
-    normal[:, [1, 2], [1, 2]] += SLOPE**-2
-    right = (weighted.transpose(0, 2, 1) @ z[..., None])[..., 0]
-    covariance = np.linalg.inv(normal)
-    offset = np.einsum("si,si->s", covariance[:, 0], right)
-    return offset, np.sqrt(covariance[:, 0, 0] + NOISE_MM**2)
+    total = weight.sum(axis=1)
+    near = np.where(is_near[..., None], near_mm, 0.0)
+    middle = np.einsum("sk,ski->si", weight, near) / total[:, None]
+    off = near - middle[:, None]
+    scatter = (off * weight[..., None]).transpose(0, 2, 1) @ off
+    scatter[:, [0, 1], [0, 1]] += SLOPE**-2
+    size, axes = np.linalg.eigh(scatter)
+    normal = axes[:, :, 0]
+    along = np.einsum("sij,si->sj", axes, middle)
+    # what scatters across the plane scatters along it too, and tells nothing of its slope
+    spread = np.maximum(size[:, 1:] - size[:, :1], SLOPE**-2)
+    variance = NOISE_MM**2 + 1.0 / total + (along[:, 1:] ** 2 / spread).sum(axis=1)
+    facing = np.maximum(np.abs(normal[:, 2]), EDGE_ON)
+    return along[:, 0] / facing, np.sqrt(variance) / facing
 
 
 REACH_PX = 60.0
@@ -290,6 +309,13 @@ def _vote(pieces: Pieces, *, is_still: bool = False) -> FloatArray:
     return np.asarray(vote[:, None])
 
 
+def field_mm(sensor: SensorCalibration) -> float:
+    """Width of the field of view in the middle of the depths of all sheets."""
+    camera = sensor.camera.camera
+    depth = float(np.mean([sheet.depth_range_mm for sheet in sensor.sheets]))
+    return camera.width_px * depth / camera.fx_px
+
+
 def frontal_direction(sensor: SensorCalibration, sheet: int) -> FloatArray:
     """(2,) direction, in the image, of a sheet's stripe on a surface that faces the camera."""
     model = sensor.sheets[sheet].sheet
@@ -317,7 +343,12 @@ def past_evidence(pieces: Pieces, log_gain: FloatArray, sharpness: FloatArray) -
 
 
 def taken_evidence(
-    log_posterior: FloatArray, pieces: Pieces, hypotheses: Hypotheses, *, is_still: bool = False
+    log_posterior: FloatArray,
+    pieces: Pieces,
+    hypotheses: Hypotheses,
+    ray_mm: float = RAY_MM,
+    *,
+    is_still: bool = False,
 ) -> FloatArray:
     """(P, H) penalty where another segment already holds the same rays of a sheet's light.
 
@@ -329,6 +360,8 @@ def taken_evidence(
         (P, H) what is believed without this.
     pieces, hypotheses
         Of the profile.
+    ray_mm
+        Along the sheet, light within this counts as one ray of the laser.
     is_still
         True where nothing but the profile is known, see `ALIKE_PIECES`.
     """
@@ -337,7 +370,7 @@ def taken_evidence(
     penalty = np.zeros(hypotheses.is_inside.shape)
     for h in range(len(hypotheses.sheets)):
         belief = np.where(hypotheses.is_inside[:, h], np.exp(log_posterior[of_sample, h]), 0.0)
-        ray = np.floor(hypotheses.place_mm[h] / RAY_MM).astype(np.int64)
+        ray = np.floor(hypotheses.place_mm[h] / ray_mm).astype(np.int64)
         ray -= ray.min(initial=0)
         table = np.zeros((int(segment.max(initial=0)) + 1, int(ray.max(initial=0)) + 1))
         np.maximum.at(table, (segment, ray), belief)
@@ -442,7 +475,9 @@ class CrossLabeller:
         self._source_of = tuple(sheet.name.partition(".")[0] for sheet in sensor.sheets)
         self._sources = tuple(dict.fromkeys(self._source_of))
         limits = [depths.limits_mm(sheet) for sheet in sensor.sheets]
-        self._surface = SurfaceMemory(depth_span_mm=max(high - low for low, high in limits))
+        self._scale = max(1.0, field_mm(sensor) / FIELD_MM)
+        span = max(high - low for low, high in limits)
+        self._surface = SurfaceMemory(depth_span_mm=span, scale=self._scale)
         self._image = ImageMemory()
         self.reset()
 
@@ -548,7 +583,9 @@ class CrossLabeller:
         switch = switch_probability(pieces, len(hypotheses.sheets))
         posterior = smoothed_posterior(evidence, switch)
         for _ in range(ROUNDS):
-            taken = taken_evidence(posterior, pieces, hypotheses, is_still=is_still)
+            taken = taken_evidence(
+                posterior, pieces, hypotheses, RAY_MM * self._scale, is_still=is_still
+            )
             posterior = smoothed_posterior(evidence + taken, switch)
         return posterior
 

@@ -10,12 +10,14 @@ import numpy as np
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.records.profile import Profile, StripeFlag
 
-GAP_PX = 6.0
-"""Accepted neighbours farther apart are not linked: a crossing or another line lies between."""
+GAP_PX, GAP_STEPS = 6.0, 3.0
+"""Accepted neighbours farther apart than this, and than so many of the profile's usual steps from
+point to point, are not linked: a crossing or another line lies between."""
 KINK_POINTS = 8
 """Points on either side from which direction and place at a kink are extrapolated."""
 KINK_RAD = np.radians(20.0)
-JUMP_PX = 0.6
+JUMP_PX, JUMP_SIGMAS = 0.6, 4.0
+"""A step of the line, and one over the points' noise, below which it is none."""
 PIECE_PX, SAMPLE_PX = 24.0, 8.0
 """Lengths of pieces that are judged by themselves, and between samples on them."""
 
@@ -54,10 +56,13 @@ def cut_segments(profile: Profile) -> StripeSegments:
         return StripeSegments(row, row)
     points = profile.points_px[row]
     n_beside = _count_beside(profile)[row]
-    is_cut = np.hypot(*np.diff(points, axis=0).T) > GAP_PX
-    is_cut |= (np.diff(profile.segment[row]) != 0) | (np.diff(n_beside) > 0)
+    is_cut = (np.diff(profile.segment[row]) != 0) | (np.diff(n_beside) > 0)
+    step = np.hypot(*np.diff(points, axis=0).T)
+    usual = float(np.median(step[~is_cut])) if not is_cut.all() else 0.0
+    is_cut |= step > max(GAP_PX, GAP_STEPS * usual)
     is_start = np.concatenate([[True], is_cut])
-    is_start |= _is_kink(points, profile.normals_px[row], np.cumsum(is_start))
+    jump_px = max(JUMP_PX, JUMP_SIGMAS * float(np.median(profile.sigma_px[row])))
+    is_start |= _is_kink(points, profile.normals_px[row], np.cumsum(is_start), jump_px)
     return StripeSegments(row, np.cumsum(is_start) - 1)
 
 
@@ -66,7 +71,9 @@ def _count_beside(profile: Profile) -> IntArray:
     return np.cumsum((profile.flags & int(StripeFlag.NEIGHBOUR)) != 0)
 
 
-def _is_kink(points: FloatArray, normals: FloatArray, segment: IntArray) -> BoolArray:
+def _is_kink(
+    points: FloatArray, normals: FloatArray, segment: IntArray, jump_px: float
+) -> BoolArray:
     """(A,) True for the first point beyond a kink or a step of its segment."""
     m, n = KINK_POINTS, len(points)
     found = np.zeros(n, dtype=np.bool_)
@@ -82,7 +89,7 @@ def _is_kink(points: FloatArray, normals: FloatArray, segment: IntArray) -> Bool
     first, then = before[:, :, 1], -after[:, :, 1]
     cross = first[:, 0] * then[:, 1] - first[:, 1] * then[:, 0]
     turn = np.abs(np.arctan2(cross, np.sum(first * then, axis=1)))
-    size = np.where(is_whole, np.maximum(turn / KINK_RAD, step / JUMP_PX), 0.0)
+    size = np.where(is_whole, np.maximum(turn / KINK_RAD, step / jump_px), 0.0)
     # of neighbouring places that exceed the limit, the largest is the kink
     padded = np.pad(size, m)
     largest = np.lib.stride_tricks.sliding_window_view(padded, 2 * m + 1).max(axis=1)

@@ -12,6 +12,8 @@ from armscan.reconstruction.label_cross import REACH_MM, SPACING_MM, SurfaceMemo
 
 BASE_FROM_SENSOR: Pose[Base, Sensor] = Pose.from_vectors([2.9, 0.3, -0.2], [600.0, -150.0, 140.0])
 SLOPE_X, SLOPE_Y = 0.4, -0.3
+STEEP = np.sqrt(1.0 + SLOPE_X**2 + SLOPE_Y**2)
+"""Depth from the plane over the distance from it."""
 
 
 def surface(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -49,7 +51,7 @@ def test_a_plane_is_continued_along_its_slope() -> None:
     on = gain(memory, at(2.0, 1.5))
     assert on > np.log(60.0 * 0.37 / 0.3)
     for off in (-1.0, 1.0):
-        assert gain(memory, at(2.0, 1.5, off)) < on - 3.0
+        assert gain(memory, at(2.0, 1.5, 1.05 * STEEP * off)) < on - 2.5
     # a horizontal continuation would be 0.45 mm off: it fits worse
     assert gain(memory, at(2.0, 1.5, -1.5 * SLOPE_Y)) < on - 1.0
 
@@ -61,9 +63,37 @@ def test_the_further_the_vaguer() -> None:
 
 
 def test_one_stripe_alone_does_not_tell_the_slope_across_it() -> None:
-    assert sharpness(taught(0.0), at(0.0, 2.0)) < 0.1
-    assert sharpness(taught(-2.0, -1.0, 0.0), at(0.0, 2.0)) > 0.2
+    one = sharpness(taught(0.0), at(0.0, 2.0))
+    assert one < 0.01
+    assert sharpness(taught(-2.0, -1.0, 0.0), at(0.0, 2.0)) > 100.0 * one
     assert sharpness(taught(0.0), at(0.0, 0.0)) > 0.9
+
+
+def test_beside_a_wall_seen_edge_on_nothing_fits() -> None:
+    """The wall's own noise is no slope by which it would reach beside itself."""
+    for seed in range(20):
+        rng, memory = np.random.default_rng(seed), SurfaceMemory()
+        for start in np.arange(-6.0, 6.0):
+            z = np.linspace(-3.0, 3.0, 60)
+            wall = np.stack([rng.normal(0.0, 0.02, 60), start - z, 140.0 + z], axis=1)
+            in_sensor: Points[Sensor] = Points(wall)
+            memory.remember((BASE_FROM_SENSOR @ in_sensor).xyz_mm)
+        assert gain(memory, np.array([[0.0, 0.3, 140.0]])) > 3.0
+        assert gain(memory, np.array([[0.4, 0.3, 140.0]])) < 0.1
+
+
+def test_in_a_wider_field_all_lengths_grow() -> None:
+    """Three times the field is a drawing at three times the scale: the same evidence."""
+    memory, wide = taught(-1.0, 0.0), SurfaceMemory(depth_span_mm=180.0, scale=3.0)
+    far: Pose[Base, Sensor] = Pose(BASE_FROM_SENSOR.rotation, 3.0 * BASE_FROM_SENSOR.translation_mm)
+    for y in (-1.0, 0.0):
+        in_sensor: Points[Sensor] = Points(3.0 * stripe(y))
+        wide.remember((far @ in_sensor).xyz_mm)
+    points = np.concatenate([at(1.0, 1.0), at(3.0, 2.0, 0.4), at(0.0, 4.0)])
+    small = memory.evidence(points, BASE_FROM_SENSOR)
+    large = wide.evidence(3.0 * points, far)
+    assert large[0] == pytest.approx(small[0], rel=1e-6)
+    assert large[1] == pytest.approx(small[1], rel=1e-6)
 
 
 def test_beyond_reach_nothing_is_known() -> None:

@@ -53,6 +53,20 @@ def test_a_gap_cuts() -> None:
     assert pieces.number.max() == 1
 
 
+def test_sparse_points_are_a_line_too_and_a_gap_is_one_by_their_spacing() -> None:
+    sparse = line(9.0 * course(np.zeros(100)) * [1.0, 0.0])
+    assert cut_segments(sparse).number.max() == 0
+    assert cut_segments(sparse.select(np.abs(np.arange(100) - 50) > 5)).number.max() == 1
+
+
+def test_noise_is_no_step() -> None:
+    noise = np.random.default_rng(2).normal(0.0, 0.35, 2000)
+    points = np.stack([np.arange(2000.0), noise], axis=1)
+    normals = np.tile([0.0, 1.0], (2000, 1))
+    noisy = make_profile("noisy", [(points, normals)], 0.35)
+    assert cut_segments(noisy).number.max() <= 1
+
+
 def test_samples_stand_for_every_point_of_their_own_piece() -> None:
     whole = line(course(np.zeros(100)))
     pieces = cut_segments(whole.select(np.abs(np.arange(100) - 92) > 3))

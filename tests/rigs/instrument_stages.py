@@ -174,13 +174,13 @@ def run_camera(made: Instrument, options: CameraOptions | None = None) -> Camera
     except ArmscanError as error:
         fit = FitFailure(str(error))
     seconds = time.process_time() - begun
-    outcome = _judge_camera(made, fit, best, seconds, len(views.found))
+    outcome = judge_camera(made, fit, best, seconds, len(views.found))
     if isinstance(fit, CameraFit) and outcome.result == "right":
         return CameraResult(outcome, camera_calibration(fit, PROVENANCE), information)
     return CameraResult(outcome, drawn_camera(made), information)
 
 
-def _judge_camera(
+def judge_camera(
     made: Instrument,
     fit: CameraFit | FitFailure,
     best: FloatArray,
@@ -291,7 +291,7 @@ def run_sheets(
     if len(made.lights) > 5:
         n = min(n, 7)
     places = board_placements(made, made.rng(2), n, for_sheets=True)
-    boards, seen, lines = _stripes_on_boards(made, camera, places, n_cameras)
+    boards, seen, lines = stripes_on_boards(made, camera, places, n_cameras)
     begun = time.process_time()
     try:
         fit = calibrate_sheets(boards, camera) if boards else FitFailure("no board")
@@ -304,7 +304,7 @@ def run_sheets(
     if reasons or isinstance(fit, FitFailure):
         result = "rightly refused" if is_hopeless else "wrongly refused"
         return SheetResult(Outcome("sheet", result, reasons[0], seconds=seconds), None)
-    outcome = _judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
+    outcome = judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
     return SheetResult(outcome, fit, tuple(light_of(made, sheet, lines) for sheet in fit.sheets))
 
 
@@ -314,12 +314,13 @@ def _boards_of_lights(made: Instrument, lines: Sequence[SeenLine]) -> list[int]:
     ]
 
 
-def _stripes_on_boards(
+def stripes_on_boards(
     made: Instrument,
     camera: CameraCalibration | StereoCalibration,
     places: Sequence[Placement],
     n_cameras: int,
 ) -> tuple[list[BoardStripes], list[SeenPoints], list[SeenLine]]:
+    """Boards as photographed with light, and what the bound needs of them."""
     cameras = HeadCameras.of(camera)
     sides = [views_of(made, places, side, 2) for side in range(n_cameras)]
     rng, is_alone = made.rng(3), made.lasers_alone or not _are_all_shown(made, places)
@@ -367,7 +368,7 @@ def _are_all_shown(made: Instrument, places: Sequence[Placement]) -> bool:
     return bool(np.mean(shown) > 0.8)
 
 
-def _judge_sheets(
+def judge_sheets(
     made: Instrument,
     fit: LaserFit,
     information: FloatArray,

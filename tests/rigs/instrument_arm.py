@@ -35,6 +35,8 @@ N_WAVES = 24
 NODES = 8
 HOPELESS_MM, HOPELESS_RAD = 1.0, 0.01
 """A hand-eye that the bound itself knows no better than this may be refused."""
+LEAST_POSTURES, LEAST_CROSSED = 5, 4
+"""The software says that fewer are refused; of crossed stripes on a plate the second."""
 LARGEST_SCATTER_MM = 0.2
 """Of an arm at the ends of a stripe, from which a refusal is right: 0.25 mm is the software's."""
 GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
@@ -97,7 +99,8 @@ def run_hand_eye(
     best = hand_eye_bound(made, seen, sensor, on_sphere)
     stage = "hand-eye on sphere" if on_sphere else "hand-eye on plate"
     if isinstance(found, FitFailure):
-        result = "rightly" if _may_be_refused(made, best, seen) else "wrongly"
+        least = LEAST_CROSSED if len(lights) > 1 and not on_sphere else LEAST_POSTURES
+        result = "rightly" if _may_be_refused(made, best, seen, least) else "wrongly"
         return Outcome(stage, f"{result} refused", found.reason, seconds=seconds)
     calibration = found.calibration
     covariance, follow = calibration.covariance, calibration.dhand_eye_dsensor
@@ -135,7 +138,9 @@ def _calibrated(
     return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
 
 
-def _may_be_refused(made: Instrument, best: FloatArray | None, seen: list[Seen]) -> bool:
+def _may_be_refused(
+    made: Instrument, best: FloatArray | None, seen: list[Seen], least: int
+) -> bool:
     """Degenerate by construction, or beyond what the software says that it refuses."""
     if made.fault in DEGENERATE["handeye"] or best is None or not seen:
         return True
@@ -146,7 +151,7 @@ def _may_be_refused(made: Instrument, best: FloatArray | None, seen: list[Seen])
         sigma[3:].max() > HOPELESS_MM
         or sigma[:3].max() > HOPELESS_RAD
         or scatter > LARGEST_SCATTER_MM
-        or len({one.posture for one in seen}) < 3
+        or len({one.posture for one in seen}) < least
     )
 
 

@@ -50,6 +50,8 @@ FOUR_SIGMA = 6.334e-5
 """Probability beyond four standard deviations, both sides."""
 HOPELESS_FOCAL = 0.02
 """Relative sigma of the focal length, by the bound, from which a refusal is right."""
+LEAST_REST_MM = 1e-6
+"""Of true heights that a sheet's parameters explain."""
 
 
 @dataclass(frozen=True)
@@ -172,13 +174,13 @@ def run_camera(made: Instrument, options: CameraOptions | None = None) -> Camera
     except ArmscanError as error:
         fit = FitFailure(str(error))
     seconds = time.process_time() - begun
-    outcome = _judge_camera(made, fit, best, seconds, len(views.found))
+    outcome = judge_camera(made, fit, best, seconds, len(views.found))
     if isinstance(fit, CameraFit) and outcome.result == "right":
         return CameraResult(outcome, camera_calibration(fit, PROVENANCE), information)
     return CameraResult(outcome, drawn_camera(made), information)
 
 
-def _judge_camera(
+def judge_camera(
     made: Instrument,
     fit: CameraFit | FitFailure,
     best: FloatArray,
@@ -289,7 +291,7 @@ def run_sheets(
     if len(made.lights) > 5:
         n = min(n, 7)
     places = board_placements(made, made.rng(2), n, for_sheets=True)
-    boards, seen, lines = _stripes_on_boards(made, camera, places, n_cameras)
+    boards, seen, lines = stripes_on_boards(made, camera, places, n_cameras)
     begun = time.process_time()
     try:
         fit = calibrate_sheets(boards, camera) if boards else FitFailure("no board")
@@ -302,7 +304,7 @@ def run_sheets(
     if reasons or isinstance(fit, FitFailure):
         result = "rightly refused" if is_hopeless else "wrongly refused"
         return SheetResult(Outcome("sheet", result, reasons[0], seconds=seconds), None)
-    outcome = _judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
+    outcome = judge_sheets(made, fit, information, seen, lines, n_cameras, seconds)
     return SheetResult(outcome, fit, tuple(light_of(made, sheet, lines) for sheet in fit.sheets))
 
 
@@ -312,12 +314,13 @@ def _boards_of_lights(made: Instrument, lines: Sequence[SeenLine]) -> list[int]:
     ]
 
 
-def _stripes_on_boards(
+def stripes_on_boards(
     made: Instrument,
     camera: CameraCalibration | StereoCalibration,
     places: Sequence[Placement],
     n_cameras: int,
 ) -> tuple[list[BoardStripes], list[SeenPoints], list[SeenLine]]:
+    """Boards as photographed with light, and what the bound needs of them."""
     cameras = HeadCameras.of(camera)
     sides = [views_of(made, places, side, 2) for side in range(n_cameras)]
     rng, is_alone = made.rng(3), made.lasers_alone or not _are_all_shown(made, places)
@@ -365,7 +368,7 @@ def _are_all_shown(made: Instrument, places: Sequence[Placement]) -> bool:
     return bool(np.mean(shown) > 0.8)
 
 
-def _judge_sheets(
+def judge_sheets(
     made: Instrument,
     fit: LaserFit,
     information: FloatArray,
@@ -400,7 +403,10 @@ def _judge_sheets(
         is_wrong |= one.result != "right"
         for group, value in one.groups.items():
             groups[group] = max(groups.get(group, 0.0), value)
-        squares, freedom = squares + one.chi2, freedom + n
+        light = made.lights[k]
+        is_plane = not (light.cone or light.skew or sheet.sheet.is_bowed)
+        # A true plane, kept as one, has no error in what a bow might be.
+        squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
         own = best[at[k] : at[k] + n, at[k] : at[k] + n]
         terms = light_terms(made, made.lights[k], points, n)
         _, _, by = sheet.sheet.height_with_jacobian(points)
@@ -444,7 +450,14 @@ def light_of(made: Instrument, sheet: SheetFit, lines: Sequence[SeenLine]) -> in
 
 
 def sheet_error(sheet: SheetFit, points: FloatArray, n: int) -> tuple[FloatArray, float]:
-    """(n,) error of a sheet's parameters over true points, and the rms height that they leave."""
+    """(n,) error of a sheet's parameters over true points, and the rms height that they leave.
+
+    Of all errors that explain the heights as well as any, the most probable one: a bow along the
+    depth does not show on two boards.
+    """
     height, _, by = sheet.sheet.height_with_jacobian(points)
-    error: FloatArray = np.asarray(np.linalg.lstsq(by[:, :n], height, rcond=None)[0], np.float64)
-    return error, float(np.sqrt(((height - by[:, :n] @ error) ** 2).mean()))
+    design, stated = by[:, :n], sheet.covariance[:n, :n]
+    best = np.linalg.lstsq(design, height, rcond=None)[0]
+    rest = float(np.sqrt(((height - design @ best) ** 2).mean()))
+    total = design @ stated @ design.T + max(rest, LEAST_REST_MM) ** 2 * np.eye(len(height))
+    return np.asarray(stated @ design.T @ np.linalg.solve(total, height)), rest

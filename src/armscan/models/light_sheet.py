@@ -16,6 +16,8 @@ PLANE_PARAMETER_NAMES = ("tilt_u_mm", "tilt_v_mm", "offset_mm")
 NEWTON_STEPS = 12
 NEWTON_TOLERANCE_MM = 1e-6
 """A last step larger than this means that the ray does not meet the bowed sheet."""
+SETTLED_MM = 1e-9
+"""Steps double their digits: the one after this would change nothing."""
 NEAREST_SOURCE = 0.2
 """Nearer to the light's source than this part of its distance the sheet is not followed."""
 
@@ -113,9 +115,12 @@ class LightSheet(ArrayRecord):
 
     def _bow_terms(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """(N, 5) values of the bow's terms, and their derivatives by u and by v."""
-        terms = np.stack([u**i * v**j for i, j in BOW_TERMS], axis=1)
-        by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in BOW_TERMS], axis=1)
-        by_v = np.stack([j * u**i * v ** max(j - 1, 0) for i, j in BOW_TERMS], axis=1)
+        powers_u, powers_v = _powers(u, 3), _powers(v, 2)
+        terms, by_u, by_v = np.zeros((3, len(u), len(BOW_TERMS)))
+        for k, (i, j) in enumerate(BOW_TERMS):
+            terms[:, k] = powers_u[i] * powers_v[j]
+            by_u[:, k] = i * powers_u[max(i - 1, 0)] * powers_v[j]
+            by_v[:, k] = j * powers_u[i] * powers_v[max(j - 1, 0)]
         lean, spread = self.fan
         w = np.maximum(1.0 + spread * v, NEAREST_SOURCE)
         dw_dv = np.where(w > NEAREST_SOURCE, spread, 0.0)
@@ -159,6 +164,8 @@ class LightSheet(ArrayRecord):
             is_valid &= np.abs(along) > 1e-9
             step = np.where(is_valid, height / np.where(is_valid, along, 1.0), 0.0)
             depth = depth - step
+            if np.abs(step).max(initial=0.0) < SETTLED_MM:
+                break
         is_valid &= np.isfinite(depth) & (depth > 0.0) & (np.abs(step) < NEWTON_TOLERANCE_MM)
         depth = np.where(is_valid, depth, 0.0)
         return rays * depth[:, None], is_valid
@@ -223,3 +230,11 @@ class LightSheet(ArrayRecord):
             bow_mm=self.bow_mm + step[3:],
             fan=self.fan,
         )
+
+
+def _powers(values: FloatArray, highest: int) -> list[FloatArray]:
+    """Values (N,) to the powers of 0, 1, ... ``highest``."""
+    powers = [np.ones_like(values)]
+    for _ in range(highest):
+        powers.append(powers[-1] * values)
+    return powers

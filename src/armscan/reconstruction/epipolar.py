@@ -4,8 +4,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
@@ -465,25 +468,36 @@ def left_out_scores(
         (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
     equations = _Equations.of(projected, crossings, sensor, prior, is_used)
-    information, right_side = equations.information(), equations.right_side()
-    scores = np.zeros(int(segment.max(initial=-1)) + 1)
-    for b in range(len(scores)):
-        rows = np.flatnonzero(segment == b)
+    lower = np.linalg.cholesky(equations.information())
+    seen = solve_triangular(lower, equations.design.T, lower=True, check_finite=False)
+    weight = equations.weight / equations.sigma**2
+    missed = equations.wanted - equations.design @ equations.state
+    order = np.argsort(segment, kind="stable")
+    bounds = np.searchsorted(segment[order], np.arange(segment.max(initial=-1) + 2))
+    scores = np.zeros(len(bounds) - 1)
+    for b, (first, last) in enumerate(pairwise(bounds)):
+        rows = order[first:last]
         if not len(rows):
             continue
-        design, sigma = equations.design[rows], equations.sigma[rows]
-        scaled = design * (equations.weight[rows] / sigma**2)[:, None]
-        others = information - design.T @ scaled
-        state = np.linalg.solve(others, right_side - scaled.T @ equations.wanted[rows])
-        place = np.linspace(-1.0, 1.0, len(rows))
-        shape = np.stack([np.ones(len(rows)), place, place**2], axis=1)[:, : min(len(rows), 3)]
-        moments = np.linalg.pinv(shape)
-        gain = moments @ design
-        missed = moments @ equations.wanted[rows] - gain @ state
-        covariance = gain @ np.linalg.solve(others, gain.T) + (moments * sigma**2) @ moments.T
+        known = seen[:, rows].T @ seen[:, rows]
+        # (I - G W)^-1 takes what these rows said themselves out of state and covariance
+        own = np.eye(len(rows)) - known * weight[rows]
+        left_out = np.linalg.solve(own, np.column_stack([known, missed[rows]]))
+        moments = _moments(len(rows))
+        shape = moments @ left_out[:, -1]
+        covariance = moments @ left_out[:, :-1] @ moments.T
+        covariance += (moments * equations.sigma[rows] ** 2) @ moments.T
         covariance[0, 0] += FLOOR_PX**2
-        scores[b] = float(missed @ np.linalg.solve(covariance, missed)) / len(missed)
+        scores[b] = float(shape @ np.linalg.solve(covariance, shape)) / len(shape)
     return scores
+
+
+@cache
+def _moments(n: int) -> FloatArray:
+    """(3, n), or fewer rows of few samples: what takes (n,) to their mean, slope and bend."""
+    place = np.linspace(-1.0, 1.0, n)
+    shape = np.stack([np.ones(n), place, place**2], axis=1)[:, : min(n, 3)]
+    return np.asarray(np.linalg.pinv(shape))
 
 
 def _mean_offset(

@@ -29,6 +29,9 @@ from armscan.geometry.rotations import (
     rotations_from_euler,
 )
 from armscan.geometry.shapes import Plane
+from rigs.instrument_arm import run_hand_eye
+from rigs.instrument_stages import run_camera, run_sheets
+from rigs.instruments import draw_instrument
 from rigs.plate_rig import (
     PLATE_NORMAL,
     SILENT,
@@ -38,6 +41,7 @@ from rigs.plate_rig import (
     RigNoise,
     good_postures,
 )
+from rigs.sheet_rig import PROVENANCE
 
 N = 12
 ARM_MM = 0.0053
@@ -401,3 +405,19 @@ def test_a_refusal_also_says_that_the_stripes_are_not_straight() -> None:
     fit = calibrate_on_plate(bowed, plate)
     assert isinstance(fit, FitFailure)
     assert "are not on straight stripes" in fit.reason
+
+
+def test_stripes_that_shrink_to_a_point_contradict_no_sensor() -> None:
+    """A sound head of 30 mm field on an arm of 0.12 mm, refused for a sheet shifted by 57 mm.
+
+    Shifted on to the camera, the sheet left no scatter at all: likelier than any other explanation.
+    """
+    made = draw_instrument(3139)
+    camera = run_camera(made)
+    sheets = run_sheets(made, camera.calibration, camera.information)
+    assert sheets.fit is not None
+    sensor = sheets.fit.to_calibration(PROVENANCE)
+    lights = {0: made.lights[sheets.names[0]]}
+    outcome = run_hand_eye(made, sensor, lights, on_sphere=False)
+    assert outcome.result == "right"
+    assert not any("sensor's calibration" in warning for warning in outcome.warnings)

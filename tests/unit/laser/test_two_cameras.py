@@ -26,13 +26,14 @@ def flat(rig: FanRig) -> FanRig:
 
 
 def fitted(
-    rig: FanRig, seed: int, *, n_sheets: int = 5
+    rig: FanRig, seed: int, *, n_sheets: int = 5, is_bow_allowed: bool = True
 ) -> tuple[LaserFit, StereoCalibration, list[int]]:
     """The fit, the calibration it rests on, and the true sheet of each of its sheets."""
     rng = np.random.default_rng(seed)
     stereo = rig.drawn_stereo(rng)
     boards, truth = rig.boards(stereo, rng)
-    fit = calibrate_sheets(boards, stereo, SheetOptions(n_sheets=n_sheets))
+    options = SheetOptions(n_sheets=n_sheets, is_bow_allowed=is_bow_allowed)
+    fit = calibrate_sheets(boards, stereo, options)
     assert isinstance(fit, LaserFit), fit
     of = []
     for k in range(len(fit.sheets)):
@@ -70,11 +71,14 @@ def errors(
 
 
 def test_joint_errors_of_cameras_and_sheets_are_as_large_as_stated() -> None:
-    """Normalised error over all 39 free parameters, 6 calibrations of five sheets."""
+    """Normalised error over all 39 free parameters, 6 calibrations of five sheets.
+
+    Of planes that are known to be planes: what a bow that none has might be is not stated.
+    """
     squares = []
     for seed in range(6):
         rig = flat(fan_rig(500 + seed, 6, 5))
-        fit, stereo, of = fitted(rig, seed)
+        fit, stereo, of = fitted(rig, seed, is_bow_allowed=False)
         assert not any(sheet.sheet.is_bowed for sheet in fit.sheets)
         error, place = errors(fit, stereo, of, rig)
         covariance = fit.covariance[np.ix_(place, place)]
@@ -88,11 +92,11 @@ def test_joint_errors_of_cameras_and_sheets_are_as_large_as_stated() -> None:
 
 def test_the_right_camera_makes_the_sheets_better_known() -> None:
     rig = flat(fan_rig(2, 6, 5))
-    fit, _, of = fitted(rig, 2)
+    fit, _, of = fitted(rig, 2, is_bow_allowed=False)
     rng = np.random.default_rng(2)
     left = rig.drawn_stereo(rng).left
     boards, _ = rig.boards(left, rng)
-    alone = calibrate_sheets(boards, left, SheetOptions(n_sheets=5))
+    alone = calibrate_sheets(boards, left, SheetOptions(n_sheets=5, is_bow_allowed=False))
     assert isinstance(alone, LaserFit)
     assert of == [0, 1, 2, 3, 4]
     offsets = [[s.offset_sigma_mm for s in found.sheets] for found in (fit, alone)]

@@ -46,8 +46,13 @@ from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 
 LEAST_ON_A_SIDE = 3
 """Postures before and after a change: fewer are told from wrong ones by nothing."""
-LARGEST_SCALE = 0.2
-"""Scaled down to nothing, any stripes lie on one point of any plate."""
+LARGEST_MOVE = 0.2
+"""Of the points' distance from the sensor, by another sensor."""
+ASKED_FOR = 0.05
+"""Another sensor is asked for if its unknowns are less probable than this under the scatter as it
+is. Scaled down to nothing, by a scale or by a sheet shifted on to the camera, any stripes lie on
+one point of any plate: scatter that is estimated beside such unknowns vanishes."""
+OF_SENSOR = ("scale", "sheet")
 FACTS_OF_POSTURE = 2
 """What a stripe says of its posture's error: a shift and a slope."""
 SUSPICIOUS = 2e-3
@@ -180,16 +185,40 @@ def _likeliest_change(fit: HandEyeSolution) -> _Unknowns | None:
 
 
 def _weighed(fit: HandEyeSolution, known: FloatArray, unknowns: _Unknowns) -> Alternative | None:
+    """Judge unknowns under the scatter that is left beside them; None where they stay open."""
     n_known, n_new = fit.jacobian.shape[1], unknowns.jacobian.shape[1]
     n_facts = FACTS_OF_POSTURE * len(fit.problem.observations.used_postures)
-    freedom = n_facts - n_known - n_new
     scale = np.linalg.norm(unknowns.jacobian, axis=0)
-    if freedom < 1 or not (scale > 0.0).all():
+    if n_facts - n_known - n_new < 1 or not (scale > 0.0).all():
         return None
     jacobian = np.concatenate([fit.jacobian, unknowns.jacobian / scale], axis=1)
-    residual = fit.placed.residual_mm
-    noise = estimate_noise(residual, jacobian, fit.components, known, fit.noise.sigmas)
+    noise = estimate_noise(
+        fit.placed.residual_mm, jacobian, fit.components, known, fit.noise.sigmas
+    )
     total = total_covariance(fit.components, noise.sigmas) + known
+    found = _judged(replace(fit, noise=noise), total, unknowns, jacobian)
+    if unknowns.name not in OF_SENSOR:
+        return found
+    total = total_covariance(fit.components, fit.noise.sigmas) + known
+    plain = _judged(fit, total, unknowns, jacobian)
+    if plain is not None and plain.probability > ASKED_FOR:
+        found = plain
+    points = fit.problem.observations.points_mm
+    most_mm = LARGEST_MOVE * float(np.median(np.linalg.norm(points, axis=1)))
+    return None if found is None or found.size_mm > most_mm else found
+
+
+def _judged(
+    fit: HandEyeSolution, total: FloatArray, unknowns: _Unknowns, jacobian: FloatArray
+) -> Alternative | None:
+    """Unknowns beside those of ``fit``, whose scatter is of ``total`` covariance.
+
+    ``jacobian`` (M, K + Q) is by both, the columns of the new ones of unit length.
+    """
+    n_known, n_new = fit.jacobian.shape[1], unknowns.jacobian.shape[1]
+    n_facts = FACTS_OF_POSTURE * len(fit.problem.observations.used_postures)
+    scale = np.linalg.norm(unknowns.jacobian, axis=0)
+    residual = fit.placed.residual_mm
     solution = solve_linear(residual, jacobian, total)
     if solution is None:
         return None
@@ -197,24 +226,21 @@ def _weighed(fit: HandEyeSolution, known: FloatArray, unknowns: _Unknowns) -> Al
     if np.linalg.cond(covariance) > 1e12:
         return None
     statistic = float(values @ np.linalg.solve(covariance, values)) / n_new
-    probability = float(f_distribution.sf(statistic, n_new, freedom)) * unknowns.n_tried
-    values = values / scale
-    if unknowns.name == "scale" and abs(float(values[0])) > LARGEST_SCALE:
-        return None
-    moved = unknowns.jacobian @ values
+    chance = float(f_distribution.sf(statistic, n_new, n_facts - n_known - n_new))
+    moved = unknowns.jacobian @ (values / scale)
     quadratic = float(residual @ solution.projected @ residual)
     determinant = float(np.linalg.slogdet(total)[1])
     return Alternative(
         name=unknowns.name,
         number=unknowns.number,
-        values=values,
+        values=values / scale,
         covariance=covariance / np.outer(scale, scale),
         size_mm=float(np.sqrt((moved**2).mean())),
-        probability=min(probability, 1.0),
+        probability=min(chance * unknowns.n_tried, 1.0),
         likelihood=-0.5 * (quadratic + determinant) - n_new,
         hand_eye_change=solution.step[:N_HAND_EYE] - fit.linear.step[:N_HAND_EYE],
         hand_eye_covariance=solution.covariance[:N_HAND_EYE, :N_HAND_EYE],
-        arm_mm=replace(fit, noise=noise).sigma_of("arm"),
+        arm_mm=fit.sigma_of("arm"),
     )
 
 

@@ -22,6 +22,7 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     likeliest_start,
     point_warnings,
+    refuse_few_facts,
     refuse_few_postures,
     refuse_underdetermined,
     scatter_warnings,
@@ -83,8 +84,8 @@ LEAST_RESIDUAL_MM = 1e-4
 LIKELY_DIAMETER = 0.2
 """Part of the diameter by which it may have been mistaken."""
 NAMED_STRIPES = 3
-UNDERDETERMINED_PART = 0.2
-"""A combination known less well than this part of the diameter is not determined."""
+UNDERDETERMINED_PART, UNDERDETERMINED_MM = 0.2, 2.0
+"""A combination known less well than this part of the diameter and than this is not determined."""
 TURN_THE_TOOL = (
     "scan the sphere from 8 or more postures that turn about at least two axes, each cutting it "
     "at another height"
@@ -165,7 +166,7 @@ def _refuse_start(
     refusal = refuse_underdetermined(conditioning, cause, VARY_POSTURES)
     if refusal is None and not start.typical_mm <= problem.options.max_rms_mm:
         return explain_misfit(problem, plate, start)
-    return refusal
+    return refuse_few_facts(problem, VARY_POSTURES) if refusal is None else refusal
 
 
 def _fit_on_plate(
@@ -328,6 +329,8 @@ def _search(
     refused = _refuse_far(few, kept[0])
     if refused is None:
         refused = _refuse_open(conditioning_at(few, kept[0]), 2.0 * radius_mm)
+    if refused is None:
+        refused = refuse_few_facts(few, TURN_THE_TOOL)
     return tuple(kept) if refused is None else refused
 
 
@@ -340,8 +343,8 @@ def _refuse_open(conditioning: Conditioning, diameter_mm: float) -> FitFailure |
     """Refuse postures that leave a combination of the unknowns open or nearly so."""
     cause = ": the tool hardly turns, or about one axis only"
     refused = refuse_underdetermined(conditioning, cause, TURN_THE_TOOL)
-    least_part = UNDERDETERMINED_PART * diameter_mm
-    if refused is None and conditioning.singular_values[-1] * least_part < 1.0:
+    least_mm = max(UNDERDETERMINED_PART * diameter_mm, UNDERDETERMINED_MM)
+    if refused is None and conditioning.singular_values[-1] * least_mm < 1.0:
         return FitFailure(
             f"the postures hardly determine the hand-eye{cause} (least known: "
             f"{conditioning.weakest})",

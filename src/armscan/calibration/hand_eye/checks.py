@@ -52,6 +52,12 @@ from armscan.geometry.shapes import Plane
 
 MAX_CONDITION = 100.0
 GOOD_POSTURES, LEAST_POSTURES = 6, 3
+LEAST_FREEDOM, LEAST_TO_ESTIMATE = 2, 4
+"""Facts of the postures beyond the unknowns: for a solution at all, and for the arm's scatter."""
+FACTS_ON_SPHERE = 3
+"""Of a section circle: its centre."""
+AS_AREA = 0.2
+"""Second extent over the first from which stripes of a posture show two slopes of the plate."""
 LIKELIER = 6.0
 """Logarithm of the likelihood ratio from which one minimum is preferred to another: 400 to 1."""
 MOST_ALTERNATIVES = 4
@@ -117,6 +123,44 @@ def refuse_underdetermined(
         f"(least known: {conditioning.weakest})",
         remedy,
     )
+
+
+def refuse_few_facts(problem: Problem, remedy: str) -> FitFailure | None:
+    """Refuse postures whose disagreement does not show how much the arm scatters.
+
+    A stripe tells a shift and a slope of its posture's pose, stripes over an area a shift and two
+    slopes, a section of a sphere three shifts. As many facts as unknowns are met exactly by several
+    hand-eyes, right and wrong. Two more than unknowns tell these apart, but no scatter.
+    """
+    facts = _facts_of_postures(problem)
+    n_unknown = len(problem.columns)
+    is_given = problem.options.arm_position_mm is not None
+    freedom = sum(facts) - n_unknown
+    missing = (LEAST_FREEDOM if is_given else LEAST_TO_ESTIMATE) - freedom
+    if missing <= 0:
+        return None
+    least = len(facts) + -(-missing // min(facts))
+    is_enough_if_given = not is_given and freedom >= LEAST_FREEDOM
+    return FitFailure(
+        f"{len(facts)} postures of stripes like these tell {sum(facts)} facts for {n_unknown} "
+        "unknowns: they do not show how much the arm scatters, and so not how far the hand-eye may "
+        "be off",
+        f"scan from {least} postures at least, better 12"
+        + (", or give the arm's scatter (--arm-position-mm)" if is_enough_if_given else "")
+        + f"; {remedy}",
+    )
+
+
+def _facts_of_postures(problem: Problem) -> list[int]:
+    observations = problem.observations
+    if not isinstance(problem.surface, PlateSurface):
+        return [FACTS_ON_SPHERE] * len(observations.used_postures)
+    facts = []
+    for posture in observations.used_postures:
+        points = observations.points_mm[observations.of_points(observations.posture) == posture]
+        extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        facts.append(3 if extent[1] > AS_AREA * extent[0] else 2)
+    return facts
 
 
 def conditioning_warnings(

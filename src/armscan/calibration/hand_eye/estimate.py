@@ -43,7 +43,7 @@ from armscan.geometry.poses import Pose, Sensor, Tool
 MAX_STEPS = 60
 SETTLED = 1e-10
 """A step that lowers chi2 by less than this part of it ends the search."""
-NOISE_ROUNDS = {"plate": (4, 0.02), "sphere": (6, 1e-3)}
+NOISE_ROUNDS = {"plate": (4, 0.02), "sphere": (12, 0.02)}
 """Rounds at most, and change of a sigma's logarithm that ends them. On a sphere the scatter of a
 robot is far from its typical value."""
 LEVER_MM = 100.0
@@ -53,6 +53,9 @@ RANK_RATIO = 1e-4
 repeat another still turns by a hundredth of a degree."""
 NAMED_SHARE = 0.3
 """Parts of the weakest combination above this are named."""
+LESS_LIKELY = 3.0
+"""Logarithm of the posterior by which a round of the sphere may be less likely than the one before:
+residuals that the sensor's errors explain can lead a small sphere away step by step."""
 ROBUST_ROUNDS = 10
 WEIGHTS_SETTLED = 0.02
 LEAST_FOR_WEIGHTS = 4
@@ -248,11 +251,11 @@ def estimate(
     """
     state = start
     rounds, settled = NOISE_ROUNDS[problem.surface.method]
-    is_settled = False
+    is_settled, last, best = False, None, None
     # On a sphere the typical scatter may be far from the true one, and would lead away from it.
     is_solved_first = problem.surface.method == "plate"
     for _ in range(rounds):
-        placed = problem.place(state)
+        found_at, placed = state, problem.place(state)
         components = problem.components(placed)
         if sigmas is None:
             sigmas = first_sigmas(problem, components, placed)
@@ -275,10 +278,24 @@ def estimate(
         is_settled = noise.is_settled and float(np.abs(change).max()) < settled
         if is_settled:
             break
+        if not is_solved_first:
+            if best is not None and noise.log_posterior < best[1].log_posterior - LESS_LIKELY:
+                state, noise, components, known = best
+                break
+            best = (found_at, noise, components, known)
+        if not is_solved_first and last is not None and float(change @ last) < 0.0:
+            sigmas = before * np.exp(change * _damping(change, last))
+        last = change
     solution = _solution(problem, state, components, noise, known)
     if solution is None:
         return None
     return replace(solution, is_settled=solution.is_settled and is_settled)
+
+
+def _damping(change: FloatArray, last: FloatArray) -> float:
+    """Part of a change that meets the middle of an oscillation with the last one (Aitken)."""
+    ratio = float(change @ last) / float(last @ last)
+    return 1.0 / (1.0 - ratio)
 
 
 def first_sigmas(
@@ -447,7 +464,7 @@ def estimate_robustly(problem: Problem, start: HandEyeState) -> HandEyeSolution 
         if float(np.abs(updated - weights).max()) < WEIGHTS_SETTLED:
             break
         weights = updated
-        solution = estimate(replace(problem, weights=weights), solution.state)
+        solution = estimate(replace(problem, weights=weights), start)
     else:
         return None if solution is None else replace(solution, is_settled=False)
     return solution

@@ -311,12 +311,13 @@ class NoiseEstimate:
     """Standard deviations (C,) of the causes of scatter, and covariance (C, C) of their logarithms.
 
     Given ones are included, with a covariance of zero. ``is_settled`` is False if the steps ran
-    out.
+    out; ``log_posterior`` is the highest, without constants.
     """
 
     sigmas: FloatArray
     log_covariance: FloatArray
     is_settled: bool = True
+    log_posterior: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -416,7 +417,7 @@ def estimate_noise(
         if is_settled:
             break
     log_covariance[np.ix_(free, free)] = np.linalg.inv(information)
-    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled)
+    return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled, value)
 
 
 def _score(

@@ -52,6 +52,7 @@ from armscan.calibration.sheets.solve import (
     SheetSolution,
     solve_sheets,
     stack_observations,
+    with_unseen_bow,
 )
 from armscan.calibration.sheets.stripes_on_board import MIN_POINTS, OUTLIER_SIGMA, BoardImage
 from armscan.calibration.sheets.voting import observe_boards
@@ -235,6 +236,11 @@ class _Case:
     cameras: HeadCameras
     options: SheetOptions
 
+    @property
+    def _errors(self) -> CommonErrors:
+        """Of boards that scatter as those of the worst sheet do."""
+        return self.errors.with_boards(max(model.board_factor for model in self.models))
+
     def solved(self) -> LaserFit | FitFailure | _Refused:
         """Solve all sheets together and put the result into words and numbers.
 
@@ -245,13 +251,17 @@ class _Case:
         solution = solve_sheets(
             used,
             [model.sheet for model in models],
-            self.errors.with_boards(max(model.board_factor for model in models)),
+            self._errors,
             [model.is_bowed for model in models],
             sigma_factor=np.array([model.sigma_factor for model in models])[used.sheet],
             are_cameras_held=True,
         )
         if isinstance(solution, FitFailure):
             return solution
+        may_bow = [self.options.is_bow_allowed] * len(models)
+        stated = with_unseen_bow(solution, used, self._errors, may_bow)
+        if isinstance(stated, FitFailure):
+            return stated
         noise = np.array([model.noise.factor for model in models])
         noise_px = used.sigma_px * noise[used.sheet]
         points = check_points(used, solution, noise_px, self.images, self.cameras)
@@ -259,7 +269,7 @@ class _Case:
         shapes = estimate_shapes_mm(used, solution, used.sigma_px * independent)
         sheets = []
         for k in range(len(models)):
-            fit = self._sheet_fit(k, used, solution, points[k], shapes[k])
+            fit = self._sheet_fit(k, used, (solution, stated.covariance), points[k], shapes[k])
             if isinstance(fit, FitFailure):
                 return _Refused(k, fit)
             sheets.append(fit)
@@ -269,16 +279,14 @@ class _Case:
         ]
         # From the order cameras, bow, sheets to that of a sensor: left camera, sheets, second one.
         n_camera = self.cameras.n_parameters
-        order = np.delete(
-            np.arange(len(solution.covariance)), slice(n_camera, self.errors.n_camera)
-        )
+        order = np.delete(np.arange(len(stated.covariance)), slice(n_camera, self.errors.n_camera))
         order = np.concatenate([order[:N_CAMERA], order[n_camera:], order[N_CAMERA:n_camera]])
         return LaserFit(
             sheets=tuple(sheets),
             images=self._image_evidence(solution),
             camera=self.cameras.left,
             second=self.cameras.second,
-            covariance=solution.covariance[np.ix_(order, order)],
+            covariance=stated.covariance[np.ix_(order, order)],
             diagnostics=SensorDiagnostics(
                 noise_factor=float((noise * scatter).max()),
                 correlation_points=max(model.noise.correlation_points for model in models),
@@ -320,17 +328,21 @@ class _Case:
         self,
         k: int,
         used: SheetObservations,
-        solution: SheetSolution,
+        solved: tuple[SheetSolution, FloatArray],
         points: SheetPointCheck,
         shape_mm: float,
     ) -> SheetFit | FitFailure:
+        """One sheet in words and numbers, of the joint fit and the covariance that is stated."""
+        solution, stated = solved
         name, model, sheet = self.assignment.names[k], self.models[k], solution.sheets[k]
         of_sheet = used.sheet == k
         observations = used.select(of_sheet)
         first = self.errors.n_camera + N_SHEET * k
-        covariance = solution.covariance[first : first + N_SHEET, first : first + N_SHEET]
+        own = slice(first, first + N_SHEET)
+        covariance = stated[own, own]
         geometry = sheet_geometry(sheet, observations, self.images)
-        tilt_variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
+        tilts = solution.covariance[own, own][:2, :2]
+        tilt_variance = max(float(np.linalg.eigvalsh(tilts)[-1]), 0.0)
         tilt_sigma_deg = float(np.degrees(np.sqrt(tilt_variance) / sheet.scale_mm))
         refused = refuse_underdetermined_tilt(name, geometry, tilt_sigma_deg)
         if refused is not None:

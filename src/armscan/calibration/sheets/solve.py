@@ -39,6 +39,13 @@ MIN_EIGENVALUE = 1e-13
 """Of the normal matrix scaled to a unit diagonal, whose rounding is about 1e-15."""
 N_SHEET = 8
 N_PLANE = 3
+LIKELY_BOW = 0.003
+"""What a sheet may bow by at the edge of its calibrated region, in parts of that region's half
+size: of a line lens that is 1 degree askew, three half sizes away."""
+BOW_SHARES = np.array([3.0, 2.0, 1.0 / 3.0, 1.0, 1.0]) / 3.0
+"""Likely size of the bow's terms (`BOW_TERMS`) over that of ``u**2``. Light spreads in straight
+rays: what bends along the depth is the bow along the stripe, carried by rays that lean, and spread,
+by a third, as from that source."""
 
 
 class SheetObservations(RowRecord):
@@ -314,6 +321,56 @@ def solve_sheets(
     )
 
 
+def with_unseen_bow(
+    solution: SheetSolution,
+    observations: SheetObservations,
+    errors: CommonErrors,
+    may_bow: Sequence[bool],
+) -> SheetSolution | FitFailure:
+    """The same sheets with the covariance of planes that may be bowed, less than the test sees.
+
+    A plane is kept as long as no test asks for more; that is no proof that the sheet is one. A true
+    bow b leaves it out, and turns the plane that is fitted by ``G b``: with the normal matrix N of
+    plane and bow ``G = N_pp^-1 N_pb``. The errors that are stated grow by ``T M T'``, where
+    ``T = (G, -1)`` and M is the mean square of b that the stripes leave likely: with a bow free
+    that is known to be 0 to `LIKELY_BOW`, and cameras free, that may look like one, its covariance
+    and the square of its mean. Where the stripes show that there is none, next to nothing is added.
+
+    Parameters
+    ----------
+    solution
+        Of cameras that are held; sheets that are bowed keep their freedom.
+    observations, errors
+        What it was solved with.
+    may_bow
+        For each sheet; False where it is known to be a plane.
+    """
+    active = solution.active | np.repeat(np.asarray(may_bow, dtype=np.bool_), N_SHEET)
+    unseen = (active & ~solution.active)[active]
+    if not unseen.any():
+        return solution
+    likely_mm = np.concatenate(
+        [
+            LIKELY_BOW * sheet.scale_mm * np.concatenate([np.ones(N_PLANE), BOW_SHARES])
+            for sheet in solution.sheets
+        ]
+    )
+    precision = np.where(unseen, likely_mm[active] ** -2.0, 0.0)
+    system = _linearised(observations, solution.sheets, errors, active)
+    held = system.solve(solution.weight, errors.n_camera, precision=precision)
+    free = system.solve(solution.weight, 0, precision=precision)
+    if held is None or free is None:
+        return _UNDETERMINED
+    of_bow = np.ix_(unseen, unseen)
+    moved = -held.covariance[:, unseen] @ np.linalg.inv(held.covariance[of_bow])
+    bow_mm = free.step[: len(unseen)][unseen]
+    likely = free.covariance[of_bow] + np.outer(bow_mm, bow_mm)
+    covariance = solution.covariance.copy()
+    places = errors.n_camera + np.flatnonzero(active)
+    covariance[np.ix_(places, places)] += moved @ likely @ moved.T
+    return replace(solution, covariance=covariance)
+
+
 _UNDETERMINED = FitFailure(
     "the stripes do not determine the light sheets: the fit leaves the plane through the points",
     "spread the boards over more depth, tilt them differently, and check their poses",
@@ -429,9 +486,17 @@ class StripeSystem:
         return result
 
     def solve(
-        self, weight: FloatArray, n_held: int, without_board: int = -1
+        self,
+        weight: FloatArray,
+        n_held: int,
+        without_board: int = -1,
+        *,
+        precision: FloatArray | None = None,
     ) -> NormalSolution | None:
         """Solve with weights (N,), the last ``n_held`` unknowns held and one board left out.
+
+        ``precision`` (n_sheet,) is that with which steps of the sheets' parameters are known to be
+        0 beforehand; none if None.
 
         None where the matrix is not positive definite to rounding, so that nothing of it means
         anything.
@@ -443,6 +508,8 @@ class StripeSystem:
         place = np.full(self.n_columns, -1)
         place[shared] = np.arange(len(shared))
         full = np.diag((np.arange(len(shared)) >= n_sheet).astype(np.float64))
+        if precision is not None:
+            full[np.arange(n_sheet), np.arange(n_sheet)] = precision
         cross, board = np.zeros((n_boards, len(shared), 6)), np.tile(np.eye(6), (n_boards, 1, 1))
         pull = np.zeros(self.n_columns)
         for stripe in self.stripes:

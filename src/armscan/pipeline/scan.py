@@ -25,7 +25,7 @@ from armscan.pipeline.measure import (
     nothing_measured,
     summarised,
 )
-from armscan.pipeline.progress import Progress, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.place import (
@@ -240,7 +240,7 @@ def measure_scan(
     hung = _hung(placed, wanted, poses)
     kept = {row: one for row, one in placed.items() if row not in hung}
     exposures = _exposures(source, scan, poses, kept, hung)
-    cloud, extra = _joined(kept, exposures, poses, transform, options)
+    cloud, extra = _joined(kept, exposures, poses, transform, options, progress=progress)
     images = tuple(one.labelled for one in kept.values())
     first_row = {row: instant.rows[0] for instant in wanted for row in instant.rows}
     doubt = doubt_scan(
@@ -377,6 +377,8 @@ def _joined(
     poses: ExposurePoses,
     transform: BaseTransform,
     options: ScanOptions,
+    *,
+    progress: Progress,
 ) -> tuple[PointCloud, tuple[str, ...]]:
     """All points in one cloud with normals towards the sensor, and what is weak about these."""
     if not placed:
@@ -395,17 +397,26 @@ def _joined(
         raise nothing_measured(images, is_by_thesis=options.measure.is_by_thesis)
     if not options.has_normals:
         return cloud, ()
-    return _with_normals(cloud, list(placed), poses, transform)
+    return _with_normals(cloud, list(placed), poses, transform, progress)
 
 
 def _with_normals(
-    cloud: PointCloud, rows: list[int], poses: ExposurePoses, transform: BaseTransform
+    cloud: PointCloud,
+    rows: list[int],
+    poses: ExposurePoses,
+    transform: BaseTransform,
+    progress: Progress,
 ) -> tuple[PointCloud, tuple[str, ...]]:
     """The cloud with normals towards the sensor of each exposure, and what is weak about these."""
     eye = transform.scanner.hand_eye.tool_from_sensor.translation_mm
     cameras = poses.rotations[rows] @ eye + poses.translations_mm[rows]
     radius_mm = choose_radius_mm(cloud.points_mm, cloud.exposure)
-    normals = estimate_normals(cloud.points_mm, cameras[cloud.exposure], radius_mm)
+    normals = estimate_normals(
+        cloud.points_mm,
+        cameras[cloud.exposure],
+        radius_mm,
+        told=lambda n_done: progress(ProgressEvent("normals", n_done, len(cloud))),
+    )
     share = float((~normals.any(axis=1)).mean())
     warnings: tuple[str, ...] = ()
     if share > MANY_WITHOUT_NORMAL:
@@ -487,7 +498,7 @@ def place_profiles(
             f"no point lies in the volume {volume}",
             remedy="give limits in mm in the arm's base frame, or none",
         )
-    merged, extra = _with_normals(merged, kept, found, transform)
+    merged, extra = _with_normals(merged, kept, found, transform, silent)
     return ScanReconstruction(
         cloud=replace(merged, forced=scanner.provenance.forced),
         images=(),

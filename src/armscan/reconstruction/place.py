@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -248,6 +248,8 @@ def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     return cloud.select(box.holds(cloud.points_mm))
 
 
+AT_ONCE = 20_000
+"""Points whose neighbourhoods are held at the same time: 2 KB each."""
 NEIGHBOURS = 32
 """Cells looked at around a point, at most: a full disc of four cells' radius holds 50."""
 SMALLEST_RADIUS_MM, LARGEST_RADIUS_MM = 2.0, 20.0
@@ -299,7 +301,11 @@ def choose_radius_mm(points_mm: FloatArray, exposure: IntArray) -> float:
 
 
 def estimate_normals(
-    points_mm: FloatArray, towards_mm: FloatArray, radius_mm: float = SMALLEST_RADIUS_MM
+    points_mm: FloatArray,
+    towards_mm: FloatArray,
+    radius_mm: float = SMALLEST_RADIUS_MM,
+    *,
+    told: Callable[[int], None] = lambda n_done: None,
 ) -> FloatArray:
     """Fit a tangent plane around every point.
 
@@ -314,6 +320,8 @@ def estimate_normals(
         (N, 3) where each point was seen from, in that frame: its normal points to that side.
     radius_mm
         Points within this distance make a point's tangent plane (see `choose_radius_mm`).
+    told
+        Called with the count of points done, now and then.
 
     Returns
     -------
@@ -330,14 +338,23 @@ def estimate_normals(
     towards = np.asarray(towards_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or towards.shape != points.shape:
         raise InputError(f"points of shape {points.shape} seen from places {towards.shape}")
+    normals = np.zeros_like(points)
     if len(points) == 0:
-        return np.zeros((0, 3))
+        return normals
     cells = _cell_means(points, _cell_keys(points, radius_mm / 4.0))
-    distance, neighbour = cKDTree(cells).query(points, k=NEIGHBOURS, distance_upper_bound=radius_mm)
-    is_near = np.isfinite(distance)
-    normals = _tangent_normals(points, cells[np.where(is_near, neighbour, 0)], is_near, radius_mm)
-    side = np.einsum("ni,ni->n", normals, towards - points)
-    return np.where(side[:, None] < 0.0, -normals, normals)
+    tree = cKDTree(cells)
+    for first in range(0, len(points), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        distance, neighbour = tree.query(
+            points[part], k=NEIGHBOURS, distance_upper_bound=radius_mm, workers=-1
+        )
+        is_near = np.isfinite(distance)
+        near = cells[np.where(is_near, neighbour, 0)]
+        found = _tangent_normals(points[part], near, is_near, radius_mm)
+        side = np.einsum("ni,ni->n", found, towards[part] - points[part])
+        normals[part] = np.where(side[:, None] < 0.0, -found, found)
+        told(min(first + AT_ONCE, len(points)))
+    return normals
 
 
 def _cell_keys(points: FloatArray, size_mm: float) -> IntArray:

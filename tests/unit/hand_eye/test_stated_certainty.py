@@ -229,6 +229,9 @@ def test_no_covariance_is_made_up() -> None:
     jacobian = placed.jacobian[:, problem.columns]
     with pytest.raises(EstimationError, match="not positive definite"):
         covariance_over_noise(placed.residual_mm, jacobian, components, known, noise)
+    untold = NoiseEstimate(sigmas, -np.eye(len(sigmas)))
+    with pytest.raises(EstimationError, match="do not tell how much each cause scatters"):
+        covariance_over_noise(placed.residual_mm, jacobian, components, -known * 1e-12, untold)
 
 
 def _crossed(count: int) -> tuple[list[PosedStripe], PlateReference]:

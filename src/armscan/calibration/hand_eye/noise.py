@@ -492,7 +492,13 @@ def covariance_over_noise(
     spread = estimate.log_covariance[np.ix_(free, free)]
     if len(free) == 0 or not spread.any():
         return SolutionCovariance(centre.covariance)
-    factor = np.sqrt(INFLATION) * np.linalg.cholesky(spread)
+    try:
+        factor = np.sqrt(INFLATION) * np.linalg.cholesky(0.5 * (spread + spread.T))
+    except LinAlgError:
+        raise EstimationError(
+            "the postures do not tell how much each cause scatters",
+            remedy="take more postures, or give the arm's scatter",
+        ) from None
     mode, parts, moved, weights = posterior.logs(estimate.sigmas), [], [], []
     for draw in _normal_draws(len(free)):
         logs = mode + factor @ draw

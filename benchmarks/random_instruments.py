@@ -199,6 +199,10 @@ def print_outcomes(found: dict[str, list[tuple[Row, Row]]], n_draws: int) -> Non
         over = np.array([o["over_bound"] for _, o in pairs if o["over_bound"]], dtype=float)
         bound = f"{np.nanmedian(over):.2f}" if np.isfinite(over).any() else "-"
         print(f"| {stage} | {len(pairs)} | {' | '.join(cells)} | {mean} | {right} | {bound} |")
+    few = [
+        o for pairs in found.values() for _, o in pairs if o["reason"].startswith("few postures")
+    ]
+    print(f"rightly refused for fewer postures than the software asks for: {len(few)}")
     total = sum(whole.values())
     for result in RESULTS[2:]:
         n = sum(any(o["result"] == result for o in row) for row in _by_draw(found))

@@ -100,8 +100,12 @@ def run_hand_eye(
     stage = "hand-eye on sphere" if on_sphere else "hand-eye on plate"
     if isinstance(found, FitFailure):
         least = LEAST_CROSSED if len(lights) > 1 and not on_sphere else LEAST_POSTURES
-        result = "rightly" if _may_be_refused(made, best, seen, least) else "wrongly"
-        return Outcome(stage, f"{result} refused", found.reason, seconds=seconds)
+        are_few = len({one.posture for one in seen}) < least
+        if _is_hopeless(made, best, seen):
+            return Outcome(stage, "rightly refused", found.reason, seconds=seconds)
+        result = "rightly refused" if are_few else "wrongly refused"
+        reason = f"few postures: {found.reason}" if are_few else found.reason
+        return Outcome(stage, result, reason, seconds=seconds)
     calibration = found.calibration
     covariance, follow = calibration.covariance, calibration.dhand_eye_dsensor
     if follow is not None:
@@ -138,9 +142,7 @@ def _calibrated(
     return calibrate_on_plate(stripes, plate, HandEyeOptions(), sensor_covariance=sensor.covariance)
 
 
-def _may_be_refused(
-    made: Instrument, best: FloatArray | None, seen: list[Seen], least: int
-) -> bool:
+def _is_hopeless(made: Instrument, best: FloatArray | None, seen: list[Seen]) -> bool:
     """Degenerate by construction, or beyond what the software says that it refuses."""
     if made.fault in DEGENERATE["handeye"] or best is None or not seen:
         return True
@@ -151,7 +153,6 @@ def _may_be_refused(
         sigma[3:].max() > HOPELESS_MM
         or sigma[:3].max() > HOPELESS_RAD
         or scatter > LARGEST_SCATTER_MM
-        or len({one.posture for one in seen}) < least
     )
 
 

@@ -382,7 +382,7 @@ def judge_sheets(
     names = [light_of(made, sheet, lines) for sheet in fit.sheets]
     bowed = [False] * len(made.lights)
     for sheet, name in zip(fit.sheets, names, strict=True):
-        bowed[name] = bool(sheet.covariance[3, 3] > 0.0)
+        bowed[name] = sheet.sheet.is_bowed
     whole = sheet_information(made, information, seen, lines, n_shared, is_bowed=bowed)
     size, kept = len(information), [k for k in range(len(made.lights)) if k in names]
     first = size + np.concatenate([[0], np.cumsum([8 if one else 3 for one in bowed])])
@@ -395,7 +395,8 @@ def judge_sheets(
     groups: dict[str, float] = {}
     for sheet, k in zip(fit.sheets, names, strict=True):
         points = points_of_light(made, lines, k)
-        n = 8 if bowed[k] else 3
+        # A plane that was kept states what it may be bowed by; the bound is that of a plane.
+        n, width = 8 if sheet.covariance[3, 3] > 0.0 else 3, 8 if bowed[k] else 3
         error, rest = sheet_error(sheet, points, n)
         one = judged(
             "sheet", error, sheet.covariance[:n, :n], {"plane": (0, 1, 2), "bow": (3, 4, 5, 6, 7)}
@@ -407,8 +408,8 @@ def judge_sheets(
         is_plane = not (light.cone or light.skew or sheet.sheet.is_bowed)
         # A true plane, kept as one, has no error in what a bow might be.
         squares, freedom = squares + one.chi2, freedom + (3 if is_plane else n)
-        own = best[at[k] : at[k] + n, at[k] : at[k] + n]
-        terms = light_terms(made, made.lights[k], points, n)
+        own = best[at[k] : at[k] + width, at[k] : at[k] + width]
+        terms = light_terms(made, made.lights[k], points, width)
         _, _, by = sheet.sheet.height_with_jacobian(points)
         stated = np.einsum("ni,ij,nj->n", by[:, :n], sheet.covariance[:n, :n], by[:, :n]).mean()
         ratios.append(np.sqrt(stated / np.einsum("ni,ij,nj->n", terms, own, terms).mean()))

@@ -40,7 +40,7 @@ BEND_PER_MM = 0.06
 SLOPE = 1.0
 """Standard deviation, before anything is known, of a surface's slope towards the camera."""
 EDGE_ON = 0.05
-"""Least cosine between a surface and the direction of view."""
+"""Least cosine between a surface's normal and the camera's axis."""
 SHARP_MM = 0.3
 """Vaguer predictions err by the same all along a segment; the change is steep (fourth power)."""
 STUDENT = 3.0

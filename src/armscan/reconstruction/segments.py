@@ -17,7 +17,7 @@ KINK_POINTS = 8
 """Points on either side from which direction and place at a kink are extrapolated."""
 KINK_RAD = np.radians(20.0)
 JUMP_PX, JUMP_SIGMAS = 0.6, 4.0
-"""A step of the line, and one over the points' noise, below which it is none."""
+"""A line steps where it is off by more than both, the second in sigmas of its points."""
 PIECE_PX, SAMPLE_PX = 24.0, 8.0
 """Lengths of pieces that are judged by themselves, and between samples on them."""
 

@@ -341,14 +341,13 @@ class _Case:
         own = slice(first, first + N_SHEET)
         covariance = stated[own, own]
         geometry = sheet_geometry(sheet, observations, self.images)
-        tilts = solution.covariance[own, own][:2, :2]
-        tilt_variance = max(float(np.linalg.eigvalsh(tilts)[-1]), 0.0)
-        tilt_sigma_deg = float(np.degrees(np.sqrt(tilt_variance) / sheet.scale_mm))
-        refused = refuse_underdetermined_tilt(name, geometry, tilt_sigma_deg)
+        # What the boards' places leave open; a bow that may be unseen is not mended by more depth.
+        fitted_deg = _tilt_sigma_deg(solution.covariance[own, own], sheet.scale_mm)
+        refused = refuse_underdetermined_tilt(name, geometry, fitted_deg)
         if refused is not None:
             return refused
         common = self._common_plane(k)
-        warnings = geometry_warnings(geometry, common, tilt_sigma_deg)
+        warnings = geometry_warnings(geometry, common, fitted_deg)
         if model.plane_test.p_value < LACK_OF_FIT_P:
             outlier = find_outlier_view(observations, sheet, self.errors)
             if outlier is not None:
@@ -380,7 +379,7 @@ class _Case:
                 board_angle_deg=geometry.board_angle_deg,
             ),
             covariance=covariance,
-            tilt_sigma_deg=tilt_sigma_deg,
+            tilt_sigma_deg=_tilt_sigma_deg(covariance, sheet.scale_mm),
             offset_sigma_mm=float(np.sqrt(covariance[2, 2])),
             comparisons=compare_planes(sheet, observations, self.images, self.cameras),
             points=points,
@@ -434,3 +433,9 @@ class _Case:
                 )
             )
         return tuple(evidence)
+
+
+def _tilt_sigma_deg(covariance: FloatArray, scale_mm: float) -> float:
+    """Largest standard deviation of a direction, of a sheet's covariance (8, 8)."""
+    variance = max(float(np.linalg.eigvalsh(covariance[:2, :2])[-1]), 0.0)
+    return float(np.degrees(np.sqrt(variance) / scale_mm))

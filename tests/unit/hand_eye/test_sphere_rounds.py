@@ -97,8 +97,8 @@ def test_a_round_that_is_less_likely_is_taken_back(
 ) -> None:
     """Else the rounds end e^15 less likely and about twice as far off; the doubt stays.
 
-    Likelier is not always nearer: of the draws that are taken back about as many would have come
-    nearer. These two are clear cases.
+    Likelier is not always nearer: of 46 draws that are taken back (seeds 200 to 353) 18 lie nearer
+    for it, 28 further off. These two are clear cases of what it is for.
     """
     problem = drawn(seed, (0.3, 12.0))
     kept = solved(problem)

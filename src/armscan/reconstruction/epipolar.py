@@ -497,7 +497,9 @@ def _moments(n: int) -> FloatArray:
     """(3, n), or fewer rows of few samples: what takes (n,) to their mean, slope and bend."""
     place = np.linspace(-1.0, 1.0, n)
     shape = np.stack([np.ones(n), place, place**2], axis=1)[:, : min(n, 3)]
-    return np.asarray(np.linalg.pinv(shape))
+    moments = np.asarray(np.linalg.pinv(shape))
+    moments.setflags(write=False)
+    return moments
 
 
 def _mean_offset(

@@ -22,7 +22,6 @@ from armscan.calibration.hand_eye.checks import (
     influence_warnings,
     likeliest_start,
     point_warnings,
-    refuse_few_facts,
     refuse_few_postures,
     refuse_underdetermined,
     scatter_warnings,
@@ -138,10 +137,11 @@ def calibrate_on_plate(
         condense_plate(stripes, kept, options.per_stripe or surface.per_stripe),
         sensor_covariance=sensor_covariance,
     )
-    few = refuse_few_postures(len(observations.used_postures))
+    problem = Problem(observations, surface, options)
+    few = refuse_few_postures(problem, VARY_POSTURES)
     if few is not None:
         return few
-    problem, start = Problem(observations, surface, options), find_start(observations, surface)
+    start = find_start(observations, surface)
     cause = common_to_postures(observations, surface.plane)
     refusal = _refuse_start(problem, surface, start, cause)
     if refusal is not None:
@@ -166,7 +166,7 @@ def _refuse_start(
     refusal = refuse_underdetermined(conditioning, cause, VARY_POSTURES)
     if refusal is None and not start.typical_mm <= problem.options.max_rms_mm:
         return explain_misfit(problem, plate, start)
-    return refuse_few_facts(problem, VARY_POSTURES) if refusal is None else refusal
+    return refusal
 
 
 def _fit_on_plate(
@@ -279,6 +279,9 @@ def calibrate_on_sphere(
         return refused
     thinned = tuple(section.thinned(START_POINTS) for section in sections)
     few = Problem(condense_sphere(thinned, START_PIECES), surface, options)
+    refused = refuse_few_postures(few, TURN_THE_TOOL)
+    if refused is not None:
+        return refused
     starts = _search(few, thinned)
     if isinstance(starts, FitFailure):
         return starts
@@ -297,15 +300,16 @@ def calibrate_on_sphere(
 def _refuse_sections(
     sections: Sequence[CircleSection], left_out: Sequence[str], diameter_mm: float
 ) -> FitFailure | None:
-    """Refuse where most stripes do not show the sphere, and too few postures."""
-    if len(left_out) > len(sections):
-        return FitFailure(
-            f"{len(left_out)} stripes show no section of a sphere of {diameter_mm:g} mm diameter, "
-            f"{len(sections)} do: {'; '.join(left_out[:NAMED_STRIPES])}",
-            "check the sphere's diameter, and that the stripes lie on the sphere",
-        )
-    few = refuse_few_postures(len({section.stripe.posture for section in sections}))
-    return None if few is None else FitFailure(few.reason, TURN_THE_TOOL)
+    """Refuse where most stripes do not show the sphere."""
+    if not sections and not left_out:
+        return FitFailure("no exposure has a stripe on the sphere", TURN_THE_TOOL)
+    if len(left_out) <= len(sections):
+        return None
+    return FitFailure(
+        f"{len(left_out)} stripes show no section of a sphere of {diameter_mm:g} mm diameter, "
+        f"{len(sections)} do: {'; '.join(left_out[:NAMED_STRIPES])}",
+        "check the sphere's diameter, and that the stripes lie on the sphere",
+    )
 
 
 def _search(
@@ -329,8 +333,6 @@ def _search(
     refused = _refuse_far(few, kept[0])
     if refused is None:
         refused = _refuse_open(conditioning_at(few, kept[0]), 2.0 * radius_mm)
-    if refused is None:
-        refused = refuse_few_facts(few, TURN_THE_TOOL)
     return tuple(kept) if refused is None else refused
 
 

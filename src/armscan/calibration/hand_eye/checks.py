@@ -51,11 +51,11 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.shapes import Plane
 
 MAX_CONDITION = 100.0
-GOOD_POSTURES, LEAST_POSTURES = 6, 3
+GOOD_POSTURES = 6
 LEAST_FREEDOM, LEAST_TO_ESTIMATE = 2, 4
-"""Facts of the postures beyond the unknowns: for a solution at all, and for the arm's scatter."""
-FACTS_ON_SPHERE = 3
-"""Of a section circle: its centre."""
+"""Numbers beyond the unknowns: for telling hand-eyes apart, and for the arm's scatter, too."""
+TOLD_BY_STRIPE, TOLD_BY_AREA, TOLD_BY_SECTION = 2, 3, 3
+"""Numbers of a posture: shift and slope; shift and two slopes; the centre of a section circle."""
 AS_AREA = 0.2
 """Second extent over the first from which stripes of a posture show two slopes of the plate."""
 LIKELIER = 6.0
@@ -100,18 +100,6 @@ NO_SOLUTION = FitFailure(
 )
 
 
-def refuse_few_postures(n_postures: int) -> FitFailure | None:
-    """Refuse fewer postures than any solution needs."""
-    if n_postures >= LEAST_POSTURES:
-        return None
-    return FitFailure(
-        f"{n_postures} postures with a usable stripe; {LEAST_POSTURES} are the least for any "
-        f"solution, {GOOD_POSTURES} for a checked one",
-        "scan from 12 postures: tilts of 30 to 45 degrees in two or more directions, stand-off "
-        "varied by 15 %",
-    )
-
-
 def refuse_underdetermined(
     conditioning: Conditioning, cause: str, remedy: str
 ) -> FitFailure | None:
@@ -125,42 +113,66 @@ def refuse_underdetermined(
     )
 
 
-def refuse_few_facts(problem: Problem, remedy: str) -> FitFailure | None:
-    """Refuse postures whose disagreement does not show how much the arm scatters.
+def refuse_few_postures(problem: Problem, remedy: str) -> FitFailure | None:
+    """Refuse postures that do not tell hand-eyes apart, or not how much the arm scatters.
 
     A stripe tells a shift and a slope of its posture's pose, stripes over an area a shift and two
-    slopes, a section of a sphere three shifts. As many facts as unknowns are met exactly by several
-    hand-eyes, right and wrong. Two more than unknowns tell these apart, but no scatter.
+    slopes, a section of a sphere three shifts. As many numbers as unknowns are met exactly by
+    several hand-eyes, right and wrong. Two more than unknowns tell these apart, but no scatter:
+    four more are needed, unless it is given (``arm_position_mm``; the other scatters do not count).
     """
-    facts = _facts_of_postures(problem)
-    n_unknown = len(problem.columns)
+    told = _told_by_postures(problem)
+    n_told, n_unknown = sum(told), len(problem.columns)
+    n_if_given, n_needed = n_unknown + LEAST_FREEDOM, n_unknown + LEAST_TO_ESTIMATE
     is_given = problem.options.arm_position_mm is not None
-    freedom = sum(facts) - n_unknown
-    missing = (LEAST_FREEDOM if is_given else LEAST_TO_ESTIMATE) - freedom
-    if missing <= 0:
+    if n_told >= (n_if_given if is_given else n_needed):
         return None
-    least = len(facts) + -(-missing // min(facts))
-    is_enough_if_given = not is_given and freedom >= LEAST_FREEDOM
+    each = min(told, default=TOLD_BY_STRIPE)
+    least, least_if_given = (
+        len(told) + -(-max(n - n_told, 0) // each) for n in (n_needed, n_if_given)
+    )
+    why, count = f"need {n_needed}, to fit one hand-eye only and show the arm's scatter", least
+    if is_given:
+        why, count = f"need {n_if_given}, to fit one hand-eye only", least_if_given
+    also = ""
+    if not is_given and least_if_given < least:
+        also = f" ({least_if_given} if the arm's scatter is given, --arm-position-mm)"
     return FitFailure(
-        f"{len(facts)} postures of stripes like these tell {sum(facts)} facts for {n_unknown} "
-        "unknowns: they do not show how much the arm scatters, and so not how far the hand-eye may "
-        "be off",
-        f"scan from {least} postures at least, better 12"
-        + (", or give the arm's scatter (--arm-position-mm)" if is_enough_if_given else "")
-        + f"; {remedy}",
+        f"{len(told)} posture{'s are' if len(told) != 1 else ' is'} too few: "
+        f"{_told_in_words(problem, each)}, {n_told} in all; {_unknowns_in_words(problem)} {why}",
+        f"scan from {count} postures at least{also}, better 12; {remedy}",
     )
 
 
-def _facts_of_postures(problem: Problem) -> list[int]:
+def _told_in_words(problem: Problem, each: int) -> str:
+    if not isinstance(problem.surface, PlateSurface):
+        return "a section of the sphere tells three numbers of a posture, where its centre lies"
+    if each == TOLD_BY_AREA:
+        return "crossed stripes tell three numbers of a posture, the plate's distance and two tilts"
+    return "one stripe tells two numbers of a posture, the plate's distance and one tilt"
+
+
+def _unknowns_in_words(problem: Problem) -> str:
+    n_all, has_scale = len(problem.columns), problem.options.solve_scale
+    n_other = n_all - N_HAND_EYE - has_scale
+    surface = "plate" if isinstance(problem.surface, PlateSurface) else "sphere"
+    words = [f"{N_HAND_EYE} of the hand-eye"]
+    words += [f"{n_other} of the {surface}"] * (n_other > 0) + ["the scale"] * has_scale
+    return f"{n_all} unknowns ({', '.join(words)})" if len(words) > 1 else f"{n_all} unknowns"
+
+
+def _told_by_postures(problem: Problem) -> list[int]:
+    """How many numbers each posture tells of its pose."""
     observations = problem.observations
     if not isinstance(problem.surface, PlateSurface):
-        return [FACTS_ON_SPHERE] * len(observations.used_postures)
-    facts = []
+        return [TOLD_BY_SECTION] * len(observations.used_postures)
+    told = []
     for posture in observations.used_postures:
         points = observations.points_mm[observations.of_points(observations.posture) == posture]
         extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        facts.append(3 if extent[1] > AS_AREA * extent[0] else 2)
-    return facts
+        is_area = extent[1] > AS_AREA * extent[0]
+        told.append(TOLD_BY_AREA if is_area else TOLD_BY_STRIPE)
+    return told
 
 
 def conditioning_warnings(

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rounds of scatter and solution on a sphere: swings settle, rounds that run away are taken back.
+
+A sphere of 50 mm seen from few postures with a sensor that is known to some tenths of a millimetre
+to millimetres only: its error explains what moves all points off the sphere. Of 350 drawn so, the
+ones here swing or run away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.calibration.hand_eye import estimate as estimate_module
+from armscan.calibration.hand_eye.estimate import HandEyeSolution, Problem, estimate
+from armscan.calibration.hand_eye.observations import (
+    HandEyeOptions,
+    condense_sphere,
+    find_sections,
+)
+from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface, hand_eye_difference
+from armscan.geometry.arrays import FloatArray
+from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
+
+SENSOR = np.array([0.3, 0.3, 0.3, 5e-3, 5e-3])
+RADIUS_MM = 0.5 * DIAMETER_MM
+
+
+def by_sensor(points_mm: FloatArray) -> FloatArray:
+    """(N, 3, 5) what a sensor's shift, scale and skew do to its points."""
+    from_middle = points_mm - [0.0, 0.0, 140.0]
+    skew = from_middle[:, [2, 1, 1]] * [1.0, 0.0, 0.0]
+    shifts = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
+    return np.concatenate([shifts, from_middle[:, :, None], skew[:, :, None]], axis=2)
+
+
+def drawn(seed: int, weakest: tuple[float, float]) -> Problem:
+    """Arm, postures and sensor of a seed; the sensor known to a multiple of `SENSOR`."""
+    rng = np.random.default_rng([9, seed])
+    n = int(rng.integers(5, 9))
+    arm_mm = float(np.exp(rng.uniform(np.log(0.005), np.log(0.2))))
+    turned = rng.uniform(0.15, 0.6)
+    lever_mm = float(rng.uniform(30.0, 300.0))
+    rig = SphereRig(arm_mm, point_noise_mm=0.005, n_points=60, lever_mm=lever_mm)
+    poses = [
+        rig.base_from_tool(
+            rng.uniform(-turned, turned, 3),
+            float(rng.uniform(3.0, 16.0)) * float(rng.choice([-1, 1])),
+            float(rng.uniform(-8.0, 8.0)),
+            float(rng.uniform(-14.0, 14.0)),
+        )
+        for _ in range(n)
+    ]
+    sigma = SENSOR * float(np.exp(rng.uniform(*np.log(weakest))))
+    wrong = sigma * rng.normal(size=5)
+    stripes = [
+        replace(
+            stripe,
+            points_mm=stripe.points_mm + by_sensor(stripe.points_mm) @ wrong,
+            dpoint_dsensor=by_sensor(stripe.points_mm),
+        )
+        for stripe in rig.stripes(poses, rng)
+    ]
+    nodes = condense_sphere(find_sections(stripes, RADIUS_MM)[0], 10)
+    nodes = replace(nodes, sensor_covariance=np.diag(sigma**2))
+    return Problem(nodes, SphereSurface(RADIUS_MM), HandEyeOptions())
+
+
+def solved(problem: Problem) -> HandEyeSolution:
+    found = estimate(problem, HandEyeState(HAND_EYE, np.array([*CENTRE_MM, RADIUS_MM])))
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("seed", [64, 76, 98, 104])
+def test_scatter_and_solution_that_swing_settle_in_the_middle(seed: int) -> None:
+    """They swung by more than 2 % of a scatter after twelve rounds.
+
+    Settled is said of the scatter: a dozen rounds from there move the hand-eye by 0.2 of its sigmas
+    and less, but by 0.5 with seed 104.
+    """
+    problem = drawn(seed, (0.03, 3.0))
+    first = solved(problem)
+    assert first.is_settled
+    again = estimate(problem, first.state, first.noise.sigmas)
+    assert again is not None
+    moved = hand_eye_difference(again.state.tool_from_sensor, first.state.tool_from_sensor)
+    sigma = np.sqrt(np.diag(first.linear.covariance)[:6])
+    assert np.abs(moved / sigma).max() < 0.6
+
+
+@pytest.mark.parametrize("seed", [235, 348])
+def test_a_round_that_is_less_likely_is_taken_back(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the rounds end e^15 less likely and about twice as far off; the doubt stays.
+
+    Likelier is not always nearer: of 46 draws that are taken back (seeds 200 to 353) 18 lie nearer
+    for it, 28 further off. These two are clear cases of what it is for.
+    """
+    problem = drawn(seed, (0.3, 12.0))
+    kept = solved(problem)
+    assert not kept.is_settled
+    monkeypatch.setattr(estimate_module, "LESS_LIKELY", np.inf)
+    led_away = solved(problem)
+    assert led_away.noise.log_posterior < kept.noise.log_posterior - 10.0
+    off, further_off = (
+        np.linalg.norm(hand_eye_difference(one.state.tool_from_sensor, HAND_EYE)[3:])
+        for one in (kept, led_away)
+    )
+    assert off < 0.7 * further_off

@@ -47,8 +47,8 @@ def test_scores_are_those_of_solving_without_each_segment() -> None:
         np.arange(len(rows)), np.arange(len(rows))
     ]
     most = np.array([1, 2])
-    kept = crossings.is_found & ((segment > 1) | (counts <= most[np.minimum(segment, 1)]))
-    kept = np.flatnonzero(kept)
+    is_kept = crossings.is_found & ((segment > 1) | (counts <= most[np.minimum(segment, 1)]))
+    kept = np.flatnonzero(is_kept)
     projected, crossings, segment = projected.select(kept), crossings.select(kept), segment[kept]
     off = segment == 3
     crossings = replace(crossings, residual_px=crossings.residual_px + SHIFTED_PX * off)

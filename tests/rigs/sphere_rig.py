@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -111,3 +111,23 @@ def shifted_poses(rig: SphereRig) -> list[Pose[Base, Tool]]:
     poses.append(Pose(first.rotation, first.translation_mm - first.rotation @ away))
     turns = ([0.6, 0, 0], [0, 0.5, 0], [0, 0, 0.7], [-0.4, 0.3, 0], [0.1, -0.5, 0.4])
     return poses + [rig.base_from_tool(np.array(turn), 8.0, 2.0) for turn in turns]
+
+
+def _by_sensor(points_mm: FloatArray) -> FloatArray:
+    """(N, 3, 5) what a sensor's shift, scale and skew do to its points."""
+    from_middle = points_mm - [0.0, 0.0, 140.0]
+    skew = from_middle[:, [2, 1, 1]] * [1.0, 0.0, 0.0]
+    shifts = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
+    return np.concatenate([shifts, from_middle[:, :, None], skew[:, :, None]], axis=2)
+
+
+def with_wrong_sensor(stripes: list[PosedStripe], wrong: FloatArray) -> list[PosedStripe]:
+    """Stripes of a sensor that errs by (5,) shift, scale and skew, alike in all postures."""
+    return [
+        replace(
+            stripe,
+            points_mm=stripe.points_mm + _by_sensor(stripe.points_mm) @ wrong,
+            dpoint_dsensor=_by_sensor(stripe.points_mm),
+        )
+        for stripe in stripes
+    ]

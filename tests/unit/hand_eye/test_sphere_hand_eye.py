@@ -23,6 +23,7 @@ from rigs.sphere_rig import (
     SHEET_NORMAL,
     SphereRig,
     turned_poses,
+    with_wrong_sensor,
 )
 
 SEED = 5
@@ -120,14 +121,6 @@ def test_errors_scatter_as_predicted() -> None:
     assert np.mean(arms) == pytest.approx(POSE_NOISE_MM, rel=4.0 * 0.14 / np.sqrt(n_runs))
 
 
-def by_sensor(points_mm: FloatArray) -> FloatArray:
-    """(N, 3, 5) what a sensor's shift, scale and skew do to its points."""
-    from_middle = points_mm - [0.0, 0.0, 140.0]
-    skew = from_middle[:, [2, 1, 1]] * [1.0, 0.0, 0.0]
-    shifts = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
-    return np.concatenate([shifts, from_middle[:, :, None], skew[:, :, None]], axis=2)
-
-
 def test_the_sensors_error_counts_once() -> None:
     """Common to all postures, it is told by the coupling alone: the arm's scatter stays its own.
 
@@ -143,14 +136,7 @@ def test_the_sensors_error_counts_once() -> None:
     squares, arms, means = [], [], []
     for _ in range(n_runs):
         wrong = sigma * generator.normal(size=5)
-        stripes = [
-            replace(
-                stripe,
-                points_mm=stripe.points_mm + by_sensor(stripe.points_mm) @ wrong,
-                dpoint_dsensor=by_sensor(stripe.points_mm),
-            )
-            for stripe in rig.stripes(poses, generator)
-        ]
+        stripes = with_wrong_sensor(rig.stripes(poses, generator), wrong)
         fit = solved(calibrate_on_sphere(stripes, DIAMETER_MM, QUICK, sensor_covariance=known))
         coupling = fit.calibration.dhand_eye_dsensor
         assert coupling is not None

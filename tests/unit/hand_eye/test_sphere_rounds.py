@@ -21,19 +21,10 @@ from armscan.calibration.hand_eye.observations import (
     find_sections,
 )
 from armscan.calibration.hand_eye.surface import HandEyeState, SphereSurface, hand_eye_difference
-from armscan.geometry.arrays import FloatArray
-from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig
+from rigs.sphere_rig import CENTRE_MM, DIAMETER_MM, HAND_EYE, SphereRig, with_wrong_sensor
 
 SENSOR = np.array([0.3, 0.3, 0.3, 5e-3, 5e-3])
 RADIUS_MM = 0.5 * DIAMETER_MM
-
-
-def by_sensor(points_mm: FloatArray) -> FloatArray:
-    """(N, 3, 5) what a sensor's shift, scale and skew do to its points."""
-    from_middle = points_mm - [0.0, 0.0, 140.0]
-    skew = from_middle[:, [2, 1, 1]] * [1.0, 0.0, 0.0]
-    shifts = np.broadcast_to(np.eye(3), (len(points_mm), 3, 3))
-    return np.concatenate([shifts, from_middle[:, :, None], skew[:, :, None]], axis=2)
 
 
 def drawn(seed: int, weakest: tuple[float, float]) -> Problem:
@@ -55,14 +46,7 @@ def drawn(seed: int, weakest: tuple[float, float]) -> Problem:
     ]
     sigma = SENSOR * float(np.exp(rng.uniform(*np.log(weakest))))
     wrong = sigma * rng.normal(size=5)
-    stripes = [
-        replace(
-            stripe,
-            points_mm=stripe.points_mm + by_sensor(stripe.points_mm) @ wrong,
-            dpoint_dsensor=by_sensor(stripe.points_mm),
-        )
-        for stripe in rig.stripes(poses, rng)
-    ]
+    stripes = with_wrong_sensor(rig.stripes(poses, rng), wrong)
     nodes = condense_sphere(find_sections(stripes, RADIUS_MM)[0], 10)
     nodes = replace(nodes, sensor_covariance=np.diag(sigma**2))
     return Problem(nodes, SphereSurface(RADIUS_MM), HandEyeOptions())

@@ -24,7 +24,12 @@ from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile,
 TOOL_FROM_SENSOR: Pose[Tool, Sensor] = Pose.from_vectors([0.4, -0.9, -1.9], [41.4, 21.5, 112.3])
 BASE_FROM_TOOL: Pose[Base, Tool] = Pose.from_vectors([1.1, 0.3, -0.6], [420.0, -310.0, 250.0])
 ARM_NOISE = ArmNoise(
-    position_mm=0.006, rotation_rad=2e-5, exposure_position_mm=0.004, exposure_rotation_rad=1e-5
+    position_mm=0.006,
+    rotation_rad=2e-5,
+    exposure_position_mm=0.004,
+    exposure_rotation_rad=1e-5,
+    tool_rotation_rad=1.5e-5,
+    exposure_tool_rotation_rad=1e-5,
 )
 HAND_EYE_SIGMA = np.array([3e-4, 1.5e-4, 2.5e-4, 0.015, 0.024, 0.02])
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.004, 0.003, 0.004, 0.002, 0.002])

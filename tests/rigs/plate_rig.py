@@ -2,7 +2,8 @@
 """Stripes on an uneven plate as a head on a noisy arm would measure them, without any image.
 
 The places of the postures, the plate's surface and the errors are drawn here, by other means than
-the calibration's: the surface is a sum of waves, pose errors turn the head about its scan point.
+the calibration's: the surface is a sum of waves, pose errors turn the arm about a point of Tool that
+the rig is told.
 """
 
 from __future__ import annotations
@@ -26,6 +27,8 @@ SHEET = np.array([-0.0042275, 0.73558, -0.67742, 91.78])
 """The thesis's light sheet (5.1.2)."""
 PLATE_NORMAL = np.array([0.1, -0.2, 0.97]) / np.linalg.norm([0.1, -0.2, 0.97])
 PLATE_CENTRE = np.array([420.0, 130.0, 60.0])
+SCAN_POINT_MM = np.array([0.0, 0.0, 140.0])
+"""In Sensor."""
 STRIPE_MM = 33.0
 PLATE_HALF_MM = 130.0
 MEAN_PEAK_TO_VALLEY = 5.0
@@ -112,7 +115,8 @@ class PlateRig:
     """Everything about one simulated calibration but its random errors.
 
     ``bow_mm`` bends every stripe alike; ``form_mm`` is the rise of the sheet's own surface at the
-    edge of its working range.
+    edge of its working range. Pose errors shift ``turns_about_mm``, a point of Tool, and turn the
+    arm about it.
     """
 
     postures: Postures
@@ -123,6 +127,7 @@ class PlateRig:
     form_mm: float = 0.0
     sheet_turn_rad: float = 0.0
     tool_from_sensor: Pose[Tool, Sensor] = TOOL_FROM_SENSOR
+    turns_about_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def plate_axes(self) -> FloatArray:
@@ -225,14 +230,13 @@ class PlateRig:
         return stripes, plate
 
     def reported_pose(self, k: int, error: FloatArray) -> Pose[Base, Tool]:
-        """Pose of the arm with an error (6,): turn about the scan point (rad), shift (mm)."""
-        rotation, origin = self.sensor_pose(k)
-        scan_point = origin + rotation @ np.array([0.0, 0.0, 140.0])
+        """Pose of the arm with an error (6,): turn about `turns_about_mm` (rad), shift (mm)."""
+        base_from_sensor: Pose[Base, Sensor] = Pose(*self.sensor_pose(k))
+        true = base_from_sensor @ self.tool_from_sensor.inverse()
+        centre = true.apply(self.turns_about_mm)
         turn = Rotation.from_rotvec(error[:3]).as_matrix()
-        turned = turn @ rotation
-        moved = turn @ (origin - scan_point) + scan_point + error[3:]
-        base_from_sensor: Pose[Base, Sensor] = Pose(turned, moved)
-        return base_from_sensor @ self.tool_from_sensor.inverse()
+        moved = turn @ (true.translation_mm - centre) + centre + error[3:]
+        return Pose(turn @ true.rotation, moved)
 
     def probe(self, rng: np.random.Generator, surface: Surface) -> PlateReference:
         """The plate as 64 touches all over it show it."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -32,6 +32,8 @@ class SphereRig:
     normals: tuple[FloatArray, ...] = (SHEET_NORMAL,)
     hand_eye: Pose[Tool, Sensor] = HAND_EYE
     lever_mm: float = LEVER_MM
+    turns_about_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
+    """Point of Tool that a pose's error shifts, and about which it turns."""
 
     def base_from_tool(
         self, turn: FloatArray, height_mm: float, along_mm: float, depth_mm: float = 0.0
@@ -76,11 +78,11 @@ class SphereRig:
         )
 
     def _reported(self, pose: Pose[Base, Tool], generator: np.random.Generator) -> Pose[Base, Tool]:
-        """The pose with an error at the scan point, and of the orientation about it."""
+        """The pose with an error at `turns_about_mm`, and of the orientation about it."""
         sigma = self.pose_noise_mm
         turn = rotation_from_vector(generator.normal(0.0, sigma / self.lever_mm, 3))
-        scan = (pose @ self.hand_eye).matrix[:3] @ [*SCAN_POINT_MM, 1.0]
-        moved = turn @ (pose.translation_mm - scan) + scan + generator.normal(0.0, sigma, 3)
+        centre = pose.apply(self.turns_about_mm)
+        moved = turn @ (pose.translation_mm - centre) + centre + generator.normal(0.0, sigma, 3)
         return Pose(turn @ pose.rotation, moved)
 
 

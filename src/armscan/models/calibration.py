@@ -379,20 +379,38 @@ HandEyeMethod = Literal["plate", "sphere"]
 class ArmNoise:
     """How much the arm's reported pose scatters, one standard deviation an axis.
 
+    Independent parts: a shift, a turn about the scan point (the middle of the sensor's working
+    range) and a turn about the origin of Tool. A point p from the scan point and q from the origin
+    of Tool scatters by ``position_mm^2 I + rotation_rad^2 [p]x [p]x' + tool_rotation_rad^2 [q]x
+    [q]x'``.
+
     Parameters
     ----------
     position_mm
-        Of the scan point (the middle of the sensor's working range), common to a posture.
+        Of the shift, common to a posture.
     rotation_rad
-        Of the orientation, common to a posture.
+        Of the turn about the scan point, common to a posture.
     exposure_position_mm, exposure_rotation_rad
         The part that is new in every exposure.
+    tool_rotation_rad, exposure_tool_rotation_rad
+        Of the turn about the origin of Tool; 0 in documents that were written without it.
     """
 
     position_mm: float
     rotation_rad: float
     exposure_position_mm: float = 0.0
     exposure_rotation_rad: float = 0.0
+    tool_rotation_rad: float = 0.0
+    exposure_tool_rotation_rad: float = 0.0
+
+    @property
+    def variances(self) -> tuple[float, float, float]:
+        """Of the shift (mm^2), the turns about scan point and Tool (rad^2), in one exposure."""
+        return (
+            self.position_mm**2 + self.exposure_position_mm**2,
+            self.rotation_rad**2 + self.exposure_rotation_rad**2,
+            self.tool_rotation_rad**2 + self.exposure_tool_rotation_rad**2,
+        )
 
 
 @dataclass(frozen=True, slots=True)

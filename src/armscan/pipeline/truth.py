@@ -5,7 +5,6 @@ distances from a surface.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -525,9 +524,15 @@ def distance_by_plate(plate: PlateReference, points_mm: FloatArray) -> FloatArra
 
 
 def distance_by_arm(
-    cloud: PointCloud, rows: IntArray, directions: FloatArray, noise: ArmNoise
+    cloud: PointCloud,
+    rows: IntArray,
+    directions: FloatArray,
+    tools_mm: FloatArray,
+    noise: ArmNoise,
 ) -> FloatArray:
-    """(N, 6 B) derivative of distances by shifts and turns of the arm, one sigma each.
+    """(N, 9 B) derivative of distances by shifts and turns of the arm, one sigma each.
+
+    ``tools_mm`` (N, 3) is where the origin of Tool was when each point was seen, in Base.
 
     Neighbouring exposures, B blocks of them, are taken to err alike: an arm's errors depend on its
     posture, which changes little from one to the next.
@@ -536,12 +541,15 @@ def distance_by_arm(
     block, n_blocks = exposure_blocks(cloud.exposure[rows], COARSE_BLOCKS[0])
     count = np.bincount(block, minlength=n_blocks)[:, None]
     middle = np.stack([np.bincount(block, points[:, k], n_blocks) for k in range(3)], 1) / count
-    turns = np.cross(points - middle[block], directions)
-    position = math.hypot(noise.position_mm, noise.exposure_position_mm)
-    rotation = math.hypot(noise.rotation_rad, noise.exposure_rotation_rad)
-    found = np.zeros((len(points), n_blocks, 6))
-    found[np.arange(len(points)), block, :3] = position * directions
-    found[np.arange(len(points)), block, 3:] = rotation * turns
+    sigmas = np.sqrt(noise.variances)
+    found = np.zeros((len(points), n_blocks, 9))
+    found[np.arange(len(points)), block] = np.column_stack(
+        [
+            sigmas[0] * directions,
+            sigmas[1] * np.cross(points - middle[block], directions),
+            sigmas[2] * np.cross(points - tools_mm, directions),
+        ]
+    )
     return found.reshape(len(points), -1)
 
 

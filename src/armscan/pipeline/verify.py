@@ -239,11 +239,10 @@ def _judged(
         gradient = effect.T @ influence_along(fit)
         sigma_mm = math.sqrt(max(0.0, float(gradient @ scanner.covariance @ gradient)))
         s = evidence.standard
+        tools_mm = scan.poses.translations_mm[np.array(scan.image_rows)[exposure]]
+        arm = scanner.hand_eye.arm_noise
         others = np.hstack(
-            [
-                s.by_standard,
-                distance_by_arm(cloud, used, fit.directions, scanner.hand_eye.arm_noise),
-            ]
+            [s.by_standard, distance_by_arm(cloud, used, fit.directions, tools_mm, arm)]
         )
         consistency = check_consistency(
             StandardDistances(

@@ -70,8 +70,8 @@ class BaseTransform:
         One (Q + 6, K) matrix F a sheet with ``F F'`` the joint covariance of what its points
         depend on (`sensor_columns`) and of the hand-eye; (6, K) where the sensor delivers points.
     scan_point_mm
-        (3,) middle of the working range in Sensor, about which the arm's noise is given: the mean
-        of the light sheets' origins. None to take the mean of each exposure's points, for a sensor
+        (3,) middle of the working range in Sensor, one of the two points about which the arm's pose
+        turns: the mean of the light sheets' origins. None to take the mean of each exposure's points, for a sensor
         that delivers points itself.
     """
 
@@ -153,7 +153,9 @@ def propagate_to_base(
     else:
         middle = base_from_tool.apply(hand_eye.tool_from_sensor.apply(transform.scan_point_mm))
     turn = placed.by_sensor_point
-    arm = arm_covariance(placed.points_base_mm, middle, hand_eye.arm_noise)
+    arm = arm_covariance(
+        placed.points_base_mm, middle, base_from_tool.translation_mm, hand_eye.arm_noise
+    )
     covariance += arm + turn @ stripe.own_covariance_mm2 @ turn.T
     return stripe_cloud(
         "Base",
@@ -192,15 +194,23 @@ def delivered_points(profile: PointProfile) -> StripePoints:
 
 
 def arm_covariance(
-    points_base_mm: FloatArray, scan_point_base_mm: FloatArray, noise: ArmNoise
+    points_base_mm: FloatArray,
+    scan_point_base_mm: FloatArray,
+    tool_base_mm: FloatArray,
+    noise: ArmNoise,
 ) -> FloatArray:
-    """(N, 3, 3) what the arm's scatter adds: shifts, and turns about the scan point."""
-    position = noise.position_mm**2 + noise.exposure_position_mm**2
-    rotation = noise.rotation_rad**2 + noise.exposure_rotation_rad**2
-    lever = points_base_mm - scan_point_base_mm
-    square = np.einsum("ni,ni->n", lever, lever)
-    turned = square[:, None, None] * np.eye(3) - lever[:, :, None] * lever[:, None, :]
-    return np.asarray(position * np.eye(3) + rotation * turned)
+    """(N, 3, 3) what the arm's scatter adds at points (N, 3): a shift, and turns about two points.
+
+    ``scan_point_base_mm`` and ``tool_base_mm``, the origin of Tool, are (3,).
+    """
+    position, at_scan_point, at_tool = noise.variances
+    covariance = np.tile(position * np.eye(3), (len(points_base_mm), 1, 1))
+    for centre, rotation in ((scan_point_base_mm, at_scan_point), (tool_base_mm, at_tool)):
+        lever = points_base_mm - centre
+        square = np.einsum("ni,ni->n", lever, lever)
+        turned = square[:, None, None] * np.eye(3) - lever[:, :, None] * lever[:, None, :]
+        covariance += rotation * turned
+    return covariance
 
 
 def _propagated(jacobian: FloatArray, factor: FloatArray) -> FloatArray:

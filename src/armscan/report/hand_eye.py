@@ -61,8 +61,8 @@ FRUSTUM_SHARE = 0.3
 HALF_ANGLE = 0.28
 AXIS_COLOURS = (PALETTE[1], PALETTE[3], PALETTE[5])
 NOISE_TEXT = (
-    "The reported pose of a posture is off by a rotation and by a shift of the scan point that "
-    "all exposures of the posture share; a smaller part is new in every exposure. The plate is "
+    "The reported pose of a posture is off by a shift, a turn about the origin of Tool and a turn "
+    "about the scan point that all exposures of the posture share; a smaller part is new in every exposure. The plate is "
     "off its plane by a smooth surface with the stated standard deviation, alike within the "
     "stated length. Stripe noise comes on top. Points of one posture therefore err together, and "
     "the sigmas of the hand-eye count postures, not points."
@@ -153,7 +153,7 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
         Quantity("euler_sigma_deg", "", numbers.euler_sigma_deg.tolist()),
         Quantity("translation_sigma_mm", "", numbers.translation_sigma_mm.tolist()),
         Quantity("arm_position_mm", "", arm.position_mm),
-        Quantity("arm_rotation_deg", "", float(np.degrees(arm.rotation_rad))),
+        Quantity("arm_rotation_deg", "", float(np.degrees(np.hypot(arm.rotation_rad, arm.tool_rotation_rad))),
         Quantity("n_postures", "Rests on", hand_eye.n_postures, shown=size),
         Quantity("n_exposures", "", hand_eye.n_exposures),
         Quantity("n_points", "", hand_eye.n_points),
@@ -178,13 +178,12 @@ def _evidence(hand_eye: HandEyeCalibration) -> tuple[Quantity, ...]:
         f"{significant(known.left_out_translation_mm)} mm"
     )
     if known.is_noise_estimated:
-        position = float(np.hypot(arm.position_mm, arm.exposure_position_mm))
-        turn_deg = float(np.degrees(np.hypot(arm.rotation_rad, arm.exposure_rotation_rad)))
+        position, at_scan_point, at_tool = np.sqrt(arm.variances).tolist()
         noise = fact(
             "Arm's scatter",
-            f"{significant(position, digits=2)} mm, {significant(turn_deg, digits=2)}°",
-            "an axis at the scan point, estimated from the residuals, which therefore test "
-            "nothing: compare it with the arm's certificate",
+            _arm_scatter(position, at_scan_point, at_tool, digits=2),
+            "an axis, estimated from the residuals, which therefore test nothing: compare it with "
+            "the arm's certificate",
         )
     else:
         fits = "no" if known.chi2_probability < 0.001 else "yes"
@@ -360,19 +359,24 @@ def _residual_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:
     return Section("How well it fits", tuple(blocks))
 
 
+def _arm_scatter(shift_mm: float, scan_rad: float, tool_rad: float, digits: int = 3) -> str:
+    """The arm's scatter in words: shift, turns about the origin of Tool and the scan point."""
+    tool, scan = (significant(float(np.degrees(one)), digits=digits) for one in (tool_rad, scan_rad))
+    return (
+        f"{significant(shift_mm, digits=digits)} mm, {tool}° about the origin of Tool, {scan}° "
+        "about the scan point"
+    )
+
+
 def _noise_facts(fit: HandEyeFit) -> tuple[Quantity, ...]:
     noise, known = fit.calibration.arm_noise, fit.calibration.diagnostics
-    common_deg, new_deg = np.degrees([noise.rotation_rad, noise.exposure_rotation_rad]).tolist()
+    common = _arm_scatter(noise.position_mm, noise.rotation_rad, noise.tool_rotation_rad)
+    new = _arm_scatter(
+        noise.exposure_position_mm, noise.exposure_rotation_rad, noise.exposure_tool_rotation_rad
+    )
     facts = [
-        fact(
-            "Arm, common to a posture",
-            f"{significant(noise.position_mm)} mm at the scan point, {significant(common_deg)}°, "
-            "an axis",
-        ),
-        fact(
-            "Arm, new in every exposure",
-            f"{significant(noise.exposure_position_mm)} mm, {significant(new_deg)}°",
-        ),
+        fact("Arm, common to a posture", f"{common}, an axis"),
+        fact("Arm, new in every exposure", new),
     ]
     if known is not None and known.method == "plate":
         flatness = significant(known.plate_flatness_mm)

@@ -300,7 +300,10 @@ LAYOUTS: Mapping[type, Layout] = {
         spread={"axes": ("along_base", "across_base", "normal_base")},
         check=_fault_of_plane,
     ),
-    ArmNoise: Layout(limits=dict.fromkeys(ArmNoise.__dataclass_fields__, (0.0, LARGEST_MM))),
+    ArmNoise: Layout(
+        limits=dict.fromkeys(ArmNoise.__dataclass_fields__, (0.0, LARGEST_MM)),
+        optional=("tool_rotation_rad", "exposure_tool_rotation_rad"),
+    ),
     CameraDiagnostics: EVIDENCE,
     SheetDiagnostics: EVIDENCE,
     SensorDiagnostics: EVIDENCE,

@@ -148,7 +148,7 @@ def _runs(options: HandEyeOptions, n_runs: int) -> tuple[FloatArray, FloatArray]
         error = hand_eye_difference(fit.state.tool_from_sensor, TOOL_FROM_SENSOR)
         coupling = fit.linear.gain @ by_sensor
         total = fit.covariance + coupling @ rig.sensor_covariance @ coupling.T
-        sigmas.append([fit.sigma_of("arm"), fit.sigma_of("sheet shape")])
+        sigmas.append([fit.arm_mm, fit.sigma_of("sheet shape")])
         squares.append(float(error @ np.linalg.solve(total, error)))
     return np.array(sigmas), np.array(squares)
 

@@ -89,18 +89,21 @@ def test_pose_slopes_are_the_derivatives_by_the_arms_pose() -> None:
 
     start = stripe.base_from_tool
     _, slopes, middle = residual(start)
+    centres = start.translation_mm, middle
     for k in range(3):
         small = 1e-5 * np.eye(3)[k]
         turn = rotation_from_vector(small)
         shifted = [Pose(start.rotation, start.translation_mm + s * small) for s in (1, -1)]
         ahead, behind = (residual(pose)[0] for pose in shifted)
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / 2e-5, atol=1e-6)
-        turned = [
-            Pose(r @ start.rotation, r @ (start.translation_mm - middle) + middle)
-            for r in (turn, turn.T)
-        ]
-        ahead, behind = (residual(pose)[0] for pose in turned)
-        np.testing.assert_allclose(slopes[:, 3 + k], (ahead - behind) / 2e-5, atol=1e-4)
+        for n, centre in enumerate(centres):
+            turned = [
+                Pose(r @ start.rotation, r @ (start.translation_mm - centre) + centre)
+                for r in (turn, turn.T)
+            ]
+            ahead, behind = (residual(pose)[0] for pose in turned)
+            expected = (ahead - behind) / 2e-5
+            np.testing.assert_allclose(slopes[:, 3 + 3 * n + k], expected, atol=1e-4)
 
 
 def test_errors_scatter_as_predicted() -> None:

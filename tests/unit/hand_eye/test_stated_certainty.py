@@ -56,11 +56,15 @@ PLANE_SIGMA = np.array([1e-5, 1e-5, 0.001])
 
 @dataclass(frozen=True)
 class Truth:
-    """What errs: an arm (mm) with a lever (mm), and a plate (mm)."""
+    """What errs: an arm (mm) with a lever (mm), and a plate (mm).
+
+    The arm turns about a point at this part of the way from the origin of Tool to the scan point.
+    """
 
     arm_mm: float
     lever_mm: float
     flatness_mm: float
+    part: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,8 @@ class Case:
 
     def draw(self, rng: np.random.Generator) -> Truth:
         ranges = (self.arm_mm, self.lever_mm, (0.0005, 0.03))
-        return Truth(*(float(np.exp(rng.uniform(*np.log(one)))) for one in ranges))
+        drawn = [float(np.exp(rng.uniform(*np.log(one)))) for one in ranges]
+        return Truth(*drawn, part=float(rng.uniform()))
 
 
 CASES = {
@@ -107,7 +112,9 @@ class Linear:
 
     def draw(self, truth: Truth, rng: np.random.Generator) -> FloatArray:
         """(M,) residuals of one calibration."""
-        by_pose = self.placed.dresidual_dpose
+        shift, at_tool, at_scan_point = np.split(self.placed.dresidual_dpose, 3, axis=1)
+        turn = (1.0 - truth.part) * at_tool + truth.part * at_scan_point
+        by_pose = np.column_stack([shift, turn])
         sigma = truth.arm_mm * np.array([1.0] * 3 + [1.0 / truth.lever_mm] * 3)
         errors = sigma * rng.normal(size=(int(self.posture.max()) + 1, 6))
         residual = np.einsum("mk,mk->m", by_pose, errors[self.posture])
@@ -170,23 +177,33 @@ def test_the_region_holds_what_it_says_and_the_usual_one_does_not() -> None:
     assert usual < inside - 0.015
 
 
-def test_the_lever_is_found() -> None:
-    """Both scatters come out of the stripes, each within what 24 postures let it be off by."""
-    for lever_mm in (30.0, 300.0):
-        truth, linear = Truth(0.03, lever_mm, 0.001), Linear.of(24, 1)
-        residual = linear.draw(truth, np.random.default_rng(4))
+@pytest.mark.parametrize("part", [0.0, 1.0])
+@pytest.mark.parametrize("lever_mm", [30.0, 300.0])
+def test_the_orientations_scatter_is_found_and_where_it_turns(lever_mm: float, part: float) -> None:
+    """Both out of the stripes of 24 postures, the scatter within what they let it be off by.
+
+    Where the arm turns is told where its turn throws the other point further than it shifts.
+    """
+    truth, linear, found = Truth(0.03, lever_mm, 0.001, part), Linear.of(24, 1), []
+    for seed in range(3):
+        residual = linear.draw(truth, np.random.default_rng(seed))
         problem, placed = linear.problem, linear.placed
         components = problem.components(placed)
-        found = estimate_noise(
+        noise = estimate_noise(
             residual,
             placed.jacobian[:, problem.columns],
             components,
             problem.surface_covariance(placed),
         )
-        arm = dict(zip((one.name for one in components), found.sigmas, strict=True))
-        off = np.log(arm["arm"] / arm["arm rotation"] / lever_mm)
-        own = np.diag(found.log_covariance)[:2].sum()
-        assert abs(off) < 3.0 * np.sqrt(own) < 1.0
+        turns = noise.sigmas[1:3]
+        assert [one.name for one in components][1:3] == ["arm rotation", "arm rotation at scan point"]
+        share = turns**2 / (turns @ turns)
+        own = np.sqrt(share @ noise.log_covariance[1:3, 1:3] @ share)
+        off = np.log(np.linalg.norm(turns) * lever_mm / truth.arm_mm)
+        assert abs(off) < 3.0 * own < 1.0
+        found.append(share[1])
+    if lever_mm < 100.0:
+        assert abs(np.mean(found) - part) < 0.25
 
 
 def test_images_of_one_instant_are_one_exposure() -> None:

@@ -114,7 +114,9 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
     ).xyz_mm[0]
     np.testing.assert_allclose(
         loud.covariance_mm2 - cloud.covariance_mm2,
-        arm_covariance(cloud.points_mm, middle, rig.ARM_NOISE),
+        arm_covariance(
+            cloud.points_mm, middle, rig.BASE_FROM_TOOL.translation_mm, rig.ARM_NOISE
+        ),
         atol=1e-12,
     )
     assert cloud.frame == "Base"
@@ -124,7 +126,7 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
 def test_covariance_is_that_of_repeats() -> None:
     """600 scanners drawn from their own documents: mean of e' C^-1 e is 3 +- 4 sigma.
 
-    The arm errs about the scan point: drawn as a turn of the tool there and a shift.
+    The arm's pose is drawn as a shift and two turns, about the scan point and the origin of Tool.
     """
     scanner = rig.scanner()
     assert scanner.sensor is not None
@@ -139,8 +141,10 @@ def test_covariance_is_that_of_repeats() -> None:
         rig.BASE_FROM_TOOL @ (rig.TOOL_FROM_SENSOR @ Points(placing.scan_point_mm[None]))
     ).xyz_mm[0]
     rng = np.random.default_rng(12)
-    position = np.hypot(rig.ARM_NOISE.position_mm, rig.ARM_NOISE.exposure_position_mm)
-    turn = np.hypot(rig.ARM_NOISE.rotation_rad, rig.ARM_NOISE.exposure_rotation_rad)
+    noise = rig.ARM_NOISE
+    position = np.hypot(noise.position_mm, noise.exposure_position_mm)
+    turn = np.hypot(noise.rotation_rad, noise.exposure_rotation_rad)
+    about_tool = np.hypot(noise.tool_rotation_rad, noise.exposure_tool_rotation_rad)
     n_repeats, squares = 600, []
     draws = rng.multivariate_normal(np.zeros(31), scanner.covariance, n_repeats)
     for error in draws:
@@ -149,8 +153,9 @@ def test_covariance_is_that_of_repeats() -> None:
         noisy = place + rng.normal(0.0, rig.SIGMA_PX) * np.array([0.6, 0.8])
         points, _ = intersect_sheets(noisy, sheet, rig.sensor_of(other, moved))
         spin = rotation_from_vector(rng.normal(0.0, turn, 3))
+        own = rotation_from_vector(rng.normal(0.0, about_tool, 3))
         arm = Pose(
-            spin @ rig.BASE_FROM_TOOL.rotation,
+            spin @ own @ rig.BASE_FROM_TOOL.rotation,
             spin @ (rig.BASE_FROM_TOOL.translation_mm - middle)
             + middle
             + rng.normal(0.0, position, 3),
@@ -161,15 +166,29 @@ def test_covariance_is_that_of_repeats() -> None:
     assert abs(np.mean(squares) - 3.0) < 4.0 * np.sqrt(6.0 / n_repeats)
 
 
-def test_the_arm_errs_least_at_the_scan_point() -> None:
-    """By hand: 100 mm along x, rotation s adds (100 s)^2 across and nothing along."""
+def test_the_arm_turns_about_the_scan_point_and_about_tool() -> None:
+    """By hand, 100 mm along x from the scan point, which lies 200 mm above the origin of Tool.
+
+    A turn of sigma s moves a point at distance d from its axis by d s: nothing along the line to
+    the centre, and both turns' parts add, across x and across the line from Tool.
+    """
     noise = ArmNoise(
-        position_mm=0.01, rotation_rad=1e-4, exposure_position_mm=0.02, exposure_rotation_rad=2e-4
+        position_mm=0.01,
+        rotation_rad=1e-4,
+        exposure_position_mm=0.02,
+        exposure_rotation_rad=2e-4,
+        tool_rotation_rad=3e-4,
+        exposure_tool_rotation_rad=4e-4,
     )
-    at, beside = arm_covariance(np.array([[0.0, 0, 0], [100.0, 0, 0]]), np.zeros(3), noise)
-    np.testing.assert_allclose(at, np.eye(3) * 5e-4)
-    turned = 100.0**2 * 5e-8
-    np.testing.assert_allclose(beside, np.diag([5e-4, 5e-4 + turned, 5e-4 + turned]))
+    scan_point, tool = np.zeros(3), np.array([0.0, 0.0, -200.0])
+    points = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    at, beside = arm_covariance(points, scan_point, tool, noise)
+    across = 200.0**2 * 25e-8
+    np.testing.assert_allclose(at, np.diag([5e-4 + across, 5e-4 + across, 5e-4]), atol=1e-18)
+    near, far = 100.0**2 * 5e-8, 100.0**2 * 25e-8
+    expected = np.diag([5e-4 + across, 5e-4 + near + across + far, 5e-4 + near + far])
+    expected[0, 2] = expected[2, 0] = -100.0 * 200.0 * 25e-8
+    np.testing.assert_allclose(beside, expected, atol=1e-18)
 
 
 def test_points_that_a_sensor_delivered() -> None:
@@ -184,7 +203,8 @@ def test_points_that_a_sensor_delivered() -> None:
     placed, covariance = cloud.points_mm, cloud.covariance_mm2
     by = place_with_jacobian(points, rig.BASE_FROM_TOOL, rig.TOOL_FROM_SENSOR)
     expected = by.by_hand_eye @ hand_eye.covariance @ by.by_hand_eye.transpose(0, 2, 1)
-    expected += arm_covariance(placed, placed.mean(axis=0), rig.ARM_NOISE)
+    tool = rig.BASE_FROM_TOOL.translation_mm
+    expected += arm_covariance(placed, placed.mean(axis=0), tool, rig.ARM_NOISE)
     turned = noise[:, :, 0] @ by.by_sensor_point.T
     expected += turned[:, :, None] * turned[:, None, :]
     np.testing.assert_allclose(covariance, expected, atol=1e-12)

@@ -240,7 +240,7 @@ def _judged(
         likelihood=-0.5 * (quadratic + determinant) - n_new,
         hand_eye_change=solution.step[:N_HAND_EYE] - fit.linear.step[:N_HAND_EYE],
         hand_eye_covariance=solution.covariance[:N_HAND_EYE, :N_HAND_EYE],
-        arm_mm=fit.sigma_of("arm"),
+        arm_mm=fit.arm_mm,
     )
 
 

@@ -359,7 +359,7 @@ def estimate_and_check(
     if first is None:
         return NO_SOLUTION
     checked = _without_wrong_postures(problem, start, first)
-    usual_mm = (first if isinstance(checked, FitFailure) else checked.fit).sigma_of("arm")
+    usual_mm = (first if isinstance(checked, FitFailure) else checked.fit).arm_mm
     trials = [first]
     if start.is_wrong.any():
         whole = estimate(problem, state)
@@ -475,7 +475,7 @@ def _left_out_in_words(
 
 def _refuse_scatter(fit: HandEyeSolution) -> FitFailure | None:
     """Refuse residuals that no arm explains; none where the arm's scatter was given."""
-    arm_mm, sigma_log = fit.sigma_of("arm"), fit.log_sigma_of("arm")
+    arm_mm, sigma_log = fit.arm_mm, fit.log_arm_mm
     is_given = fit.problem.options.arm_position_mm is not None
     if is_given or arm_mm * np.exp(-2.0 * sigma_log) < MOST_ARM_MM:
         return None
@@ -502,7 +502,7 @@ def agreement_warnings(fit: HandEyeSolution, plate: PlateSurface) -> tuple[str, 
             "the refinement had not settled when its steps ran out: the hand-eye may be off by "
             "more than stated"
         )
-    arm_mm = fit.sigma_of("arm")
+    arm_mm = fit.arm_mm
     if arm_mm > LARGE_ARM_MM and fit.problem.options.arm_position_mm is None:
         warnings.append(
             f"the arm's poses seem to scatter by {arm_mm:.2f} mm: much for a measuring arm; a bad "
@@ -513,7 +513,7 @@ def agreement_warnings(fit: HandEyeSolution, plate: PlateSurface) -> tuple[str, 
 
 def scatter_warnings(fit: HandEyeSolution) -> tuple[str, ...]:
     """Warn where the stripes hardly tell how much the arm scatters."""
-    if fit.log_sigma_of("arm") < UNKNOWN_ARM:
+    if fit.log_arm_mm < UNKNOWN_ARM:
         return ()
     return (
         f"{len(fit.problem.observations.used_postures)} postures hardly tell how much the arm "

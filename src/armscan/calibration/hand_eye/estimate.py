@@ -43,7 +43,7 @@ from armscan.geometry.poses import Pose, Sensor, Tool
 MAX_STEPS = 60
 SETTLED = 1e-10
 """A step that lowers chi2 by less than this part of it ends the search."""
-NOISE_ROUNDS = {"plate": (4, 0.02), "sphere": (12, 0.02)}
+NOISE_ROUNDS = {"plate": (8, 0.02), "sphere": (12, 0.02)}
 """Rounds at most, and change of a sigma's logarithm that ends them.
 
 On a sphere the scatter of a robot is far from its typical value. 2 % of a scatter are 2 % of the
@@ -190,9 +190,33 @@ class HandEyeSolution:
         return float(np.sqrt(self.noise.log_covariance[k, k]))
 
     def scatter_of(self, name: str, rows: IntArray) -> FloatArray:
-        """(n, n) covariance of some residuals by one cause of scatter."""
-        own = next(component for component in self.components if component.name == name)
-        return np.asarray(self.sigma_of(name) ** 2 * own.covariance[np.ix_(rows, rows)])
+        """(n, n) covariance of some residuals by one cause of scatter, a pose's turns included."""
+        found = np.zeros((len(rows), len(rows)))
+        for component, sigma in zip(self.components, self.noise.sigmas, strict=True):
+            if component.name.split()[0] == name:
+                found += sigma**2 * component.covariance[np.ix_(rows, rows)]
+        return found
+
+    @property
+    def arm_mm(self) -> float:
+        """How far the arm's pose throws the scan point, as the postures see it, one sigma an axis.
+
+        Its shift, and what its turn about the origin of Tool adds there.
+        """
+        return float(np.sqrt(self._arm_variances_mm2.sum()))
+
+    @property
+    def log_arm_mm(self) -> float:
+        """Standard deviation of the logarithm of `arm_mm`; 0 where the scatters were given."""
+        share = self._arm_variances_mm2
+        share = share / max(float(share.sum()), 1e-300)
+        return float(np.sqrt(share @ self.noise.log_covariance[:2, :2] @ share))
+
+    @property
+    def _arm_variances_mm2(self) -> FloatArray:
+        """(2,) parts of `arm_mm` squared: of the arm's shift and of its turn about Tool."""
+        seen = np.array([np.trace(one.covariance) for one in self.components[:2]])
+        return np.asarray(self.noise.sigmas[:2] ** 2 * seen / seen[0])
 
     @property
     def covariance(self) -> FloatArray:
@@ -312,8 +336,9 @@ def first_sigmas(
     sigmas = np.array([component.sigma for component in components])
     if not isinstance(problem.surface, PlateSurface) and components[0].is_estimated:
         size_mm = max(float(np.sqrt(np.mean(placed.residual_mm**2))), 1e-4)
-        if components[1].is_estimated:
-            sigmas[1] *= size_mm / sigmas[0]
+        for k, component in enumerate(components):
+            if component.follows == "arm" and component.is_estimated:
+                sigmas[k] *= size_mm / components[0].sigma
         sigmas[0] = size_mm
     return sigmas
 
@@ -421,8 +446,7 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
     shape = _pose_errors(solution, rows)
     weighted = block @ shape
     if weights is not None and weights[posture] < 1.0:
-        arm = solution.scatter_of("arm", rows) + solution.scatter_of("arm rotation", rows)
-        lent = (1.0 - weights[posture]) * arm
+        lent = (1.0 - weights[posture]) * solution.scatter_of("arm", rows)
         weighted = np.linalg.pinv(inverse - lent, rcond=1e-10, hermitian=True) @ shape
     weight, score = shape.T @ weighted, weighted.T @ predicted
     strength = np.linalg.eigvalsh(weight)

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Why points do not lie on the reference: causes of scatter, and how large each is.
 
-The arm's pose errs by a shift of the scan point and a turn about it, alike for all points of a
-posture, and by a smaller part that is new in every exposure. A plate is uneven by a smooth random
+The arm's pose errs by a shift, a turn about the origin of Tool and a turn about the scan point, alike
+for all points of a posture, and by a smaller part that is new in every exposure. Where an arm's error
+turns, nobody knows: its last joints turn it about Tool, its elbow about a point behind, and a tip
+that is held still about a point before it. With two turns of a scatter each the postures tell. A
+plate is uneven by a smooth random
 function of the place on it, so that postures which look at the same place see the same error. The
 light sheets are not quite what their parameters describe, by another smooth function, of the place
 on the sheet, the same in all postures. A stripe on a sphere may have the wrong curvature. Only the
@@ -45,7 +48,9 @@ from armscan.models.camera import PARAMETER_NAMES as CAMERA_PARAMETER_NAMES
 TYPICAL_ARM_MM = 0.03
 """Measuring arms scatter by 0.005 mm, robots by 0.1 to 0.2."""
 TYPICAL_LEVER_MM = 100.0
-"""Scatter of the scan point over scatter of the orientation; arms have 30 to 300 mm."""
+"""Scatter of the shift over scatter of the orientation; arms have 30 to 300 mm."""
+TURNS = ("rotation", "rotation at scan point")
+"""About the origin of Tool, and about the scan point; each is expected to be half the variance."""
 TYPICAL_EXPOSURE_SHARE = 0.3
 """What is new in every exposure over what a posture's exposures share."""
 TYPICAL_FLATNESS_MM = 0.004
@@ -84,7 +89,7 @@ is near its highest point."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseComponent:
-    """One cause of scatter: ``arm``, ``exposure``, each with its ``rotation``, ``flatness``, ...
+    """One cause of scatter: ``arm``, ``exposure``, each with its `TURNS`, ``flatness``, ...
 
     ``covariance`` (M, M) is that of the residuals when ``sigma`` is 1. ``sigma`` is given, or
     typical where it is estimated; ``log_width`` is the standard deviation of its logarithm then,
@@ -112,12 +117,12 @@ def noise_components(
     ``weights`` (n postures,) are at most 1: below it, a posture's pose is trusted less.
     """
     by_pose = placed.dresidual_dpose
-    shift, turn = by_pose[:, :3] @ by_pose[:, :3].T, by_pose[:, 3:] @ by_pose[:, 3:].T
+    shift, *turns = (part @ part.T for part in np.split(by_pose, 3, axis=1))
     posture = _same(observations.posture)
     if weights is not None:
         posture = posture / weights[observations.posture][:, None]
     components: tuple[NoiseComponent, ...] = _pose_components(
-        (posture * shift, posture * turn),
+        [posture * part for part in (shift, *turns)],
         _component("arm", shift, options.arm_position_mm, *_expected_arm(surface)),
         options.arm_rotation_rad,
     )
@@ -134,7 +139,7 @@ def noise_components(
         typical = TYPICAL_EXPOSURE_SHARE * components[0].sigma
         new = _component("exposure", shift, options.exposure_position_mm, typical, ARM_WIDTH)
         components += _pose_components(
-            (exposure * shift, exposure * turn),
+            [exposure * part for part in (shift, *turns)],
             replace(new, follows="arm"),
             options.exposure_rotation_rad,
         )
@@ -220,17 +225,28 @@ def _component(
 
 
 def _pose_components(
-    covariances: tuple[FloatArray, FloatArray], shift: NoiseComponent, rotation: float | None
-) -> tuple[NoiseComponent, NoiseComponent]:
-    """Shift and turn of one pose; the turn is sought about the shift's unless it is given."""
-    turn = NoiseComponent(
-        f"{shift.name} rotation",
-        covariances[1],
-        shift.sigma / TYPICAL_LEVER_MM if rotation is None else rotation,
-        is_estimated=rotation is None and shift.sigma > 0.0,
-        follows=shift.name,
+    covariances: list[FloatArray], shift: NoiseComponent, rotation: float | None
+) -> tuple[NoiseComponent, ...]:
+    """Shift and turns of one pose, by their (M, M) covariances.
+
+    The turns are sought about what the shift's scatter lets expect, unless the orientation's
+    scatter is given: then all of it turns about the origin of Tool.
+    """
+    expected = shift.sigma / TYPICAL_LEVER_MM / np.sqrt(len(TURNS))
+    sigmas = [expected] * len(TURNS) if rotation is None else [rotation]
+    return (
+        replace(shift, covariance=covariances[0]),
+        *(
+            NoiseComponent(
+                f"{shift.name} {name}",
+                covariance,
+                sigma,
+                is_estimated=rotation is None and shift.sigma > 0.0,
+                follows=shift.name,
+            )
+            for name, covariance, sigma in zip(TURNS, covariances[1:], sigmas, strict=False)
+        ),
     )
-    return replace(shift, covariance=covariances[0]), turn
 
 
 def total_covariance(components: tuple[NoiseComponent, ...], sigmas: FloatArray) -> FloatArray:
@@ -244,11 +260,14 @@ def total_covariance(components: tuple[NoiseComponent, ...], sigmas: FloatArray)
 def arm_noise(components: tuple[NoiseComponent, ...], sigmas: FloatArray) -> ArmNoise:
     """What the standard deviations say about the arm."""
     known = {one.name: float(sigma) for one, sigma in zip(components, sigmas, strict=True)}
+    at_tool, at_scan_point = TURNS
     return ArmNoise(
         position_mm=known["arm"],
-        rotation_rad=known["arm rotation"],
+        rotation_rad=known.get(f"arm {at_scan_point}", 0.0),
         exposure_position_mm=known.get("exposure", 0.0),
-        exposure_rotation_rad=known.get("exposure rotation", 0.0),
+        exposure_rotation_rad=known.get(f"exposure {at_scan_point}", 0.0),
+        tool_rotation_rad=known[f"arm {at_tool}"],
+        exposure_tool_rotation_rad=known.get(f"exposure {at_tool}", 0.0),
     )
 
 

@@ -60,10 +60,11 @@ class HandEyeOptions:
     Parameters
     ----------
     arm_position_mm
-        Scatter of the scan point by the arm's pose, an axis, common to a posture.
+        Scatter of the arm's position at the origin of Tool, an axis, common to a posture.
     arm_rotation_rad
-        Scatter of the arm's orientation, an axis, common to a posture. None has it estimated, about
-        what moves a point at 100 mm by as much as the position scatters.
+        Scatter of the arm's orientation about that origin, an axis, common to a posture. None has
+        it estimated, about what moves a point at 100 mm by as much as the position scatters; it may
+        turn about the scan point in part, then.
     exposure_position_mm, exposure_rotation_rad
         The parts of both that are new in every exposure, on a plate. None: none if the arm's
         position is given; else estimated where a posture has several exposures.

@@ -75,10 +75,7 @@ class PlateSurface:
         points_base_mm: FloatArray,
         tool_from_sensor: Pose[Tool, Sensor],
     ) -> FloatArray:
-        """(N, 3) about which an error of the arm's pose turns each placed point.
-
-        The middle of the sensor's working range, where each exposure has it.
-        """
+        """(N, 3) scan point of each placed point: the middle of the sensor's working range."""
         stripe = observations.of_points(observations.stripe)
         middle = tool_from_sensor.apply(observations.points_mm.mean(axis=0))
         return (observations.rotations @ middle + observations.translations_mm)[stripe]
@@ -192,8 +189,8 @@ class Placed:
     jacobian
         (M, 6 + K + 1) its derivative by a step of `HandEyeState.retract`.
     dresidual_dpose
-        (M, 6) its derivative by a shift of the arm's pose in Base, and by its turn about
-        `PlateSurface.scan_points`.
+        (M, 9) its derivative by a shift of the arm's pose in Base, by its turn about the origin of
+        Tool, and by its turn about `PlateSurface.scan_points`.
     """
 
     points_base_mm: FloatArray
@@ -224,8 +221,10 @@ def place(
     jacobian = np.column_stack(
         [np.cross(turned, in_tool_normals), in_tool_normals, by_surface, by_scale]
     )
+    from_tool = base - observations.translations_mm[stripe]
+    from_scan_point = base - surface.scan_points(observations, base, hand_eye)
     by_pose = np.column_stack(
-        [normals, np.cross(base - surface.scan_points(observations, base, hand_eye), normals)]
+        [normals, np.cross(from_tool, normals), np.cross(from_scan_point, normals)]
     )
     return Placed(
         points_base_mm=base,

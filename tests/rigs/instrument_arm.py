@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hand-eye of a drawn instrument on a plate and on a sphere, judged against the truth.
 
-The arm's errors turn the head about its scan point and shift it; the plate is a sum of waves. The
+The arm's errors turn the head about a point that is drawn, between some hundred millimetres behind
+the origin of Tool and the scan point, and shift it; the plate is a sum of waves. The
 stripes reach the hand-eye through the sensor as it was calibrated.
 """
 
@@ -39,6 +40,9 @@ LEAST_POSTURES, LEAST_CROSSED = 5, 4
 """The software says that fewer are refused; of crossed stripes on a plate the second."""
 LARGEST_SCATTER_MM = 0.2
 """Of an arm at the ends of a stripe, from which a refusal is right: 0.25 mm is the software's."""
+TYPICAL_TILT = np.radians(25.0)
+"""Of plates against the optical axis: by its sine a turn about a point behind shows."""
+MOST_BEHIND_MM = 400.0
 GROUPS = {"rotation": (0, 1, 2), "translation": (3, 4, 5)}
 
 
@@ -148,7 +152,8 @@ def _is_hopeless(made: Instrument, best: FloatArray | None, seen: list[Seen]) ->
         return True
     sigma = np.sqrt(np.diag(best))
     half = 0.35 * made.field_mm
-    scatter = made.arm.position_mm * np.hypot(1.0, half / made.arm.lever_mm)
+    apart = np.linalg.norm(_scan_point(made) - turning_point(made)) * np.sin(TYPICAL_TILT)
+    scatter = made.arm.position_mm * np.hypot(1.0, np.hypot(half, apart) / made.arm.lever_mm)
     return bool(
         sigma[3:].max() > HOPELESS_MM
         or sigma[:3].max() > HOPELESS_RAD
@@ -300,11 +305,29 @@ def _pose_error(made: Instrument, rng: np.random.Generator) -> FloatArray:
     return rng.normal(size=6) * np.repeat([sigma / made.arm.lever_mm, sigma], 3)
 
 
+def _scan_point(made: Instrument) -> FloatArray:
+    """(3,) in Sensor."""
+    return np.array([0.0, 0.0, made.stand_off_mm])
+
+
+def turning_point(made: Instrument) -> FloatArray:
+    """(3,) in Sensor: about which the arm's pose turns.
+
+    Anywhere from the scan point past the origin of Tool to a lever (400 mm at most) behind it, in
+    the middle the origin of Tool itself.
+    """
+    tool = made.tool_from_sensor.back(np.zeros((1, 3)))[0]
+    before = _scan_point(made) - tool
+    behind = before / np.linalg.norm(before) * min(made.arm.lever_mm, MOST_BEHIND_MM)
+    part = made.rng(40).uniform(-1.0, 1.0)
+    return np.asarray(tool + part * (before if part > 0.0 else behind))
+
+
 def _reported(made: Instrument, head: Placement, error: FloatArray) -> Pose:
-    scan_point = head.apply(np.array([[0.0, 0.0, made.stand_off_mm]]))[0]
+    centre = head.apply(turning_point(made)[None])[0]
     turn = Rotation.from_rotvec(error[:3]).as_matrix()
     rotation = turn @ head.rotation
-    shift = turn @ (head.shift - scan_point) + scan_point + error[3:]
+    shift = turn @ (head.shift - centre) + centre + error[3:]
     tool = made.tool_from_sensor.rotation
     return Pose(rotation @ tool.T, shift - rotation @ tool.T @ made.tool_from_sensor.shift)
 
@@ -364,8 +387,8 @@ def hand_eye_bound(
         rows.append(
             np.column_stack([np.cross(in_tool, in_tool_gradient), in_tool_gradient, by_surface])
         )
-        scan_point = head.apply(np.array([[0.0, 0.0, made.stand_off_mm]]))[0]
-        lever.append(np.column_stack([np.cross(base - scan_point, gradient), gradient]))
+        centre = head.apply(turning_point(made)[None])[0]
+        lever.append(np.column_stack([np.cross(base - centre, gradient), gradient]))
         in_sensor = gradient @ head.rotation
         size = np.einsum("ni,ni->n", in_sensor, one.stripe.noise_mm[chosen, :, 0])
         noise.append((size / made.claimed[1]) ** 2 * len(chosen) / n)

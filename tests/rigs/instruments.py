@@ -158,8 +158,8 @@ class Placement:
 class ArmKind:
     """How an arm errs, and how it is used.
 
-    A posture's pose is turned about the scan point and shifted; ``exposure_share`` of both
-    standard deviations is new in every exposure.
+    A posture's pose is turned about a point (`rigs.instrument_arm.turning_point`) and shifted;
+    ``exposure_share`` of both standard deviations is new in every exposure.
     """
 
     position_mm: float

@@ -25,6 +25,8 @@ KEPT_BAND_MM = 0.02
 """Points nearer to the surface than this are never left out: a scanner's own noise."""
 SEARCH_BAND_MM = 0.2
 """Half width of the band in which points support a candidate while a feature is searched."""
+SEARCH_SIGMAS = 2.0
+"""The same in the points' stated sigmas, where these are larger: 19 of 20 points lie within."""
 MIN_POINTS = 30
 """Fewest points that make a feature."""
 
@@ -107,6 +109,22 @@ class Selection:
     def points_mm(self) -> FloatArray:
         """(N, 3) their positions."""
         return np.asarray(self.cloud.points_mm[self.rows])
+
+    @property
+    def sigma_mm(self) -> FloatArray:
+        """(N,) stated standard deviation of each point an axis, common errors included."""
+        variances = np.einsum("nii->n", self.cloud.covariance_mm2[self.rows]) / 3.0
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
+
+    @property
+    def search_band_mm(self) -> FloatArray:
+        """(N,) half width of the band in which each point supports a ball.
+
+        As far as the points' own scatter may throw them off it; half the feature's band at most, or
+        any shape within it would be supported.
+        """
+        widest = max(SEARCH_BAND_MM, 0.5 * self.feature_mm)
+        return np.clip(SEARCH_SIGMAS * self.sigma_mm, SEARCH_BAND_MM, widest)
 
 
 def select(
@@ -242,7 +260,9 @@ def _polished(points: FloatArray, normal: FloatArray, offset: float) -> FloatArr
     return normal
 
 
-def find_ball(points_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, int] | FitFailure:
+def find_ball(
+    points_mm: FloatArray, radius_mm: float, band_mm: FloatArray
+) -> tuple[FloatArray, int] | FitFailure:
     """Centre (3,) of the ball of known radius that most points lie on, and their count.
 
     Candidates pass through three points of one neighbourhood each, as a ball may be a small part
@@ -254,9 +274,12 @@ def find_ball(points_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, int]
         (N, 3) points.
     radius_mm
         Radius of the ball.
+    band_mm
+        (N,) how far off it each of them may lie.
     """
     rng = np.random.default_rng(0)
-    scored = points_mm[rng.permutation(len(points_mm))[:N_SCORED]]
+    chosen = rng.permutation(len(points_mm))[:N_SCORED]
+    scored = points_mm[chosen]
     centres = _ball_candidates(scored, radius_mm, rng)
     if len(centres) == 0:
         return FitFailure(
@@ -265,12 +288,12 @@ def find_ball(points_mm: FloatArray, radius_mm: float) -> tuple[FloatArray, int]
         )
     votes = np.concatenate(
         [
-            _ball_votes(scored, centres[k : k + BATCH], radius_mm)
+            _ball_votes(scored, centres[k : k + BATCH], radius_mm, band_mm[chosen])
             for k in range(0, len(centres), BATCH)
         ]
     )
     centre = centres[int(votes.argmax())]
-    near = np.abs(np.linalg.norm(points_mm - centre, axis=1) - radius_mm) <= SEARCH_BAND_MM
+    near = np.abs(np.linalg.norm(points_mm - centre, axis=1) - radius_mm) <= band_mm
     return centre, int(near.sum())
 
 
@@ -300,10 +323,12 @@ def _ball_candidates(scored: FloatArray, radius_mm: float, rng: np.random.Genera
     return np.concatenate([start + middle + rise, start + middle - rise])
 
 
-def _ball_votes(scored: FloatArray, centres: FloatArray, radius_mm: float) -> FloatArray:
+def _ball_votes(
+    scored: FloatArray, centres: FloatArray, radius_mm: float, band_mm: FloatArray
+) -> FloatArray:
     # |p - c|^2 by its parts: no (M, N, 3) array; about the mean, so that digits are kept
     mean = scored.mean(axis=0)
     p, c = scored - mean, centres - mean
     squared = (c**2).sum(axis=1)[:, None] + (p**2).sum(axis=1)[None, :] - 2.0 * c @ p.T
     distance = np.sqrt(np.maximum(squared, 0.0))
-    return np.asarray((np.abs(distance - radius_mm) <= SEARCH_BAND_MM).sum(axis=1))
+    return np.asarray((np.abs(distance - radius_mm) <= band_mm).sum(axis=1))

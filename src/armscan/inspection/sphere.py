@@ -17,6 +17,7 @@ from armscan.inspection.selection import (
     MIN_POINTS,
     OUTLIER_RULE,
     SEARCH_BAND_MM,
+    SEARCH_SIGMAS,
     InspectionOptions,
     Selection,
     find_ball,
@@ -27,7 +28,8 @@ from armscan.inspection.uncertainty import FitLinearised, measured_length
 from armscan.records.cloud import PointCloud
 
 LARGEST_MISFIT = 0.02
-"""Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball."""
+"""Largest difference of fitted and nominal diameter, as a part of it, that may be the same ball;
+points that scatter so much that the search's band is wider add twice what it is wider by."""
 
 SETTLING_ROUNDS = 3
 
@@ -61,7 +63,7 @@ def inspect_sphere(
         raise InputError(f"a ball of {diameter_mm} mm diameter", remedy="give the diameter in mm")
     selection = select(cloud, region, options)
     points = selection.points_mm
-    found = find_ball(points, diameter_mm / 2.0)
+    found = find_ball(points, diameter_mm / 2.0, selection.search_band_mm)
     if isinstance(found, FitFailure):
         return found
     centre, n_near = found
@@ -80,7 +82,7 @@ def _settled(
     """Fit to the feature, choose the feature anew about the fit, until it stays."""
     points, feature_mm = selection.points_mm, selection.feature_mm
     is_feature = np.zeros(len(points), dtype=np.bool_)
-    is_fitted = is_feature
+    is_fitted, band_mm = is_feature, selection.search_band_mm
     for _ in range(SETTLING_ROUNDS):
         chosen = np.abs(sphere.distance_mm(points)) <= feature_mm
         if np.array_equal(chosen, is_feature):
@@ -94,21 +96,42 @@ def _settled(
             )
         sphere, is_fitted = fit
         misfit = 2.0 * sphere.radius_mm - diameter_mm
-        if abs(misfit) > LARGEST_MISFIT * diameter_mm:
+        wider_mm = float(np.median(band_mm[chosen])) - SEARCH_BAND_MM
+        if abs(misfit) > LARGEST_MISFIT * diameter_mm + 2.0 * wider_mm:
             return FitFailure(
                 f"the points that a ball of {diameter_mm:g} mm could have lie on one of "
                 f"{2.0 * sphere.radius_mm:.4g} mm",
                 "check the diameter, or show where the ball is with --region",
             )
-    near = np.abs(sphere.distance_mm(points[is_feature])) <= SEARCH_BAND_MM
-    if float(near.mean()) < LEAST_CONCENTRATION:
+    near = np.abs(sphere.distance_mm(points[is_feature])) <= band_mm[is_feature]
+    middle_mm = float(np.median(band_mm[is_feature]))
+    # As far above the part of evenly spread points as without a wider band.
+    least = LEAST_CONCENTRATION + (middle_mm - SEARCH_BAND_MM) / feature_mm
+    if float(near.mean()) < least:
+        return _not_concentrated(selection, is_feature, int(near.sum()), middle_mm, diameter_mm)
+    return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
+
+
+def _not_concentrated(
+    selection: Selection, is_feature: BoolArray, n_near: int, band_mm: float, diameter_mm: float
+) -> FitFailure:
+    """The points about the best place for a ball do not gather on it: another shape, or smeared."""
+    facts = (
+        f"at the best place for one, only {n_near} of {int(is_feature.sum())} points within "
+        f"{selection.feature_mm:g} mm of its surface lie within {band_mm:.3g} mm"
+    )
+    sigma_mm = float(np.median(selection.sigma_mm[is_feature]))
+    if SEARCH_SIGMAS * sigma_mm <= SEARCH_BAND_MM:
         return FitFailure(
-            f"there is no ball of {diameter_mm:g} mm: at the best place for one, only "
-            f"{int(near.sum())} of {len(near)} points within {feature_mm:g} mm of its "
-            f"surface lie within {SEARCH_BAND_MM:g} mm",
+            f"there is no ball of {diameter_mm:g} mm: {facts}",
             "check the diameter, or show where the ball is with --region",
         )
-    return _described(selection, is_feature, is_fitted, sphere, diameter_mm)
+    return FitFailure(
+        f"the points scatter too much to tell a ball of {diameter_mm:g} mm: their stated sigma is "
+        f"{sigma_mm:.2g} mm an axis (median), and {facts}",
+        "the scanner's calibration says how much of it is the arm's; scan from fewer postures, or "
+        f"give --feature-mm {2.0 * SEARCH_SIGMAS * sigma_mm:.2g}",
+    )
 
 
 def _described(

@@ -11,7 +11,9 @@ from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.results import SphereInspection
+from armscan.inspection.selection import InspectionOptions
 from armscan.inspection.sphere import inspect_sphere
+from armscan.records.cloud import PointCloud
 from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
 
 DIAMETER_MM = 2.0 * RADIUS_MM
@@ -100,6 +102,47 @@ def test_moving_the_ball_changes_nothing() -> None:
         )
         for key in ("std_mm", "d95_mm"):
             assert moved.nominal.value(key) == pytest.approx(still.nominal.value(key), abs=1e-7)
+
+
+def smeared(sigma_mm: float, seed: int, n_exposures: int = 8) -> PointCloud:
+    """A ball seen from eight poses of an arm that shifts each by a sigma an axis, as stated."""
+    rng = np.random.default_rng(seed)
+    points = ball(DIAMETER_MM, 0.005, seed)
+    exposure = np.arange(len(points)) * n_exposures // len(points)
+    moved = points + rng.normal(0.0, sigma_mm, (n_exposures, 3))[exposure]
+    return cloud_of(moved, exposure, sigma_mm=sigma_mm)
+
+
+def test_an_arm_that_smears_a_ball_does_not_make_it_another() -> None:
+    """Shifts of 0.2 mm an axis: with a fixed band of 0.2 mm one of them in three is no ball.
+
+    The diameter follows the eight shifts: 0.35 sigma of them times two, at least.
+    """
+    for seed in range(10):
+        found = inspected(inspect_sphere(smeared(0.2, seed), DIAMETER_MM))
+        assert abs(found.diameter.value_mm - DIAMETER_MM) < 5.0 * 0.2
+    wide = InspectionOptions(feature_mm=4.0)
+    for seed in range(5):
+        inspected(inspect_sphere(smeared(0.8, seed), DIAMETER_MM, options=wide))
+
+
+def test_points_that_scatter_too_much_are_not_called_another_diameter() -> None:
+    """Shifts of 1 mm within a band of 1 mm: refused for the scatter, with the band that it takes.
+
+    A box of the same stated sigma is no ball for it.
+    """
+    reasons = []
+    for seed in range(10):
+        found = inspect_sphere(smeared(1.0, seed), DIAMETER_MM)
+        if isinstance(found, FitFailure):
+            reasons.append(found.reason)
+    assert any("their stated sigma is 1 mm an axis" in reason for reason in reasons)
+    flat = np.stack(np.meshgrid(np.arange(40.0), np.arange(40.0), [0.0]), -1).reshape(-1, 3)
+    box = np.concatenate([flat, flat[:, [0, 2, 1]], flat[:, [2, 1, 0]]])
+    for sigma_mm in (0.05, 0.2, 1.0):
+        nothing = inspect_sphere(cloud_of(box, sigma_mm=sigma_mm), DIAMETER_MM)
+        assert isinstance(nothing, FitFailure)
+        assert ("scatter too much" in nothing.reason) == (sigma_mm > 0.1)
 
 
 def test_input_without_the_ball_is_refused_in_words() -> None:

@@ -7,21 +7,20 @@
 Each run draws an instrument and its errors: an arm of 0.005 to 0.2 mm with a lever (scatter of its
 position over that of its orientation) of 30 to 300 mm, whose pose turns about the origin of Tool,
 the scan point, or a point up to 400 mm behind the origin of Tool (the position's scatter is that of
-the origin of Tool then, so that the point lies within the lever), 4 to 24 postures, one to three exposures
-each, a plate uneven by 0.5 to 30 um over waves of 70 to 220 mm, touches that scatter by 0.3 to 3
-times what the arm does, stripes of 2 um noise; or a sphere. From points, without images: the
-estimate begins at the truth, unless ``--whole`` runs search and checks too. Nothing of the scatter
-is given.
+the origin of Tool then, so that the point lies within the lever), 4 to 24 postures, one to three
+exposures each, a plate uneven by 0.5 to 30 um over waves of 70 to 220 mm, touches that scatter by
+0.3 to 3 times what the arm does, stripes of 2 um noise; or a sphere. From points, without images:
+the estimate begins at the truth, unless ``--whole`` runs search and checks too. Nothing of the
+scatter is given.
 
 Columns: draws, refusals, results that say that they had not settled; mean of e' C^-1 e / 6 of error
 e and stated covariance C; how many per cent of the truths lie in the stated joint 95 % region, and
-in the usual one of C (without the region's factor); mean of the squared error of placed points over their stated
-variance, along directions 10 to 40 degrees from the optical axis (a plate's normals) and 50 to 75
-(sides of balls), of plates only; median and 90 % quantile of the stated sigma
-over the Cramer-Rao bound that knows every variance (sixth root of the ratio of determinants, as
-sigma; for the sphere, over the sigma that is stated if the arm's scatter is given, of arms that do
-not turn about a point behind). ``--typical``
-multiplies the locations of all priors.
+in the usual one of C (without the region's factor); mean of the squared error of placed points over
+their stated variance, along directions 10 to 40 degrees from the optical axis (a plate's normals)
+and 50 to 75 (sides of balls), of plates only; median and 90 % quantile of the stated sigma over the
+Cramer-Rao bound that knows every variance (sixth root of the ratio of determinants, as sigma; for
+the sphere, over the sigma that is stated if the arm's scatter is given, of arms that do not turn
+about a point behind). ``--typical`` multiplies the locations of all priors.
 """
 
 from __future__ import annotations
@@ -232,9 +231,7 @@ class Stated:
         known, result = fit.calibration.diagnostics, fit.calibration
         factor = 1.0 if known is None else known.region_factor
         settled = not any("settled" in warning for warning in fit.warnings)
-        return Stated(
-            result.tool_from_sensor, result.covariance, factor, settled, result.arm_noise
-        )
+        return Stated(result.tool_from_sensor, result.covariance, factor, settled, result.arm_noise)
 
     @staticmethod
     def of_solution(found: HandEyeSolution) -> Stated:
@@ -244,9 +241,7 @@ class Stated:
         covariance = stated.matrix[:6, :6]
         return Stated(pose, covariance, stated.region_factor, found.is_settled, arm)
 
-    def outcome(
-        self, drawn: Drawn, bound: FloatArray | None, truth: Pose[Tool, Sensor]
-    ) -> Outcome:
+    def outcome(self, drawn: Drawn, bound: FloatArray | None, truth: Pose[Tool, Sensor]) -> Outcome:
         """The error over what is stated, and what is stated over the bound if there is one."""
         error, ratio = hand_eye_difference(self.pose, truth), np.nan
         if bound is not None:
@@ -256,9 +251,7 @@ class Stated:
         return Outcome(drawn, square, REGION * self.region_factor, ratio, self.is_settled)
 
 
-def placed_squares(
-    stated: Stated, rig: PlateRig, rng: np.random.Generator
-) -> tuple[float, float]:
+def placed_squares(stated: Stated, rig: PlateRig, rng: np.random.Generator) -> tuple[float, float]:
     """Mean squared error of points near the scan point over what is stated (`Outcome.placed`).
 
     The arm's error has the variance that the rig draws it with; that of the hand-eye is its own.

@@ -319,7 +319,7 @@ def turning_point(made: Instrument) -> FloatArray:
     tool = made.tool_from_sensor.back(np.zeros((1, 3)))[0]
     before = _scan_point(made) - tool
     behind = before / np.linalg.norm(before) * min(made.arm.lever_mm, MOST_BEHIND_MM)
-    part = made.rng(40).uniform(-1.0, 1.0)
+    part = made.rng(50).uniform(-1.0, 1.0)
     return np.asarray(tool + part * (before if part > 0.0 else behind))
 
 

@@ -2,8 +2,8 @@
 """Stripes on an uneven plate as a head on a noisy arm would measure them, without any image.
 
 The places of the postures, the plate's surface and the errors are drawn here, by other means than
-the calibration's: the surface is a sum of waves, pose errors turn the arm about a point of Tool that
-the rig is told.
+the calibration's: the surface is a sum of waves, pose errors turn the arm about a point of Tool
+that the rig is told.
 """
 
 from __future__ import annotations

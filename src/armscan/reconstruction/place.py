@@ -71,8 +71,8 @@ class BaseTransform:
         depend on (`sensor_columns`) and of the hand-eye; (6, K) where the sensor delivers points.
     scan_point_mm
         (3,) middle of the working range in Sensor, one of the two points about which the arm's pose
-        turns: the mean of the light sheets' origins. None to take the mean of each exposure's points, for a sensor
-        that delivers points itself.
+        turns: the mean of the light sheets' origins. None to take the mean of each exposure's
+        points, for a sensor that delivers points itself.
     """
 
     scanner: ScannerCalibration

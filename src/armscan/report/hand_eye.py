@@ -62,10 +62,10 @@ HALF_ANGLE = 0.28
 AXIS_COLOURS = (PALETTE[1], PALETTE[3], PALETTE[5])
 NOISE_TEXT = (
     "The reported pose of a posture is off by a shift, a turn about the origin of Tool and a turn "
-    "about the scan point that all exposures of the posture share; a smaller part is new in every exposure. The plate is "
-    "off its plane by a smooth surface with the stated standard deviation, alike within the "
-    "stated length. Stripe noise comes on top. Points of one posture therefore err together, and "
-    "the sigmas of the hand-eye count postures, not points."
+    "about the scan point that all exposures of the posture share; a smaller part is new in every "
+    "exposure. The plate is off its plane by a smooth surface with the stated standard deviation, "
+    "alike within the stated length. Stripe noise comes on top. Points of one posture therefore "
+    "err together, and the sigmas of the hand-eye count postures, not points."
 )
 
 
@@ -127,6 +127,7 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
     angles = zip(EULER_NAMES, numbers.euler_deg, numbers.euler_sigma_deg, strict=True)
     lengths = zip("XYZ", numbers.translation_mm, numbers.translation_sigma_mm, strict=True)
     arm = hand_eye.arm_noise
+    turn_deg = float(np.degrees(np.hypot(arm.rotation_rad, arm.tool_rotation_rad)))
     size = (
         f"{hand_eye.n_postures} postures, {hand_eye.n_exposures} exposures, "
         f"{hand_eye.n_points:,} points"
@@ -153,7 +154,7 @@ def hand_eye_quantities(scanner: ScannerCalibration) -> tuple[Quantity, ...]:
         Quantity("euler_sigma_deg", "", numbers.euler_sigma_deg.tolist()),
         Quantity("translation_sigma_mm", "", numbers.translation_sigma_mm.tolist()),
         Quantity("arm_position_mm", "", arm.position_mm),
-        Quantity("arm_rotation_deg", "", float(np.degrees(np.hypot(arm.rotation_rad, arm.tool_rotation_rad))),
+        Quantity("arm_rotation_deg", "", turn_deg),
         Quantity("n_postures", "Rests on", hand_eye.n_postures, shown=size),
         Quantity("n_exposures", "", hand_eye.n_exposures),
         Quantity("n_points", "", hand_eye.n_points),
@@ -361,7 +362,8 @@ def _residual_section(fit: HandEyeFit, scanner: ScannerCalibration) -> Section:
 
 def _arm_scatter(shift_mm: float, scan_rad: float, tool_rad: float, digits: int = 3) -> str:
     """The arm's scatter in words: shift, turns about the origin of Tool and the scan point."""
-    tool, scan = (significant(float(np.degrees(one)), digits=digits) for one in (tool_rad, scan_rad))
+    tool_deg, scan_deg = np.degrees([tool_rad, scan_rad]).tolist()
+    tool, scan = significant(tool_deg, digits=digits), significant(scan_deg, digits=digits)
     return (
         f"{significant(shift_mm, digits=digits)} mm, {tool}° about the origin of Tool, {scan}° "
         "about the scan point"

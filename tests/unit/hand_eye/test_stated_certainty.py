@@ -196,7 +196,10 @@ def test_the_orientations_scatter_is_found_and_where_it_turns(lever_mm: float, p
             problem.surface_covariance(placed),
         )
         turns = noise.sigmas[1:3]
-        assert [one.name for one in components][1:3] == ["arm rotation", "arm rotation at scan point"]
+        assert [one.name for one in components][1:3] == [
+            "arm rotation",
+            "arm rotation at scan point",
+        ]
         share = turns**2 / (turns @ turns)
         own = np.sqrt(share @ noise.log_covariance[1:3, 1:3] @ share)
         off = np.log(np.linalg.norm(turns) * lever_mm / truth.arm_mm)

@@ -114,9 +114,7 @@ def test_covariance_term_by_term_on_two_sheets() -> None:
     ).xyz_mm[0]
     np.testing.assert_allclose(
         loud.covariance_mm2 - cloud.covariance_mm2,
-        arm_covariance(
-            cloud.points_mm, middle, rig.BASE_FROM_TOOL.translation_mm, rig.ARM_NOISE
-        ),
+        arm_covariance(cloud.points_mm, middle, rig.BASE_FROM_TOOL.translation_mm, rig.ARM_NOISE),
         atol=1e-12,
     )
     assert cloud.frame == "Base"

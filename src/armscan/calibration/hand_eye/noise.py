@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Why points do not lie on the reference: causes of scatter, and how large each is.
 
-The arm's pose errs by a shift, a turn about the origin of Tool and a turn about the scan point, alike
-for all points of a posture, and by a smaller part that is new in every exposure. Where an arm's error
-turns, nobody knows: its last joints turn it about Tool, its elbow about a point behind, and a tip
-that is held still about a point before it. With two turns of a scatter each the postures tell. A
-plate is uneven by a smooth random
-function of the place on it, so that postures which look at the same place see the same error. The
-light sheets are not quite what their parameters describe, by another smooth function, of the place
-on the sheet, the same in all postures. A stripe on a sphere may have the wrong curvature. Only the
-stripe's own noise is independent.
+The arm's pose errs by a shift, a turn about the origin of Tool and a turn about the scan point,
+alike for all points of a posture, and by a smaller part that is new in every exposure. About which
+point an arm's error turns, nobody knows beforehand; the scatter of both turns tells. A plate is
+uneven by a smooth random function of the place on it, so that postures which look at the same place
+see the same error. The light sheets are not quite what their parameters describe, by another smooth
+function, of the place on the sheet, the same in all postures. A stripe on a sphere may have the
+wrong curvature. Only the stripe's own noise is independent.
 
 Standard deviations that nobody gave come from restricted maximum likelihood: the likelihood of
 those combinations of the residuals that no hand-eye can change, so that the fitted parameters do

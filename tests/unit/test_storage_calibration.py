@@ -262,6 +262,20 @@ def test_a_scanner_keeps_its_second_camera(tmp_path: Path) -> None:
     assert described["baseline_mm"] == pytest.approx(np.linalg.norm([117.4, 1 / 3, 63.2]), abs=1e-4)
 
 
+def test_a_scanner_without_a_turn_about_tool_is_read(tmp_path: Path) -> None:
+    """Documents from before it state none: their key is left out, and means a scatter of zero."""
+    path, known = tmp_path / "scanner.json", scanner_calibration()
+    path.write_bytes(scanner_document(known))
+    assert b"tool_rotation" not in path.read_bytes()
+    assert read_scanner_calibration(path).hand_eye.arm_noise.tool_rotation_rad == 0.0
+    arm = replace(
+        known.hand_eye.arm_noise, tool_rotation_rad=1e-4 / 3, exposure_tool_rotation_rad=1e-5 / 7
+    )
+    turning = replace(known, hand_eye=replace(known.hand_eye, arm_noise=arm))
+    path.write_bytes(scanner_document(turning))
+    assert_same(read_scanner_calibration(path), turning)
+
+
 def test_a_scanner_keeps_the_factor_of_its_region(tmp_path: Path) -> None:
     scanner = scanner_calibration()
     assert scanner.hand_eye.diagnostics is not None

@@ -11,12 +11,14 @@ import pytest
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.poses import Pose
 from armscan.geometry.rotations import rotation_from_vector
-from armscan.models.calibration import ScannerCalibration
+from armscan.models.calibration import ArmNoise, ScannerCalibration
 from armscan.pipeline.simulate import fewer_views
-from armscan.pipeline.truth import hand_eye_errors, true_names
+from armscan.pipeline.truth import distance_by_arm, hand_eye_errors, true_names
+from armscan.reconstruction.place import arm_covariance
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from rigs.hand_eye_fake import TOOL_FROM_SENSOR, fake_fit
+from rigs.inspection_clouds import cloud_of
 from rigs.scan_fake import scanner as one_sheet_scanner
 from rigs.sheet_rig import PROVENANCE
 
@@ -33,6 +35,22 @@ def test_hand_eye_errors_are_in_the_form_of_its_covariance() -> None:
     assert errors.rotation_deg == pytest.approx(np.degrees(sigma[0]), rel=1e-6)
     assert errors.translation_mm == pytest.approx(2.0 * sigma[5])
     assert errors.normalised == pytest.approx(np.sqrt(5.0), rel=1e-6)
+
+
+def test_distances_follow_the_arm_as_placed_points_do() -> None:
+    """Of one exposure about its middle: their variance is that of the covariance in Base."""
+    rng = np.random.default_rng(4)
+    points, tool = rng.uniform(-30.0, 30.0, (40, 3)), np.array([50.0, -90.0, 210.0])
+    directions = rng.normal(size=points.shape)
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    noise = ArmNoise(
+        0.01, 2e-4, 0.004, 1e-4, tool_rotation_rad=3e-4, exposure_tool_rotation_rad=1e-4
+    )
+    tools = np.broadcast_to(tool, points.shape)
+    effect = distance_by_arm(cloud_of(points), np.arange(40), directions, tools, noise)
+    covariance = arm_covariance(points, points.mean(axis=0), tool, noise)
+    expected = np.einsum("ni,nij,nj->n", directions, covariance, directions)
+    np.testing.assert_allclose((effect**2).sum(axis=1), expected, rtol=1e-12)
 
 
 @dataclass

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
@@ -153,3 +154,65 @@ def test_the_likelihood_is_highest_at_the_estimate() -> None:
     for step in (np.array([0.02, 0.0]), np.array([0.0, 0.02])):
         for sign in (-1.0, 1.0):
             assert likelihood(found.sigmas * np.exp(sign * step)) < best
+
+
+def _scored_densely(
+    residual: FloatArray, slopes: FloatArray, components: tuple[NoiseComponent, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Fisher scoring of the restricted likelihood by full matrices: sigmas, covariance of logs."""
+    typical = np.array([one.sigma for one in components])
+    precision = np.diag([one.log_width**-2.0 for one in components])
+    logs = np.zeros(len(components))
+    for _ in range(30):
+        scatter = [
+            (s * np.exp(x)) ** 2 * one.covariance
+            for s, x, one in zip(typical, logs, components, strict=True)
+        ]
+        inverse = np.linalg.inv(sum(scatter))
+        normal = slopes.T @ inverse @ slopes
+        projected = inverse - inverse @ slopes @ np.linalg.solve(normal, slopes.T @ inverse)
+        score = np.array(
+            [
+                residual @ projected @ v @ projected @ residual - np.trace(projected @ v)
+                for v in scatter
+            ]
+        )
+        information = np.array(
+            [[2.0 * np.trace(projected @ v @ projected @ w) for w in scatter] for v in scatter]
+        )
+        information = information + precision
+        step = np.linalg.solve(information, score - precision @ logs)
+        step *= min(1.0, 1.0 / np.abs(step).max())
+        logs = logs + step
+        if np.abs(step).max() < 1e-3:
+            break
+    return typical * np.exp(logs), np.linalg.inv(information)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
+    """Own to each posture, to each sheet across postures, smooth over all, and to each point.
+
+    A product by groups that forgot one, or put it elsewhere, would change the scores.
+    """
+    rng = np.random.default_rng(seed)
+    n = 48
+    posture, sheet = np.repeat(np.arange(8), 6), rng.permutation(np.arange(n) % 3)
+    lever, place = rng.normal(size=n), rng.uniform(0.0, 100.0, n)
+    smooth = np.exp(-0.5 * ((place[:, None] - place) / 30.0) ** 2)
+    components = (
+        NoiseComponent("arm", (posture[:, None] == posture).astype(float), 0.02, True, 1.5),
+        NoiseComponent(
+            "turn", (posture[:, None] == posture) * np.outer(lever, lever), 0.01, True, 1.5
+        ),
+        NoiseComponent("sheet", (sheet[:, None] == sheet) * smooth, 0.01, True, 1.0),
+        NoiseComponent("flatness", smooth, 0.01, True, 1.5),
+        NoiseComponent("stripe", np.diag(rng.uniform(0.5, 2.0, n)), 0.004, True, 1.0),
+    )
+    total = sum(one.sigma**2 * one.covariance for one in components)
+    residual = np.linalg.cholesky(total) @ rng.normal(size=n)
+    slopes = np.column_stack([np.ones(n), rng.normal(size=(n, 3))])
+    found = estimate_noise(residual, slopes, components, np.zeros((n, n)))
+    sigmas, log_covariance = _scored_densely(residual, slopes, components)
+    np.testing.assert_allclose(found.sigmas, sigmas, rtol=1e-9)
+    np.testing.assert_allclose(found.log_covariance, log_covariance, rtol=1e-8, atol=1e-10)

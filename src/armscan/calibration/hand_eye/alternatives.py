@@ -84,9 +84,10 @@ LIKELIER = 10.0
 SMALLER = 0.7
 """And they leave less than this part of what the data as given leave."""
 HOPELESS = 2.0
-"""Mirrored data that leave more than so many times what the data as given leave, before anything is
-weighted, are no reason to refuse: over 300 drawn scanners the estimate never left them less than
-HOPELESS_MEASURED of that."""
+"""Mirrored data that leave more than so many times what the data as given leave, at every minimum
+of the plain sum of squares, are no reason to refuse. Of 114 drawn plates, 48 of them mirrored, none
+was judged otherwise for it: what was beyond kept 1.86 times as much when it was estimated all the
+same, and what a refusal rests on left 0.73 times as much at most."""
 LARGEST_SHIFT = 0.1
 """Of the middle of a mirrored image, over the focal length."""
 NO_FIT_MM = 1e6

@@ -15,7 +15,7 @@ from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
-from rigs.plate_bound import cramer_rao, plain_least_squares
+from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
 NOISE = RigNoise()
@@ -156,39 +156,6 @@ def test_the_likelihood_is_highest_at_the_estimate() -> None:
             assert likelihood(found.sigmas * np.exp(sign * step)) < best
 
 
-def _scored_densely(
-    residual: FloatArray, slopes: FloatArray, components: tuple[NoiseComponent, ...]
-) -> tuple[FloatArray, FloatArray]:
-    """Fisher scoring of the restricted likelihood by full matrices: sigmas, covariance of logs."""
-    typical = np.array([one.sigma for one in components])
-    precision = np.diag([one.log_width**-2.0 for one in components])
-    logs = np.zeros(len(components))
-    for _ in range(30):
-        scatter = [
-            (s * np.exp(x)) ** 2 * one.covariance
-            for s, x, one in zip(typical, logs, components, strict=True)
-        ]
-        inverse = np.linalg.inv(sum(scatter))
-        normal = slopes.T @ inverse @ slopes
-        projected = inverse - inverse @ slopes @ np.linalg.solve(normal, slopes.T @ inverse)
-        score = np.array(
-            [
-                residual @ projected @ v @ projected @ residual - np.trace(projected @ v)
-                for v in scatter
-            ]
-        )
-        information = np.array(
-            [[2.0 * np.trace(projected @ v @ projected @ w) for w in scatter] for v in scatter]
-        )
-        information = information + precision
-        step = np.linalg.solve(information, score - precision @ logs)
-        step *= min(1.0, 1.0 / np.abs(step).max())
-        logs = logs + step
-        if np.abs(step).max() < 1e-3:
-            break
-    return typical * np.exp(logs), np.linalg.inv(information)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
     """Own to each posture, to each sheet across postures, smooth over all, and to each point.
@@ -213,6 +180,6 @@ def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
     residual = np.linalg.cholesky(total) @ rng.normal(size=n)
     slopes = np.column_stack([np.ones(n), rng.normal(size=(n, 3))])
     found = estimate_noise(residual, slopes, components, np.zeros((n, n)))
-    sigmas, log_covariance = _scored_densely(residual, slopes, components)
+    sigmas, log_covariance = scored_densely(residual, slopes, components, np.zeros((n, n)))
     np.testing.assert_allclose(found.sigmas, sigmas, rtol=1e-9)
     np.testing.assert_allclose(found.log_covariance, log_covariance, rtol=1e-8, atol=1e-10)

@@ -139,4 +139,4 @@ def scored_densely(
         logs = logs + step
         if np.abs(step).max() < 1e-3:
             break
-    return typical * np.exp(logs), np.linalg.inv(information)
+    return np.asarray(typical * np.exp(logs)), np.asarray(np.linalg.inv(information))

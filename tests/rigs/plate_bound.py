@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from armscan.calibration.hand_eye.noise import NoiseComponent
 from armscan.calibration.hand_eye.observations import PlateReference, PosedStripe
 from armscan.geometry.arrays import FloatArray
 from rigs.plate_rig import (
@@ -106,3 +107,37 @@ def _flatness(places: FloatArray, sigma_mm: float) -> FloatArray:
     angle = places @ waves.T
     features = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
     return np.asarray(sigma_mm**2 / N_WAVES * features @ features.T)
+
+
+def scored_densely(
+    residual: FloatArray,
+    slopes: FloatArray,
+    components: tuple[NoiseComponent, ...],
+    known: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Fisher scoring of the restricted likelihood by full matrices: sigmas, covariance of logs.
+
+    Every component is estimated; none follows another.
+    """
+    typical = np.array([one.sigma for one in components])
+    precision = np.diag([one.log_width**-2.0 for one in components])
+    logs = np.zeros(len(components))
+    for _ in range(30):
+        scatter = [
+            (s * np.exp(x)) ** 2 * one.covariance
+            for s, x, one in zip(typical, logs, components, strict=True)
+        ]
+        inverse = np.linalg.inv(known + sum(scatter))
+        normal = slopes.T @ inverse @ slopes
+        projected = inverse - inverse @ slopes @ np.linalg.solve(normal, slopes.T @ inverse)
+        explained, products = projected @ residual, [projected @ v for v in scatter]
+        score = np.array([explained @ v @ explained for v in scatter])
+        score -= [np.trace(product) for product in products]
+        information = 2.0 * np.array([[(p * q.T).sum() for q in products] for p in products])
+        information += precision
+        step = np.linalg.solve(information, score - precision @ logs)
+        step *= min(1.0, 1.0 / np.abs(step).max())
+        logs = logs + step
+        if np.abs(step).max() < 1e-3:
+            break
+    return np.asarray(typical * np.exp(logs)), np.asarray(np.linalg.inv(information))

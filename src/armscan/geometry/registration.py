@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray, RowRecord, floats
@@ -80,7 +80,7 @@ class PointMisfit(Generic[A]):
         if not len(known):
             return None
         worst = int(known[np.argmax(self.chi2[known])])
-        limit = float(chi2.isf(level / len(known), 3))
+        limit = float(chdtri(3, level / len(known)))
         return worst if float(self.chi2[worst]) > limit else None
 
 

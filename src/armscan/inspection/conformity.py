@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -281,7 +281,7 @@ def check_consistency(data: StandardDistances) -> Check | None:
     expected = _expected(data, estimator) + _scatter(estimator, remaining, block, n_blocks)
     square = float(correction @ np.linalg.solve(expected, correction))
     freedom = int(kept.sum())
-    error, limit = math.sqrt(max(square, 0.0)), math.sqrt(float(chi2.ppf(CONFIDENCE, freedom)))
+    error, limit = math.sqrt(max(square, 0.0)), math.sqrt(float(chdtri(freedom, 1.0 - CONFIDENCE)))
     return Check(
         name="hand-eye correction",
         definition="correction of the hand-eye that would fit this scan to the standard best, over "

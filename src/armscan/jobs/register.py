@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
@@ -271,7 +271,7 @@ def _assumed_sigma(lists: Sequence[MarkerList]) -> str:
 
 def _too_small(chi2_sum: float, degrees_of_freedom: int) -> tuple[str, ...]:
     """Warn of residuals that the stated covariances do not allow."""
-    if float(chi2.sf(chi2_sum, max(degrees_of_freedom, 1))) >= UNLIKELY:
+    if float(chdtrc(max(degrees_of_freedom, 1), chi2_sum)) >= UNLIKELY:
         return ()
     ratio = float(np.sqrt(chi2_sum / degrees_of_freedom))
     return (

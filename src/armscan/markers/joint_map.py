@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armscan.geometry.arrays import (
     ArrayRecord,
@@ -250,7 +250,7 @@ class _Problem:
         n_seen = np.bincount(seen.marker, minlength=len(self.markers_mm))[seen.marker]
         score[n_seen < 3] = 0.0
         k = int(np.argmax(score))
-        return k if score[k] > float(chi2.isf(OUTLIER_LEVEL / len(seen), 3)) else None
+        return k if score[k] > float(chdtri(3, OUTLIER_LEVEL / len(seen))) else None
 
 
 def _reduced(normal: _Normal) -> tuple[FloatArray, FloatArray]:

@@ -373,6 +373,23 @@ HAND_EYE_PARAMETER_NAMES = (
 (``R <- exp(dr) R``), then the increment of the translation."""
 
 HandEyeMethod = Literal["plate", "sphere"]
+LaserColour = Literal[
+    "auto",
+    "red",
+    "green",
+    "blue",
+    "grey",
+    "red-excess",
+    "green-excess",
+    "blue-excess",
+    "red-green",
+    "red-blue",
+    "green-red",
+    "green-blue",
+    "blue-red",
+    "blue-green",
+]
+"""What of a colour image shows the line: `armscan.vision.stripe.image.StripeOptions`."""
 
 
 @dataclass(frozen=True, slots=True)

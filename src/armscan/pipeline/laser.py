@@ -30,7 +30,7 @@ from armscan.calibration.sheets.voting import observe_boards
 from armscan.geometry.arrays import IntArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma
-from armscan.models.calibration import CameraCalibration, SensorCalibration
+from armscan.models.calibration import CameraCalibration, LaserColour, SensorCalibration
 from armscan.models.two_views import StereoCalibration
 from armscan.pipeline.instants import ExposurePair, check_sizes
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
@@ -39,7 +39,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.observations import Observations
-from armscan.vision.stripe.image import SIGMA_RANGE_PX, LaserColour, StripeOptions
+from armscan.vision.stripe.image import SIGMA_RANGE_PX, StripeOptions
 from armscan.vision.targets.circle_grid import correct_centres
 from armscan.vision.targets.detect import numberings, renumbered
 from armscan.vision.targets.target import CircleEdges, Target, TargetView

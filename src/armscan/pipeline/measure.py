@@ -17,7 +17,7 @@ import numpy as np
 
 from armscan.errors import EstimationError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.models.calibration import SensorCalibration
+from armscan.models.calibration import LaserColour, SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.pipeline.instants import (
     ExposurePair,
@@ -44,7 +44,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import LaserColour, StripeOptions
+from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
 LEAST_APART_RAD = 0.5

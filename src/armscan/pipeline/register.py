@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
@@ -121,7 +121,7 @@ class PlaceRegistration:
     @property
     def chi2_probability(self) -> float:
         """Chance of residuals as large as these if the covariances are right."""
-        return float(chi2.sf(self.fit.chi2, self.fit.degrees_of_freedom))
+        return float(chdtrc(self.fit.degrees_of_freedom, self.fit.chi2))
 
 
 def register_place(

@@ -36,6 +36,7 @@ from armscan.models.calibration import (
     HandEyeCalibration,
     HandEyeDiagnostics,
     InputFile,
+    LaserColour,
     Provenance,
     ScannerCalibration,
     SecondCamera,
@@ -66,7 +67,6 @@ from armscan.storage.codec import (
 from armscan.storage.files import path_text, read_bytes
 from armscan.storage.foreign import parse_foreign_camera
 from armscan.storage.tables import LARGEST_MM
-from armscan.vision.stripe.image import LaserColour
 
 T = TypeVar("T")
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.geometry.arrays import ImageArray, IntArray
-from armscan.kernels.jpeg_entropy import WHOLE, walk_scan
 from armscan.records.exposure import Exposure
 from armscan.storage.files import path_text, read_bytes
 
@@ -190,6 +189,8 @@ def _end_of_scan(data: bytes, position: int) -> int:
 
 
 def _scan_defect(codes: bytes, header: bytes, picture: _Picture) -> str:
+    from armscan.kernels.jpeg_entropy import WHOLE, walk_scan  # compiled: only JPEGs wait for it
+
     if not picture.is_sequential:
         return ""
     n = header[0]

@@ -19,10 +19,15 @@ from armscan.calibration.hand_eye.observations import (
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.search import (
+    descend_all,
     distinct,
+    find_start,
+    find_start_within,
+    many_placed,
     minima_on_plate,
     minima_on_sphere,
     rotations_all_over,
+    unit_steps,
 )
 from armscan.calibration.hand_eye.surface import PlateSurface
 from armscan.geometry.arrays import FloatArray
@@ -131,3 +136,50 @@ def test_a_pose_that_is_off_by_a_metre_does_not_spoil_the_start() -> None:
         fit = calibrate_on_plate(wrong, plate)
         assert isinstance(fit, HandEyeFit)
         assert any("left out 1 postures" in text and "posture04" in text for text in fit.warnings)
+
+
+def test_descents_over_points_of_their_own_are_those_made_one_by_one() -> None:
+    """A batch of subsets: places, poses and units of one must not reach another."""
+    stripes, plate = PlateRig(good_postures(9, np.random.default_rng(4))).draw(3)
+    observations = condense_plate(stripes, straight_stripes(stripes), 3)
+    surface, random = PlateSurface(plate), np.random.default_rng(5)
+    rows = np.array([random.choice(len(observations), 18, replace=False) for _ in range(6)])
+    points, stripe = observations.points_mm[rows], observations.stripe[rows]
+    poses = observations.rotations[stripe], observations.translations_mm[stripe]
+    starts, shifts = rotations_all_over(6), random.normal(0.0, 50.0, (6, 3))
+    units = np.array([unit_steps(one, 3) for one in points])
+    together = descend_all(many_placed(points, *poses, surface), starts, shifts, 6, units)
+    for k in range(6):
+        place = many_placed(points[k], poses[0][k], poses[1][k], surface)
+        alone = descend_all(place, starts[k : k + 1], shifts[k : k + 1], 6, units[k])
+        for many, one in zip(together, alone, strict=True):
+            np.testing.assert_allclose(many[k], one[0], rtol=1e-9, atol=1e-9)
+
+
+def test_a_swapped_pose_is_found_among_postures_of_unequal_count() -> None:
+    """Subsets hold 6 to 12 stripes here: rows that fill a short one up must weigh nothing."""
+    rig = PlateRig(good_postures(12, np.random.default_rng(6)))
+    stripes, plate = rig.draw(7)
+    stripes += [replace(one, source=f"{one.source} again") for one in stripes[:5]]
+    far = replace(
+        stripes[9],
+        base_from_tool=Pose(
+            stripes[9].base_from_tool.rotation, stripes[9].base_from_tool.translation_mm + 40.0
+        ),
+    )
+    stripes[9] = far
+    start = find_start(condense_plate(stripes, straight_stripes(stripes), 12), PlateSurface(plate))
+    assert np.flatnonzero(start.is_wrong).tolist() == [9]
+    apart = start.tool_from_sensor.translation_mm - TOOL_FROM_SENSOR.translation_mm
+    assert np.linalg.norm(apart) < 0.3
+
+
+def test_a_start_is_told_to_be_hopeless_only_beyond_its_limit() -> None:
+    stripes, plate = PlateRig(good_postures(10, np.random.default_rng(8))).draw(9)
+    observations = condense_plate(stripes, straight_stripes(stripes), 12)
+    surface = PlateSurface(plate)
+    start = find_start(observations, surface)
+    found = find_start_within(observations, surface, 1.01 * start.typical_mm)
+    assert found is not None
+    np.testing.assert_array_equal(found.tool_from_sensor.rotation, start.tool_from_sensor.rotation)
+    assert find_start_within(observations, surface, 0.5 * start.typical_mm) is None

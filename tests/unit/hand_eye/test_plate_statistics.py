@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from armscan.calibration.hand_eye.calibrate import calibrate_on_plate
@@ -14,7 +15,7 @@ from armscan.calibration.hand_eye.observations import HandEyeOptions
 from armscan.calibration.hand_eye.result import HandEyeFit
 from armscan.calibration.hand_eye.surface import hand_eye_difference
 from armscan.geometry.arrays import FloatArray
-from rigs.plate_bound import cramer_rao, plain_least_squares
+from rigs.plate_bound import cramer_rao, plain_least_squares, scored_densely
 from rigs.plate_rig import TOOL_FROM_SENSOR, PlateRig, RigNoise, good_postures
 
 NOISE = RigNoise()
@@ -153,3 +154,32 @@ def test_the_likelihood_is_highest_at_the_estimate() -> None:
     for step in (np.array([0.02, 0.0]), np.array([0.0, 0.02])):
         for sign in (-1.0, 1.0):
             assert likelihood(found.sigmas * np.exp(sign * step)) < best
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_groups_of_observations_give_what_full_matrices_give(seed: int) -> None:
+    """Own to each posture, to each sheet across postures, smooth over all, and to each point.
+
+    A product by groups that forgot one, or put it elsewhere, would change the scores.
+    """
+    rng = np.random.default_rng(seed)
+    n = 48
+    posture, sheet = np.repeat(np.arange(8), 6), rng.permutation(np.arange(n) % 3)
+    lever, place = rng.normal(size=n), rng.uniform(0.0, 100.0, n)
+    smooth = np.exp(-0.5 * ((place[:, None] - place) / 30.0) ** 2)
+    components = (
+        NoiseComponent("arm", (posture[:, None] == posture).astype(float), 0.02, True, 1.5),
+        NoiseComponent(
+            "turn", (posture[:, None] == posture) * np.outer(lever, lever), 0.01, True, 1.5
+        ),
+        NoiseComponent("sheet", (sheet[:, None] == sheet) * smooth, 0.01, True, 1.0),
+        NoiseComponent("flatness", smooth, 0.01, True, 1.5),
+        NoiseComponent("stripe", np.diag(rng.uniform(0.5, 2.0, n)), 0.004, True, 1.0),
+    )
+    total = sum(one.sigma**2 * one.covariance for one in components)
+    residual = np.linalg.cholesky(total) @ rng.normal(size=n)
+    slopes = np.column_stack([np.ones(n), rng.normal(size=(n, 3))])
+    found = estimate_noise(residual, slopes, components, np.zeros((n, n)))
+    sigmas, log_covariance = scored_densely(residual, slopes, components, np.zeros((n, n)))
+    np.testing.assert_allclose(found.sigmas, sigmas, rtol=1e-9)
+    np.testing.assert_allclose(found.log_covariance, log_covariance, rtol=1e-8, atol=1e-10)

@@ -11,10 +11,11 @@ from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.result import BoardStripes, SheetOptions
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
+from armscan.models.calibration import LaserColour
 from armscan.pipeline.laser import choose_channel
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.extract import extract_stripes
-from armscan.vision.stripe.image import LaserColour, StripeOptions
+from armscan.vision.stripe.image import StripeOptions
 from rigs.sheet_rig import SheetRig, thesis_rig
 
 WIDTH_PX = 2.0

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -270,7 +270,7 @@ def chance_of_coefficients(solution: Solution, names: tuple[str, ...]) -> float:
     scale = np.sqrt(np.diag(own))
     z = value / scale
     square = float(z @ np.linalg.solve(own / np.outer(scale, scale), z))
-    return float(stats.chi2.sf(square, len(rows)))
+    return float(chdtrc(len(rows), square))
 
 
 SIGNIFICANT_SIGMAS = 4.0

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 
 from armscan.calibration.cameras.adjustment import (
     SINGULAR_CONDITION,
@@ -129,7 +129,7 @@ NO_AGREEMENT_LEVEL = 2500.0
 RIVAL_LEVEL = 9.0
 """Another compromise that fits up to three times as badly is not refuted."""
 
-MEDIAN_LEVEL = float(stats.chi2.median(6)) / 6.0
+MEDIAN_LEVEL = float(chdtri(6, 0.5)) / 6.0
 ROUNDS = 4
 
 
@@ -435,7 +435,7 @@ def compare_pairs(relatives: Sequence[RelativePose], near: Pose[CameraRight, Sen
     )
     covariances = np.array([relative.covariance for relative in relatives])
     n = len(relatives)
-    limit = max(float(stats.chi2.isf(FALSE_ALARM / n, 6)) / 6.0, MISFIT_LEVEL)
+    limit = max(float(chdtri(6, FALSE_ALARM / n)) / 6.0, MISFIT_LEVEL)
     is_good = np.ones(n, dtype=np.bool_)
     while True:
         absolute = _left_out_levels(apart, covariances, is_good)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc
 
 from armscan.calibration.cameras.adjustment import (
     SHARED_NAMES,
@@ -462,7 +462,7 @@ class BowTest:
         decrease = max(flat.equations.chi2 - bowed.equations.chi2, 0.0)
         statistic = decrease / n_parameters / bowed.variance_factor
         freedom = max(bowed.degrees_of_freedom, 1)
-        return BowTest(float(statistic), float(stats.f.sf(statistic, n_parameters, freedom)))
+        return BowTest(float(statistic), float(fdtrc(n_parameters, freedom, statistic)))
 
     @property
     def is_significant(self) -> bool:

@@ -17,7 +17,7 @@ from typing import get_args
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import f as f_distribution
+from scipy.special import fdtrc
 
 from armscan.calibration.hand_eye.estimate import (
     HandEyeSolution,
@@ -30,6 +30,7 @@ from armscan.calibration.hand_eye.observations import CondensedObservations, Pla
 from armscan.calibration.hand_eye.search import (
     Start,
     find_start,
+    find_start_within,
     linear_hand_eye,
     posture_rms,
     posture_rms_at,
@@ -82,6 +83,11 @@ LIKELIER = 10.0
 """Logarithm of the likelihood ratio from which mirrored data are believed: 22,000 to 1."""
 SMALLER = 0.7
 """And they leave less than this part of what the data as given leave."""
+HOPELESS = 2.0
+"""Mirrored data that leave more than so many times what the data as given leave, at every minimum
+of the plain sum of squares, are no reason to refuse. Of 114 drawn plates, 48 of them mirrored, none
+was judged otherwise for it: what was beyond kept 1.86 times as much when it was estimated all the
+same, and what a refusal rests on left 0.73 times as much at most."""
 LARGEST_SHIFT = 0.1
 """Of the middle of a mirrored image, over the focal length."""
 NO_FIT_MM = 1e6
@@ -226,7 +232,7 @@ def _judged(
     if np.linalg.cond(covariance) > 1e12:
         return None
     statistic = float(values @ np.linalg.solve(covariance, values)) / n_new
-    chance = float(f_distribution.sf(statistic, n_new, n_facts - n_known - n_new))
+    chance = float(fdtrc(n_new, n_facts - n_known - n_new, max(statistic, 0.0)))
     moved = unknowns.jacobian @ (values / scale)
     quadratic = float(residual @ solution.projected @ residual)
     determinant = float(np.linalg.slogdet(total)[1])
@@ -400,19 +406,38 @@ def find_mirror(
     given = _likelihood(replace(problem, observations=few), start.tool_from_sensor)
     if given is None:
         return None
-    best: tuple[float, float, str, str] | None = None
-    for words, remedy, mirrored in _all_mirrored(few, plate):
-        pose = find_start(mirrored, plate).tool_from_sensor
-        found = _likelihood(replace(problem, observations=mirrored), pose)
-        if found is not None and (best is None or found[0] > best[0]):
-            best = (*found, words, remedy)
-    if best is None or best[0] < given[0] + LIKELIER or best[1] > smaller * given[1]:
+    best = None
+    # A reading that is far off cannot be the mirror, but may be likelier than one that could: all
+    # are heard before anything is refused.
+    for most_mm in (HOPELESS * given[1], np.inf):
+        best = _likeliest_mirrored(replace(problem, observations=few), plate, most_mm)
+        if best is None or best[0] < given[0] + LIKELIER or best[1] > smaller * given[1]:
+            return None
+    if best is None:
         return None
     return FitFailure(
         f"mirrored data: the stripes of the typical posture lie {given[1]:.3f} mm from the plate, "
         f"and {best[1]:.3f} mm {best[2]}",
         best[3],
     )
+
+
+def _likeliest_mirrored(
+    problem: Problem, plate: PlateSurface, most_mm: float
+) -> tuple[float, float, str, str] | None:
+    """`_likelihood`, words and remedy of the likeliest of the mirrored readings.
+
+    Those that leave more than ``most_mm`` at every plain minimum are not estimated.
+    """
+    best: tuple[float, float, str, str] | None = None
+    for words, remedy, mirrored in _all_mirrored(problem.observations, plate):
+        start = find_start_within(mirrored, plate, most_mm)
+        if start is None:
+            continue
+        found = _likelihood(replace(problem, observations=mirrored), start.tool_from_sensor)
+        if found is not None and (best is None or found[0] > best[0]):
+            best = (*found, words, remedy)
+    return best
 
 
 def _likelihood(problem: Problem, pose: Pose[Tool, Sensor]) -> tuple[float, float] | None:

@@ -364,16 +364,20 @@ def estimate_and_check(
     if start.is_wrong.any():
         whole = estimate(problem, state)
         trials += [] if whole is None else [whole]
+    found: tuple[Alternative, ...] | None = None
     for fit in trials:
-        moved = find_contradiction(find_alternatives(fit), fit, plate.reference)
+        alternatives = find_alternatives(fit)
+        moved = find_contradiction(alternatives, fit, plate.reference)
         is_all = isinstance(checked, CheckedFit) and fit is checked.fit
+        found = alternatives if is_all else found
         if moved is None or not moved.is_refused:
             continue
         if is_all or moved.arm_mm < AS_WELL * usual_mm:
             return moved.failure
     if isinstance(checked, FitFailure):
         return checked
-    found = find_alternatives(checked.fit)
+    if found is None:
+        found = find_alternatives(checked.fit)
     moved = find_contradiction(found, checked.fit, plate.reference)
     checked = _with_plane_check(checked, problem, found)
     if moved is None:

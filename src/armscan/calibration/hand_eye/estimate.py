@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from armscan.calibration.hand_eye.noise import (
     LinearSolution,
@@ -175,7 +175,7 @@ class HandEyeSolution:
     def probability(self) -> float:
         """Of residuals at least this large under the noise model."""
         freedom = len(self.placed.residual_mm) - len(self.problem.columns)
-        return float(chi2_distribution.sf(self.chi2, freedom))
+        return float(chdtrc(freedom, self.chi2))
 
     def sigma_of(self, name: str) -> float:
         """Standard deviation of one cause of scatter; 0 where it is none."""
@@ -457,7 +457,7 @@ def leave_out(solution: HandEyeSolution, posture: int) -> LeftOut:
         change=solution.linear.gain[:, rows] @ predicted,
         normalised=float(np.sqrt(max(size, 0.0) / max(int(used.sum()), 1))),
         pose_sigmas=float(np.sqrt(max(statistic, 0.0) / rank)),
-        probability=float(chi2_distribution.sf(statistic, shape.shape[1])),
+        probability=float(chdtrc(shape.shape[1], statistic)),
     )
 
 

@@ -22,11 +22,10 @@ from functools import cache
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import brentq
-from scipy.special import ndtri
-from scipy.stats import chi2
-from scipy.stats.qmc import Sobol
+from scipy.special import chdtr, chdtri, ndtri
 
 from armscan.calibration.hand_eye.observations import (
     CondensedObservations,
@@ -301,26 +300,72 @@ def solve_linear(
 
     Returns None where the covariance or the normal matrix is not positive definite.
     """
+    solved = _solve(residual, jacobian, covariance)
+    if solved is None:
+        return None
+    projected, weighted = _projected(solved)
+    return LinearSolution(
+        step=solved.step,
+        covariance=solved.covariance,
+        projected=projected,
+        gain=solved.covariance @ weighted.T,
+        log_likelihood=solved.log_likelihood,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solved:
+    """``step``, ``covariance`` and ``log_likelihood`` of `LinearSolution`, for less.
+
+    ``lower`` (M, M) is the Cholesky factor of the residuals' covariance, ``whitened`` (M, K) the
+    Jacobian over it, ``left`` (M,) what the step leaves of the residuals over it.
+    """
+
+    step: FloatArray
+    covariance: FloatArray
+    log_likelihood: float
+    lower: FloatArray
+    whitened: FloatArray
+    left: FloatArray
+
+
+def _solve(residual: FloatArray, jacobian: FloatArray, covariance: FloatArray) -> _Solved | None:
+    """As `solve_linear`, without what only the scoring and the checks need."""
     try:
-        factor = cho_factor(covariance, lower=True)
-        inverse = cho_solve(factor, np.eye(len(covariance)))
-        weighted = inverse @ jacobian
-        normal = jacobian.T @ weighted
-        normal_factor = cho_factor(0.5 * (normal + normal.T), lower=True)
+        lower = cholesky(covariance, lower=True, check_finite=False)
+        whitened = solve_triangular(
+            lower, np.column_stack([jacobian, residual]), lower=True, check_finite=False
+        )
+        own, right = whitened[:, :-1], whitened[:, -1]
+        factor = cholesky(own.T @ own, lower=True)
     except LinAlgError:
         return None
-    solved = cho_solve(normal_factor, np.eye(jacobian.shape[1]))
-    gain = solved @ weighted.T
-    projected = inverse - weighted @ gain
-    determinants = np.log(np.diag(factor[0])).sum() + np.log(np.diag(normal_factor[0])).sum()
-    quadratic = float(residual @ projected @ residual)
-    return LinearSolution(
-        step=-gain @ residual,
+    solved = np.asarray(cho_solve((factor, True), np.eye(len(factor))))
+    step = -solved @ (own.T @ right)
+    left = right + own @ step
+    determinants = np.log(np.diag(lower)).sum() + np.log(np.diag(factor)).sum()
+    return _Solved(
+        step=step,
         covariance=0.5 * (solved + solved.T),
-        projected=0.5 * (projected + projected.T),
-        gain=gain,
-        log_likelihood=-0.5 * quadratic - float(determinants),
+        log_likelihood=-0.5 * float(left @ left) - float(determinants),
+        lower=lower,
+        whitened=own,
+        left=left,
     )
+
+
+def _projected(solved: _Solved) -> tuple[FloatArray, FloatArray]:
+    """``projected`` (M, M) of `LinearSolution`, and (M, K) ``C^-1 A``."""
+    inverse = np.tril(dpotri(solved.lower, lower=1)[0])
+    inverse += np.tril(inverse, -1).T
+    weighted = _transposed_solve(solved.lower, solved.whitened)
+    root = np.linalg.cholesky(solved.covariance)
+    thin = weighted @ root
+    return inverse - thin @ thin.T, weighted
+
+
+def _transposed_solve(lower: FloatArray, values: FloatArray) -> FloatArray:
+    return np.asarray(solve_triangular(lower, values, lower=True, trans=1, check_finite=False))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,17 +383,67 @@ class NoiseEstimate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Blocks:
+    """A covariance (M, M) that is zero between groups of observations, by its groups.
+
+    What a posture, an exposure, a sheet or a point has of its own is so; whole ones are one group.
+    ``diagonal`` (M,) stands for groups of one each, and there are no others then.
+    """
+
+    rows: tuple[slice | IntArray, ...]
+    parts: tuple[FloatArray, ...]
+    diagonal: FloatArray | None = None
+
+    @staticmethod
+    def of(covariance: FloatArray) -> _Blocks:
+        """Groups of a symmetric matrix: rows alike in where their first entry is."""
+        n = len(covariance)
+        labels = np.argmax(covariance != 0.0, axis=1)
+        if (labels == np.arange(n)).all() and np.count_nonzero(covariance) == n:
+            return _Blocks((), (), np.diag(covariance).copy())
+        if covariance[labels[:, None] != labels[None, :]].any():
+            return _Blocks((slice(0, n),), (covariance,))
+        groups = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+        parts = tuple(np.ascontiguousarray(covariance[np.ix_(rows, rows)]) for rows in groups)
+        return _Blocks(tuple(_as_slice(rows) for rows in groups), parts)
+
+    def times(self, values: FloatArray) -> FloatArray:
+        """Covariance times (M,) or (M, N) values."""
+        if self.diagonal is not None:
+            return np.asarray((values.T * self.diagonal).T)
+        product = np.zeros_like(values)
+        for rows, part in zip(self.rows, self.parts, strict=True):
+            product[rows] = part @ values[rows]
+        return product
+
+    def add_to(self, total: FloatArray, factor: float) -> None:
+        """Add so many times the covariance to (M, M)."""
+        if self.diagonal is not None:
+            total[np.diag_indices_from(total)] += factor * self.diagonal
+        for rows, part in zip(self.rows, self.parts, strict=True):
+            total[(rows, rows) if isinstance(rows, slice) else np.ix_(rows, rows)] += factor * part
+
+
+def _as_slice(rows: IntArray) -> slice | IntArray:
+    """Ascending rows as a slice where they lie side by side."""
+    is_whole = int(rows[-1]) - int(rows[0]) + 1 == len(rows)
+    return slice(int(rows[0]), int(rows[-1]) + 1) if is_whole else rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Posterior:
     """Restricted likelihood and prior of the free standard deviations, over their logarithms.
 
-    ``typical`` (C,) are the components' own, ``free`` (F,) which of them are estimated;
-    ``precision`` (F, F) is that of the normal prior of ``logs``, log sigma over typical.
+    ``known`` (M, M) is the covariance of all that is not estimated, ``blocks`` (F,) are those of
+    what is, for a sigma of 1. ``typical`` (C,) are the components' own, ``free`` (F,) which of them
+    are estimated; ``precision`` (F, F) is that of the normal prior of ``logs``, log sigma over
+    typical.
     """
 
     residual: FloatArray
     jacobian: FloatArray
-    components: tuple[NoiseComponent, ...]
     known: FloatArray
+    blocks: tuple[_Blocks, ...]
     typical: FloatArray
     free: IntArray
     precision: FloatArray
@@ -370,7 +465,16 @@ class _Posterior:
         scaled = deviation / np.array([component.log_width for component in components])[:, None]
         own = scaled[np.ix_(free, free)]
         typical = np.array([component.sigma for component in components])
-        return _Posterior(residual, jacobian, components, known, typical, free, own.T @ own)
+        given = np.where([component.is_estimated for component in components], 0.0, typical)
+        return _Posterior(
+            residual=residual,
+            jacobian=jacobian,
+            known=known + total_covariance(components, given),
+            blocks=tuple(_Blocks.of(components[k].covariance) for k in free),
+            typical=typical,
+            free=free,
+            precision=own.T @ own,
+        )
 
     def logs(self, sigmas: FloatArray) -> FloatArray:
         """(F,) of the free ones of (C,) standard deviations."""
@@ -384,13 +488,34 @@ class _Posterior:
 
     def covariance(self, logs: FloatArray) -> FloatArray:
         """(M, M) of the residuals."""
-        return total_covariance(self.components, self.sigmas(logs)) + self.known
+        total = self.known.copy()
+        for block, sigma in zip(self.blocks, self.sigmas(logs)[self.free], strict=True):
+            block.add_to(total, float(sigma) ** 2)
+        return total
 
-    def at(self, logs: FloatArray) -> tuple[float, LinearSolution | None]:
+    def at(self, logs: FloatArray) -> tuple[float, _Solved | None]:
         """Logarithm of the posterior, and the solution that it belongs to."""
-        solution = solve_linear(self.residual, self.jacobian, self.covariance(logs))
+        solution = _solve(self.residual, self.jacobian, self.covariance(logs))
         likelihood = -np.inf if solution is None else solution.log_likelihood
         return likelihood - 0.5 * float(logs @ self.precision @ logs), solution
+
+    def score(self, logs: FloatArray, solved: _Solved) -> tuple[FloatArray, FloatArray]:
+        """Derivative (F,) of the restricted likelihood by log sigma, and (F, F) its information.
+
+        With P of `LinearSolution` and ``V_k`` the scatter by a cause: ``e' P V_k P e - tr(P V_k)``
+        and ``2 tr(P V_i P V_j)``. ``V_k P`` is a full product only where ``V_k`` is one group.
+        """
+        projected = _projected(solved)[0]
+        explained = _transposed_solve(solved.lower, solved.left)
+        variances = self.sigmas(logs)[self.free] ** 2
+        products = np.stack([block.times(projected) for block in self.blocks])
+        traces = np.einsum("kii->k", products)
+        sizes = np.array([float(explained @ block.times(explained)) for block in self.blocks])
+        turned = np.ascontiguousarray(products.transpose(0, 2, 1))
+        n_free = len(products)
+        curvature = products.reshape(n_free, -1) @ turned.reshape(n_free, -1).T
+        score = variances * (sizes - traces)
+        return score, 2.0 * variances[:, None] * variances * curvature
 
 
 def estimate_noise(
@@ -416,7 +541,7 @@ def estimate_noise(
     for _ in range(MAX_SCORING_STEPS):
         if solution is None:
             break
-        score, information = _score(residual, solution, components, posterior.sigmas(logs), free)
+        score, information = posterior.score(logs, solution)
         score -= precision @ logs
         information += precision
         step = np.linalg.solve(information, score)
@@ -435,29 +560,6 @@ def estimate_noise(
             break
     log_covariance[np.ix_(free, free)] = np.linalg.inv(information)
     return NoiseEstimate(posterior.sigmas(logs), log_covariance, is_settled, value)
-
-
-def _score(
-    residual: FloatArray,
-    solution: LinearSolution,
-    components: tuple[NoiseComponent, ...],
-    sigmas: FloatArray,
-    free: IntArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Derivative of the restricted log-likelihood by log sigma, and its expected curvature."""
-    explained = solution.projected @ residual
-    products = [2.0 * sigmas[k] ** 2 * solution.projected @ components[k].covariance for k in free]
-    score = np.array(
-        [
-            sigmas[k] ** 2 * float(explained @ components[k].covariance @ explained)
-            - 0.5 * float(np.trace(product))
-            for k, product in zip(free, products, strict=True)
-        ]
-    )
-    information = np.array(
-        [[0.5 * float((one * other.T).sum()) for other in products] for one in products]
-    )
-    return score, information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -536,35 +638,10 @@ def covariance_over_noise(
 @cache
 def _normal_draws(n: int) -> FloatArray:
     """(N_DRAWS, n) evenly spread draws of a standard normal distribution."""
+    from scipy.stats.qmc import Sobol  # half a second that other commands need not wait for
+
     sobol = Sobol(n, rng=np.random.default_rng(0))
     return np.asarray(ndtri(sobol.random(N_DRAWS)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """``step``, ``covariance`` and ``log_likelihood`` of `LinearSolution`, for less."""
-
-    step: FloatArray
-    covariance: FloatArray
-    log_likelihood: float
-
-
-def _solve(residual: FloatArray, jacobian: FloatArray, covariance: FloatArray) -> _Solved | None:
-    """As `solve_linear`, without what only the scoring and the checks need."""
-    try:
-        lower = cholesky(covariance, lower=True, check_finite=False)
-        whitened = solve_triangular(
-            lower, np.column_stack([jacobian, residual]), lower=True, check_finite=False
-        )
-        own, right = whitened[:, :-1], whitened[:, -1]
-        factor = cholesky(own.T @ own, lower=True)
-    except LinAlgError:
-        return None
-    solved = np.asarray(cho_solve((factor, True), np.eye(len(factor))))
-    step = -solved @ (own.T @ right)
-    left = right + own @ step
-    determinants = np.log(np.diag(lower)).sum() + np.log(np.diag(factor)).sum()
-    return _Solved(step, solved, -0.5 * float(left @ left) - float(determinants))
 
 
 def _region_factor(mixed: FloatArray, parts: FloatArray, share: FloatArray) -> float:
@@ -577,10 +654,10 @@ def _region_factor(mixed: FloatArray, parts: FloatArray, share: FloatArray) -> f
     shapes = np.linalg.solve(mixed[block, block], parts[:, block, block])
     mean = np.einsum("mii->m", shapes)
     square = np.einsum("mij,mji->m", shapes, shapes)
-    limit = float(chi2.ppf(REGION, N_HAND_EYE))
+    limit = float(chdtri(N_HAND_EYE, 1.0 - REGION))
 
     def excess(factor: float) -> float:
-        held = chi2.cdf(factor * limit * mean / square, mean**2 / square)
+        held = chdtr(mean**2 / square, factor * limit * mean / square)
         return float(share @ held) - REGION
 
     return 1.0 if excess(1.0) >= 0.0 else float(brentq(excess, 1.0, 100.0))

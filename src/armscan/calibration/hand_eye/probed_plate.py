@@ -8,7 +8,7 @@ from math import isfinite
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from armscan.calibration.hand_eye.observations import PlateReference
 from armscan.errors import InputError, OptionError
@@ -105,7 +105,7 @@ def find_outliers(points_mm: FloatArray) -> tuple[int, ...]:
     while len(left) >= FEWEST_TO_JUDGE and len(named) < len(points_mm) // 4:
         scores = _studentised(points_mm[left])
         worst = int(np.argmax(scores))
-        limit = student.isf(OUTLIER_PROBABILITY / (2 * len(left)), len(left) - 4)
+        limit = -stdtrit(len(left) - 4, OUTLIER_PROBABILITY / (2 * len(left)))
         if not scores[worst] > limit:
             break
         named.append(int(left[worst]))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from armscan.calibration.hand_eye.checks import CheckedFit
 from armscan.calibration.hand_eye.estimate import (
@@ -494,7 +494,7 @@ def study_poses(
             for pose, covariance in zip(poses, covariances, strict=True)
         ]
         predicted = np.sqrt(np.diag(np.mean(spread, axis=0)))
-    low, high = np.sqrt(chi2.ppf([0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE], n - 1) / (n - 1))
+    low, high = np.sqrt(chdtri(n - 1, [0.5 + 0.5 * CONFIDENCE, 0.5 - 0.5 * CONFIDENCE]) / (n - 1))
     std = values.std(axis=0, ddof=1)
     return RepeatStudy(
         values=values,

@@ -91,9 +91,9 @@ def many_placed(
     Parameters
     ----------
     points_mm
-        (N, 3) in the Sensor frame.
+        (N, 3) in the Sensor frame, or (K, N, 3) of each of the K states its own.
     rotations, translations_mm
-        (N, 3, 3) and (N, 3) ``base_from_tool`` of each.
+        (N, 3, 3) and (N, 3) ``base_from_tool`` of each, or (K, N, 3, 3) and (K, N, 3).
     surface
         Its first parameters are unknown, as many as there are further unknowns.
     """
@@ -101,12 +101,12 @@ def many_placed(
     def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
         turned = points_mm @ turns.transpose(0, 2, 1)
         in_tool = turned + others[:, None, :3]
-        base = np.einsum("nij,knj->kni", rotations, in_tool) + translations_mm
+        base = np.einsum("...nij,...nj->...ni", rotations, in_tool) + translations_mm
         n_free = others.shape[1] - 3
         held = np.broadcast_to(surface.start[n_free:], (len(turns), len(surface.start) - n_free))
         parameters = np.concatenate([others[:, 3:], held], axis=1)
         residual, normals, by_surface = surface.distance(base, parameters)
-        in_tool_normals = np.einsum("nij,kni->knj", rotations, normals)
+        in_tool_normals = np.einsum("...nij,...ni->...nj", rotations, normals)
         by_turn = np.cross(turned, in_tool_normals)
         return residual, np.concatenate(
             [by_turn, in_tool_normals, by_surface[..., :n_free]], axis=2
@@ -139,7 +139,7 @@ def descend_all(
     n_steps
         Steps of each.
     scale
-        (3 + U,) of `unit_steps`.
+        (3 + U,) of `unit_steps`, or (K, 3 + U).
 
     Returns
     -------
@@ -149,11 +149,12 @@ def descend_all(
     residual, jacobian = place(rotations, others)
     cost = (residual**2).sum(axis=1)
     damping = np.full(len(rotations), 1e-3)
-    diagonal = np.eye(len(scale))
+    n_unknown = scale.shape[-1]
+    diagonal = np.eye(n_unknown)
     for _ in range(n_steps):
-        scaled = jacobian * scale
+        scaled = jacobian * scale[..., None, :]
         matrix = scaled.transpose(0, 2, 1) @ scaled
-        mean = np.einsum("kii->k", matrix) / len(scale)
+        mean = np.einsum("kii->k", matrix) / n_unknown
         matrix += (damping * mean + 1e-12)[:, None, None] * diagonal
         gradient = np.einsum("kni,kn->ki", scaled, residual)
         step = -np.linalg.solve(matrix, gradient[:, :, None])[:, :, 0] * scale
@@ -234,10 +235,36 @@ def find_start(observations: CondensedObservations, plate: PlateSurface) -> Star
     Of all minima of the sum of squares: those that descents from all over the rotations end in,
     that of the linear solution, and, where a posture is wrong, those of subsets of the postures.
     """
+    return _start_among(observations, plate, *_plain_minima(observations, plate))
+
+
+def find_start_within(
+    observations: CondensedObservations, plate: PlateSurface, most_mm: float
+) -> Start | None:
+    """`find_start`; None, for less, where no minimum of all postures leaves ``most_mm`` or less."""
+    linear, candidates = _plain_minima(observations, plate)
+    left = [np.nanmedian(posture_rms_at(observations, plate, pose)) for pose in candidates]
+    return None if min(left) > most_mm else _start_among(observations, plate, linear, candidates)
+
+
+def _plain_minima(
+    observations: CondensedObservations, plate: PlateSurface
+) -> tuple[Pose[Tool, Sensor] | None, list[Pose[Tool, Sensor]]]:
+    """The linear solution, and the minima of all postures."""
     linear = linear_hand_eye(observations, plate.plane)
     candidates = list(minima_on_plate(observations, plate))
     if linear is not None:
         candidates.append(_descend(observations, plate, linear))
+    return linear, candidates
+
+
+def _start_among(
+    observations: CondensedObservations,
+    plate: PlateSurface,
+    linear: Pose[Tool, Sensor] | None,
+    candidates: list[Pose[Tool, Sensor]],
+) -> Start:
+    """The start among these minima, and among those of subsets where a posture is wrong."""
     used = observations.used_postures
     is_many = len(used) >= LEAST_FOR_SUBSETS
     if is_many and _has_wrong(posture_rms_at(observations, plate, candidates[0])):
@@ -357,19 +384,50 @@ def _has_wrong(rms: FloatArray) -> bool:
 def _from_subsets(
     observations: CondensedObservations, plate: PlateSurface, used: IntArray
 ) -> list[Pose[Tool, Sensor]]:
-    """Solutions of random subsets of postures, the best few of them."""
-    few = three_a_stripe(observations)
-    random = np.random.default_rng(0)
-    found: list[tuple[float, Pose[Tool, Sensor]]] = []
+    """Solutions of random subsets of postures, the best few of them.
+
+    All descend at once: rows of a subset that has fewer than another are repeated without weight.
+    """
+    few, random = three_a_stripe(observations), np.random.default_rng(0)
+    normals, constants = plate_in_tool(few, plate.plane)
+    starts: list[Pose[Tool, Sensor]] = []
+    subsets: list[IntArray] = []
     for _ in range(N_SUBSETS):
-        chosen = random.choice(used, SUBSET_SIZE, replace=False)
-        subset = few.select(np.isin(few.posture, chosen))
-        pose = linear_hand_eye(subset, plate.plane)
+        rows = np.flatnonzero(np.isin(few.posture, random.choice(used, SUBSET_SIZE, replace=False)))
+        pose = _linear(few.points_mm[rows], normals[rows], constants[rows])
         if pose is not None:
-            pose = _descend(subset, plate, pose, 4)
-            found.append((float(np.nanmedian(posture_rms_at(few, plate, pose))), pose))
-    found.sort(key=lambda item: item[0])
-    return [pose for _, pose in found[:3]]
+            starts.append(pose)
+            subsets.append(rows)
+    if not starts:
+        return []
+    counts = np.array([len(rows) for rows in subsets])
+    width = int(counts.max())
+    kept = np.arange(width) < counts[:, None]
+    rotations, shifts, _ = descend_all(
+        _placed_subsets(few, plate, np.array([np.resize(rows, width) for rows in subsets]), kept),
+        np.array([pose.rotation for pose in starts]),
+        np.array([pose.translation_mm for pose in starts]),
+        4,
+        np.array([unit_steps(few.points_mm[rows], 3) for rows in subsets]),
+    )
+    residuals, _ = _placed_on(few, plate)(rotations, shifts)
+    typical = [np.nanmedian(posture_rms(few, residual)) for residual in residuals]
+    return [Pose(rotations[k], shifts[k]) for k in np.argsort(typical, kind="stable")[:3]]
+
+
+def _placed_subsets(
+    observations: CondensedObservations, plate: PlateSurface, rows: IntArray, kept: BoolArray
+) -> ManyPlaced:
+    """`many_placed` of (K, N) rows of the observations, those that are not ``kept`` as zeros."""
+    stripe = observations.stripe[rows]
+    poses = observations.rotations[stripe], observations.translations_mm[stripe]
+    place_rows = many_placed(observations.points_mm[rows], *poses, plate)
+
+    def place(turns: FloatArray, others: FloatArray) -> tuple[FloatArray, FloatArray]:
+        residual, jacobian = place_rows(turns, others)
+        return residual * kept, jacobian * kept[:, :, None]
+
+    return place
 
 
 def thinned(observations: CondensedObservations) -> CondensedObservations:
@@ -397,14 +455,13 @@ def _descend(
     observations: CondensedObservations,
     plate: PlateSurface,
     pose: Pose[Tool, Sensor],
-    n_steps: int = N_DESCENT,
 ) -> Pose[Tool, Sensor]:
     """Plain least squares of eq. 2.76 over six parameters."""
     rotations, shifts, _ = descend_all(
         _placed_on(observations, plate),
         pose.rotation[None],
         pose.translation_mm[None],
-        n_steps,
+        N_DESCENT,
         unit_steps(observations.points_mm, 3),
     )
     return Pose(rotations[0], shifts[0])
@@ -424,7 +481,17 @@ def linear_hand_eye(
     None where the postures leave one of the nine (or twelve) unknowns open; the six of eq. 2.69 may
     still be determined then.
     """
-    points = observations.points_mm
+    return _linear(
+        observations.points_mm,
+        *plate_in_tool(observations, plane),
+        is_offset_free=is_offset_free,
+    )
+
+
+def _linear(
+    points: FloatArray, normals: FloatArray, constants: FloatArray, *, is_offset_free: bool = False
+) -> Pose[Tool, Sensor] | None:
+    """`linear_hand_eye` of points (M, 3) and what `plate_in_tool` gives of them."""
     centre = points.mean(axis=0)
     _, extent, axes = np.linalg.svd(points - centre, full_matrices=False)
     if extent[1] <= RANK_RATIO * extent[0]:
@@ -432,7 +499,6 @@ def linear_hand_eye(
     n_axes = 2 if extent[2] < FLAT_RATIO * extent[1] else 3
     scale = float(extent[0]) / np.sqrt(len(points))
     local = homogeneous((points - centre) @ axes[:n_axes].T / scale)
-    normals, constants = plate_in_tool(observations, plane)
     rows = (local[:, :, None] * normals[:, None, :]).reshape(len(points), -1)
     if is_offset_free:
         rows = np.column_stack([rows, np.ones(len(rows))])

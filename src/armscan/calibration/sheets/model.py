@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, fdtrc
 
 from armscan.calibration.sheets.board_points import HeadCameras
 from armscan.calibration.sheets.coplanarity import SheetGeometry, refuse_lost_spread
@@ -162,7 +162,7 @@ def lack_of_fit(
         return FTest(f_ratio=0.0, degrees_of_freedom=0, p_value=1.0)
     share = (noise.sigma_factor / (sigma_factor or noise.sigma_factor)) ** 2
     ratio = max(chi2 - noise.effective_freedom * share, 0.0) / freedom
-    p_value = float(stats.f.sf(ratio, freedom, max(noise.effective_freedom, 1.0)))
+    p_value = float(fdtrc(freedom, max(noise.effective_freedom, 1.0), ratio))
     return FTest(f_ratio=ratio, degrees_of_freedom=freedom, p_value=p_value)
 
 
@@ -416,7 +416,7 @@ def _bow_or_boards(
         )
     boards_bowed = data.board_scatter(bowed, noise)
     gain = 2.0 * (boards_bowed.log_likelihood - boards.log_likelihood)
-    p_value = float(stats.chi2.sf(max(gain, 0.0), bowed.n_parameters - flat.n_parameters))
+    p_value = float(chdtrc(bowed.n_parameters - flat.n_parameters, max(gain, 0.0)))
     likelihood = f"likelihood ratio {gain:.1f}, p {p_value:.2g}"
     if p_value >= LACK_OF_FIT_P:
         return plane(

@@ -18,6 +18,7 @@ from armscan.geometry.estimate import Estimate
 from armscan.geometry.poses import Board, Pose, Sensor
 from armscan.models.calibration import (
     CameraCalibration,
+    LaserColour,
     Provenance,
     SecondCamera,
     SensorCalibration,
@@ -27,7 +28,6 @@ from armscan.models.calibration import (
 )
 from armscan.models.light_sheet import LightSheet
 from armscan.records.profile import Profile
-from armscan.vision.stripe.image import LaserColour
 from armscan.vision.targets.target import TargetView
 
 LACK_OF_FIT_P = 0.001

@@ -13,26 +13,11 @@ from numpy.typing import NDArray
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.models.calibration import LaserColour
 from armscan.records.exposure import Exposure
 from armscan.vision.stripe.ridge import SAMPLE_STEP_PX, FloatImage, mean_along, strong_median
 
 StripeMethod = Literal["fit", "threshold", "centroid", "template", "hessian"]
-LaserColour = Literal[
-    "auto",
-    "red",
-    "green",
-    "blue",
-    "grey",
-    "red-excess",
-    "green-excess",
-    "blue-excess",
-    "red-green",
-    "red-blue",
-    "green-red",
-    "green-blue",
-    "blue-red",
-    "blue-green",
-]
 MaskImage: TypeAlias = NDArray[np.uint8]
 
 SIGMA_RANGE_PX = (0.6, 10.0)

@@ -160,7 +160,7 @@ class _SectorFit:
     def _linearise(
         self, parameters: FloatArray, blur: FloatArray
     ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-        inner, outer, shift = parameters[self._sector].T
+        inner, outer, shift = np.ascontiguousarray(parameters.T)[:, self._sector]
         s = blur[self._pixels.ellipse]
         z = (self._pixels.distance_px - shift) / s
         share = ndtr(z)

@@ -77,7 +77,9 @@ def find_blobs(
             rows += [
                 (*ellipse, float(is_light))
                 for contour, links in zip(contours, _links(hierarchy), strict=True)
-                if links[_PARENT] < 0
+                # noise makes thousands of the shortest
+                if len(contour) >= 2.0 * smallest_px
+                and links[_PARENT] < 0
                 and (ellipse := _ellipse_of(np.asarray(contour), smallest_px, largest_px))
                 is not None
             ]
@@ -104,8 +106,6 @@ def _ellipse_of(
     contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], smallest_px: float, largest_px: float
 ) -> tuple[float, float, float, float, float, float] | None:
     """Centre u, v, shape uu, uv, vv and roundness error of a contour, if it is an ellipse."""
-    if len(contour) < 2.0 * smallest_px:
-        return None
     low = contour.reshape(-1, 2).min(axis=0)
     high = contour.reshape(-1, 2).max(axis=0)
     extent = float((high - low).max())

@@ -277,19 +277,26 @@ def band_pixels(
     levels.
     """
     parts = [_patch(grey.shape, rims, k, half_width_px[k]) for k in range(len(rims))]
-    ellipse = np.repeat(np.arange(len(rims)), [len(part) for part in parts])
-    pixels = np.concatenate(parts) if parts else np.zeros((0, 2), np.int64)
-    offset = pixels - rims.centres_px[ellipse]
-    own = np.einsum("kij,ki->kj", rims.directions[ellipse], offset)
+    ellipse = np.repeat(np.arange(len(rims)), [len(pixels) for pixels, _ in parts])
+    pixels = np.concatenate([np.zeros((0, 2), np.int64), *(one for one, _ in parts)])
+    own = np.concatenate([np.zeros((0, 2)), *(one for _, one in parts)])
     distance, angle = _nearest(own, rims.half_px[ellipse])
     kept = np.abs(distance) <= half_width_px[ellipse]
-    shade = 1.0 + (gradient[ellipse[kept]] * offset[kept]).sum(axis=1)
-    levels = grey[pixels[kept, 1], pixels[kept, 0]] / shade
-    return BandPixels(levels, ellipse[kept], distance[kept], angle[kept])
+    ellipse, pixels = ellipse[kept], pixels[kept]
+    slope_u, slope_v = gradient[ellipse].T
+    offset_u, offset_v = (pixels - rims.centres_px[ellipse]).T
+    shade = 1.0 + (slope_u * offset_u + slope_v * offset_v)
+    levels = grey[pixels[:, 1], pixels[:, 0]] / shade
+    return BandPixels(levels, ellipse, distance[kept], angle[kept])
 
 
-def _patch(shape: tuple[int, ...], rims: Rims, k: int, half_width_px: float) -> IntArray:
-    """Pixels (K, 2), column and row, that may lie in the band of ellipse ``k``."""
+def _patch(
+    shape: tuple[int, ...], rims: Rims, k: int, half_width_px: float
+) -> tuple[IntArray, FloatArray]:
+    """Pixels (K, 2), column and row, that may lie in the band of ellipse ``k``.
+
+    With their places (K, 2) along its axes.
+    """
     centre, half = rims.centres_px[k], rims.half_px[k]
     reach = np.sqrt(rims.directions[k] ** 2 @ half**2) + half_width_px + 1.0
     low = np.maximum(np.floor(centre - reach), 0).astype(np.int64)
@@ -298,10 +305,11 @@ def _patch(shape: tuple[int, ...], rims: Rims, k: int, half_width_px: float) -> 
     pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
     own = (pixels - centre) @ rims.directions[k]
     inner = np.maximum(half - half_width_px - 0.5, 0.1)
-    is_inner = ((own / inner) ** 2).sum(axis=1) < 1.0
-    is_outer = ((own / (half + half_width_px + 0.5)) ** 2).sum(axis=1) > 1.0
+    squares = own**2
     # A parallel curve of an ellipse lies between these two ellipses.
-    return np.asarray(pixels[~is_inner & ~is_outer])
+    kept = squares @ inner**-2.0 >= 1.0
+    kept &= squares @ (half + half_width_px + 0.5) ** -2.0 <= 1.0
+    return pixels[kept], own[kept]
 
 
 def _nearest(own: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:

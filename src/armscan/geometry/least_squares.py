@@ -35,7 +35,13 @@ HUBER_LIMIT = 1.345
 
 def robust_sigma(residuals: FloatArray) -> float:
     """Standard deviation of residuals about zero from their median size; 0 where there are none."""
-    return MAD_TO_SIGMA * float(np.median(np.abs(residuals))) if np.size(residuals) else 0.0
+    size = np.abs(residuals).ravel()
+    half = len(size) // 2
+    if not len(size) or np.isnan(size.sum()):
+        return np.nan if len(size) else 0.0
+    ordered = np.partition(size, half)
+    below = ordered[half] if len(size) % 2 else ordered[:half].max()
+    return MAD_TO_SIGMA * float(0.5 * (below + ordered[half]))
 
 
 def huber_weights(residuals: FloatArray, limit: float = HUBER_LIMIT) -> FloatArray:

@@ -31,8 +31,8 @@ NONE = -1
 def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
     """Enter points into a map of pixels, dropping row points that repeat a column point.
 
-    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32, filled with -1; receives
-    the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32 zeros; receives one
+    more than the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
     """
     height, width = owner.shape
     for side in range(2):
@@ -45,15 +45,15 @@ def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
             if side == ROW:
                 for v in range(max(y - 1, 0), min(y + 2, height)):
                     for u in range(max(x - 1, 0), min(x + 2, width)):
-                        j = owner[v, u]
+                        j = owner[v, u] - 1
                         if j >= 0 and points[j, 5] != ROW:
                             distance = math.hypot(
                                 points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
                             )
                             if distance < SAME_PX:
                                 is_kept[i] = 0
-            if is_kept[i] == 1 and owner[y, x] < 0:
-                owner[y, x] = i
+            if is_kept[i] == 1 and owner[y, x] == 0:
+                owner[y, x] = i + 1
             else:
                 is_kept[i] = 0
 
@@ -70,14 +70,14 @@ def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOu
     for i in range(points.shape[0]):
         x = int(points[i, 0] + 0.5)
         y = int(points[i, 1] + 0.5)
-        if owner[y, x] != i:
+        if owner[y, x] != i + 1:
             continue
         nx = points[i, 2]
         ny = points[i, 3]
         best_ahead = best_behind = 1e9
         for v in range(max(y - 3, 0), min(y + 4, height)):
             for u in range(max(x - 3, 0), min(x + 4, width)):
-                j = owner[v, u]
+                j = owner[v, u] - 1
                 if j < 0 or j == i:
                     continue
                 dx = points[j, 0] - points[i, 0]

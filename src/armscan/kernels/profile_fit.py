@@ -101,7 +101,9 @@ def accumulate(
     against the skew term, the skew term's norm, its product with the centre's derivative, and the
     same product for a term ``u^3``.
     """
-    sums[:] = 0.0
+    # sums in an array would wait for memory at every pixel
+    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = 0.0
+    skew = skew_norm = skew_centre = cubic = 0.0
     # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
     step = 1.0 / state[2]
     u = (-1.0 - state[0]) * step
@@ -123,19 +125,22 @@ def accumulate(
         j0 = falling * step
         j2 = falling * u
         q = bell * third
-        sums[0] += w * j0 * j0
-        sums[1] += w * j0 * m
-        sums[2] += w * j0 * j2
-        sums[3] += w * m * m
-        sums[4] += w * m * j2
-        sums[5] += w * j2 * j2
-        sums[6] += w * r * j0
-        sums[7] += w * r * m
-        sums[8] += w * r * j2
-        sums[9] += w * r * q
-        sums[10] += w * q * q
-        sums[11] += w * q * j0
-        sums[12] += w * j0 * bell * u * u * u
+        a00 += w * j0 * j0
+        a01 += w * j0 * m
+        a02 += w * j0 * j2
+        a11 += w * m * m
+        a12 += w * m * j2
+        a22 += w * j2 * j2
+        b0 += w * r * j0
+        b1 += w * r * m
+        b2 += w * r * j2
+        skew += w * r * q
+        skew_norm += w * q * q
+        skew_centre += w * q * j0
+        cubic += w * j0 * bell * u * u * u
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a00, a01, a02, a11, a12, a22
+    sums[6], sums[7], sums[8] = b0, b1, b2
+    sums[9], sums[10], sums[11], sums[12] = skew, skew_norm, skew_centre, cubic
 
 
 @compiled()
@@ -156,6 +161,38 @@ def solve_step(sums: Floats, steps: FloatsOut) -> float:
     steps[1] = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
     steps[2] = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
     return float(c00 / determinant)
+
+
+@compiled()
+def read_profile(
+    image: Image,
+    clipped: Mask,
+    point: Floats,
+    side: Floats,
+    sigma: float,
+    first: int,
+    n: int,
+    profile: TableOut,
+) -> None:
+    """Copy ``n`` pixels from ``first`` on of a point's column or row, less their background.
+
+    ``profile``: (3, >= n) output: grey level less background, background, and 1 where the pixel is
+    not clipped. The others: One point's of `fit_profiles`.
+    """
+    is_column = int(point[5]) == COLUMN
+    start = point[1] if is_column else point[0]
+    line = int(point[0] if is_column else point[1])
+    has_clipped = clipped.shape[0] == image.shape[0] and clipped.shape[1] == image.shape[1]
+    middle = 0.5 * (side[0] + side[1])
+    ramp = (side[1] - side[0]) / (SIDE_SPAN * sigma)
+    for k in range(n):
+        at = first + k
+        value = image[at, line] if is_column else image[line, at]
+        profile[1, k] = middle + ramp * (at - start)
+        profile[0, k] = value - profile[1, k]
+        profile[2, k] = 1.0
+        if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
+            profile[2, k] = 0.0
 
 
 @compiled(error_model="numpy")
@@ -181,7 +218,8 @@ def fit_profiles(
     ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
     as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
-    half width of the fitted window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma,
+    half width of the fitted window in sigmas. ``result``: (N, 8) input: results for nearly the same
+    noise and section, from which the steps begin, or zeros; output: centre, amplitude, sigma,
     variance of the centre (0: the fit failed), score of a skew beyond the section's, its norm,
     count of clipped pixels, and by how much a term ``u^3`` in the profile's exponent moves the
     centre, in sigmas (for the correction on bent lines).
@@ -210,20 +248,16 @@ def fit_profiles(
             grow = (n_clipped + 1) // 2
             first = max(first - grow, 0)
             last = min(last + grow, size - 1)
-        middle = 0.5 * (sides[i, 0] + sides[i, 1])
-        ramp = (sides[i, 1] - sides[i, 0]) / (SIDE_SPAN * sigma_px[i])
         n = last - first + 1
-        for k in range(n):
-            at = first + k
-            value = image[at, line] if is_column else image[line, at]
-            profile[1, k] = middle + ramp * (at - start)
-            profile[0, k] = value - profile[1, k]
-            profile[2, k] = 1.0
-            if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
-                profile[2, k] = 0.0
-        state[0] = start - first
-        state[1] = start_amplitude(profile, n, state[0], sigma_px[i])
-        state[2] = sigma_px[i]
+        read_profile(image, clipped, points[i], sides[i], sigma_px[i], first, n, profile)
+        if result[i, VARIANCE] > 0.0:
+            state[0] = result[i, CENTRE] - first
+            state[1] = result[i, AMPLITUDE]
+            state[2] = result[i, SIGMA]
+        else:
+            state[0] = start - first
+            state[1] = start_amplitude(profile, n, state[0], sigma_px[i])
+            state[2] = sigma_px[i]
         result[i, VARIANCE] = 0.0
         result[i, CLIPPED] = n_clipped
         if state[1] <= 0.0 or n - n_clipped < LEAST_PIXELS:
@@ -251,6 +285,210 @@ def fit_profiles(
             is_near = drift < 2.0 * sigma_px[i] + 1.0
             if not is_near or not 0.4 < state[2] / sigma_px[i] < 2.5 + 0.5 / sigma_px[i]:
                 break
+
+
+NORMAL_00, NORMAL_01, NORMAL_11, SCORE_0, SCORE_1, HAS_CORE = range(6)
+SECTION_COLUMNS = 6
+"""Columns of what one profile says of the section that all have in common."""
+SIDE_FROM, SIDE_TO = 3.4, 4.2
+"""Sigmas between which pixels beside the line tell the noise of the background."""
+CORE_SIGMAS = 1.3
+"""Profiles that are clipped farther out say nothing of the section: their flanks alone are left."""
+FIT_PARAMETERS = 3.0
+LEAST_DETERMINANT = 1e-12
+MAD_TO_SIGMA = 1.4826022185056018
+
+
+@compiled(error_model="numpy")
+def section_sums(
+    profile: Table,
+    n: int,
+    first: int,
+    fit: Floats,
+    section: Floats,
+    noise: Floats,
+    sums: FloatsOut,
+    pixels: TableOut,
+    count: int,
+) -> int:
+    """Sums over one profile, and its pixels' residuals.
+
+    ``profile``: (3, >= n) from `read_profile`, beginning at pixel ``first``. ``fit``: (8,) of
+    `fit_profiles`. ``section``: (2,). ``noise``: (3,). ``sums``: (21,) output: weighted products of
+    the derivatives by centre, amplitude and width (00 01 02 11 12 22), of each with the terms of
+    third (6 7 8) and fourth order (9 10 11), of these terms (12 13 14), of the residual with all
+    five (15 to 19), and 1 where no pixel beyond the core is clipped. ``pixels``: (3, capacity)
+    output from ``count`` on: the line's own grey level, the same with the background, the residual.
+
+    Returns the new count.
+    """
+    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = b3 = b4 = 0.0
+    p0 = p1 = p2 = q0 = q1 = q2 = t33 = t34 = t44 = 0.0
+    has_core = 1.0
+    begun = stop = -1
+    for k in range(n):
+        u = (first + k - fit[CENTRE]) / fit[SIGMA]
+        is_line = abs(u) < REACH_SIGMAS
+        if not is_line and not SIDE_FROM < abs(u) < SIDE_TO:
+            continue
+        bell = fit[AMPLITUDE] * math.exp(-0.5 * u * u)
+        third = u * (u * u - 3.0)
+        fourth = u * u * (u * u - 6.0) + 3.0
+        shape = 1.0 + section[0] * third + section[1] * fourth
+        m = bell * max(shape, 0.0)
+        r = profile[0, k] - m
+        pixels[0, count] = m
+        pixels[1, count] = m + profile[1, k]
+        pixels[2, count] = r
+        count += 1
+        if not is_line:
+            continue
+        begun = count - 1 if begun < 0 else begun
+        stop = count
+        if profile[2, k] == 0.0:
+            has_core = has_core if abs(u) <= CORE_SIGMAS else 0.0
+            continue
+        w = 1.0 / (noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2])
+        j0 = bell * (u * shape - 3.0 * section[0] * (u * u - 1.0) - 4.0 * section[1] * third)
+        j2 = j0 * u
+        third *= bell
+        fourth *= bell
+        a00 += w * j0 * j0
+        a01 += w * j0 * m
+        a02 += w * j0 * j2
+        a11 += w * m * m
+        a12 += w * m * j2
+        a22 += w * j2 * j2
+        p0 += w * j0 * third
+        p1 += w * m * third
+        p2 += w * j2 * third
+        q0 += w * j0 * fourth
+        q1 += w * m * fourth
+        q2 += w * j2 * fourth
+        t33 += w * third * third
+        t34 += w * third * fourth
+        t44 += w * fourth * fourth
+        b0 += w * r * j0
+        b1 += w * r * m
+        b2 += w * r * j2
+        b3 += w * r * third
+        b4 += w * r * fourth
+    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a00, a01, a02, a11, a12, a22
+    sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = p0, p1, p2, q0, q1, q2
+    sums[12], sums[13], sums[14] = t33, t34, t44
+    sums[15], sums[16], sums[17], sums[18], sums[19], sums[20] = b0, b1, b2, b3, b4, has_core
+    freedom = math.sqrt((stop - begun) / max(stop - begun - FIT_PARAMETERS, 1.0))
+    for k in range(max(begun, 0), stop):
+        pixels[2, k] *= freedom
+    return count
+
+
+@compiled(error_model="numpy")
+def leave_fitted(sums: Floats, said: FloatsOut) -> None:
+    """Normal matrix and right-hand side of what the fitted parameters do not take up of the terms.
+
+    ``sums``: (21,) of `section_sums`. ``said``: (6,) output; zeros where the parameters themselves
+    are not determined.
+    """
+    said[:] = 0.0
+    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * c00 + b * c01 + c * c02
+    if not determinant > LEAST_DETERMINANT * a * d * f:
+        return
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    for term in range(2):
+        x, y, z = sums[6 + 3 * term], sums[7 + 3 * term], sums[8 + 3 * term]
+        t0 = (c00 * x + c01 * y + c02 * z) / determinant
+        t1 = (c01 * x + c11 * y + c12 * z) / determinant
+        t2 = (c02 * x + c12 * y + c22 * z) / determinant
+        said[SCORE_0 + term] = sums[18 + term] - t0 * sums[15] - t1 * sums[16] - t2 * sums[17]
+        if term == 0:
+            said[NORMAL_00] = sums[12] - t0 * x - t1 * y - t2 * z
+            said[NORMAL_01] = sums[13] - t0 * sums[9] - t1 * sums[10] - t2 * sums[11]
+        else:
+            said[NORMAL_11] = sums[14] - t0 * x - t1 * y - t2 * z
+    said[HAS_CORE] = sums[20]
+
+
+@compiled(error_model="numpy")
+def weigh_section(
+    image: Image,
+    clipped: Mask,
+    points: Table,
+    sides: Table,
+    fits: Table,
+    noise: Floats,
+    section: Floats,
+    reach: int,
+    said: TableOut,
+    pixels: TableOut,
+) -> int:
+    """What fitted profiles leave: for the terms of their common section, and for the noise.
+
+    Of the terms of third and fourth order of `accumulate`, only what centre, amplitude and width
+    do not take up counts.
+
+    ``image``, ``clipped``, ``points``, ``sides``, ``noise``, ``section``: As for `fit_profiles`,
+    which gave ``fits`` (N, 8). ``reach``: Pixels looked at on both sides. ``said``: (N, 6) output:
+    normal matrix of the two terms as 00 01 11, their right-hand side, and 1 where no pixel beyond
+    the core is clipped. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the
+    same with the background, and the residual, widened by the freedom that the fit took, of every
+    pixel of the lines and of those beside them.
+
+    Returns count of pixels.
+    """
+    height, width = image.shape
+    profile = np.zeros((3, 2 * reach + 1))
+    sums = np.zeros(21)
+    count = 0
+    for i in range(points.shape[0]):
+        is_column = int(points[i, 5]) == COLUMN
+        start = points[i, 1] if is_column else points[i, 0]
+        first = max(int(np.rint(start)) - reach, 0)
+        stop = min(int(np.rint(start)) + reach + 1, height if is_column else width)
+        n = stop - first
+        read_profile(image, clipped, points[i], sides[i], fits[i, SIGMA], first, n, profile)
+        own = section[:2] if is_column else section[2:]
+        count = section_sums(profile, n, first, fits[i], own, noise, sums, pixels, count)
+        leave_fitted(sums, said[i])
+    return count
+
+
+@compiled()
+def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOut) -> None:
+    """Terms (2,) that profiles share, robustly: a score counts little beyond the median's scatter.
+
+    ``said``: (N, 6) of `weigh_section`. ``rounds``: Of weighing. ``clipped_score``: Of one profile,
+    in scatters, beyond which it counts the less. ``terms``: (2,) output.
+    """
+    n = said.shape[0]
+    ratio = np.zeros((2, n))
+    limit = np.full(2, np.inf)
+    terms[:] = 0.0
+    for _ in range(rounds):
+        a = b = c = d = e = f = 0.0
+        for i in range(n):
+            k0 = min(1.0, limit[0] / max(abs(ratio[0, i]), 1e-12))
+            k1 = min(1.0, limit[1] / max(abs(ratio[1, i]), 1e-12))
+            a += k0 * said[i, NORMAL_00]
+            b += k0 * said[i, NORMAL_01]
+            c += k1 * said[i, NORMAL_01]
+            d += k1 * said[i, NORMAL_11]
+            e += k0 * said[i, SCORE_0]
+            f += k1 * said[i, SCORE_1]
+        determinant = a * d - b * c
+        if not abs(determinant) > LEAST_DETERMINANT * a * d:
+            return
+        terms[0] = (d * e - b * f) / determinant
+        terms[1] = (a * f - c * e) / determinant
+        for i in range(n):
+            left = said[i, SCORE_0] - said[i, NORMAL_00] * terms[0] - said[i, NORMAL_01] * terms[1]
+            right = said[i, SCORE_1] - said[i, NORMAL_01] * terms[0] - said[i, NORMAL_11] * terms[1]
+            ratio[0, i] = left / math.sqrt(max(said[i, NORMAL_00], 1e-12))
+            ratio[1, i] = right / math.sqrt(max(said[i, NORMAL_11], 1e-12))
+        for term in range(2):
+            limit[term] = clipped_score * max(MAD_TO_SIGMA * np.median(np.abs(ratio[term])), 1.0)
 
 
 SHIFT, SLOPE, BEND, BEND_SIGMA, SMOOTH_SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
@@ -310,6 +548,7 @@ def gather(
     """
     nx = normals[i, 0]
     ny = normals[i, 1]
+    m0 = m1 = m2 = m3 = m4 = d0 = d1 = d2 = count = 0.0
     while 0 <= j < points.shape[0] and chain[j] == chain[i]:
         dx = points[j, 0] - points[i, 0]
         dy = points[j, 1] - points[i, 1]
@@ -319,16 +558,27 @@ def gather(
         if is_used[j] != 0:
             d = dx * nx + dy * ny
             w = 1.0 / (sigma_px[j] * sigma_px[j])
-            moments[0] += w
-            moments[1] += w * s
-            moments[2] += w * s * s
-            moments[3] += w * s * s * s
-            moments[4] += w * s * s * s * s
-            moments[5] += w * d
-            moments[6] += w * s * d
-            moments[7] += w * s * s * d
-            moments[COUNT] += 1.0
+            ws = w * s
+            wss = ws * s
+            m0 += w
+            m1 += ws
+            m2 += wss
+            m3 += wss * s
+            m4 += wss * s * s
+            d0 += w * d
+            d1 += ws * d
+            d2 += wss * d
+            count += 1.0
         j += direction
+    moments[0] += m0
+    moments[1] += m1
+    moments[2] += m2
+    moments[3] += m3
+    moments[4] += m4
+    moments[5] += d0
+    moments[6] += d1
+    moments[7] += d2
+    moments[COUNT] += count
     return j
 
 
@@ -374,6 +624,7 @@ def smooth_chains(
         result[i, SMOOTH_SIGMA] = sigma_px[i]
         lower = -1e9
         upper = 1e9
+        inflated = 1.0
         down = i - 1
         up = i + 1
         for k in range(windows_px.shape[0]):
@@ -396,9 +647,11 @@ def smooth_chains(
             result[i, BEND_SIGMA] = math.sqrt(solved[4] * inflation[k])
             result[i, SMOOTH_SIGMA] = sigma
             result[i, WINDOW] = reach
+            inflated = inflation[k]
             others[:] = moments
+        if result[i, WINDOW] > 0.0:
             if is_used[i] != 0:
                 others[0] -= own
             if solve_quadratic(others, solved):
                 result[i, PREDICTED] = solved[0]
-                result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflation[k])
+                result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflated)

@@ -10,6 +10,7 @@ import numpy as np
 from armscan.kernels.arrays import (
     COLUMN,
     ROW,
+    Floats,
     FloatsOut,
     Image,
     ImageOut,
@@ -135,12 +136,17 @@ def find_runs(
     floor = np.zeros(width, np.float32)
     upper = np.zeros(width, np.float32)
     lower = np.zeros(width, np.float32)
+    n_words = -(-width // 8)
+    is_lit = np.zeros(8 * n_words, np.uint8)
+    words = is_lit.view(np.int64)
+    n_open = np.zeros(n_words, np.int64)
     above = -1
     start = np.full(width, -1, np.int64)
     count = 0
     lift = np.float32(rise)
     for y in range(height + 1):
         row_start = -1
+        is_lit[:] = 0
         if y < height:
             v = min(max((y + 0.5) / cell_px - 0.5, 0.0), background.shape[0] - 1.0)
             cell = int(v)
@@ -150,31 +156,39 @@ def find_runs(
                 interpolate_columns(background, cell_px, following, lower)
                 above = cell
             fraction = np.float32(v - cell)
+            row = image[y]
             for x in range(width):
                 floor[x] = upper[x] + fraction * (lower[x] - upper[x]) + lift
-        for x in range(width):
-            if y < height and image[y, x] > floor[x]:
-                if start[x] < 0:
-                    start[x] = y
-                if row_start < 0:
-                    row_start = x
-                if x < width - 1:
-                    continue
-                stop = x
-            else:
-                if start[x] >= 0:
-                    if y - start[x] <= longest_px:
+                is_lit[x] = row[x] > floor[x]
+        for word in range(n_words):
+            # most of the image is dark, and is passed over by eight pixels at once
+            if words[word] == 0 and n_open[word] == 0 and row_start < 0:
+                continue
+            for x in range(8 * word, min(8 * word + 8, width)):
+                if is_lit[x]:
+                    if start[x] < 0:
+                        start[x] = y
+                        n_open[word] += 1
+                    if row_start < 0:
+                        row_start = x
+                    if x < width - 1:
+                        continue
+                    stop = x
+                else:
+                    if start[x] >= 0:
+                        if y - start[x] <= longest_px:
+                            base = float(floor[x]) - rise
+                            count = split_run(
+                                image, COLUMN, x, start[x], y - 1, base, rise, runs, count
+                            )
+                        start[x] = -1
+                        n_open[word] -= 1
+                    stop = x - 1
+                if row_start >= 0:
+                    if stop - row_start < longest_px:
                         base = float(floor[x]) - rise
-                        count = split_run(
-                            image, COLUMN, x, start[x], y - 1, base, rise, runs, count
-                        )
-                    start[x] = -1
-                stop = x - 1
-            if row_start >= 0:
-                if stop - row_start < longest_px:
-                    base = float(floor[x]) - rise
-                    count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
-                row_start = -1
+                        count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
+                    row_start = -1
     return count
 
 
@@ -183,6 +197,7 @@ REACH_SIGMAS = 3.5
 STEEPNESS_SLACK = 0.85
 REPEAT_PX = 1.5
 ROUNDS = 3
+LANES = 8
 
 
 def gaussian_taps(sigma_px: float) -> Image:
@@ -207,17 +222,18 @@ def derivatives_at(
     x: int,
     y: int,
     taps: Image,
+    radius: int,
     columns: ImageOut,
     result: FloatsOut,
 ) -> None:
     """Smoothed derivatives at one pixel; beyond the border the image is continued constantly.
 
-    ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`.
+    ``image``: (H, W) grey levels. ``x``, ``y``: Pixel. ``taps``: (3, m) from `gaussian_taps`, of
+    which the first 2 radius + 1 columns count and the rest is 0.
     ``columns``: (3, m) scratch. ``result``: (5,) output: d/dx, d/dy, d2/dx2, d2/dxdy, d2/dy2.
     """
     height, width = image.shape
     m = taps.shape[1]
-    radius = m // 2
     left = x - radius
     is_inside = left >= 0 and left + m <= width
     # views, because an index that might be negative keeps the loops from being vectorised
@@ -226,7 +242,7 @@ def derivatives_at(
     down0[:] = np.float32(0.0)
     down1[:] = np.float32(0.0)
     down2[:] = np.float32(0.0)
-    for j in range(m):
+    for j in range(2 * radius + 1):
         row = min(max(y + j - radius, 0), height - 1)
         smooth = taps0[j]
         slope = taps1[j]
@@ -264,6 +280,7 @@ def step_to_ridge(
     x_px: float,
     y_px: float,
     taps: Image,
+    radius: int,
     scratch: ImageOut,
     derivatives: FloatsOut,
     result: FloatsOut,
@@ -274,9 +291,9 @@ def step_to_ridge(
     polynomial has its maximum at ``t = -(g . n) / (n' H n)``. The expansion point is moved while
     the step leaves its pixel.
 
-    ``image``, ``taps``, ``scratch``: As for `derivatives_at`. ``x_px``, ``y_px``: Start.
-    ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal y, negative
-    second derivative along the normal.
+    ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``x_px``,
+    ``y_px``: Start. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
+    y, negative second derivative along the normal.
     """
     height, width = image.shape
     x = math.floor(x_px + 0.5)
@@ -284,7 +301,7 @@ def step_to_ridge(
     for _ in range(ROUNDS):
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
-        derivatives_at(image, x, y, taps, scratch, derivatives)
+        derivatives_at(image, x, y, taps, radius, scratch, derivatives)
         half = 0.5 * (derivatives[2] - derivatives[4])
         gxy = derivatives[3]
         root = math.sqrt(half * half + gxy * gxy)
@@ -306,7 +323,7 @@ def step_to_ridge(
             result[3] = ny
             result[4] = -bend
             return True
-        if abs(step) > taps.shape[1] // 2:
+        if abs(step) > radius:
             return False
         x += math.floor(dx + 0.5)
         y += math.floor(dy + 0.5)
@@ -336,14 +353,20 @@ def refine_candidates(
     Returns count of points.
     """
     height, width = image.shape
-    scratch = np.zeros((3, taps.shape[1]), np.float32)
+    radius = taps.shape[1] // 2
+    # whole registers: what is left over of a row would take as long as the rest
+    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
+    padded[:, : taps.shape[1]] = taps
+    scratch = np.zeros(padded.shape, np.float32)
     derivatives = np.zeros(5)
     ridge = np.zeros(5)
     latest = np.full((2, max(height, width)), -1e9)
     count = 0
     for r in range(n_runs):
         is_row = runs[r, 2] == ROW
-        if not step_to_ridge(image, runs[r, 0], runs[r, 1], taps, scratch, derivatives, ridge):
+        if not step_to_ridge(
+            image, runs[r, 0], runs[r, 1], padded, radius, scratch, derivatives, ridge
+        ):
             continue
         if ridge[4] < least_bend:
             continue
@@ -371,3 +394,33 @@ def refine_candidates(
         points[count, 5] = side
         count += 1
     return count
+
+
+@compiled()
+def sample_across(
+    image: Image, points: Table, across_px: Floats, along_px: Floats, profiles: TableOut
+) -> None:
+    """Grey levels across ridges, linear between pixels, constant beyond the border.
+
+    ``image``: (H, W) grey levels. ``points``: (N, >= 4) x, y, normal. ``across_px``: (K,) places
+    along the normal. ``along_px``: (M,) places along the tangent, of which the mean is taken.
+    ``profiles``: (N, K) output.
+    """
+    height, width = image.shape
+    n_along = along_px.shape[0]
+    for i in range(points.shape[0]):
+        nx, ny = points[i, 2], points[i, 3]
+        for k in range(across_px.shape[0]):
+            total = 0.0
+            for m in range(n_along):
+                x = points[i, 0] + nx * across_px[k] - ny * along_px[m]
+                y = points[i, 1] + ny * across_px[k] + nx * along_px[m]
+                x = min(max(x, 0.0), width - 1.0)
+                y = min(max(y, 0.0), height - 1.0)
+                u, v = int(x), int(y)
+                right, below = min(u + 1, width - 1), min(v + 1, height - 1)
+                fx, fy = x - u, y - v
+                upper = image[v, u] + fx * (image[v, right] - image[v, u])
+                lower = image[below, u] + fx * (image[below, right] - image[below, u])
+                total += upper + fy * (lower - upper)
+            profiles[i, k] = total / n_along

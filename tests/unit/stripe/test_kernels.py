@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import correlate
+from scipy.ndimage import correlate, map_coordinates
 from scipy.optimize import curve_fit
 
 from armscan.kernels.chains import find_other_lines, walk_chains
@@ -14,9 +14,11 @@ from armscan.kernels.profile_fit import (
     SIGMA,
     SMOOTH_SIGMA,
     VARIANCE,
+    common_terms,
     fit_profiles,
     read_sides,
     smooth_chains,
+    weigh_section,
 )
 from armscan.kernels.ridge import (
     derivatives_at,
@@ -24,6 +26,7 @@ from armscan.kernels.ridge import (
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
+    sample_across,
 )
 
 FLOAT32 = 3e-5
@@ -49,7 +52,7 @@ def test_derivatives_match_scipy(pixel: tuple[int, int]) -> None:
     image = np.random.default_rng(1).uniform(0, 255, (30, 40)).astype(np.float32)
     taps = gaussian_taps(1.7)
     result = np.zeros(5)
-    derivatives_at(image, *pixel, taps, np.zeros_like(taps), result)
+    derivatives_at(image, *pixel, taps, taps.shape[1] // 2, np.zeros_like(taps), result)
     g0, g1, g2 = taps.astype(np.float64)
     pairs = ((g0, g1), (g1, g0), (g0, g2), (g1, g1), (g2, g0))
     x, y = pixel
@@ -186,6 +189,128 @@ def test_clipped_pixels_are_left_out() -> None:
     )
     fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)
     assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx([20.3, 400.0, 2.5], rel=1e-3)
+
+
+def test_known_results_are_where_the_steps_begin() -> None:
+    image = gaussian_row(20.3)
+    points = np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]])
+    arguments = (
+        image,
+        np.zeros((1, 1), np.uint8),
+        points,
+        np.full(1, 2.0),
+        np.full((1, 2), 5.0),
+        np.array([0.01, 0.1, 1.0]),
+        np.zeros(4),
+        np.full(1, 2.7),
+    )
+    result = np.zeros((1, 8))
+    fit_profiles(*arguments, result)
+    again = result.copy()
+    fit_profiles(*arguments, again)
+    assert again[0, :4] == pytest.approx(result[0, :4], rel=1e-4)
+    wrong = result.copy()
+    wrong[0, CENTRE] += 30.0
+    fit_profiles(*arguments, wrong)
+    assert wrong[0, VARIANCE] == 0.0
+
+
+def lopsided_rows(c3: float, c4: float) -> tuple[np.ndarray, np.ndarray]:
+    """Image of 40 noisy rows with a lopsided section, and their ridge points."""
+    rng = np.random.default_rng(6)
+    centre = 20.0 + rng.uniform(-0.5, 0.5, (40, 1))
+    u = (np.arange(41) - centre) / 2.5
+    section = 1.0 + c3 * (u**3 - 3.0 * u) + c4 * (u**4 - 6.0 * u**2 + 3.0)
+    image = 5.0 + 150.0 * np.exp(-0.5 * u * u) * np.maximum(section, 0.0)
+    points = np.zeros((40, 6))
+    points[:, 0], points[:, 1] = centre[:, 0], np.arange(40)
+    points[:, 2], points[:, 5] = 1.0, 1.0
+    return (image + rng.normal(0.0, 1.0, image.shape)).astype(np.float32), points
+
+
+def test_section_is_what_the_fit_leaves() -> None:
+    """Each profile's normal matrix and right-hand side against weighted least squares in NumPy."""
+    c3, c4 = 0.05, 0.01
+    image, points = lopsided_rows(c3, c4)
+    noise, none, sides = np.array([1e-4, 0.0, 1.0]), np.zeros((1, 1), np.uint8), np.full((40, 2), 5)
+    start, fits = np.array([0.0, 0.0, 0.02, 0.0]), np.zeros((40, 8))
+    sides = sides.astype(np.float64)
+    arguments = (np.full(40, 2.5), sides, noise, start, np.full(40, 2.7))
+    fit_profiles(image, none, points, *arguments, fits)
+    said, pixels = np.zeros((40, 6)), np.zeros((3, 40 * 31))
+    weigh_section(image, none, points, sides, fits, noise, start, 15, said, pixels)
+    for i in (0, 17, 39):
+        _, amplitude, sigma = fits[i, [CENTRE, AMPLITUDE, SIGMA]]
+        u = (np.arange(41) - fits[i, CENTRE]) / sigma
+        near = np.abs(u) < 2.7
+        u = u[near]
+        bell = amplitude * np.exp(-0.5 * u * u)
+        h3, h4 = u**3 - 3.0 * u, u**4 - 6.0 * u**2 + 3.0
+        model = bell * (1.0 + 0.02 * h3)
+        slope = bell * (u * (1.0 + 0.02 * h3) - 0.06 * (u * u - 1.0))
+        weight = 1.0 / np.sqrt(noise[0] * model**2 + noise[2])
+        fitted = np.stack([slope, model, slope * u], axis=1) * weight[:, None]
+        terms = np.stack([bell * h3, bell * h4], axis=1) * weight[:, None]
+        rest = terms - fitted @ np.linalg.lstsq(fitted, terms, rcond=None)[0]
+        residual = (image[i, near] - 5.0 - model) * weight
+        normal, score = rest.T @ rest, rest.T @ residual
+        assert said[i] == pytest.approx([*normal[0], normal[1, 1], *score, 1.0], rel=1e-6)
+    common = np.zeros(2)
+    common_terms(said, 8, 0.7, common)
+    sigma = np.sqrt(np.diag(np.linalg.inv(40.0 * normal)))
+    # 1.6: what a clipped score loses against least squares
+    assert np.all(np.abs(start[2:] + common - [c3, c4]) < 4.0 * 1.6 * sigma)
+    true = np.array([0.0, 0.0, c3, c4])
+    fits = np.zeros((40, 8))
+    fit_profiles(image, none, points, *arguments[:3], true, arguments[4], fits)
+    count = weigh_section(image, none, points, sides, fits, noise, true, 15, said, pixels)
+    # the freedom that each fit took is given back
+    assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
+
+
+def test_clipped_cores_say_nothing_of_the_section() -> None:
+    image, points = lopsided_rows(0.0, 0.0)
+    fits, said, pixels = np.zeros((40, 8)), np.zeros((40, 6)), np.zeros((3, 40 * 31))
+    noise, sides = np.array([0.0, 0.0, 1.0]), np.full((40, 2), 5.0)
+    clipped = np.zeros(image.shape, np.uint8)
+    clipped[3, 20] = 1  # the peak
+    clipped[4, 25] = 1  # two sigmas beside it
+    arguments = (np.full(40, 2.5), sides, noise, np.zeros(4), np.full(40, 2.7))
+    fit_profiles(image, clipped, points, *arguments, fits)
+    weigh_section(image, clipped, points, sides, fits, noise, np.zeros(4), 15, said, pixels)
+    assert np.flatnonzero(said[:, 5] == 0.0).tolist() == [4]
+
+
+def test_one_profile_of_another_surface_hardly_moves_the_common_terms() -> None:
+    rng = np.random.default_rng(7)
+    said = np.zeros((101, 6))
+    said[:, 0], said[:, 2], said[:, 5] = 100.0, 50.0, 1.0
+    said[:, 3] = 100.0 * 0.03 + rng.normal(0.0, 10.0, 101)
+    said[:, 4] = rng.normal(0.0, 7.0, 101)
+    before, after = np.zeros(2), np.zeros(2)
+    common_terms(said, 8, 0.7, before)
+    said[50, 3] = 5000.0
+    common_terms(said, 8, 0.7, after)
+    assert abs(after[0] - before[0]) < 4.0 * 10.0 / (100.0 * np.sqrt(101.0))
+    assert abs(said[:, 3].sum() / said[:, 0].sum() - 0.03) > 0.3
+
+
+def test_sampling_across_matches_scipy() -> None:
+    rng = np.random.default_rng(8)
+    image = rng.uniform(0.0, 255.0, (40, 50)).astype(np.float32)
+    angle = rng.uniform(0.0, 2.0 * np.pi, 6)
+    points = np.stack(
+        [rng.uniform(2, 47, 6), rng.uniform(2, 37, 6), *np.array([np.cos(angle), np.sin(angle)])]
+    )
+    points = np.ascontiguousarray(points.T)
+    across, along = np.arange(-10.0, 10.5, 0.5), np.array([-2.0, 0.0, 2.0])
+    found = np.zeros((6, len(across)))
+    sample_across(image, points, across, along, found)
+    x = points[:, 0, None, None] + points[:, 2, None, None] * across[:, None]
+    y = points[:, 1, None, None] + points[:, 3, None, None] * across[:, None]
+    x, y = x - points[:, 3, None, None] * along, y + points[:, 2, None, None] * along
+    expected = map_coordinates(image.astype(np.float64), [y, x], order=1, mode="nearest")
+    assert found == pytest.approx(expected.mean(axis=2), abs=255.0 * FLOAT32)
 
 
 def test_sides_are_means_beside_the_line() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,17 +11,26 @@ from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.kernels.arrays import COLUMN, ROW
 from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
-    CENTRE,
     FIT_COLUMNS,
+    HAS_CORE,
+    NORMAL_00,
+    NORMAL_01,
+    NORMAL_11,
     REACH_SIGMAS,
+    SCORE_0,
+    SCORE_1,
+    SECTION_COLUMNS,
     SIDE_SPAN,
     SIGMA,
     VARIANCE,
+    common_terms,
     fit_profiles,
     read_sides,
+    weigh_section,
 )
 from armscan.vision.stripe.image import StripePlane
 from armscan.vision.stripe.ridge import (
@@ -36,7 +46,6 @@ START_PER_GAIN = 0.1
 BIN_EDGES = np.array([0.0, 0.01, 0.03, 0.07, 0.13, 0.22, 0.33, 0.46, 0.6, 0.75, 0.9, 1.2])
 LEAST_PER_BIN = 30
 LEAST_VARIANCE = 0.02
-FIT_PARAMETERS = 3.0
 
 
 def start_noise(background_noise: float) -> FloatArray:
@@ -44,31 +53,28 @@ def start_noise(background_noise: float) -> FloatArray:
     return np.array([START_CONTRAST2, START_PER_GAIN, max(background_noise**2, LEAST_VARIANCE)])
 
 
-def estimate_noise(
-    seen: _Profiles, section: FloatArray, peak: float, fallback: FloatArray
-) -> FloatArray:
+def estimate_noise(pixels: FloatArray, peak: float, fallback: FloatArray) -> FloatArray:
     """Fit ``v = C^2 m^2 + (m + background) / gain + read^2`` to squared residuals.
 
     The residuals are binned by the line's own grey level ``m``; each bin gives a robust variance,
     and non-negative least squares gives the three terms.
 
-    ``seen``: profiles fitted with any sensible weights. ``section``: (4,) that they were fitted
-    with. ``peak``: amplitude of the bright ones. ``fallback``: (3,) what to return if there are too
-    few residuals.
+    ``pixels``: (3, N) of `kernels.profile_fit.weigh_section`. ``peak``: amplitude of the bright
+    ones. ``fallback``: (3,) what to return if there are too few residuals.
     """
-    level, total, residual = _residuals(seen, _lines(seen, section)[0])
-    bins = np.digitize(level / peak, BIN_EDGES)
+    bins = np.searchsorted(BIN_EDGES, pixels[0] / peak, side="right").astype(np.uint8)
+    ordered = pixels[:, np.argsort(bins, kind="stable")]
+    ends = np.cumsum(np.bincount(bins, minlength=len(BIN_EDGES) + 1))
     rows, variances, counts = [], [], []
-    for b in range(1, len(BIN_EDGES)):
-        inside = bins == b
-        if inside.sum() < LEAST_PER_BIN:
+    for low, high in itertools.pairwise(ends[:-1]):
+        if high - low < LEAST_PER_BIN:
             continue
-        m = level[inside]
-        rows.append([np.mean(m * m), np.mean(np.maximum(total[inside], 0.0)), 1.0])
-        typical = robust_sigma(residual[inside])
-        clipped = np.minimum(residual[inside] ** 2, (3.5 * typical) ** 2)
+        m, total, residual = ordered[:, low:high]
+        rows.append([np.mean(m * m), np.mean(np.maximum(total, 0.0)), 1.0])
+        typical = robust_sigma(residual)
+        clipped = np.minimum(residual**2, (3.5 * typical) ** 2)
         variances.append(max(float(clipped.mean()), LEAST_VARIANCE))
-        counts.append(inside.sum())
+        counts.append(high - low)
     if len(rows) < 4:
         return fallback
     variance = np.array(variances)
@@ -78,88 +84,18 @@ def estimate_noise(
     return np.asarray(terms)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Profiles:
-    """Pixels (N, K) of fitted profiles.
-
-    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian. ``background``: beside the
-    line. ``above``: grey level over it. ``is_inside``: in the image. ``is_known``: and not clipped.
-    ``is_column``: (N,).
-    """
-
-    u: FloatArray
-    bell: FloatArray
-    background: FloatArray
-    above: FloatArray
-    is_inside: BoolArray
-    is_known: BoolArray
-    is_column: BoolArray
-
-
-def _profiles(
-    plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
-) -> _Profiles:
-    image = plane.image
-    height, width = image.shape
-    is_column = points[:, 5] == 0
-    line = np.where(is_column, points[:, 0], points[:, 1]).astype(np.int64)
-    start = np.where(is_column, points[:, 1], points[:, 0])
-    sigma = fits[:, SIGMA]
-    reach = int(np.ceil(np.quantile(sigma, 0.9) * SIDE_SPAN / 2.0))
-    k: IntArray = np.rint(start).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
-    size = np.asarray(np.where(is_column, height, width)).reshape(-1, 1)
-    safe = np.clip(k, 0, size - 1)
-    y = np.where(is_column[:, None], safe, line[:, None])
-    x = np.where(is_column[:, None], line[:, None], safe)
-    u = (k - fits[:, CENTRE][:, None]) / sigma[:, None]
-    bell = fits[:, AMPLITUDE][:, None] * np.exp(-0.5 * u * u)
-    ramp = (sides[:, 1] - sides[:, 0]) / (SIDE_SPAN * sigma)
-    background = sides.mean(axis=1)[:, None] + ramp[:, None] * (k - start[:, None])
-    is_inside = k == safe
-    is_known = is_inside
-    if plane.clipped.shape == image.shape:
-        is_known = is_inside & (plane.clipped[y, x] == 0)
-    above = image[y, x] - background
-    return _Profiles(u, bell, background, above, is_inside, is_known, is_column)
-
-
-def _lines(seen: _Profiles, section: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N, K) line's own grey level, and how it falls with u: eq. of `kernels.profile_fit`."""
-    of_axis = np.where(seen.is_column[:, None], section[:2], section[2:])
-    c3, c4 = of_axis[:, :1], of_axis[:, 1:]
-    u = seen.u
-    third = u * (u * u - 3.0)
-    shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
-    falling = u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third
-    return seen.bell * np.maximum(shape, 0.0), seen.bell * falling
-
-
-def _residuals(seen: _Profiles, model: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Model level, model plus background, and residual of every pixel of the fitted profiles."""
-    residual = seen.above - model
-    pixels = (np.abs(seen.u) < REACH_SIGMAS) & seen.is_inside
-    n = pixels.sum(axis=1, keepdims=True)
-    freedom = np.sqrt(n / np.maximum(n - FIT_PARAMETERS, 1.0))
-    is_side = (np.abs(seen.u) > 3.4) & (np.abs(seen.u) < 4.2) & seen.is_inside
-    residual = np.where(pixels, residual * freedom, residual)
-    use = pixels | is_side
-    return model[use], (model + seen.background)[use], residual[use]
-
-
 MOST_SECTION = np.array([0.12, 0.03])
 """Larger terms would turn the flank of the section negative."""
 ROBUST_ROUNDS = 8
 CLIPPED_SCORE = 0.7
 """Of one profile, in scatters: next to a median, so that a minority at edges hardly counts."""
-CORE_SIGMAS = 1.3
-"""Profiles that are clipped farther out say nothing of the section: their flanks alone are left."""
 
 
 def estimate_section(
-    seen: _Profiles,
-    noise: FloatArray,
+    said: FloatArray,
     section: FloatArray,
-    is_alone: BoolArray,
+    is_usable: BoolArray,
+    axis: IntArray,
     chain: IntArray,
 ) -> FloatArray:
     """Shape (4,) of the line's own section: what all fitted profiles of an axis have in common.
@@ -169,70 +105,46 @@ def estimate_section(
     profiles share are therefore made part of the model; what single profiles have beside them
     stays the sign of an edge.
 
-    ``seen``: pixels of the fitted profiles. ``noise``: (3,). ``section``: (4,) of the fit.
-    ``is_alone``: (N,) profiles that no other line is near. ``chain``: (N,) increasing numbers.
+    ``said``: (N, 6) of `kernels.profile_fit.weigh_section`. ``section``: (4,) of the fit.
+    ``is_usable``: (N,) profiles whose core is not clipped and that no other line is near.
+    ``axis``: (N,) along which each was fitted. ``chain``: (N,) increasing numbers.
     """
-    model, falling = _lines(seen, section)
-    variance = noise[0] * model**2 + noise[1] * np.maximum(model + seen.background, 0.0) + noise[2]
-    u = seen.u
-    weight = ((np.abs(u) < REACH_SIGMAS) & seen.is_known) / variance
-    has_core = ~((np.abs(u) < REACH_SIGMAS) & (np.abs(u) > CORE_SIGMAS) & ~seen.is_known).any(
-        axis=1
-    )
-    fitted = np.stack([falling, model, falling * u], axis=2)
-    third, fourth = seen.bell * u * (u * u - 3.0), seen.bell * (u * u * (u * u - 6.0) + 3.0)
-    terms = np.stack([third, fourth], axis=2)
-    weighted = weight[:, :, None] * fitted
-    # beside what centre, amplitude and width take up already
-    taken = np.linalg.pinv(np.einsum("nki,nkj->nij", weighted, fitted))
-    taken = taken @ np.einsum("nki,nkj->nij", weighted, terms)
-    rest = terms - fitted @ taken
-    weighted = weight[:, :, None] * rest
-    normal = np.einsum("nki,nkj->nij", weighted, rest)
-    score = np.einsum("nki,nk->ni", weighted, seen.above - model)
     found = section.copy()
-    for axis, is_own in enumerate((seen.is_column, ~seen.is_column)):
-        rows = np.flatnonzero(is_own & has_core & is_alone)
-        blocks = _blocks(chain[rows])
-        if len(blocks) >= LEAST_BLOCKS:
-            own = slice(2 * axis, 2 * axis + 2)
-            found[own] = _common_terms(normal[rows], score[rows], section[own], blocks)
+    for along in (COLUMN, ROW):
+        rows = np.flatnonzero((axis == along) & is_usable)
+        block = _blocks(chain[rows])
+        if block.max(initial=-1) + 1 >= LEAST_BLOCKS:
+            own = slice(2 * along, 2 * along + 2)
+            found[own] = _certain_terms(said[rows], section[own], block)
     return found
 
 
-def _blocks(chain: IntArray) -> list[IntArray]:
-    """Rows of each stretch of `BLOCK` neighbours on one chain."""
-    inner = np.flatnonzero(np.diff(chain) != 0) + 1
-    return [
-        rows[first : first + BLOCK]
-        for rows in np.split(np.arange(len(chain)), inner)
-        for first in range(0, len(rows) - BLOCK + 1, BLOCK)
-    ]
+def _blocks(chain: IntArray) -> IntArray:
+    """(N,) number of the stretch of `BLOCK` neighbours on one chain; -1 where less is left."""
+    first, stop = chain_bounds(chain)
+    place = np.arange(len(chain)) - first
+    is_whole = place < (stop - first) // BLOCK * BLOCK
+    begins = is_whole & (place % BLOCK == 0)
+    return np.where(is_whole, np.cumsum(begins) - 1, -1)
 
 
-def _common_terms(
-    normal: FloatArray, score: FloatArray, start: FloatArray, blocks: list[IntArray]
-) -> FloatArray:
-    """(2,) terms that profiles share, of their normal matrices (N, 2, 2) and scores (N, 2).
+def _certain_terms(said: FloatArray, start: FloatArray, block: IntArray) -> FloatArray:
+    """(2,) terms that profiles share, of what they say (N, 6) beside the ``start`` (2,).
 
     They are shrunk by how far stretches of the line differ from each other: what comes and goes
-    along the line is the surface's.
+    along the line is the surface's. ``block``: (N,) number of the stretch.
     """
-    size = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-12))
-    step, scatter = np.zeros(2), np.ones(2)
-    keep = np.ones(score.shape)
-    for _ in range(ROBUST_ROUNDS):
-        total = np.einsum("ni,nij->ij", keep, normal)
-        step = np.linalg.lstsq(total, (keep * score).sum(axis=0), rcond=None)[0]
-        ratio = (score - normal @ step) / size
-        scatter = np.maximum([robust_sigma(one) for one in ratio.T], 1.0)
-        keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
+    step = np.zeros(2)
+    common_terms(said, ROBUST_ROUNDS, CLIPPED_SCORE, step)
     terms = np.clip(start + step, -MOST_SECTION, MOST_SECTION)
-    rest = score - normal @ step
-    diagonal = np.einsum("nii->ni", normal)
-    apart = np.array([rest[b].sum(axis=0) / diagonal[b].sum(axis=0) for b in blocks])
-    differ = np.array([robust_sigma(one) for one in apart.T])
-    sigma = CERTAIN_SIGMAS * differ / np.sqrt(len(blocks))
+    normal = said[:, [NORMAL_00, NORMAL_01, NORMAL_01, NORMAL_11]].reshape(-1, 2, 2)
+    rest, diagonal = said[:, [SCORE_0, SCORE_1]] - normal @ step, said[:, [NORMAL_00, NORMAL_11]]
+    inside = block >= 0
+    sums = [
+        [np.bincount(block[inside], one[inside, k]) for one in (rest, diagonal)] for k in (0, 1)
+    ]
+    differ = np.array([robust_sigma(apart / weight) for apart, weight in sums])
+    sigma = CERTAIN_SIGMAS * differ / np.sqrt(block.max() + 1)
     certain = np.maximum(1.0 - (sigma / np.maximum(np.abs(terms), 1e-12)) ** 2, 0.0)
     return np.asarray(terms * certain * terms**2 / np.maximum(terms**2 + differ**2, 1e-12))
 
@@ -313,10 +225,10 @@ def fit_ridge(
     guess = noise = start_noise(background_noise)
     section = np.zeros(4)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
+    sample = np.zeros((len(pick), FIT_COLUMNS))
     for round_ in range(NOISE_ROUNDS + SECTION_ROUNDS):
         if round_ >= NOISE_ROUNDS and not section.any():
             break
-        sample = np.zeros((len(pick), FIT_COLUMNS))
         fit_profiles(
             plane.image,
             plane.clipped,
@@ -332,12 +244,15 @@ def fit_ridge(
         if good.sum() < LEAST_PER_BIN:
             continue
         at = pick[good]
-        seen = _profiles(plane, table[at], sides[at], sample[good])
         peak = float(np.quantile(sample[good, AMPLITUDE], 0.9))
-        noise = estimate_noise(seen, section, peak, noise)
-        is_alone = reach[at] >= REACH_SIGMAS
-        section = estimate_section(seen, noise, section, is_alone, ridge.chain[at])
+        fitted = (plane, table[at], sides[at], sample[good])
+        noise = estimate_noise(_weighed(*fitted, noise=noise, section=section)[1], peak, noise)
+        said, _ = _weighed(*fitted, noise=noise, section=section)
+        is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
+        axis = table[at, 5].astype(np.int64)
+        section = estimate_section(said, section, is_usable, axis, ridge.chain[at])
     values = np.zeros((len(table), FIT_COLUMNS))
+    values[pick] = sample
     fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, section, reach, values)
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
@@ -350,6 +265,24 @@ def fit_ridge(
         section,
         is_noise_assumed=noise is guess,
     )
+
+
+def _weighed(
+    plane: StripePlane,
+    points: FloatArray,
+    sides: FloatArray,
+    fits: FloatArray,
+    *,
+    noise: FloatArray,
+    section: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Outputs (N, 6) and (3, M) of `weigh_section`."""
+    reach = int(np.ceil(np.quantile(fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
+    said = np.zeros((len(fits), SECTION_COLUMNS))
+    pixels = np.zeros((3, len(fits) * (2 * reach + 1)))
+    images = (plane.image, plane.clipped)
+    n = weigh_section(*images, points, sides, fits, noise, section, reach, said, pixels)
+    return said, pixels[:, :n]
 
 
 def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:

@@ -9,13 +9,12 @@ from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
 from armscan.kernels.chains import find_neighbours, place_points, walk_chains
-from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates
+from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates, sample_across
 
 FloatImage: TypeAlias = NDArray[np.float32]
 
@@ -60,8 +59,7 @@ def measure_level(image: FloatImage, threshold: float | None) -> ImageLevel:
     noise = _noise(image, 1)
     clutter = max(_noise(image, CLUTTER_LAG_PX), noise)
     if threshold is None:
-        sample = image[::2, ::2]
-        peak = float(np.quantile(sample, PEAK_QUANTILE)) - float(np.median(background))
+        peak = _brightest(image[::2, ::2]) - float(np.median(background))
         threshold = max(THRESHOLD_SIGMAS * clutter, LEAST_PEAK_SHARE * peak)
     return ImageLevel(background, noise, clutter, threshold)
 
@@ -74,8 +72,20 @@ def _cell_quantiles(image: FloatImage) -> FloatImage:
     missing = (rows * steps - sample.shape[0], columns * steps - sample.shape[1])
     filled = np.pad(sample, ((0, missing[0]), (0, missing[1])), mode="edge")
     cells = filled.reshape(rows, steps, columns, steps).swapaxes(1, 2)
-    ordered = np.sort(cells.reshape(rows, columns, steps * steps), axis=2)
-    return np.ascontiguousarray(ordered[:, :, int(BACKGROUND_QUANTILE * steps * steps)])
+    k = int(BACKGROUND_QUANTILE * steps * steps)
+    ordered = np.partition(cells.reshape(rows, columns, steps * steps), k, axis=2)
+    return np.ascontiguousarray(ordered[:, :, k])
+
+
+def _brightest(sample: FloatImage) -> float:
+    """The level that a share of `PEAK_QUANTILE` of the pixels stays below."""
+    few = np.sort(sample[::8, ::8], axis=None)
+    # nearly all pixels are dark: the bright ones are sorted alone
+    bright = sample[sample > few[int(0.98 * (len(few) - 1))]]
+    n_above = (1.0 - PEAK_QUANTILE) * (sample.size - 1)
+    if len(bright) - 1 <= n_above:
+        return float(np.quantile(sample, PEAK_QUANTILE))
+    return float(np.quantile(bright, 1.0 - n_above / (len(bright) - 1)))
 
 
 def _noise(image: FloatImage, lag: int) -> float:
@@ -89,10 +99,15 @@ def _noise(image: FloatImage, lag: int) -> float:
 
 
 def chain_bounds(chain: IntArray) -> tuple[IntArray, IntArray]:
-    """First index, and index after the last, of each point's chain: two (N,) arrays."""
-    first = np.searchsorted(chain, chain, side="left")
-    stop = np.searchsorted(chain, chain, side="right")
-    return first.astype(np.int64), stop.astype(np.int64)
+    """First index, and index after the last, of each point's chain: two (N,) arrays.
+
+    ``chain``: (N,) numbers; a chain's points are consecutive.
+    """
+    is_first = np.ones(len(chain), dtype=np.bool_)
+    is_first[1:] = chain[1:] != chain[:-1]
+    starts = np.flatnonzero(is_first)
+    sizes = np.diff(starts, append=len(chain))
+    return np.repeat(starts, sizes), np.repeat(starts + sizes, sizes)
 
 
 def sum_along(values: FloatArray, chain: IntArray, half: int) -> FloatArray:
@@ -141,7 +156,7 @@ STEP_PX = 0.5
 FWHM_PER_SIGMA = 2.3548
 SIGMA_LIMITS_PX = (0.7, 10.0)
 FALLBACK_PX = 2.0
-ALONG_PX = (-2.0, 0.0, 2.0)
+ALONG_PX = np.array([-2.0, 0.0, 2.0])
 LOPSIDED = 1.8
 
 
@@ -187,12 +202,9 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
 def _across(image: FloatImage, points: FloatArray) -> FloatArray:
     """Profiles (N, K) across the ridges, averaged over a few places along them."""
     t = np.arange(-REACH_PX, REACH_PX + STEP_PX, STEP_PX)
-    total = np.zeros((len(points), len(t)))
-    for along in ALONG_PX:
-        x = points[:, :1] + points[:, 2:3] * t - points[:, 3:4] * along
-        y = points[:, 1:2] + points[:, 3:4] * t + points[:, 2:3] * along
-        total += map_coordinates(image, [y, x], order=1, mode="nearest")
-    return total / len(ALONG_PX)
+    profiles = np.zeros((len(points), len(t)))
+    sample_across(image, np.ascontiguousarray(points), t, ALONG_PX, profiles)
+    return profiles
 
 
 def _half_widths(profiles: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -300,7 +312,7 @@ def link(points: FloatArray, shape: tuple[int, ...]) -> RidgePoints:
     ``points``: Rows as in `RidgePoints.table`. ``shape``: Rows and columns of the image.
     """
     n = len(points)
-    owner = np.full(shape, -1, np.int32)
+    owner = np.zeros(shape, np.int32)
     is_kept = np.zeros(n, np.int64)
     place_points(points, owner, is_kept)
     ahead = np.full(n, -1, np.int64)

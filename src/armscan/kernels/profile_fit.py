@@ -73,7 +73,7 @@ def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> floa
     top = norm = 0.0
     for k in range(n):
         u = (k - offset) / sigma
-        g = math.exp(-0.5 * u * u) * profile[2, k]
+        g = math.exp(-0.5 * u * u) * profile[2, k] * profile[3, k]
         top += g * profile[0, k]
         norm += g * g
     return top / norm if norm > 0.0 else 0.0
@@ -92,8 +92,10 @@ def accumulate(
 
     The line is ``A exp(-u^2 / 2) (1 + c3 (u^3 - 3 u) + c4 (u^4 - 6 u^2 + 3))`` with ``u`` the
     distance from the centre over sigma: a Gram-Charlier series, whose centre of gravity is u = 0.
+    What is seen of it is that times the ground's reflectance.
 
-    ``profile``: (3, >= n) grey level less background, background, and 1 where the pixel counts.
+    ``profile``: (4, >= n) grey level less background, background, 1 where the pixel counts, and
+    reflectance.
     ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
     ``section``: (2,) ``c3, c4``.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
@@ -115,14 +117,15 @@ def accumulate(
         ratio *= change
         third = u * (u * u - 3.0)
         shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
-        m = bell * max(shape, 0.0)
-        falling = bell * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
+        seen = bell * profile[3, k]
+        m = seen * max(shape, 0.0)
+        falling = seen * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
         variance = noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2]
         w = profile[2, k] / variance
         r = profile[0, k] - m
         j0 = falling * step
         j2 = falling * u
-        q = bell * third
+        q = seen * third
         sums[0] += w * j0 * j0
         sums[1] += w * j0 * m
         sums[2] += w * j0 * j2
@@ -135,7 +138,7 @@ def accumulate(
         sums[9] += w * r * q
         sums[10] += w * q * q
         sums[11] += w * q * j0
-        sums[12] += w * j0 * bell * u * u * u
+        sums[12] += w * j0 * seen * u * u * u
 
 
 @compiled()
@@ -162,6 +165,7 @@ def solve_step(sums: Floats, steps: FloatsOut) -> float:
 def fit_profiles(
     image: Image,
     clipped: Mask,
+    reflectance: Image,
     points: Table,
     sigma_px: Floats,
     sides: Table,
@@ -177,7 +181,8 @@ def fit_profiles(
     saturated line is fitted on its flanks.
 
     ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
-    (1, 1) if none is. ``sigma_px``: (N,) start value of the sigma along the column or row.
+    (1, 1) if none is. ``reflectance``: (H, W) of the ground, relative; (1, 1) where it is not known
+    and taken to be even. ``sigma_px``: (N,) start value of the sigma along the column or row.
     ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
     as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
@@ -187,12 +192,13 @@ def fit_profiles(
     centre, in sigmas (for the correction on bent lines).
     """
     height, width = image.shape
-    profile = np.zeros((3, max(height, width)))
+    profile = np.ones((4, max(height, width)))
     state = np.zeros(3)
     steps = np.zeros(3)
     sums = np.zeros(13)
     shape = np.zeros(2)
     has_clipped = clipped.shape[0] == height and clipped.shape[1] == width
+    has_ground = reflectance.shape[0] == height and reflectance.shape[1] == width
     for i in range(points.shape[0]):
         is_column = int(points[i, 5]) == COLUMN
         shape[0] = section[0] if is_column else section[2]
@@ -219,6 +225,8 @@ def fit_profiles(
             profile[1, k] = middle + ramp * (at - start)
             profile[0, k] = value - profile[1, k]
             profile[2, k] = 1.0
+            if has_ground:
+                profile[3, k] = reflectance[at, line] if is_column else reflectance[line, at]
             if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
                 profile[2, k] = 0.0
         state[0] = start - first

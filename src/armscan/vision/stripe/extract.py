@@ -45,6 +45,11 @@ LEAST_SIGMA_PX = 0.002
 FLANKS_PER_LEAN = 1.0
 """Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
 its section's third-order term: what sections leave that are no Gram-Charlier series."""
+EDGE_BLUR_PX2 = 0.5
+"""Over the line's sigma, what an edge of the ground under the line leaves: the lens blurs what the
+ground reflects, not the light on it. Of a blur of 1 px, for a ground that is dark on one side."""
+MOST_PULL = 0.5
+"""Of the line's sigma: an edge under a line takes up to half of its light."""
 
 
 def extract_stripes(
@@ -88,20 +93,22 @@ def extract_stripes(
     threshold = options.threshold
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
-    level = measure_level(plane.image, threshold)
-    runs = find_candidates(plane.image, level)
-    sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
+    noise = measure_level(plane.image, None).noise
+    image = plane.on_even_ground(plane.image, noise)
+    level = measure_level(image, threshold)
+    runs = find_candidates(image, level)
+    sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
     if options.method == "fit":
-        ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+        ridge = trace_ridges(image, runs, sigma, level.rise)
     else:
-        centres = THESIS_METHODS[options.method](plane.image, level, sigma)
-        ridge = link_centres(centres, plane.image)
+        centres = THESIS_METHODS[options.method](image, level, sigma)
+        ridge = link_centres(centres, image)
     ridge = _of_laser(plane, ridge, sigma)
     if not len(ridge):
         return Profile.empty(source=exposure.source)
     if options.method != "fit":
         return thesis_profile(exposure, plane, ridge, sigma)
-    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, level.noise), options)
+    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
 
 
 def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgePoints:
@@ -167,7 +174,9 @@ def to_profile(
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
-    beside = FLANKS_PER_LEAN * np.abs(fits.lean) * width * is_on_flanks
+    by_section = FLANKS_PER_LEAN * np.abs(fits.lean) * width
+    by_edge = np.minimum(np.hypot(by_section, EDGE_BLUR_PX2 / width), MOST_PULL * width)
+    beside = np.maximum(by_section * is_on_flanks, by_edge * fits.ground[:, 1])
     if fits.is_noise_assumed and not smoothed.is_noise_measured:
         flags |= int(StripeFlag.NOISE_ASSUMED)
     binning = exposure.window.binning
@@ -178,7 +187,7 @@ def to_profile(
         normals_px=smoothed.normals,
         sigma_px=np.hypot(sigma, beside) * binning,
         width_px=width * binning,
-        intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
+        intensity=fits.values[:, AMPLITUDE] * fits.ground[:, 0] * plane.grey_levels_per_unit,
         flags=flags,
         segment=np.unique(chain, return_inverse=True)[1],
         noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),

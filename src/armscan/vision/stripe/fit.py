@@ -82,7 +82,7 @@ def estimate_noise(
 class _Profiles:
     """Pixels (N, K) of fitted profiles.
 
-    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian. ``background``: beside the
+    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian on its ground. ``background``: beside the
     line. ``above``: grey level over it. ``is_inside``: in the image. ``is_known``: and not clipped.
     ``is_column``: (N,).
     """
@@ -100,25 +100,20 @@ def _profiles(
     plane: StripePlane, points: FloatArray, sides: FloatArray, fits: FloatArray
 ) -> _Profiles:
     image = plane.image
-    height, width = image.shape
     is_column = points[:, 5] == 0
-    line = np.where(is_column, points[:, 0], points[:, 1]).astype(np.int64)
     start = np.where(is_column, points[:, 1], points[:, 0])
     sigma = fits[:, SIGMA]
     reach = int(np.ceil(np.quantile(sigma, 0.9) * SIDE_SPAN / 2.0))
-    k: IntArray = np.rint(start).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
-    size = np.asarray(np.where(is_column, height, width)).reshape(-1, 1)
-    safe = np.clip(k, 0, size - 1)
-    y = np.where(is_column[:, None], safe, line[:, None])
-    x = np.where(is_column[:, None], line[:, None], safe)
+    y, x, k, is_inside = _pixels(plane, points, start, reach)
     u = (k - fits[:, CENTRE][:, None]) / sigma[:, None]
     bell = fits[:, AMPLITUDE][:, None] * np.exp(-0.5 * u * u)
     ramp = (sides[:, 1] - sides[:, 0]) / (SIDE_SPAN * sigma)
     background = sides.mean(axis=1)[:, None] + ramp[:, None] * (k - start[:, None])
-    is_inside = k == safe
     is_known = is_inside
     if plane.clipped.shape == image.shape:
         is_known = is_inside & (plane.clipped[y, x] == 0)
+    if plane.reflectance.shape == image.shape:
+        bell *= plane.reflectance[y, x]
     above = image[y, x] - background
     return _Profiles(u, bell, background, above, is_inside, is_known, is_column)
 
@@ -266,7 +261,8 @@ class ProfileFits:
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
     section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
-    estimate the noise, so that it is the first guess.
+    estimate the noise, so that it is the first guess. ``ground``: (N, 2) reflectance under the line,
+    weighted as the line lights it, and its standard deviation across the line over that.
     """
 
     ridge: RidgePoints
@@ -277,6 +273,7 @@ class ProfileFits:
     noise: FloatArray
     section: FloatArray
     is_noise_assumed: bool
+    ground: FloatArray
 
     @property
     def lean(self) -> FloatArray:
@@ -320,6 +317,7 @@ def fit_ridge(
         fit_profiles(
             plane.image,
             plane.clipped,
+            plane.reflectance,
             table[pick],
             sigma[pick],
             sides[pick],
@@ -338,7 +336,10 @@ def fit_ridge(
         is_alone = reach[at] >= REACH_SIGMAS
         section = estimate_section(seen, noise, section, is_alone, ridge.chain[at])
     values = np.zeros((len(table), FIT_COLUMNS))
-    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, section, reach, values)
+    ground = plane.reflectance
+    fit_profiles(
+        plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
+    )
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
         ridge.select(good),
@@ -349,7 +350,37 @@ def fit_ridge(
         noise,
         section,
         is_noise_assumed=noise is guess,
+        ground=_ground(plane, table[good], values[good]),
     )
+
+
+def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:
+    """(N, 2) mean reflectance under each line, and how much of it the ground differs there."""
+    if plane.reflectance.size == 1 or not len(points):
+        return np.tile([1.0, 0.0], (len(points), 1))
+    reach = REACH_SIGMAS * float(np.quantile(fits[:, SIGMA], 0.9))
+    y, x, k, _ = _pixels(plane, points, fits[:, CENTRE], int(np.ceil(reach)))
+    light = np.exp(-0.5 * ((k - fits[:, CENTRE, None]) / fits[:, SIGMA, None]) ** 2)
+    light /= light.sum(axis=1, keepdims=True)
+    ground = plane.reflectance[y, x]
+    mean = (light * ground).sum(axis=1)
+    spread = np.sqrt((light * (ground - mean[:, None]) ** 2).sum(axis=1))
+    return np.stack([mean, spread / mean], axis=1)
+
+
+def _pixels(
+    plane: StripePlane, points: FloatArray, centre: FloatArray, reach: int
+) -> tuple[IntArray, IntArray, IntArray, BoolArray]:
+    """Rows, columns and running coordinate (N, K) of the pixels within reach of each centre (N,).
+
+    Beyond the image's border rows and columns are those of the border; the mask (N, K) tells.
+    """
+    height, width = plane.image.shape
+    is_column = (points[:, 5] == 0)[:, None]
+    line = np.where(is_column, points[:, :1], points[:, 1:2]).astype(np.int64)
+    k: IntArray = np.rint(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
+    safe = np.clip(k, 0, np.where(is_column, height, width) - 1)
+    return np.where(is_column, safe, line), np.where(is_column, line, safe), k, k == safe
 
 
 def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
@@ -129,6 +130,34 @@ def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage
     return np.asarray(lit - np.float32(gain) * dark - np.float32(offset), dtype=np.float32)
 
 
+EVEN = np.ones((1, 1), np.float32)
+PEAK_QUANTILE = 0.999
+LOST_SIGMAS = 3.0
+GROUND_PX = 5
+"""Within such squares noise of the view without laser is told from the print."""
+WHITE_QUANTILE = 0.9
+LEAST_WHITE_SIGMAS = 10.0
+DARKEST = 0.02
+
+
+def relative_reflectance(dark: FloatImage) -> FloatImage:
+    """Reflectance (H, W) of the ground relative to its brightest, from the view without laser.
+
+    Where a square of pixels differs by no more than noise, its mean is taken (Lee 1980); an edge stays
+    as it is. (1, 1) where the view is too dark to say anything.
+    """
+    mean = uniform_filter(dark, GROUND_PX)
+    variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
+    white = float(np.quantile(mean, WHITE_QUANTILE))
+    is_light = mean > 0.5 * white
+    per_level = float(np.median(variance[is_light] / np.maximum(mean[is_light], 1e-3)))
+    if white < LEAST_WHITE_SIGMAS**2 * per_level:
+        return EVEN
+    keep = np.maximum(1.0 - per_level * mean / variance, 0.0)
+    ground = (mean + keep * (dark - mean)) / np.float32(white)
+    return np.ascontiguousarray(np.maximum(ground, DARKEST), dtype=np.float32)
+
+
 NORMAL_SCALE = 255.0
 """Grey levels are scaled to 8 bits, so that no constant depends on the camera's depth."""
 
@@ -142,7 +171,7 @@ class StripePlane:
     own channel saturated. ``grey_levels_per_unit``: Factor from ``image`` to the exposure's own
     grey levels. ``gate``: (H, W) how much the pixel has the laser's colour, or None for grey
     images. ``unknown``: (H, W) 1 where the view without laser saturated already; None without such
-    a view.
+    a view. ``reflectance``: (H, W) of the ground relative to the brightest, (1, 1) if it is not known.
     """
 
     image: FloatImage
@@ -151,6 +180,18 @@ class StripePlane:
     grey_levels_per_unit: float
     gate: FloatImage | None = None
     unknown: MaskImage | None = None
+    reflectance: FloatImage = field(default_factory=lambda: EVEN)
+
+    def on_even_ground(self, image: FloatImage, noise: float) -> FloatImage:
+        """What an image (H, W) of the laser's light would be on ground that is bright everywhere.
+
+        Where the ground is so dark that the light is lost in the ``noise``, it stays dark.
+        """
+        if self.reflectance.size == 1:
+            return image
+        peak = max(float(np.quantile(image, PEAK_QUANTILE)), noise)
+        least = np.float32((LOST_SIGMAS * noise / peak) ** 2)
+        return np.asarray(image * self.reflectance / (self.reflectance**2 + least))
 
 
 def _saturated(channel: ImageArray, full_scale: int) -> MaskImage:
@@ -179,6 +220,10 @@ def _unknown(background: Exposure | None, k: int | None) -> MaskImage | None:
     return _saturated(_channel(background, k), background.full_scale)
 
 
+def _reflectance(background: Exposure | None, k: int | None) -> FloatImage:
+    return EVEN if background is None else relative_reflectance(_level(background, None, k))
+
+
 def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     """Plane of a grey exposure, less the background."""
     clipped = _saturated(exposure.image, exposure.full_scale)
@@ -188,6 +233,7 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
         saturated=clipped,
         grey_levels_per_unit=exposure.full_scale / NORMAL_SCALE,
         unknown=_unknown(background, None),
+        reflectance=_reflectance(background, None),
     )
 
 
@@ -290,6 +336,7 @@ def colour_plane(
         grey_levels_per_unit=factor,
         gate=gate,
         unknown=_unknown(background, own),
+        reflectance=_reflectance(background, own),
     )
 
 

@@ -183,7 +183,8 @@ def fit_profiles(
     ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
     (1, 1) if none is. ``reflectance``: (H, W) of the ground, relative; (1, 1) where it is not known
     and taken to be even. ``sigma_px``: (N,) start value of the sigma along the column or row.
-    ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
+    ``sides``: (N, 2) background on the lower and upper side, on ground of reflectance 1;
+    interpolated linearly across the line.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
     as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
     half width of the fitted window in sigmas. ``result``: (N, 8) output: centre, amplitude, sigma,
@@ -222,11 +223,11 @@ def fit_profiles(
         for k in range(n):
             at = first + k
             value = image[at, line] if is_column else image[line, at]
-            profile[1, k] = middle + ramp * (at - start)
-            profile[0, k] = value - profile[1, k]
-            profile[2, k] = 1.0
             if has_ground:
                 profile[3, k] = reflectance[at, line] if is_column else reflectance[line, at]
+            profile[1, k] = (middle + ramp * (at - start)) * profile[3, k]
+            profile[0, k] = value - profile[1, k]
+            profile[2, k] = 1.0
             if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
                 profile[2, k] = 0.0
         state[0] = start - first

@@ -10,7 +10,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile, StripeFlag
+from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import ProfileFits, axis_component, fit_ridge
 from armscan.vision.stripe.flags import (
     is_asymmetric,
@@ -28,6 +28,7 @@ from armscan.vision.stripe.image import (
     has_laser_colour,
     is_on_known_ground,
     mono_plane,
+    relative_reflectance,
 )
 from armscan.vision.stripe.ridge import (
     RidgePoints,
@@ -90,6 +91,9 @@ def extract_stripes(
         plane = mono_plane(exposure, background)
     else:
         plane = colour_plane(exposure, background, options.laser_colour)
+    if background is not None and options.on_print and options.method == "fit":
+        ground = relative_reflectance(background, options.laser_colour)
+        plane = replace(plane, reflectance=ground)
     threshold = options.threshold
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
@@ -156,7 +160,8 @@ def to_profile(
     chain = fits.ridge.chain
     width = fits.values[:, SIGMA] * axis_component(fits.ridge.table)
     near = is_near_other_line(fits.neighbour, chain, width)
-    flags = np.zeros(len(points), np.int64)
+    is_known = plane.reflectance.size > 1
+    flags = np.full(len(points), int(StripeFlag.GROUND_KNOWN) if is_known else 0)
     for flag, holds in (
         (StripeFlag.SATURATED, is_saturated(points, plane.saturated)),
         (StripeFlag.BACKGROUND_STEP, is_background_step(fits)),
@@ -166,7 +171,7 @@ def to_profile(
         (StripeFlag.SHORT_SEGMENT, is_short(points, chain)),
     ):
         flags[holds] |= int(flag)
-    usable = (flags & ~int(StripeFlag.SATURATED)) == 0
+    usable = (flags & int(REJECTING)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])

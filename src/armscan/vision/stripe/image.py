@@ -58,6 +58,9 @@ class StripeOptions:
         image's noise.
     smoothing_px
         Largest half window of the smoothing along the line; 0 switches it off.
+    on_print
+        The lines lie on matt print, which the laser lights up as the room's light does: of ``fit``,
+        the view without laser then tells how bright the ground is under the line.
     """
 
     method: StripeMethod = "fit"
@@ -65,6 +68,7 @@ class StripeOptions:
     line_sigma_px: float | None = None
     threshold: float | None = None
     smoothing_px: float = 12.0
+    on_print: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in (("method", StripeMethod), ("laser_colour", LaserColour)):
@@ -135,17 +139,26 @@ PEAK_QUANTILE = 0.999
 LOST_SIGMAS = 3.0
 GROUND_PX = 5
 """Within such squares noise of the view without laser is told from the print."""
-WHITE_QUANTILE = 0.9
+WHITE_QUANTILE = 0.95
 LEAST_WHITE_SIGMAS = 10.0
 DARKEST = 0.02
+"""Black print reflects 3 % and more of what white paper does."""
 
 
-def relative_reflectance(dark: FloatImage) -> FloatImage:
+def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
     """Reflectance (H, W) of the ground relative to its brightest, from the view without laser.
 
-    Where a square of pixels differs by no more than noise, its mean is taken (Lee 1980); an edge stays
-    as it is. (1, 1) where the view is too dark to say anything.
+    Where a square of pixels differs by no more than noise, its mean is taken (Lee 1980); an edge
+    stays as it is. (1, 1) where the view is too dark to say anything. ``colour``: As in
+    `StripeOptions.laser_colour`; of ``auto``, the mean of the channels is taken.
     """
+    if background.colour == "mono":
+        dark = _level(background, None, None)
+    else:
+        first = colour.partition("-")[0]
+        own = [CHANNELS.index(first)] if first in CHANNELS else range(3)
+        levels = [_level(background, None, k) for k in own]
+        dark = np.asarray(sum(levels) / np.float32(len(levels)), dtype=np.float32)
     mean = uniform_filter(dark, GROUND_PX)
     variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
     white = float(np.quantile(mean, WHITE_QUANTILE))
@@ -220,10 +233,6 @@ def _unknown(background: Exposure | None, k: int | None) -> MaskImage | None:
     return _saturated(_channel(background, k), background.full_scale)
 
 
-def _reflectance(background: Exposure | None, k: int | None) -> FloatImage:
-    return EVEN if background is None else relative_reflectance(_level(background, None, k))
-
-
 def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
     """Plane of a grey exposure, less the background."""
     clipped = _saturated(exposure.image, exposure.full_scale)
@@ -233,7 +242,6 @@ def mono_plane(exposure: Exposure, background: Exposure | None) -> StripePlane:
         saturated=clipped,
         grey_levels_per_unit=exposure.full_scale / NORMAL_SCALE,
         unknown=_unknown(background, None),
-        reflectance=_reflectance(background, None),
     )
 
 
@@ -336,7 +344,6 @@ def colour_plane(
         grey_levels_per_unit=factor,
         gate=gate,
         unknown=_unknown(background, own),
-        reflectance=_reflectance(background, own),
     )
 
 

@@ -404,29 +404,29 @@ def _sides(
 ) -> tuple[FloatArray, FloatArray]:
     """Background on both sides, averaged along the line, and the sigma of their difference.
 
-    Both are of light on ground of reflectance 1. A side that another line lights up takes the value of the other side.
+    Both are of light on ground of reflectance 1. A side that another line lights up takes the value
+    of the other side.
     """
-    raw = np.zeros((len(ridge), 4))
+    raw, ground = np.zeros((len(ridge), 4)), np.ones((len(ridge), 4))
     read_sides(plane.image, ridge.table, sigma, raw)
-    level, count = raw[:, 0::2], raw[:, 1::2] * is_clear
-    darkest = np.ones(len(ridge))
     if plane.reflectance.size > 1:
-        ground = np.zeros((len(ridge), 4))
         read_sides(plane.reflectance, ridge.table, sigma, ground)
-        seen = np.where(ground[:, 1::2] > 0.0, ground[:, 0::2], 1.0)
-        level, darkest = level / seen, seen.min(axis=1)
+    count = raw[:, 1::2] * is_clear
+    seen = np.where(raw[:, 1::2] > 0.0, ground[:, 0::2], 1.0)
+    level, weight = raw[:, 0::2] / seen, count * seen**2
     stretch = _axis_runs(ridge)
     places = np.minimum(np.subtract(*chain_bounds(stretch)[::-1]), 2 * SIDE_HALF + 1)
-    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in count.T], 1)
+    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in weight.T], 1)
     mean = np.stack(
-        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, count.T, strict=True)], 1
+        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, weight.T, strict=True)], 1
     )
     has_own = (total > 0.0) & is_clear
     lowest = np.where(raw[:, 1::2] > 0.0, level, np.inf).min(axis=1)
     lowest = np.where(np.isfinite(lowest), lowest, 0.0)[:, None]
     sides = np.where(has_own, mean, np.where(has_own[:, ::-1], mean[:, ::-1], lowest))
     pixels = np.where(has_own.all(axis=1), count.min(axis=1), 1.0) * places
-    return sides, background_noise / darkest * np.sqrt(2.0 / np.maximum(pixels, 1.0))
+    on_ground = background_noise / seen.min(axis=1)
+    return sides, on_ground * np.sqrt(2.0 / np.maximum(pixels, 1.0))
 
 
 def _axis_runs(ridge: RidgePoints) -> IntArray:

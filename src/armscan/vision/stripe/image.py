@@ -94,7 +94,7 @@ class StripeOptions:
 
 ROUNDS = 4
 TRIM_SIGMAS = 2.5
-GAIN_LIMITS = (0.05, 20.0)
+GAIN_LIMITS = (0.0, 20.0)
 
 
 def check_background(exposure: Exposure, background: Exposure) -> None:

@@ -51,6 +51,9 @@ EDGE_BLUR_PX2 = 0.5
 ground reflects, not the light on it. Of a blur of 1 px, for a ground that is dark on one side."""
 MOST_PULL = 0.5
 """Of the line's sigma: an edge under a line takes up to half of its light."""
+MOST_LEFT = 0.1
+"""Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside only
+a part of such lines, and the points there are better left out."""
 
 
 def extract_stripes(
@@ -91,12 +94,11 @@ def extract_stripes(
         plane = mono_plane(exposure, background)
     else:
         plane = colour_plane(exposure, background, options.laser_colour)
-    if background is not None and options.on_print and options.method == "fit":
-        ground = relative_reflectance(background, options.laser_colour)
-        plane = replace(plane, reflectance=ground)
     threshold = options.threshold
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
+    if background is not None and options.on_print and options.method == "fit":
+        plane = _with_ground(plane, background, options, threshold)
     noise = measure_level(plane.image, None).noise
     image = plane.on_even_ground(plane.image, noise)
     level = measure_level(image, threshold)
@@ -113,6 +115,19 @@ def extract_stripes(
     if options.method != "fit":
         return thesis_profile(exposure, plane, ridge, sigma)
     return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
+
+
+def _with_ground(
+    plane: StripePlane, background: Exposure, options: StripeOptions, threshold: float | None
+) -> StripePlane:
+    """The plane with what is printed under its lines, if they are so wide that it is worth it."""
+    ground = relative_reflectance(background, options.laser_colour)
+    known = replace(plane, reflectance=ground)
+    image = known.on_even_ground(plane.image, measure_level(plane.image, None).noise)
+    level = measure_level(image, threshold)
+    sigma = options.line_sigma_px
+    sigma = sigma or find_line_sigma(image, find_candidates(image, level), level)
+    return known if EDGE_BLUR_PX2 / sigma <= MOST_LEFT * MOST_PULL * sigma else plane
 
 
 def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgePoints:

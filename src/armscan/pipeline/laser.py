@@ -128,9 +128,7 @@ def calibrate_sheets_from_pairs(
         pair: ExposurePair, colour: LaserColour, line_sigma_px: float | None = None
     ) -> BoardStripes | FitFailure:
         sigma = options.stripes.line_sigma_px or line_sigma_px
-        chosen = replace(
-            options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True
-        )
+        chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True)
         place = places[placement_of(pair)]
         return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
 

@@ -149,6 +149,7 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     fit_profiles(
         image,
         np.zeros((1, 1), np.uint8),
+        np.ones((1, 1), np.float32),
         points,
         width,
         sides,
@@ -171,6 +172,46 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     assert result[0, VARIANCE] == pytest.approx(covariance[0, 0], rel=0.05)
 
 
+def test_profile_fit_on_print_matches_scipy() -> None:
+    """SciPy's least squares of ``reflectance (background + line)``: a border beside the centre."""
+    rng = np.random.default_rng(5)
+    x = np.arange(41.0)
+    ground = np.where(x < 21.0, 0.1, 1.0)
+    line = 100.0 * np.exp(-0.5 * ((x - 19.2) / 5.0) ** 2)
+    image = np.tile(ground * (5.0 + line), (3, 1)).astype(np.float32)
+    image += rng.normal(0.0, 0.3, image.shape).astype(np.float32)
+    result, even = np.zeros((1, 8)), np.zeros((1, 8))
+    for reflectance, out in (
+        (np.tile(ground, (3, 1)).astype(np.float32), result),
+        (np.ones((1, 1), np.float32), even),
+    ):
+        fit_profiles(
+            image,
+            np.zeros((1, 1), np.uint8),
+            reflectance,
+            np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]]),
+            np.full(1, 5.0),
+            np.full((1, 2), 5.0),
+            np.array([0.0, 0.0, 0.09]),
+            np.zeros(4),
+            np.full(1, 2.7),
+            out,
+        )
+    use = np.abs(x - 20.0) <= 2.7 * 5.0
+    best, covariance = curve_fit(
+        lambda t, c, a, s: ground[use] * (5.0 + a * np.exp(-0.5 * ((t - c) / s) ** 2)),
+        x[use],
+        image[1, use].astype(np.float64),
+        p0=[20.0, 100.0, 5.0],
+        sigma=np.full(use.sum(), 0.3),
+        absolute_sigma=True,
+    )
+    assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx(best, rel=1e-4)
+    assert result[0, VARIANCE] == pytest.approx(covariance[0, 0], rel=0.05)
+    assert abs(result[0, CENTRE] - 19.2) < 4.0 * np.sqrt(covariance[0, 0])
+    assert even[0, VARIANCE] == 0.0 or even[0, CENTRE] > 22.0, "a Gaussian goes to the bright side"
+
+
 def test_clipped_pixels_are_left_out() -> None:
     image = gaussian_row(20.3, peak=400.0)
     clipped = (image >= 255.0).astype(np.uint8)
@@ -184,7 +225,8 @@ def test_clipped_pixels_are_left_out() -> None:
         np.zeros(4),
         np.full(1, 2.7),
     )
-    fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)
+    even = np.ones((1, 1), np.float32)
+    fit_profiles(np.minimum(image, np.float32(255.0)), clipped, even, *arguments, result)
     assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx([20.3, 400.0, 2.5], rel=1e-3)
 
 

@@ -46,14 +46,14 @@ LEAST_SIGMA_PX = 0.002
 FLANKS_PER_LEAN = 1.0
 """Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
 its section's third-order term: what sections leave that are no Gram-Charlier series."""
-EDGE_BLUR_PX2 = 0.5
-"""Over the line's sigma, what an edge of the ground under the line leaves: the lens blurs what the
-ground reflects, not the light on it. Of a blur of 1 px, for a ground that is dark on one side."""
+EDGE_BLUR_PX2 = 1.0
+"""Over the line's sigma, what an edge of the ground under the line leaves at its worst place: the
+lens blurs what the ground reflects, not the light on it alone. Of a blur of 1 px."""
 MOST_PULL = 0.5
 """Of the line's sigma: an edge under a line takes up to half of its light."""
-MOST_LEFT = 0.1
-"""Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside only
-a part of such lines, and the points there are better left out."""
+MOST_LEFT = 0.2
+"""Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside
+only a part of such lines, and the points there are better left out."""
 
 
 def extract_stripes(

@@ -82,15 +82,16 @@ def estimate_noise(
 class _Profiles:
     """Pixels (N, K) of fitted profiles.
 
-    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian on its ground. ``background``: beside the
-    line. ``above``: grey level over it. ``is_inside``: in the image. ``is_known``: and not clipped.
-    ``is_column``: (N,).
+    ``u``: distance from the centre in sigmas. ``bell``: the Gaussian on its ground. ``background``:
+    beside the line. ``above``: grey level over it. ``ground``: reflectance, (1, 1) if even.
+    ``is_inside``: in the image. ``is_known``: and not clipped. ``is_column``: (N,).
     """
 
     u: FloatArray
     bell: FloatArray
     background: FloatArray
     above: FloatArray
+    ground: FloatArray
     is_inside: BoolArray
     is_known: BoolArray
     is_column: BoolArray
@@ -112,11 +113,12 @@ def _profiles(
     is_known = is_inside
     if plane.clipped.shape == image.shape:
         is_known = is_inside & (plane.clipped[y, x] == 0)
-    if plane.reflectance.shape == image.shape:
-        background *= plane.reflectance[y, x]
-        bell *= plane.reflectance[y, x]
+    ground = plane.reflectance
+    if ground.shape == image.shape:
+        ground = ground[y, x]
+        background, bell = background * ground, bell * ground
     above = image[y, x] - background
-    return _Profiles(u, bell, background, above, is_inside, is_known, is_column)
+    return _Profiles(u, bell, background, above, ground, is_inside, is_known, is_column)
 
 
 def _lines(seen: _Profiles, section: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -168,24 +170,12 @@ def estimate_section(
     ``seen``: pixels of the fitted profiles. ``noise``: (3,). ``section``: (4,) of the fit.
     ``is_alone``: (N,) profiles that no other line is near. ``chain``: (N,) increasing numbers.
     """
-    model, falling = _lines(seen, section)
-    variance = noise[0] * model**2 + noise[1] * np.maximum(model + seen.background, 0.0) + noise[2]
     u = seen.u
-    weight = ((np.abs(u) < REACH_SIGMAS) & seen.is_known) / variance
     has_core = ~((np.abs(u) < REACH_SIGMAS) & (np.abs(u) > CORE_SIGMAS) & ~seen.is_known).any(
         axis=1
     )
-    fitted = np.stack([falling, model, falling * u], axis=2)
     third, fourth = seen.bell * u * (u * u - 3.0), seen.bell * (u * u * (u * u - 6.0) + 3.0)
-    terms = np.stack([third, fourth], axis=2)
-    weighted = weight[:, :, None] * fitted
-    # beside what centre, amplitude and width take up already
-    taken = np.linalg.pinv(np.einsum("nki,nkj->nij", weighted, fitted))
-    taken = taken @ np.einsum("nki,nkj->nij", weighted, terms)
-    rest = terms - fitted @ taken
-    weighted = weight[:, :, None] * rest
-    normal = np.einsum("nki,nkj->nij", weighted, rest)
-    score = np.einsum("nki,nk->ni", weighted, seen.above - model)
+    normal, score = _beside_fit(seen, noise, section, np.stack([third, fourth], axis=2))
     found = section.copy()
     for axis, is_own in enumerate((seen.is_column, ~seen.is_column)):
         rows = np.flatnonzero(is_own & has_core & is_alone)
@@ -194,6 +184,46 @@ def estimate_section(
             own = slice(2 * axis, 2 * axis + 2)
             found[own] = _common_terms(normal[rows], score[rows], section[own], blocks)
     return found
+
+
+def _beside_fit(
+    seen: _Profiles, noise: FloatArray, section: FloatArray, terms: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Normal matrices (N, T, T) and scores (N, T) of terms (N, K, T) that the model lacks.
+
+    They count beside what centre, amplitude and width take up already.
+    """
+    model, falling = _lines(seen, section)
+    variance = noise[0] * model**2 + noise[1] * np.maximum(model + seen.background, 0.0) + noise[2]
+    weight = ((np.abs(seen.u) < REACH_SIGMAS) & seen.is_known) / variance
+    fitted = np.stack([falling, model, falling * seen.u], axis=2)
+    weighted = weight[:, :, None] * fitted
+    taken = np.linalg.pinv(np.einsum("nki,nkj->nij", weighted, fitted))
+    taken = taken @ np.einsum("nki,nkj->nij", weighted, terms)
+    rest = terms - fitted @ taken
+    weighted = weight[:, :, None] * rest
+    normal = np.einsum("nki,nkj->nij", weighted, rest)
+    return normal, np.einsum("nki,nk->ni", weighted, seen.above - model)
+
+
+def estimate_black(seen: _Profiles, noise: FloatArray, section: FloatArray) -> float:
+    """What the reflectance is too large by everywhere: the camera's black level, or other light.
+
+    A camera that shows darkness as some grey levels, and ink that is not as dark for the laser as
+    for the room's light, make dark print seem lighter or darker than it is under the line.
+    """
+    light = _lines(seen, section)[0] / seen.ground
+    normal, score = _beside_fit(seen, noise, section, -light[:, :, None])
+    normal, score = normal[:, 0, 0], score[:, 0]
+    size = np.sqrt(np.maximum(normal, 1e-12))
+    keep, black = np.ones(len(score)), 0.0
+    for _ in range(ROBUST_ROUNDS):
+        black = float((keep * score).sum() / max(float((keep * normal).sum()), 1e-12))
+        ratio = (score - normal * black) / size
+        scatter = max(robust_sigma(ratio), 1.0)
+        keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
+    sigma = CERTAIN_SIGMAS * scatter / np.sqrt(max(float((keep * normal).sum()), 1e-12))
+    return black * max(1.0 - (sigma / max(abs(black), 1e-12)) ** 2, 0.0)
 
 
 def _blocks(chain: IntArray) -> list[IntArray]:
@@ -262,8 +292,8 @@ class ProfileFits:
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
     section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
-    estimate the noise, so that it is the first guess. ``ground``: (N, 2) reflectance under the line,
-    weighted as the line lights it, and its standard deviation across the line over that.
+    estimate the noise, so that it is the first guess. ``ground``: (N, 2) reflectance under the
+    line, weighted as the line lights it, and its standard deviation across the line over that.
     """
 
     ridge: RidgePoints
@@ -336,6 +366,8 @@ def fit_ridge(
         noise = estimate_noise(seen, section, peak, noise)
         is_alone = reach[at] >= REACH_SIGMAS
         section = estimate_section(seen, noise, section, is_alone, ridge.chain[at])
+        if plane.reflectance.size > 1:
+            plane = plane.with_black(estimate_black(seen, noise, section))
     values = np.zeros((len(table), FIT_COLUMNS))
     ground = plane.reflectance
     fit_profiles(

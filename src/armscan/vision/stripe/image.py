@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -184,7 +184,8 @@ class StripePlane:
     own channel saturated. ``grey_levels_per_unit``: Factor from ``image`` to the exposure's own
     grey levels. ``gate``: (H, W) how much the pixel has the laser's colour, or None for grey
     images. ``unknown``: (H, W) 1 where the view without laser saturated already; None without such
-    a view. ``reflectance``: (H, W) of the ground relative to the brightest, (1, 1) if it is not known.
+    a view. ``reflectance``: (H, W) of the ground relative to the brightest, (1, 1) if it is not
+    known.
     """
 
     image: FloatImage
@@ -205,6 +206,11 @@ class StripePlane:
         peak = max(float(np.quantile(image, PEAK_QUANTILE)), noise)
         least = np.float32((LOST_SIGMAS * noise / peak) ** 2)
         return np.asarray(image * self.reflectance / (self.reflectance**2 + least))
+
+    def with_black(self, black: float) -> StripePlane:
+        """The same with a reflectance that is smaller by ``black`` everywhere."""
+        ground = np.maximum(self.reflectance - np.float32(black), np.float32(DARKEST))
+        return replace(self, reflectance=ground)
 
 
 def _saturated(channel: ImageArray, full_scale: int) -> MaskImage:

@@ -96,7 +96,7 @@ def runs_along_edge(profile: Profile, edges: TargetEdges) -> BoolArray:
     edge = np.concatenate([np.asarray(neighbours, dtype=np.int64) for neighbours in found])
     across = np.einsum("ni,ni->n", profile.normals_px[row], edges.directions_px[edge])
     near[row[np.abs(across) < np.sin(np.radians(LARGEST_ANGLE_DEG))]] = True
-    return near & ((profile.flags & int(StripeFlag.GROUND_KNOWN)) == 0)
+    return np.asarray(near & ((profile.flags & int(StripeFlag.GROUND_KNOWN)) == 0))
 
 
 def _rims(edges: CircleEdges) -> TargetEdges:

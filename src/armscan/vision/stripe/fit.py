@@ -113,7 +113,7 @@ def _profiles(
     is_known = is_inside
     if plane.clipped.shape == image.shape:
         is_known = is_inside & (plane.clipped[y, x] == 0)
-    ground = plane.reflectance
+    ground = plane.reflectance.astype(np.float64)
     if ground.shape == image.shape:
         ground = ground[y, x]
         background, bell = background * ground, bell * ground
@@ -223,7 +223,7 @@ def estimate_black(seen: _Profiles, noise: FloatArray, section: FloatArray) -> f
         scatter = max(robust_sigma(ratio), 1.0)
         keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
     sigma = CERTAIN_SIGMAS * scatter / np.sqrt(max(float((keep * normal).sum()), 1e-12))
-    return black * max(1.0 - (sigma / max(abs(black), 1e-12)) ** 2, 0.0)
+    return float(black * max(1.0 - (sigma / max(abs(black), 1e-12)) ** 2, 0.0))
 
 
 def _blocks(chain: IntArray) -> list[IntArray]:
@@ -412,7 +412,7 @@ def _pixels(
     is_column = (points[:, 5] == 0)[:, None]
     line = np.where(is_column, points[:, :1], points[:, 1:2]).astype(np.int64)
     k: IntArray = np.rint(centre).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
-    safe = np.clip(k, 0, np.where(is_column, height, width) - 1)
+    safe = np.clip(k, 0, np.asarray(np.where(is_column, height, width)) - 1)
     return np.where(is_column, safe, line), np.where(is_column, line, safe), k, k == safe
 
 

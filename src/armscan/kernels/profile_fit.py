@@ -73,7 +73,7 @@ def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> floa
     top = norm = 0.0
     for k in range(n):
         u = (k - offset) / sigma
-        g = math.exp(-0.5 * u * u) * profile[2, k]
+        g = math.exp(-0.5 * u * u) * profile[2, k] * profile[3, k]
         top += g * profile[0, k]
         norm += g * g
     return top / norm if norm > 0.0 else 0.0
@@ -92,8 +92,10 @@ def accumulate(
 
     The line is ``A exp(-u^2 / 2) (1 + c3 (u^3 - 3 u) + c4 (u^4 - 6 u^2 + 3))`` with ``u`` the
     distance from the centre over sigma: a Gram-Charlier series, whose centre of gravity is u = 0.
+    What is seen of it is that times the ground's reflectance.
 
-    ``profile``: (3, >= n) grey level less background, background, and 1 where the pixel counts.
+    ``profile``: (4, >= n) grey level less background, background, 1 where the pixel counts, and
+    reflectance.
     ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
     ``section``: (2,) ``c3, c4``.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
@@ -117,14 +119,15 @@ def accumulate(
         ratio *= change
         third = u * (u * u - 3.0)
         shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
-        m = bell * max(shape, 0.0)
-        falling = bell * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
+        seen = bell * profile[3, k]
+        m = seen * max(shape, 0.0)
+        falling = seen * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
         variance = noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2]
         w = profile[2, k] / variance
         r = profile[0, k] - m
         j0 = falling * step
         j2 = falling * u
-        q = bell * third
+        q = seen * third
         a00 += w * j0 * j0
         a01 += w * j0 * m
         a02 += w * j0 * j2
@@ -137,7 +140,7 @@ def accumulate(
         skew += w * r * q
         skew_norm += w * q * q
         skew_centre += w * q * j0
-        cubic += w * j0 * bell * u * u * u
+        cubic += w * j0 * seen * u * u * u
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a00, a01, a02, a11, a12, a22
     sums[6], sums[7], sums[8] = b0, b1, b2
     sums[9], sums[10], sums[11], sums[12] = skew, skew_norm, skew_centre, cubic
@@ -167,6 +170,7 @@ def solve_step(sums: Floats, steps: FloatsOut) -> float:
 def read_profile(
     image: Image,
     clipped: Mask,
+    reflectance: Image,
     point: Floats,
     side: Floats,
     sigma: float,
@@ -176,19 +180,23 @@ def read_profile(
 ) -> None:
     """Copy ``n`` pixels from ``first`` on of a point's column or row, less their background.
 
-    ``profile``: (3, >= n) output: grey level less background, background, and 1 where the pixel is
-    not clipped. The others: One point's of `fit_profiles`.
+    ``profile``: (4, >= n) output: grey level less background, background, 1 where the pixel is not
+    clipped, and reflectance. The others: One point's of `fit_profiles`.
     """
     is_column = int(point[5]) == COLUMN
     start = point[1] if is_column else point[0]
     line = int(point[0] if is_column else point[1])
     has_clipped = clipped.shape[0] == image.shape[0] and clipped.shape[1] == image.shape[1]
+    has_ground = reflectance.shape[0] == image.shape[0] and reflectance.shape[1] == image.shape[1]
     middle = 0.5 * (side[0] + side[1])
     ramp = (side[1] - side[0]) / (SIDE_SPAN * sigma)
     for k in range(n):
         at = first + k
         value = image[at, line] if is_column else image[line, at]
-        profile[1, k] = middle + ramp * (at - start)
+        profile[3, k] = 1.0
+        if has_ground:
+            profile[3, k] = reflectance[at, line] if is_column else reflectance[line, at]
+        profile[1, k] = (middle + ramp * (at - start)) * profile[3, k]
         profile[0, k] = value - profile[1, k]
         profile[2, k] = 1.0
         if has_clipped and (clipped[at, line] if is_column else clipped[line, at]):
@@ -199,6 +207,7 @@ def read_profile(
 def fit_profiles(
     image: Image,
     clipped: Mask,
+    reflectance: Image,
     points: Table,
     sigma_px: Floats,
     sides: Table,
@@ -214,8 +223,10 @@ def fit_profiles(
     saturated line is fitted on its flanks.
 
     ``image``, ``points``: As for `read_sides`. ``clipped``: (H, W) 1 where a pixel is saturated;
-    (1, 1) if none is. ``sigma_px``: (N,) start value of the sigma along the column or row.
-    ``sides``: (N, 2) background on the lower and upper side; interpolated linearly across the line.
+    (1, 1) if none is. ``reflectance``: (H, W) of the ground, relative; (1, 1) where it is not known
+    and taken to be even. ``sigma_px``: (N,) start value of the sigma along the column or row.
+    ``sides``: (N, 2) background on the lower and upper side, on ground of reflectance 1;
+    interpolated linearly across the line.
     ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's section
     as for `accumulate`: of points fitted along columns, then of those along rows. ``reach``: (N,)
     half width of the fitted window in sigmas. ``result``: (N, 8) input: results for nearly the same
@@ -225,7 +236,7 @@ def fit_profiles(
     centre, in sigmas (for the correction on bent lines).
     """
     height, width = image.shape
-    profile = np.zeros((3, max(height, width)))
+    profile = np.zeros((4, max(height, width)))
     state = np.zeros(3)
     steps = np.zeros(3)
     sums = np.zeros(13)
@@ -249,7 +260,9 @@ def fit_profiles(
             first = max(first - grow, 0)
             last = min(last + grow, size - 1)
         n = last - first + 1
-        read_profile(image, clipped, points[i], sides[i], sigma_px[i], first, n, profile)
+        read_profile(
+            image, clipped, reflectance, points[i], sides[i], sigma_px[i], first, n, profile
+        )
         if result[i, VARIANCE] > 0.0:
             state[0] = result[i, CENTRE] - first
             state[1] = result[i, AMPLITUDE]
@@ -287,9 +300,9 @@ def fit_profiles(
                 break
 
 
-NORMAL_00, NORMAL_01, NORMAL_11, SCORE_0, SCORE_1, HAS_CORE = range(6)
-SECTION_COLUMNS = 6
-"""Columns of what one profile says of the section that all have in common."""
+NORMAL_00, NORMAL_01, NORMAL_11, SCORE_0, SCORE_1, HAS_CORE, BLACK_NORMAL, BLACK_SCORE = range(8)
+SECTION_COLUMNS = 8
+"""Columns of what one profile says of what all have in common: section, and black of the ground."""
 SIDE_FROM, SIDE_TO = 3.4, 4.2
 """Sigmas between which pixels beside the line tell the noise of the background."""
 CORE_SIGMAS = 1.3
@@ -313,17 +326,20 @@ def section_sums(
 ) -> int:
     """Sums over one profile, and its pixels' residuals.
 
-    ``profile``: (3, >= n) from `read_profile`, beginning at pixel ``first``. ``fit``: (8,) of
-    `fit_profiles`. ``section``: (2,). ``noise``: (3,). ``sums``: (21,) output: weighted products of
+    ``profile``: (4, >= n) from `read_profile`, beginning at pixel ``first``. ``fit``: (8,) of
+    `fit_profiles`. ``section``: (2,). ``noise``: (3,). ``sums``: (26,) output: weighted products of
     the derivatives by centre, amplitude and width (00 01 02 11 12 22), of each with the terms of
     third (6 7 8) and fourth order (9 10 11), of these terms (12 13 14), of the residual with all
-    five (15 to 19), and 1 where no pixel beyond the core is clipped. ``pixels``: (3, capacity)
+    five (15 to 19), 1 where no pixel beyond the core is clipped, and of the light that too large a
+    reflectance would add the products with the three (21 22 23), itself and the residual.
+    ``pixels``: (3, capacity)
     output from ``count`` on: the line's own grey level, the same with the background, the residual.
 
     Returns the new count.
     """
     a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = b3 = b4 = 0.0
     p0 = p1 = p2 = q0 = q1 = q2 = t33 = t34 = t44 = 0.0
+    g0 = g1 = g2 = tgg = bg = 0.0
     has_core = 1.0
     begun = stop = -1
     for k in range(n):
@@ -331,7 +347,7 @@ def section_sums(
         is_line = abs(u) < REACH_SIGMAS
         if not is_line and not SIDE_FROM < abs(u) < SIDE_TO:
             continue
-        bell = fit[AMPLITUDE] * math.exp(-0.5 * u * u)
+        bell = fit[AMPLITUDE] * math.exp(-0.5 * u * u) * profile[3, k]
         third = u * (u * u - 3.0)
         fourth = u * u * (u * u - 6.0) + 3.0
         shape = 1.0 + section[0] * third + section[1] * fourth
@@ -373,10 +389,17 @@ def section_sums(
         b2 += w * r * j2
         b3 += w * r * third
         b4 += w * r * fourth
+        light = -m / profile[3, k]
+        g0 += w * j0 * light
+        g1 += w * m * light
+        g2 += w * j2 * light
+        tgg += w * light * light
+        bg += w * r * light
     sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a00, a01, a02, a11, a12, a22
     sums[6], sums[7], sums[8], sums[9], sums[10], sums[11] = p0, p1, p2, q0, q1, q2
     sums[12], sums[13], sums[14] = t33, t34, t44
     sums[15], sums[16], sums[17], sums[18], sums[19], sums[20] = b0, b1, b2, b3, b4, has_core
+    sums[21], sums[22], sums[23], sums[24], sums[25] = g0, g1, g2, tgg, bg
     freedom = math.sqrt((stop - begun) / max(stop - begun - FIT_PARAMETERS, 1.0))
     for k in range(max(begun, 0), stop):
         pixels[2, k] *= freedom
@@ -387,7 +410,7 @@ def section_sums(
 def leave_fitted(sums: Floats, said: FloatsOut) -> None:
     """Normal matrix and right-hand side of what the fitted parameters do not take up of the terms.
 
-    ``sums``: (21,) of `section_sums`. ``said``: (6,) output; zeros where the parameters themselves
+    ``sums``: (26,) of `section_sums`. ``said``: (8,) output; zeros where the parameters themselves
     are not determined.
     """
     said[:] = 0.0
@@ -397,17 +420,21 @@ def leave_fitted(sums: Floats, said: FloatsOut) -> None:
     if not determinant > LEAST_DETERMINANT * a * d * f:
         return
     c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
-    for term in range(2):
-        x, y, z = sums[6 + 3 * term], sums[7 + 3 * term], sums[8 + 3 * term]
+    for term in range(3):
+        at = 21 if term == 2 else 6 + 3 * term
+        x, y, z = sums[at], sums[at + 1], sums[at + 2]
         t0 = (c00 * x + c01 * y + c02 * z) / determinant
         t1 = (c01 * x + c11 * y + c12 * z) / determinant
         t2 = (c02 * x + c12 * y + c22 * z) / determinant
-        said[SCORE_0 + term] = sums[18 + term] - t0 * sums[15] - t1 * sums[16] - t2 * sums[17]
+        taken = t0 * sums[15] + t1 * sums[16] + t2 * sums[17]
+        own = t0 * x + t1 * y + t2 * z
         if term == 0:
-            said[NORMAL_00] = sums[12] - t0 * x - t1 * y - t2 * z
+            said[NORMAL_00], said[SCORE_0] = sums[12] - own, sums[18] - taken
             said[NORMAL_01] = sums[13] - t0 * sums[9] - t1 * sums[10] - t2 * sums[11]
+        elif term == 1:
+            said[NORMAL_11], said[SCORE_1] = sums[14] - own, sums[19] - taken
         else:
-            said[NORMAL_11] = sums[14] - t0 * x - t1 * y - t2 * z
+            said[BLACK_NORMAL], said[BLACK_SCORE] = sums[24] - own, sums[25] - taken
     said[HAS_CORE] = sums[20]
 
 
@@ -415,6 +442,7 @@ def leave_fitted(sums: Floats, said: FloatsOut) -> None:
 def weigh_section(
     image: Image,
     clipped: Mask,
+    reflectance: Image,
     points: Table,
     sides: Table,
     fits: Table,
@@ -429,18 +457,19 @@ def weigh_section(
     Of the terms of third and fourth order of `accumulate`, only what centre, amplitude and width
     do not take up counts.
 
-    ``image``, ``clipped``, ``points``, ``sides``, ``noise``, ``section``: As for `fit_profiles`,
-    which gave ``fits`` (N, 8). ``reach``: Pixels looked at on both sides. ``said``: (N, 6) output:
-    normal matrix of the two terms as 00 01 11, their right-hand side, and 1 where no pixel beyond
-    the core is clipped. ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the
-    same with the background, and the residual, widened by the freedom that the fit took, of every
-    pixel of the lines and of those beside them.
+    ``image``, ``clipped``, ``reflectance``, ``points``, ``sides``, ``noise``, ``section``: As for
+    `fit_profiles`, which gave ``fits`` (N, 8). ``reach``: Pixels looked at on both sides. ``said``:
+    (N, 8) output: normal matrix of the two terms as 00 01 11, their right-hand side, 1 where no
+    pixel beyond the core is clipped, and both for what the reflectance is too large by.
+    ``pixels``: (3, >= N (2 reach + 1)) output: the line's own grey level, the same with the
+    background, and the residual, widened by the freedom that the fit took, of every pixel of the
+    lines and of those beside them.
 
     Returns count of pixels.
     """
     height, width = image.shape
-    profile = np.zeros((3, 2 * reach + 1))
-    sums = np.zeros(21)
+    profile = np.zeros((4, 2 * reach + 1))
+    sums = np.zeros(26)
     count = 0
     for i in range(points.shape[0]):
         is_column = int(points[i, 5]) == COLUMN
@@ -448,7 +477,9 @@ def weigh_section(
         first = max(int(np.rint(start)) - reach, 0)
         stop = min(int(np.rint(start)) + reach + 1, height if is_column else width)
         n = stop - first
-        read_profile(image, clipped, points[i], sides[i], fits[i, SIGMA], first, n, profile)
+        read_profile(
+            image, clipped, reflectance, points[i], sides[i], fits[i, SIGMA], first, n, profile
+        )
         own = section[:2] if is_column else section[2:]
         count = section_sums(profile, n, first, fits[i], own, noise, sums, pixels, count)
         leave_fitted(sums, said[i])
@@ -459,7 +490,7 @@ def weigh_section(
 def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOut) -> None:
     """Terms (2,) that profiles share, robustly: a score counts little beyond the median's scatter.
 
-    ``said``: (N, 6) of `weigh_section`. ``rounds``: Of weighing. ``clipped_score``: Of one profile,
+    ``said``: (N, 8) of `weigh_section`. ``rounds``: Of weighing. ``clipped_score``: Of one profile,
     in scatters, beyond which it counts the less. ``terms``: (2,) output.
     """
     n = said.shape[0]

@@ -128,7 +128,7 @@ def calibrate_sheets_from_pairs(
         pair: ExposurePair, colour: LaserColour, line_sigma_px: float | None = None
     ) -> BoardStripes | FitFailure:
         sigma = options.stripes.line_sigma_px or line_sigma_px
-        chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma)
+        chosen = replace(options.stripes, laser_colour=colour, line_sigma_px=sigma, on_print=True)
         place = places[placement_of(pair)]
         return _board_stripes(pair, place, target, cameras, chosen, cache=cache)
 
@@ -496,7 +496,7 @@ def look_at_pairs(
         if not isinstance(board, FitFailure):
             lit = around_board(board, exposure)
             dark = None if background is None else around_board(board, background)
-        profile = cached_profile(lit, options.stripes, dark, cache)
+        profile = cached_profile(lit, replace(options.stripes, on_print=True), dark, cache)
         seen.append(SeenPair(exposure.source, board, tried.source, profile))
     progress(ProgressEvent(AGAIN_STAGE, len(pairs), len(pairs)))
     if cache is not None:

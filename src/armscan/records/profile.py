@@ -33,6 +33,8 @@ class StripeFlag(IntFlag):
     """Where something cuts the line at a slant: the fitted column or row reaches past its end."""
     NOISE_ASSUMED = 256
     """Too few points to measure their noise: the sigma rests on an assumption."""
+    GROUND_KNOWN = 512
+    """What is printed under the line is part of the fit, as the view without laser shows it."""
 
 
 REJECTING = (

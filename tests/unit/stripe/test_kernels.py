@@ -152,6 +152,7 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     fit_profiles(
         image,
         np.zeros((1, 1), np.uint8),
+        np.ones((1, 1), np.float32),
         points,
         width,
         sides,
@@ -174,6 +175,46 @@ def test_profile_fit_matches_scipy(centre: float) -> None:
     assert result[0, VARIANCE] == pytest.approx(covariance[0, 0], rel=0.05)
 
 
+def test_profile_fit_on_print_matches_scipy() -> None:
+    """SciPy's least squares of ``reflectance (background + line)``: a border beside the centre."""
+    rng = np.random.default_rng(5)
+    x = np.arange(41.0)
+    ground = np.where(x < 21.0, 0.1, 1.0)
+    line = 100.0 * np.exp(-0.5 * ((x - 19.2) / 5.0) ** 2)
+    image = np.tile(ground * (5.0 + line), (3, 1)).astype(np.float32)
+    image += rng.normal(0.0, 0.3, image.shape).astype(np.float32)
+    result, even = np.zeros((1, 8)), np.zeros((1, 8))
+    for reflectance, out in (
+        (np.tile(ground, (3, 1)).astype(np.float32), result),
+        (np.ones((1, 1), np.float32), even),
+    ):
+        fit_profiles(
+            image,
+            np.zeros((1, 1), np.uint8),
+            reflectance,
+            np.array([[20.0, 1.0, 1.0, 0.0, 0.0, 1.0]]),
+            np.full(1, 5.0),
+            np.full((1, 2), 5.0),
+            np.array([0.0, 0.0, 0.09]),
+            np.zeros(4),
+            np.full(1, 2.7),
+            out,
+        )
+    use = np.abs(x - 20.0) <= 2.7 * 5.0
+    best, covariance = curve_fit(
+        lambda t, c, a, s: ground[use] * (5.0 + a * np.exp(-0.5 * ((t - c) / s) ** 2)),
+        x[use],
+        image[1, use].astype(np.float64),
+        p0=[20.0, 100.0, 5.0],
+        sigma=np.full(use.sum(), 0.3),
+        absolute_sigma=True,
+    )
+    assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx(best, rel=1e-4)
+    assert result[0, VARIANCE] == pytest.approx(covariance[0, 0], rel=0.05)
+    assert abs(result[0, CENTRE] - 19.2) < 4.0 * np.sqrt(covariance[0, 0])
+    assert even[0, VARIANCE] == 0.0 or even[0, CENTRE] > 22.0, "a Gaussian goes to the bright side"
+
+
 def test_clipped_pixels_are_left_out() -> None:
     image = gaussian_row(20.3, peak=400.0)
     clipped = (image >= 255.0).astype(np.uint8)
@@ -187,7 +228,8 @@ def test_clipped_pixels_are_left_out() -> None:
         np.zeros(4),
         np.full(1, 2.7),
     )
-    fit_profiles(np.minimum(image, np.float32(255.0)), clipped, *arguments, result)
+    even = np.ones((1, 1), np.float32)
+    fit_profiles(np.minimum(image, np.float32(255.0)), clipped, even, *arguments, result)
     assert result[0, [CENTRE, AMPLITUDE, SIGMA]] == pytest.approx([20.3, 400.0, 2.5], rel=1e-3)
 
 
@@ -197,6 +239,7 @@ def test_known_results_are_where_the_steps_begin() -> None:
     arguments = (
         image,
         np.zeros((1, 1), np.uint8),
+        np.ones((1, 1), np.float32),
         points,
         np.full(1, 2.0),
         np.full((1, 2), 5.0),
@@ -215,13 +258,16 @@ def test_known_results_are_where_the_steps_begin() -> None:
     assert wrong[0, VARIANCE] == 0.0
 
 
-def lopsided_rows(c3: float, c4: float) -> tuple[np.ndarray, np.ndarray]:
+EVEN = np.ones((1, 1), np.float32)
+
+
+def lopsided_rows(c3: float, c4: float, ground: np.ndarray = EVEN) -> tuple[np.ndarray, np.ndarray]:
     """Image of 40 noisy rows with a lopsided section, and their ridge points."""
     rng = np.random.default_rng(6)
     centre = 20.0 + rng.uniform(-0.5, 0.5, (40, 1))
     u = (np.arange(41) - centre) / 2.5
     section = 1.0 + c3 * (u**3 - 3.0 * u) + c4 * (u**4 - 6.0 * u**2 + 3.0)
-    image = 5.0 + 150.0 * np.exp(-0.5 * u * u) * np.maximum(section, 0.0)
+    image = (5.0 + 150.0 * np.exp(-0.5 * u * u) * np.maximum(section, 0.0)) * ground
     points = np.zeros((40, 6))
     points[:, 0], points[:, 1] = centre[:, 0], np.arange(40)
     points[:, 2], points[:, 5] = 1.0, 1.0
@@ -231,59 +277,65 @@ def lopsided_rows(c3: float, c4: float) -> tuple[np.ndarray, np.ndarray]:
 def test_section_is_what_the_fit_leaves() -> None:
     """Each profile's normal matrix and right-hand side against weighted least squares in NumPy."""
     c3, c4 = 0.05, 0.01
-    image, points = lopsided_rows(c3, c4)
-    noise, none, sides = np.array([1e-4, 0.0, 1.0]), np.zeros((1, 1), np.uint8), np.full((40, 2), 5)
+    ground = (1.0 + 0.3 * np.sin(np.arange(41) / 2.0) * np.ones((40, 1))).astype(np.float32)
+    image, points = lopsided_rows(c3, c4, ground)
+    noise, none, sides = (
+        np.array([1e-4, 0.0, 1.0]),
+        np.zeros((1, 1), np.uint8),
+        np.full((40, 2), 5.0),
+    )
     start, fits = np.array([0.0, 0.0, 0.02, 0.0]), np.zeros((40, 8))
-    sides = sides.astype(np.float64)
-    arguments = (np.full(40, 2.5), sides, noise, start, np.full(40, 2.7))
-    fit_profiles(image, none, points, *arguments, fits)
-    said, pixels = np.zeros((40, 6)), np.zeros((3, 40 * 31))
-    weigh_section(image, none, points, sides, fits, noise, start, 15, said, pixels)
+    images, arguments = (image, none, ground, points), (np.full(40, 2.5), sides, noise)
+    reach = np.full(40, 2.7)
+    fit_profiles(*images, *arguments, start, reach, fits)
+    said, pixels = np.zeros((40, 8)), np.zeros((3, 40 * 31))
+    weigh_section(*images, sides, fits, noise, start, 15, said, pixels)
     for i in (0, 17, 39):
         _, amplitude, sigma = fits[i, [CENTRE, AMPLITUDE, SIGMA]]
         u = (np.arange(41) - fits[i, CENTRE]) / sigma
         near = np.abs(u) < 2.7
-        u = u[near]
-        bell = amplitude * np.exp(-0.5 * u * u)
+        u, light = u[near], amplitude * np.exp(-0.5 * u[near] ** 2)
+        bell = light * ground[i, near]
         h3, h4 = u**3 - 3.0 * u, u**4 - 6.0 * u**2 + 3.0
         model = bell * (1.0 + 0.02 * h3)
         slope = bell * (u * (1.0 + 0.02 * h3) - 0.06 * (u * u - 1.0))
         weight = 1.0 / np.sqrt(noise[0] * model**2 + noise[2])
         fitted = np.stack([slope, model, slope * u], axis=1) * weight[:, None]
-        terms = np.stack([bell * h3, bell * h4], axis=1) * weight[:, None]
+        black = -light * (1.0 + 0.02 * h3)
+        terms = np.stack([bell * h3, bell * h4, black], axis=1) * weight[:, None]
         rest = terms - fitted @ np.linalg.lstsq(fitted, terms, rcond=None)[0]
-        residual = (image[i, near] - 5.0 - model) * weight
+        residual = (image[i, near] - 5.0 * ground[i, near] - model) * weight
         normal, score = rest.T @ rest, rest.T @ residual
-        assert said[i] == pytest.approx([*normal[0], normal[1, 1], *score, 1.0], rel=1e-6)
+        expected = [*normal[0, :2], normal[1, 1], *score[:2], 1.0, normal[2, 2], score[2]]
+        assert said[i] == pytest.approx(expected, rel=1e-6)
     common = np.zeros(2)
     common_terms(said, 8, 0.7, common)
-    sigma = np.sqrt(np.diag(np.linalg.inv(40.0 * normal)))
+    sigma = np.sqrt(np.diag(np.linalg.inv(40.0 * normal[:2, :2])))
     # 1.6: what a clipped score loses against least squares
     assert np.all(np.abs(start[2:] + common - [c3, c4]) < 4.0 * 1.6 * sigma)
-    true = np.array([0.0, 0.0, c3, c4])
-    fits = np.zeros((40, 8))
-    fit_profiles(image, none, points, *arguments[:3], true, arguments[4], fits)
-    count = weigh_section(image, none, points, sides, fits, noise, true, 15, said, pixels)
+    true, fits = np.array([0.0, 0.0, c3, c4]), np.zeros((40, 8))
+    fit_profiles(*images, *arguments, true, reach, fits)
+    count = weigh_section(*images, sides, fits, noise, true, 15, said, pixels)
     # the freedom that each fit took is given back
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
 
 
 def test_clipped_cores_say_nothing_of_the_section() -> None:
     image, points = lopsided_rows(0.0, 0.0)
-    fits, said, pixels = np.zeros((40, 8)), np.zeros((40, 6)), np.zeros((3, 40 * 31))
+    fits, said, pixels = np.zeros((40, 8)), np.zeros((40, 8)), np.zeros((3, 40 * 31))
     noise, sides = np.array([0.0, 0.0, 1.0]), np.full((40, 2), 5.0)
     clipped = np.zeros(image.shape, np.uint8)
     clipped[3, 20] = 1  # the peak
     clipped[4, 25] = 1  # two sigmas beside it
-    arguments = (np.full(40, 2.5), sides, noise, np.zeros(4), np.full(40, 2.7))
-    fit_profiles(image, clipped, points, *arguments, fits)
-    weigh_section(image, clipped, points, sides, fits, noise, np.zeros(4), 15, said, pixels)
+    images, arguments = (image, clipped, EVEN, points), (np.full(40, 2.5), sides, noise)
+    fit_profiles(*images, *arguments, np.zeros(4), np.full(40, 2.7), fits)
+    weigh_section(*images, sides, fits, noise, np.zeros(4), 15, said, pixels)
     assert np.flatnonzero(said[:, 5] == 0.0).tolist() == [4]
 
 
 def test_one_profile_of_another_surface_hardly_moves_the_common_terms() -> None:
     rng = np.random.default_rng(7)
-    said = np.zeros((101, 6))
+    said = np.zeros((101, 8))
     said[:, 0], said[:, 2], said[:, 5] = 100.0, 50.0, 1.0
     said[:, 3] = 100.0 * 0.03 + rng.normal(0.0, 10.0, 101)
     said[:, 4] = rng.normal(0.0, 7.0, 101)

@@ -83,7 +83,10 @@ def find_target_edges(
 
 
 def runs_along_edge(profile: Profile, edges: TargetEdges) -> BoolArray:
-    """(N,) True for stripe points near an edge that runs along the stripe."""
+    """(N,) True for stripe points near an edge that runs along the stripe.
+
+    Not for those in whose fit the print is known: their sigma says what that leaves.
+    """
     near = np.zeros(len(profile), dtype=np.bool_)
     if len(edges.points_px) == 0 or len(profile) == 0:
         return near
@@ -93,7 +96,7 @@ def runs_along_edge(profile: Profile, edges: TargetEdges) -> BoolArray:
     edge = np.concatenate([np.asarray(neighbours, dtype=np.int64) for neighbours in found])
     across = np.einsum("ni,ni->n", profile.normals_px[row], edges.directions_px[edge])
     near[row[np.abs(across) < np.sin(np.radians(LARGEST_ANGLE_DEG))]] = True
-    return near
+    return np.asarray(near & ((profile.flags & int(StripeFlag.GROUND_KNOWN)) == 0))
 
 
 def _rims(edges: CircleEdges) -> TargetEdges:

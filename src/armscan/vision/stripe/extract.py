@@ -10,7 +10,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.profile_fit import AMPLITUDE, BEND_GAIN, CENTRE, SIGMA, VARIANCE
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile, StripeFlag
+from armscan.records.profile import REJECTING, Profile, StripeFlag
 from armscan.vision.stripe.fit import ProfileFits, axis_component, fit_ridge
 from armscan.vision.stripe.flags import (
     is_asymmetric,
@@ -28,6 +28,7 @@ from armscan.vision.stripe.image import (
     has_laser_colour,
     is_on_known_ground,
     mono_plane,
+    relative_reflectance,
 )
 from armscan.vision.stripe.ridge import (
     RidgePoints,
@@ -45,6 +46,14 @@ LEAST_SIGMA_PX = 0.002
 FLANKS_PER_LEAN = 1.0
 """Sigmas of the line by which the flanks of a saturated one lie beside the centre, for each unit of
 its section's third-order term: what sections leave that are no Gram-Charlier series."""
+EDGE_BLUR_PX2 = 1.0
+"""Over the line's sigma, what an edge of the ground under the line leaves at its worst place: the
+lens blurs what the ground reflects, not the light on it alone. Of a blur of 1 px."""
+MOST_PULL = 0.5
+"""Of the line's sigma: an edge under a line takes up to half of its light."""
+MOST_LEFT = 0.2
+"""Of an edge's pull: the blur leaves more of it on lines of sigma below 3.2 px. Edges lie beside
+only a part of such lines, and the points there are better left out."""
 
 
 def extract_stripes(
@@ -88,20 +97,37 @@ def extract_stripes(
     threshold = options.threshold
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
-    level = measure_level(plane.image, threshold)
-    runs = find_candidates(plane.image, level)
-    sigma = options.line_sigma_px or find_line_sigma(plane.image, runs, level)
+    if background is not None and options.on_print and options.method == "fit":
+        plane = _with_ground(plane, background, options, threshold)
+    noise = measure_level(plane.image, None).noise
+    image = plane.on_even_ground(plane.image, noise)
+    level = measure_level(image, threshold)
+    runs = find_candidates(image, level)
+    sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
     if options.method == "fit":
-        ridge = trace_ridges(plane.image, runs, sigma, level.rise)
+        ridge = trace_ridges(image, runs, sigma, level.rise)
     else:
-        centres = THESIS_METHODS[options.method](plane.image, level, sigma)
-        ridge = link_centres(centres, plane.image)
+        centres = THESIS_METHODS[options.method](image, level, sigma)
+        ridge = link_centres(centres, image)
     ridge = _of_laser(plane, ridge, sigma)
     if not len(ridge):
         return Profile.empty(source=exposure.source)
     if options.method != "fit":
         return thesis_profile(exposure, plane, ridge, sigma)
-    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, level.noise), options)
+    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
+
+
+def _with_ground(
+    plane: StripePlane, background: Exposure, options: StripeOptions, threshold: float | None
+) -> StripePlane:
+    """The plane with what is printed under its lines, if they are so wide that it is worth it."""
+    ground = relative_reflectance(background, options.laser_colour)
+    known = replace(plane, reflectance=ground)
+    image = known.on_even_ground(plane.image, measure_level(plane.image, None).noise)
+    level = measure_level(image, threshold)
+    sigma = options.line_sigma_px
+    sigma = sigma or find_line_sigma(image, find_candidates(image, level), level)
+    return known if EDGE_BLUR_PX2 / sigma <= MOST_LEFT * MOST_PULL * sigma else plane
 
 
 def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgePoints:
@@ -149,7 +175,8 @@ def to_profile(
     chain = fits.ridge.chain
     width = fits.values[:, SIGMA] * axis_component(fits.ridge.table)
     near = is_near_other_line(fits.neighbour, chain, width)
-    flags = np.zeros(len(points), np.int64)
+    is_known = plane.reflectance.size > 1
+    flags = np.full(len(points), int(StripeFlag.GROUND_KNOWN) if is_known else 0)
     for flag, holds in (
         (StripeFlag.SATURATED, is_saturated(points, plane.saturated)),
         (StripeFlag.BACKGROUND_STEP, is_background_step(fits)),
@@ -159,7 +186,7 @@ def to_profile(
         (StripeFlag.SHORT_SEGMENT, is_short(points, chain)),
     ):
         flags[holds] |= int(flag)
-    usable = (flags & ~int(StripeFlag.SATURATED)) == 0
+    usable = (flags & int(REJECTING)) == 0
     # beyond a crossing a chain may follow the other line: nothing is averaged across it
     is_new = (np.diff(chain) != 0) | (np.diff(near) != 0)
     stretch = np.concatenate([[0], np.cumsum(is_new)])
@@ -167,7 +194,9 @@ def to_profile(
     smoothed = smooth(course, options.smoothing_px)
     flags[smoothed.is_outlier] |= int(StripeFlag.OUTLIER)
     is_on_flanks = (flags & int(StripeFlag.SATURATED)) != 0
-    beside = FLANKS_PER_LEAN * np.abs(fits.lean) * width * is_on_flanks
+    by_section = FLANKS_PER_LEAN * np.abs(fits.lean) * width
+    by_edge = np.minimum(np.hypot(by_section, EDGE_BLUR_PX2 / width), MOST_PULL * width)
+    beside = np.maximum(by_section * is_on_flanks, by_edge * fits.ground[:, 1])
     if fits.is_noise_assumed and not smoothed.is_noise_measured:
         flags |= int(StripeFlag.NOISE_ASSUMED)
     binning = exposure.window.binning
@@ -178,7 +207,7 @@ def to_profile(
         normals_px=smoothed.normals,
         sigma_px=np.hypot(sigma, beside) * binning,
         width_px=width * binning,
-        intensity=fits.values[:, AMPLITUDE] * plane.grey_levels_per_unit,
+        intensity=fits.values[:, AMPLITUDE] * fits.ground[:, 0] * plane.grey_levels_per_unit,
         flags=flags,
         segment=np.unique(chain, return_inverse=True)[1],
         noise_length=np.maximum((smoothed.sigma_sum / sigma) ** 2, 1.0),

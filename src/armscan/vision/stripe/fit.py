@@ -15,6 +15,9 @@ from armscan.kernels.arrays import COLUMN, ROW
 from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
+    BLACK_NORMAL,
+    BLACK_SCORE,
+    CENTRE,
     FIT_COLUMNS,
     HAS_CORE,
     NORMAL_00,
@@ -105,7 +108,7 @@ def estimate_section(
     profiles share are therefore made part of the model; what single profiles have beside them
     stays the sign of an edge.
 
-    ``said``: (N, 6) of `kernels.profile_fit.weigh_section`. ``section``: (4,) of the fit.
+    ``said``: (N, 8) of `kernels.profile_fit.weigh_section`. ``section``: (4,) of the fit.
     ``is_usable``: (N,) profiles whose core is not clipped and that no other line is near.
     ``axis``: (N,) along which each was fitted. ``chain``: (N,) increasing numbers.
     """
@@ -128,8 +131,28 @@ def _blocks(chain: IntArray) -> IntArray:
     return np.where(is_whole, np.cumsum(begins) - 1, -1)
 
 
+def estimate_black(said: FloatArray) -> float:
+    """What the reflectance is too large by everywhere: the camera's black level, or other light.
+
+    A camera that shows darkness as some grey levels, and ink that is not as dark for the laser as
+    for the room's light, make dark print seem lighter or darker than it is under the line.
+
+    ``said``: (N, 8) of `kernels.profile_fit.weigh_section`.
+    """
+    normal, score = said[:, BLACK_NORMAL], said[:, BLACK_SCORE]
+    size = np.sqrt(np.maximum(normal, 1e-12))
+    keep, black = np.ones(len(score)), 0.0
+    for _ in range(ROBUST_ROUNDS):
+        black = float((keep * score).sum() / max(float((keep * normal).sum()), 1e-12))
+        ratio = (score - normal * black) / size
+        scatter = max(robust_sigma(ratio), 1.0)
+        keep = np.minimum(1.0, CLIPPED_SCORE * scatter / np.maximum(np.abs(ratio), 1e-12))
+    sigma = CERTAIN_SIGMAS * scatter / np.sqrt(max(float((keep * normal).sum()), 1e-12))
+    return float(black * max(1.0 - (sigma / max(abs(black), 1e-12)) ** 2, 0.0))
+
+
 def _certain_terms(said: FloatArray, start: FloatArray, block: IntArray) -> FloatArray:
-    """(2,) terms that profiles share, of what they say (N, 6) beside the ``start`` (2,).
+    """(2,) terms that profiles share, of what they say (N, 8) beside the ``start`` (2,).
 
     They are shrunk by how far stretches of the line differ from each other: what comes and goes
     along the line is the surface's. ``block``: (N,) number of the stretch.
@@ -178,7 +201,8 @@ class ProfileFits:
     sides. ``neighbour``: (N, 2) distance to the nearest other line on the lower and upper side, in
     px. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``section``: (4,) shape of the line's own
     section: see `estimate_section`. ``is_noise_assumed``: True if there were too few residuals to
-    estimate the noise, so that it is the first guess.
+    estimate the noise, so that it is the first guess. ``ground``: (N, 2) reflectance under the
+    line, weighted as the line lights it, and its standard deviation across the line over that.
     """
 
     ridge: RidgePoints
@@ -189,6 +213,7 @@ class ProfileFits:
     noise: FloatArray
     section: FloatArray
     is_noise_assumed: bool
+    ground: FloatArray
 
     @property
     def lean(self) -> FloatArray:
@@ -232,6 +257,7 @@ def fit_ridge(
         fit_profiles(
             plane.image,
             plane.clipped,
+            plane.reflectance,
             table[pick],
             sigma[pick],
             sides[pick],
@@ -251,9 +277,15 @@ def fit_ridge(
         is_usable = (reach[at] >= REACH_SIGMAS) & (said[:, HAS_CORE] > 0.0)
         axis = table[at, 5].astype(np.int64)
         section = estimate_section(said, section, is_usable, axis, ridge.chain[at])
+        if plane.reflectance.size > 1:
+            said, _ = _weighed(*fitted, noise=noise, section=section)
+            plane = plane.with_black(estimate_black(said))
     values = np.zeros((len(table), FIT_COLUMNS))
     values[pick] = sample
-    fit_profiles(plane.image, plane.clipped, table, sigma, sides, noise, section, reach, values)
+    ground = plane.reflectance
+    fit_profiles(
+        plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
+    )
     good = values[:, VARIANCE] > 0.0
     return ProfileFits(
         ridge.select(good),
@@ -264,6 +296,7 @@ def fit_ridge(
         noise,
         section,
         is_noise_assumed=noise is guess,
+        ground=_ground(plane, table[good], values[good]),
     )
 
 
@@ -276,13 +309,31 @@ def _weighed(
     noise: FloatArray,
     section: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Outputs (N, 6) and (3, M) of `weigh_section`."""
+    """Outputs (N, 8) and (3, M) of `weigh_section`."""
     reach = int(np.ceil(np.quantile(fits[:, SIGMA], 0.9) * SIDE_SPAN / 2.0))
     said = np.zeros((len(fits), SECTION_COLUMNS))
     pixels = np.zeros((3, len(fits) * (2 * reach + 1)))
-    images = (plane.image, plane.clipped)
+    images = (plane.image, plane.clipped, plane.reflectance)
     n = weigh_section(*images, points, sides, fits, noise, section, reach, said, pixels)
     return said, pixels[:, :n]
+
+
+def _ground(plane: StripePlane, points: FloatArray, fits: FloatArray) -> FloatArray:
+    """(N, 2) mean reflectance under each line, and how much of it the ground differs there."""
+    if plane.reflectance.size == 1 or not len(points):
+        return np.tile([1.0, 0.0], (len(points), 1))
+    reach = int(np.ceil(REACH_SIGMAS * float(np.quantile(fits[:, SIGMA], 0.9))))
+    height, width = plane.image.shape
+    is_column = (points[:, 5] == COLUMN)[:, None]
+    line = np.where(is_column, points[:, :1], points[:, 1:2]).astype(np.int64)
+    k: IntArray = np.rint(fits[:, CENTRE, None]).astype(np.int64) + np.arange(-reach, reach + 1)
+    safe = np.clip(k, 0, np.asarray(np.where(is_column, height, width)) - 1)
+    light = np.exp(-0.5 * ((k - fits[:, CENTRE, None]) / fits[:, SIGMA, None]) ** 2)
+    light /= light.sum(axis=1, keepdims=True)
+    ground = plane.reflectance[np.where(is_column, safe, line), np.where(is_column, line, safe)]
+    mean = (light * ground).sum(axis=1)
+    spread = np.sqrt((light * (ground - mean[:, None]) ** 2).sum(axis=1))
+    return np.stack([mean, spread / mean], axis=1)
 
 
 def _neighbours(plane: StripePlane, ridge: RidgePoints, line_sigma_px: float) -> FloatArray:
@@ -305,23 +356,29 @@ def _sides(
 ) -> tuple[FloatArray, FloatArray]:
     """Background on both sides, averaged along the line, and the sigma of their difference.
 
-    A side that another line lights up takes the value of the other side.
+    Both are of light on ground of reflectance 1. A side that another line lights up takes the value
+    of the other side.
     """
-    raw = np.zeros((len(ridge), 4))
+    raw, ground = np.zeros((len(ridge), 4)), np.ones((len(ridge), 4))
     read_sides(plane.image, ridge.table, sigma, raw)
-    level, count = raw[:, 0::2], raw[:, 1::2] * is_clear
+    if plane.reflectance.size > 1:
+        read_sides(plane.reflectance, ridge.table, sigma, ground)
+    count = raw[:, 1::2] * is_clear
+    seen = np.where(raw[:, 1::2] > 0.0, ground[:, 0::2], 1.0)
+    level, weight = raw[:, 0::2] / seen, count * seen**2
     stretch = _axis_runs(ridge)
     places = np.minimum(np.subtract(*chain_bounds(stretch)[::-1]), 2 * SIDE_HALF + 1)
-    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in count.T], 1)
+    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in weight.T], 1)
     mean = np.stack(
-        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, count.T, strict=True)], 1
+        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, weight.T, strict=True)], 1
     )
     has_own = (total > 0.0) & is_clear
     lowest = np.where(raw[:, 1::2] > 0.0, level, np.inf).min(axis=1)
     lowest = np.where(np.isfinite(lowest), lowest, 0.0)[:, None]
     sides = np.where(has_own, mean, np.where(has_own[:, ::-1], mean[:, ::-1], lowest))
     pixels = np.where(has_own.all(axis=1), count.min(axis=1), 1.0) * places
-    return sides, background_noise * np.sqrt(2.0 / np.maximum(pixels, 1.0))
+    on_ground = background_noise / seen.min(axis=1)
+    return sides, on_ground * np.sqrt(2.0 / np.maximum(pixels, 1.0))
 
 
 def _axis_runs(ridge: RidgePoints) -> IntArray:

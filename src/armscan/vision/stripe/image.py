@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, ImageArray, IntArray
@@ -42,6 +43,9 @@ class StripeOptions:
         image's noise.
     smoothing_px
         Largest half window of the smoothing along the line; 0 switches it off.
+    on_print
+        The lines lie on matt print, which the laser lights up as the room's light does: of ``fit``,
+        the view without laser then tells how bright the ground is under the line.
     """
 
     method: StripeMethod = "fit"
@@ -49,6 +53,7 @@ class StripeOptions:
     line_sigma_px: float | None = None
     threshold: float | None = None
     smoothing_px: float = 12.0
+    on_print: bool = False
 
     def __post_init__(self) -> None:
         for name, choices in (("method", StripeMethod), ("laser_colour", LaserColour)):
@@ -74,7 +79,7 @@ class StripeOptions:
 
 ROUNDS = 4
 TRIM_SIGMAS = 2.5
-GAIN_LIMITS = (0.05, 20.0)
+GAIN_LIMITS = (0.0, 20.0)
 
 
 def check_background(exposure: Exposure, background: Exposure) -> None:
@@ -114,6 +119,43 @@ def subtract(lit: FloatImage, dark: FloatImage, full_scale: float) -> FloatImage
     return np.asarray(lit - np.float32(gain) * dark - np.float32(offset), dtype=np.float32)
 
 
+EVEN = np.ones((1, 1), np.float32)
+PEAK_QUANTILE = 0.999
+LOST_SIGMAS = 3.0
+GROUND_PX = 5
+"""Within such squares noise of the view without laser is told from the print."""
+WHITE_QUANTILE = 0.95
+LEAST_WHITE_SIGMAS = 10.0
+DARKEST = 0.02
+"""Black print reflects 3 % and more of what white paper does."""
+
+
+def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
+    """Reflectance (H, W) of the ground relative to its brightest, from the view without laser.
+
+    Where a square of pixels differs by no more than noise, its mean is taken (Lee 1980); an edge
+    stays as it is. (1, 1) where the view is too dark to say anything. ``colour``: As in
+    `StripeOptions.laser_colour`; of ``auto``, the mean of the channels is taken.
+    """
+    if background.colour == "mono":
+        dark = _level(background, None, None)
+    else:
+        first = colour.partition("-")[0]
+        own = [CHANNELS.index(first)] if first in CHANNELS else range(3)
+        levels = [_level(background, None, k) for k in own]
+        dark = np.asarray(sum(levels) / np.float32(len(levels)), dtype=np.float32)
+    mean = uniform_filter(dark, GROUND_PX)
+    variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
+    white = float(np.quantile(mean, WHITE_QUANTILE))
+    is_light = mean > 0.5 * white
+    per_level = float(np.median(variance[is_light] / np.maximum(mean[is_light], 1e-3)))
+    if white < LEAST_WHITE_SIGMAS**2 * per_level:
+        return EVEN
+    keep = np.maximum(1.0 - per_level * mean / variance, 0.0)
+    ground = (mean + keep * (dark - mean)) / np.float32(white)
+    return np.ascontiguousarray(np.maximum(ground, DARKEST), dtype=np.float32)
+
+
 NORMAL_SCALE = 255.0
 """Grey levels are scaled to 8 bits, so that no constant depends on the camera's depth."""
 
@@ -127,7 +169,8 @@ class StripePlane:
     own channel saturated. ``grey_levels_per_unit``: Factor from ``image`` to the exposure's own
     grey levels. ``gate``: (H, W) how much the pixel has the laser's colour, or None for grey
     images. ``unknown``: (H, W) 1 where the view without laser saturated already; None without such
-    a view.
+    a view. ``reflectance``: (H, W) of the ground relative to the brightest, (1, 1) if it is not
+    known.
     """
 
     image: FloatImage
@@ -136,6 +179,23 @@ class StripePlane:
     grey_levels_per_unit: float
     gate: FloatImage | None = None
     unknown: MaskImage | None = None
+    reflectance: FloatImage = field(default_factory=lambda: EVEN)
+
+    def on_even_ground(self, image: FloatImage, noise: float) -> FloatImage:
+        """What an image (H, W) of the laser's light would be on ground that is bright everywhere.
+
+        Where the ground is so dark that the light is lost in the ``noise``, it stays dark.
+        """
+        if self.reflectance.size == 1:
+            return image
+        peak = max(float(np.quantile(image, PEAK_QUANTILE)), noise)
+        least = np.float32((LOST_SIGMAS * noise / peak) ** 2)
+        return np.asarray(image * self.reflectance / (self.reflectance**2 + least))
+
+    def with_black(self, black: float) -> StripePlane:
+        """The same with a reflectance that is smaller by ``black`` everywhere."""
+        ground = np.maximum(self.reflectance - np.float32(black), np.float32(DARKEST))
+        return replace(self, reflectance=ground)
 
 
 def _saturated(channel: ImageArray, full_scale: int) -> MaskImage:

@@ -137,7 +137,7 @@ def measured(
     """The scan, its stripes put where the extraction of images would give them."""
 
     def stripes_of(
-        pair: tuple[Exposure, Exposure | None], camera: CameraModel, options: object
+        pair: tuple[Exposure, Exposure | None], camera: CameraModel, *_: object
     ) -> Profile:
         row = int(pair[0].image[0, 0]) * 256 + int(pair[0].image[0, 1])
         return pixels(recording.profiles[row])

@@ -115,7 +115,9 @@ class SeenAs:
 
     profiles: tuple[Profile, Profile]
 
-    def __call__(self, pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> Profile:
+    def __call__(
+        self, pair: ExposurePair, camera: CameraModel, options: StripeOptions, cache: None = None
+    ) -> Profile:
         """The camera's profile under the image's name."""
         exposure = pair[0]
         return replace(self.profiles[exposure.camera], source=exposure.source)

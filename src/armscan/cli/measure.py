@@ -14,6 +14,7 @@ from armscan.cli.options import (
     AsJson,
     BitsAlign,
     BitsUsed,
+    Cache,
     DefaultOf,
     EulerAngles,
     Force,
@@ -38,7 +39,7 @@ SIMULATE_EXAMPLE = (
 )
 OF_IMAGES = (
     "background right right_background sheet depth_margin arm "
-    "method stripe_method laser_colour bits_used bits_align"
+    "method stripe_method laser_colour bits_used bits_align cache"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -251,6 +252,7 @@ def reconstruct(
     laser_colour: LaserColourOption = None,
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
+    cache: Cache = True,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -262,31 +264,29 @@ def reconstruct(
     from armscan.storage.images import ImageOptions
     from armscan.vision.stripe.image import StripeOptions
 
-    left, dark = tuple(images), tuple(background or ())
-    paths = StillPaths(left, dark, tuple(right or ()), tuple(right_background or ()))
+    names = (images, background, right, right_background)
     _check_poses(context, poses, euler)
-    table = None if poses is None else given(PoseTable, path=poses, euler=euler)
     options = MeasureOptions(
         stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
         depths=None if depth_margin is None else DepthRange(depth_margin),
         sheet=sheet,
         is_by_thesis=method is Method.THESIS,
     )
-    pixels = given(ImageOptions, bits_used=bits_used, align=bits_align)
     run(
         lambda job: reconstruct_points(
             job,
             sensor,
-            paths,
+            StillPaths(*(tuple(one or ()) for one in names)),
             volume=volume,
             arm=arm,
-            poses=table,
+            poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
             options=options,
-            image_options=pixels,
+            image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
         ),
         as_json=as_json,
         output=output,
         force=force,
+        cache=cache,
     )
 
 

@@ -241,16 +241,20 @@ def run(
     from armscan.jobs.job import Job
 
     with progress_bar() as progress:
-        summary = work(
-            Job(
-                output=output,
-                is_overwriting=force,
-                is_forced=force_bad,
-                is_caching=cache,
-                command=("armscan", *sys.argv[1:]),
-                progress=progress,
-            )
+        job = Job(
+            output=output,
+            is_overwriting=force,
+            is_forced=force_bad,
+            is_caching=cache,
+            command=("armscan", *sys.argv[1:]),
+            progress=progress,
         )
+        try:
+            summary = work(job)
+        except KeyboardInterrupt:
+            if job.cache is not None:
+                typer.echo("what was found in images is kept: the same command uses it", err=True)
+            raise
     show(summary, as_json=as_json)
     return summary
 

@@ -208,6 +208,7 @@ def _stills(
         right_backgrounds=read.right.dark,
         options=options,
         progress=job.progress,
+        cache=job.cache,
     )
     result = replace(result, warnings=(*read.warnings, *result.warnings))
     provenance = job.provenance(
@@ -279,7 +280,7 @@ def _scan(
     places = job.places(".ply", ".xyz", beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
-    scan = measure_scan(recording, scanner, options, progress=job.progress)
+    scan = measure_scan(recording, scanner, options, progress=job.progress, cache=job.cache)
     warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
     tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
     inputs = [path for path in (*tables, calibration, arm) if path is not None and path.exists()]

@@ -7,8 +7,9 @@ Still images, hand-eye calibration, scans and scans that choose their lasers mea
 
 from __future__ import annotations
 
+import os
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import cast
@@ -26,6 +27,7 @@ from armscan.pipeline.instants import (
     pair_exposures,
 )
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.targets import cached_profile
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.label_single import SingleLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
@@ -42,15 +44,15 @@ from armscan.reconstruction.triangulate import (
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
+from armscan.storage.detection_cache import DetectionCache
 from armscan.thesis.row_rule import RowLabeller
-from armscan.vision.stripe.extract import extract_stripes
 from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
 LEAST_APART_RAD = 0.5
 """Stripes whose directions differ by more are told from each other by direction."""
-LOOK_AHEAD = 1
-"""Instants that are read while the stripes of an earlier one are extracted."""
+MOST_THREADS = 8
+"""Instants whose stripes are extracted at the same time, if there are as many cores."""
 CLEAN_SHARE = 0.5
 """An image of which less than this share of the stripe points is measured is pointed out."""
 LISTED = 4
@@ -157,6 +159,7 @@ def measure_instants(
     *,
     is_pass: bool,
     reads_ahead: bool = True,
+    cache: DetectionCache | None = None,
 ) -> Iterator[MeasuredInstant]:
     """Extract the stripes of each instant, label them, and turn them into points.
 
@@ -173,7 +176,10 @@ def measure_instants(
     is_pass
         True where each instant follows the one before; else the labeller forgets it.
     reads_ahead
-        Read the next instant meanwhile; False where its exposure depends on the labels of this one.
+        Read and extract the next instants meanwhile; False where an exposure depends on the labels
+        of the one before.
+    cache
+        Keeps the stripes of every image for another run; None to keep none.
 
     Raises
     ------
@@ -183,35 +189,38 @@ def measure_instants(
         If the sheet of a stripe is ambiguous.
     """
     depths = options.accepted_depths(sensor)
-    for images, profiles in _extracted(instants, sensor, options.stripes, reads_ahead):
+    cameras, stripes = cameras_of(sensor), stripes_for(sensor, options.stripes)
+
+    def extract(images: InstantImages) -> list[Profile]:
+        pairs = zip(images.pairs, cameras, strict=True)
+        return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
+
+    for images, profiles in _in_order(instants, extract, reads_ahead=reads_ahead):
         if not is_pass:
             labeller.reset()
         labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
         yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
+    if cache is not None:
+        cache.trim()
 
 
-def _extracted(
+def _in_order(
     instants: Iterable[InstantImages],
-    sensor: SensorCalibration,
-    options: StripeOptions,
+    extract: Callable[[InstantImages], list[Profile]],
+    *,
     reads_ahead: bool,
 ) -> Iterator[tuple[InstantImages, list[Profile]]]:
     """Profiles of each instant, in order, with few instants in memory; ends at the first error."""
-    cameras, stripes = cameras_of(sensor), stripes_for(sensor, options)
-
-    def extract(images: InstantImages) -> list[Profile]:
-        pairs = zip(images.pairs, cameras, strict=True)
-        return [extract_profile(pair, camera, stripes) for pair, camera in pairs]
-
     if not reads_ahead:
         yield from ((images, extract(images)) for images in instants)
         return
     pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    with ThreadPoolExecutor(LOOK_AHEAD) as pool:
+    n_threads = min(_count_cores(), MOST_THREADS)
+    with ThreadPoolExecutor(n_threads) as pool:
         try:
             for images in instants:
                 pending.append((images, pool.submit(extract, images)))
-                if len(pending) > LOOK_AHEAD:
+                if len(pending) > n_threads:
                     first, found = pending.popleft()
                     yield first, found.result()
             while pending:
@@ -221,6 +230,13 @@ def _extracted(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def _count_cores() -> int:
+    """Cores that this process may use, where the system tells."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOptions:
     """The options with the channel in which the sensor was calibrated, unless one was chosen."""
     if options.laser_colour != "auto":
@@ -228,8 +244,13 @@ def stripes_for(sensor: SensorCalibration, options: StripeOptions) -> StripeOpti
     return replace(options, laser_colour=cast(LaserColour, sensor.laser_colour))
 
 
-def extract_profile(pair: ExposurePair, camera: CameraModel, options: StripeOptions) -> Profile:
-    """Extract the stripes of one exposure.
+def extract_profile(
+    pair: ExposurePair,
+    camera: CameraModel,
+    options: StripeOptions,
+    cache: DetectionCache | None = None,
+) -> Profile:
+    """Extract the stripes of one exposure, or take them from the cache.
 
     Raises
     ------
@@ -238,7 +259,7 @@ def extract_profile(pair: ExposurePair, camera: CameraModel, options: StripeOpti
     """
     exposure, background = pair
     check_sizes([image for image in pair if image is not None], camera)
-    return extract_stripes(exposure, options, background)
+    return cached_profile(exposure, options, background, cache)
 
 
 def cameras_of(sensor: SensorCalibration) -> tuple[CameraModel, ...]:
@@ -294,6 +315,7 @@ def reconstruct(
     right_backgrounds: Sequence[Exposure] = (),
     options: MeasureOptions | None = None,
     progress: Progress = silent,
+    cache: DetectionCache | None = None,
 ) -> Reconstruction:
     """Extract the stripes of every exposure, label their sheets and triangulate them.
 
@@ -312,6 +334,8 @@ def reconstruct(
         Defaults if None.
     progress
         Told of every image.
+    cache
+        Keeps the stripes of every image for another run; None to keep none.
 
     Raises
     ------
@@ -330,7 +354,7 @@ def reconstruct(
     weak: list[str] = []
     labeller = labeller_for(sensor, options)
     for instant in measure_instants(
-        _stills(cameras, progress), labeller, sensor, options, is_pass=False
+        _stills(cameras, progress), labeller, sensor, options, is_pass=False, cache=cache
     ):
         for found in instant.profiles:
             images.append(found.labelled)

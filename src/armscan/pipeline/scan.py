@@ -48,6 +48,7 @@ from armscan.reconstruction.sync import (
 from armscan.records.cloud import PointCloud
 from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
+from armscan.storage.detection_cache import DetectionCache
 
 STAGE = "scan"
 MANY_WITHOUT_NORMAL = 0.1
@@ -191,6 +192,7 @@ def measure_scan(
     options: ScanOptions | None = None,
     *,
     progress: Progress = silent,
+    cache: DetectionCache | None = None,
 ) -> ScanReconstruction:
     """Measure the stripes of every exposure that has a pose and place them in Base.
 
@@ -209,6 +211,8 @@ def measure_scan(
         Defaults if None.
     progress
         Told of every exposure.
+    cache
+        Keeps the stripes of every exposure for another run; None to keep none.
 
     Raises
     ------
@@ -232,7 +236,9 @@ def measure_scan(
     placed: dict[int, _Placed] = {}
     weak: list[str] = []
     instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner))
-    for one in measure_instants(instants, labeller, sensor, options.measure, is_pass=True):
+    for one in measure_instants(
+        instants, labeller, sensor, options.measure, is_pass=True, cache=cache
+    ):
         rows = one.images.instant.rows
         for row, measured in zip(rows, one.profiles, strict=True):
             placed[row] = _place(measured, poses.pose(rows[0]), transform, options.volume)

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +13,15 @@ import pytest
 from armscan.errors import EstimationError, InputError
 from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline import measure
+from armscan.pipeline import measure, targets
 from armscan.pipeline import scan as scan_module
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import ProgressEvent
 from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
+from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile
+from armscan.storage.detection_cache import DetectionCache
+from armscan.vision.stripe.extract import extract_stripes
 from rigs.scan_fake import (
     PERIOD_NS,
     FakeScan,
@@ -61,8 +67,10 @@ def test_the_plane_comes_back_in_base(device: ScannerCalibration) -> None:
 def test_reading_ahead_and_volume_change_nothing_but_speed_and_extent(
     device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(measure, "MOST_THREADS", 1)
     one = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
-    monkeypatch.setattr(measure, "LOOK_AHEAD", 2)
+    monkeypatch.setattr(measure, "MOST_THREADS", 3)
+    monkeypatch.setattr(measure, "_count_cores", lambda: 3)
     two = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
     assert one.cloud.normals is None
@@ -180,6 +188,32 @@ def test_ctrl_c_stops_the_scan(device: ScannerCalibration) -> None:
     with pytest.raises(KeyboardInterrupt):
         measure_scan(as_source(scan), device, progress=interrupt)
     assert scan.reads == [0, 1]
+
+
+def test_an_interrupted_scan_looks_at_each_image_once(
+    device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What was extracted before the interrupt is taken from the cache, to the last bit."""
+    options, looked = ScanOptions(has_normals=False), []
+
+    def counted(exposure: Exposure, *others: Any) -> Profile:
+        looked.append(exposure.source)
+        return extract_stripes(exposure, *others)
+
+    def interrupt(event: ProgressEvent) -> None:
+        if event.done == 4:
+            raise KeyboardInterrupt
+
+    whole = measure_scan(as_source(fake_scan(6)), device, options)
+    monkeypatch.setattr(targets, "extract_stripes", counted)
+    cache = DetectionCache(tmp_path / "kept")
+    with pytest.raises(KeyboardInterrupt):
+        measure_scan(as_source(fake_scan(6)), device, options, progress=interrupt, cache=cache)
+    assert 0 < len(looked) < 6
+    again = measure_scan(as_source(fake_scan(6)), device, options, cache=cache)
+    assert sorted(looked) == sorted(image.profile.source for image in whole.images)
+    np.testing.assert_array_equal(again.cloud.points_mm, whole.cloud.points_mm)
+    np.testing.assert_array_equal(again.cloud.sigma_mm, whole.cloud.sigma_mm)
 
 
 def test_a_few_points_without_normal_are_normal(

@@ -55,10 +55,10 @@ def frozen_floats(
         If the shape differs or a value is not finite.
     """
     array: FloatArray = _frozen(values, np.dtype(np.float64), shape, name)
-    if allow_nan and allow_infinite:
+    if (allow_nan and allow_infinite) or np.isfinite(array).all():
         return array
     bad = ~np.isfinite(array)
-    if bad.any() and (allow_nan or allow_infinite):
+    if allow_nan or allow_infinite:
         bad = np.isinf(array) if allow_nan else np.isnan(array)
     if bad.any():
         raise InputError(

@@ -486,6 +486,51 @@ def weigh_section(
     return count
 
 
+BIN_MEANS = 4
+"""Columns of what is told of the residuals at one grey level."""
+CLIPPED_RESIDUAL = 3.5
+
+
+@compiled()
+def bin_residuals(pixels: Table, edges: Floats, bins: TableOut) -> None:
+    """What the residuals are at each of the line's own grey levels.
+
+    ``pixels``: (3, M) of `weigh_section`. ``edges``: (B + 1,) increasing levels. ``bins``: (B, 4)
+    output: count, means of the level's square and of all light (not below 0), and mean square of
+    the residuals, those beyond `CLIPPED_RESIDUAL` robust sigmas taken as so large.
+    """
+    n_bins = bins.shape[0]
+    bins[:] = 0.0
+    place = np.full(pixels.shape[1], -1, np.int64)
+    for k in range(pixels.shape[1]):
+        if not edges[0] <= pixels[0, k] < edges[n_bins]:
+            continue
+        b = 0
+        while pixels[0, k] >= edges[b + 1]:
+            b += 1
+        place[k] = b
+        bins[b, 0] += 1.0
+        bins[b, 1] += pixels[0, k] * pixels[0, k]
+        bins[b, 2] += max(pixels[1, k], 0.0)
+    for b in range(n_bins):
+        n = int(bins[b, 0])
+        if n == 0:
+            continue
+        size = np.zeros(n)
+        i = 0
+        for k in range(pixels.shape[1]):
+            if place[k] == b:
+                size[i] = abs(pixels[2, k])
+                i += 1
+        limit = CLIPPED_RESIDUAL * MAD_TO_SIGMA * np.median(size)
+        total = 0.0
+        for i in range(n):
+            total += min(size[i], limit) ** 2
+        bins[b, 1] /= n
+        bins[b, 2] /= n
+        bins[b, 3] = total / n
+
+
 @compiled()
 def common_terms(said: Table, rounds: int, clipped_score: float, terms: FloatsOut) -> None:
     """Terms (2,) that profiles share, robustly: a score counts little beyond the median's scatter.

@@ -14,6 +14,7 @@ from armscan.kernels.profile_fit import (
     SIGMA,
     SMOOTH_SIGMA,
     VARIANCE,
+    bin_residuals,
     common_terms,
     fit_profiles,
     read_sides,
@@ -318,6 +319,20 @@ def test_section_is_what_the_fit_leaves() -> None:
     count = weigh_section(*images, sides, fits, noise, true, 15, said, pixels)
     # the freedom that each fit took is given back
     assert np.std(pixels[2, :count]) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * count))
+
+
+def test_residuals_are_binned_by_the_lines_own_level() -> None:
+    rng = np.random.default_rng(9)
+    pixels = np.stack([rng.uniform(-5, 130, 5000), rng.uniform(-20, 150, 5000), np.zeros(5000)])
+    pixels[2] = rng.normal(0.0, 1.0, 5000) * (rng.uniform(size=5000) > 0.05) * 40.0
+    edges, bins = np.array([0.0, 10.0, 40.0, 41.0, 120.0]), np.zeros((4, 4))
+    bin_residuals(pixels, edges, bins)
+    for b in range(4):
+        own = pixels[:, (pixels[0] >= edges[b]) & (pixels[0] < edges[b + 1])]
+        limit = 3.5 * 1.4826 * np.median(np.abs(own[2]))
+        light, spread = np.maximum(own[1], 0.0).mean(), np.minimum(np.abs(own[2]), limit) ** 2
+        expected = [own.shape[1], (own[0] ** 2).mean(), light, spread.mean()]
+        assert bins[b] == pytest.approx(expected, rel=1e-5)
 
 
 def test_clipped_cores_say_nothing_of_the_section() -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +14,7 @@ from armscan.kernels.arrays import COLUMN, ROW
 from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
+    BIN_MEANS,
     BLACK_NORMAL,
     BLACK_SCORE,
     CENTRE,
@@ -30,6 +30,7 @@ from armscan.kernels.profile_fit import (
     SIDE_SPAN,
     SIGMA,
     VARIANCE,
+    bin_residuals,
     common_terms,
     fit_profiles,
     read_sides,
@@ -65,24 +66,15 @@ def estimate_noise(pixels: FloatArray, peak: float, fallback: FloatArray) -> Flo
     ``pixels``: (3, N) of `kernels.profile_fit.weigh_section`. ``peak``: amplitude of the bright
     ones. ``fallback``: (3,) what to return if there are too few residuals.
     """
-    bins = np.searchsorted(BIN_EDGES, pixels[0] / peak, side="right").astype(np.uint8)
-    ordered = pixels[:, np.argsort(bins, kind="stable")]
-    ends = np.cumsum(np.bincount(bins, minlength=len(BIN_EDGES) + 1))
-    rows, variances, counts = [], [], []
-    for low, high in itertools.pairwise(ends[:-1]):
-        if high - low < LEAST_PER_BIN:
-            continue
-        m, total, residual = ordered[:, low:high]
-        rows.append([np.mean(m * m), np.mean(np.maximum(total, 0.0)), 1.0])
-        typical = robust_sigma(residual)
-        clipped = np.minimum(residual**2, (3.5 * typical) ** 2)
-        variances.append(max(float(clipped.mean()), LEAST_VARIANCE))
-        counts.append(high - low)
-    if len(rows) < 4:
+    bins = np.zeros((len(BIN_EDGES) - 1, BIN_MEANS))
+    bin_residuals(np.ascontiguousarray(pixels), BIN_EDGES * peak, bins)
+    count, square, light, spread = bins[bins[:, 0] >= LEAST_PER_BIN].T
+    if len(count) < 4:
         return fallback
-    variance = np.array(variances)
-    weight = np.sqrt(np.array(counts)) / variance
-    terms, _ = nnls(np.array(rows) * weight[:, None], variance * weight)
+    variance = np.maximum(spread, LEAST_VARIANCE)
+    rows = np.stack([square, light, np.ones_like(count)], axis=1)
+    weight = np.sqrt(count) / variance
+    terms, _ = nnls(rows * weight[:, None], variance * weight)
     terms[2] = max(terms[2], LEAST_VARIANCE)
     return np.asarray(terms)
 

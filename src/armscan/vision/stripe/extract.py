@@ -99,9 +99,11 @@ def extract_stripes(
         threshold /= plane.grey_levels_per_unit
     if background is not None and options.on_print and options.method == "fit":
         plane = _with_ground(plane, background, options, threshold)
-    noise = measure_level(plane.image, None).noise
-    image = plane.on_even_ground(plane.image, noise)
-    level = measure_level(image, threshold)
+    image, level = plane.image, measure_level(plane.image, threshold)
+    noise = level.noise
+    if plane.reflectance.size > 1:
+        image = plane.on_even_ground(image, noise)
+        level = measure_level(image, threshold)
     runs = find_candidates(image, level)
     sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
     if options.method == "fit":

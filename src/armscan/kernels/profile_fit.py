@@ -593,14 +593,13 @@ def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
         return False
     c11 = s0 * s4 - s2 * s2
     c12 = s1 * s2 - s0 * s3
-    value = (c00 * moments[5] + c01 * moments[6] + c02 * moments[7]) / determinant
-    slope = (c01 * moments[5] + c11 * moments[6] + c12 * moments[7]) / determinant
+    share = 1.0 / determinant
     c22 = s0 * s2 - s1 * s1
-    solved[0] = value
-    solved[1] = slope
-    solved[2] = 2.0 * (c02 * moments[5] + c12 * moments[6] + c22 * moments[7]) / determinant
-    solved[3] = c00 / determinant
-    solved[4] = 4.0 * c22 / determinant
+    solved[0] = (c00 * moments[5] + c01 * moments[6] + c02 * moments[7]) * share
+    solved[1] = (c01 * moments[5] + c11 * moments[6] + c12 * moments[7]) * share
+    solved[2] = 2.0 * (c02 * moments[5] + c12 * moments[6] + c22 * moments[7]) * share
+    solved[3] = c00 * share
+    solved[4] = 4.0 * c22 * share
     return True
 
 
@@ -608,8 +607,7 @@ def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
 def gather(
     points: Table,
     normals: Table,
-    sigma_px: Floats,
-    is_used: Ints,
+    weight: Floats,
     chain: Ints,
     i: int,
     j: int,
@@ -631,9 +629,9 @@ def gather(
         s = dy * nx - dx * ny
         if abs(s) > reach or abs(normals[j, 0] * nx + normals[j, 1] * ny) < LEAST_COSINE:
             break
-        if is_used[j] != 0:
+        w = weight[j]
+        if w > 0.0:
             d = dx * nx + dy * ny
-            w = 1.0 / (sigma_px[j] * sigma_px[j])
             ws = w * s
             wss = ws * s
             m0 += w
@@ -663,7 +661,7 @@ def smooth_chains(
     points: Table,
     normals: Table,
     sigma_px: Floats,
-    is_used: Ints,
+    weight: Floats,
     chain: Ints,
     windows_px: Floats,
     inflation: Floats,
@@ -676,9 +674,10 @@ def smooth_chains(
     intervals): a bend stops the growth before its bias exceeds the noise.
 
     ``points``, ``normals``: (N, 2) centres and unit normals, ordered along the chains.
-    ``sigma_px``: (N,) standard deviation along the normal. ``is_used``: (N,) 0 for points that must
-    not pull their neighbours. ``chain``: (N,) chain number of each point; a chain is consecutive.
-    ``windows_px``: (K,) half widths along the tangent, increasing. ``inflation``: (K,) factor on
+    ``sigma_px``: (N,) standard deviation along the normal. ``weight``: (N,) its inverse square, or
+    0 for points that must not pull their neighbours. ``chain``: (N,) chain number of each point; a
+    chain is consecutive. ``windows_px``: (K,) half widths along the tangent, increasing.
+    ``inflation``: (K,) factor on
     the variance of each window because neighbours' noise is correlated. ``confidence``: Half width
     of the confidence intervals in sigmas. ``result``: (N, 8) output: shift along the normal, slope
     of the line against the tangent, its second derivative (curvature) and that one's sigma, sigma
@@ -691,9 +690,8 @@ def smooth_chains(
     solved = np.zeros(5)
     for i in range(n):
         moments[:] = 0.0
-        own = 1.0 / (sigma_px[i] * sigma_px[i])
-        if is_used[i] != 0:
-            moments[0] = own
+        if weight[i] > 0.0:
+            moments[0] = weight[i]
             moments[COUNT] = 1.0
         for k in range(result.shape[1]):
             result[i, k] = 0.0
@@ -705,8 +703,8 @@ def smooth_chains(
         up = i + 1
         for k in range(windows_px.shape[0]):
             reach = windows_px[k]
-            down = gather(points, normals, sigma_px, is_used, chain, i, down, -1, reach, moments)
-            up = gather(points, normals, sigma_px, is_used, chain, i, up, 1, reach, moments)
+            down = gather(points, normals, weight, chain, i, down, -1, reach, moments)
+            up = gather(points, normals, weight, chain, i, up, 1, reach, moments)
             if moments[COUNT] < LEAST_POINTS:
                 continue
             if not solve_quadratic(moments, solved):
@@ -726,8 +724,7 @@ def smooth_chains(
             inflated = inflation[k]
             others[:] = moments
         if result[i, WINDOW] > 0.0:
-            if is_used[i] != 0:
-                others[0] -= own
+            others[0] -= weight[i]
             if solve_quadratic(others, solved):
                 result[i, PREDICTED] = solved[0]
                 result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflated)

@@ -396,9 +396,9 @@ def test_smoothing_matches_polyfit() -> None:
     sigma = rng.uniform(0.08, 0.12, 41)
     result = np.zeros((41, 8))
     normals = np.tile([0.0, 1.0], (41, 1))
-    used, chain = np.ones(41, np.int64), np.zeros(41, np.int64)
+    weight, chain = sigma**-2.0, np.zeros(41, np.int64)
     points = np.stack([x, y], axis=1)
-    smooth_chains(points, normals, sigma, used, chain, np.array([9.0]), np.ones(1), 3.0, result)
+    smooth_chains(points, normals, sigma, weight, chain, np.array([9.0]), np.ones(1), 3.0, result)
     near = np.abs(x - 20) <= 9.0
     fit, covariance = np.polyfit(x[near] - 20, y[near], 2, w=1.0 / sigma[near], cov="unscaled")
     assert result[20, SHIFT] == pytest.approx(fit[2] - y[20], abs=1e-9)

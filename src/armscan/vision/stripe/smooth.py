@@ -67,7 +67,7 @@ class Polyline:
             self.points,
             self.normals,
             self.sigma,
-            self.is_used.astype(np.int64),
+            np.where(self.is_used, self.sigma**-2.0, 0.0),
             self.chain,
             windows_px,
             inflation,

@@ -2,8 +2,9 @@
 """Time of stripe extraction against the usual ways to compute a Steger ridge, in one run.
 
 Command: ``python benchmarks/stripe_speed.py [repeats]`` (default 15). One thread, processor time.
-Trust the ratios: times on a shared machine vary. Images: 11 nearly horizontal lines at 2658 x 800 and one line at
-3072 x 2048, line sigma 3, peak 150, speckle 0.2, seed 0. scikit-image is used if it is installed.
+Trust the ratios: times on a shared machine vary. Images: 11 nearly horizontal lines at 2658 x 800
+and one line at 3072 x 2048, line sigma 3, peak 150, speckle 0.2, seed 0. scikit-image is used if it
+is installed.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from armscan.vision.stripe.flags import (
     is_short,
 )
 from armscan.vision.stripe.image import (
+    EVEN,
     StripeOptions,
     StripePlane,
     check_background,
@@ -98,7 +99,16 @@ def extract_stripes(
     if threshold is not None:
         threshold /= plane.grey_levels_per_unit
     if background is not None and options.on_print and options.method == "fit":
-        plane = _with_ground(plane, background, options, threshold)
+        ground = relative_reflectance(background, options.laser_colour)
+        plane = replace(plane, reflectance=ground)
+    return _find(exposure, plane, options, threshold)
+
+
+def _find(
+    exposure: Exposure, plane: StripePlane, options: StripeOptions, threshold: float | None
+) -> Profile:
+    """Points of the lines in a plane, without its ground's reflectance if they are too thin."""
+    bare = replace(plane, reflectance=EVEN)
     image, level = plane.image, measure_level(plane.image, threshold)
     noise = level.noise
     if plane.reflectance.size > 1:
@@ -106,6 +116,8 @@ def extract_stripes(
         level = measure_level(image, threshold)
     runs = find_candidates(image, level)
     sigma = options.line_sigma_px or find_line_sigma(image, runs, level)
+    if _is_too_thin(plane, sigma):
+        return _find(exposure, bare, options, threshold)
     if options.method == "fit":
         ridge = trace_ridges(image, runs, sigma, level.rise)
     else:
@@ -116,20 +128,18 @@ def extract_stripes(
         return Profile.empty(source=exposure.source)
     if options.method != "fit":
         return thesis_profile(exposure, plane, ridge, sigma)
-    return to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
+    profile = to_profile(exposure, plane, fit_ridge(plane, ridge, sigma, noise), options)
+    width = profile.width_px[profile.is_accepted] / exposure.window.binning
+    # where cores are clipped, runs are wider than the line's own sigma
+    if len(width) and _is_too_thin(plane, float(np.median(width))):
+        return _find(exposure, bare, options, threshold)
+    return profile
 
 
-def _with_ground(
-    plane: StripePlane, background: Exposure, options: StripeOptions, threshold: float | None
-) -> StripePlane:
-    """The plane with what is printed under its lines, if they are so wide that it is worth it."""
-    ground = relative_reflectance(background, options.laser_colour)
-    known = replace(plane, reflectance=ground)
-    image = known.on_even_ground(plane.image, measure_level(plane.image, None).noise)
-    level = measure_level(image, threshold)
-    sigma = options.line_sigma_px
-    sigma = sigma or find_line_sigma(image, find_candidates(image, level), level)
-    return known if EDGE_BLUR_PX2 / sigma <= MOST_LEFT * MOST_PULL * sigma else plane
+def _is_too_thin(plane: StripePlane, sigma_px: float) -> bool:
+    """True where the ground is known and its blur leaves too much of an edge's pull on a line."""
+    left = EDGE_BLUR_PX2 / sigma_px
+    return plane.reflectance.size > 1 and left > MOST_LEFT * MOST_PULL * sigma_px
 
 
 def _of_laser(plane: StripePlane, ridge: RidgePoints, sigma_px: float) -> RidgePoints:

@@ -125,6 +125,10 @@ LOST_SIGMAS = 3.0
 GROUND_PX = 5
 """Within such squares noise of the view without laser is told from the print."""
 WHITE_QUANTILE = 0.95
+FLATTEST = 0.1
+FLATTEST_VARIANCE = 0.65
+"""Such a share of squares that hold noise alone shows less than that of its variance (chi square of
+24 degrees of freedom): small dots leave fewer flat squares than edges."""
 LEAST_WHITE_SIGMAS = 10.0
 DARKEST = 0.02
 """Black print reflects 3 % and more of what white paper does."""
@@ -148,7 +152,8 @@ def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
     variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
     white = float(np.quantile(mean, WHITE_QUANTILE))
     is_light = mean > 0.5 * white
-    per_level = float(np.median(variance[is_light] / np.maximum(mean[is_light], 1e-3)))
+    flattest = np.quantile(variance[is_light] / np.maximum(mean[is_light], 1e-3), FLATTEST)
+    per_level = float(flattest) / FLATTEST_VARIANCE
     if white < LEAST_WHITE_SIGMAS**2 * per_level:
         return EVEN
     keep = np.maximum(1.0 - per_level * mean / variance, 0.0)

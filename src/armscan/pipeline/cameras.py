@@ -128,11 +128,13 @@ def calibrate_camera_from_views(
     options = options or CameraOptions()
     has_circles = any(view.edges is not None for view in views)
     total = CENTRE_ROUNDS if has_circles else 1
+    views, rounds, quick = _settled(views, options, total, progress)
     fit = calibrate_camera(views, options)
-    progress(ProgressEvent("solve", 1, total))
     if isinstance(fit, FitFailure):
+        progress(ProgressEvent("solve", rounds + 1, total))
         return fit
-    rounds, is_stable = 0, False
+    is_stable = quick is not None and _moved_sigmas(quick, fit) < CENTRES_STABLE
+    progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
     while rounds < total - 1 and not is_stable:
         views = [_corrected(view, fit) for view in views]
         again = calibrate_camera(views, options)
@@ -143,6 +145,30 @@ def calibrate_camera_from_views(
         fit = again
         progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
     return CameraRun(fit, (), rounds)
+
+
+def _settled(
+    views: Sequence[TargetView], options: CameraOptions, total: int, progress: Progress
+) -> tuple[Sequence[TargetView], int, CameraFit | None]:
+    """Circle centres measured again until the camera stays, without a hold-out or other models.
+
+    Which model is chosen, and how well it predicts, matters only once the centres are right.
+    Returns the views, how often they were measured again, and the camera that fits them; None
+    where there are no circles or no such camera.
+    """
+    model = "k1k2p1p2k3" if options.distortion == "auto" else options.distortion
+    plain = replace(options, distortion=model, n_folds=0)
+    before: CameraFit | None = None
+    for rounds in range(total if total > 1 else 0):
+        fit = calibrate_camera(views, plain)
+        if isinstance(fit, FitFailure):
+            return views, rounds, None
+        is_stable = before is not None and _moved_sigmas(before, fit) < CENTRES_STABLE
+        if is_stable or rounds == total - 1:
+            return views, rounds, fit
+        views, before = [_corrected(view, fit) for view in views], fit
+        progress(ProgressEvent("solve", rounds + 1, total))
+    return views, 0, None
 
 
 def _corrected(view: TargetView, fit: CameraFit) -> TargetView:

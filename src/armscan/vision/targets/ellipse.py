@@ -252,5 +252,5 @@ def band_pixels(
     n = collect_band(
         np.column_stack([table, gradient]), half_width_px, n_columns, n_rows, place, ellipse, found
     )
-    levels = np.take(grey, place[:n]) / found[2, :n]
+    levels = np.asarray(grey).reshape(-1)[place[:n]].astype(np.float64) / found[2, :n]
     return BandPixels(levels, ellipse[:n], found[0, :n], found[1, :n])

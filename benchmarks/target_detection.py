@@ -212,7 +212,7 @@ def beside_opencv(folder: Path, paths: list[Path], text: str) -> None:
             other, other_wall, n = processor_seconds(theirs)
             print(
                 f"{folder.name:24s} {len(paths):3d} images: ours {used:.2f} s processor, "
-                f"{wall:.2f} s wall; OpenCV {other:.2f} and {other_wall:.2f} s ({n.strip()} found); "
+                f"{wall:.2f} s wall; OpenCV {other:.2f} and {other_wall:.2f} s, {n.strip()} found; "
                 f"ratio {used / other:.2f}",
                 flush=True,
             )

@@ -139,7 +139,9 @@ def calibrate_camera_from_views(
     options = options or CameraOptions()
     total = MODEL_ROUNDS if any(view.edges is not None for view in views) else 1
     model = _LARGEST if options.distortion == "auto" else options.distortion
-    for done in range(1, total + 1):
+    done = 0
+    while True:
+        done += 1
         rounds, settled = 0, None
         if total > 1:
             plain = replace(options, distortion=model, n_folds=0)
@@ -154,11 +156,10 @@ def calibrate_camera_from_views(
             return fit
         is_same = settled is not None and settled.free_parameters == fit.free_parameters
         if is_same or done == total:
-            break
+            progress(ProgressEvent("solve", total, total))
+            return CameraRun(fit, (), rounds)
         progress(ProgressEvent("solve", done, total))
         model = _model_of(fit)
-    progress(ProgressEvent("solve", total, total))
-    return CameraRun(fit, (), rounds)
 
 
 def _with_settled_centres(

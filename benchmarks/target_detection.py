@@ -5,6 +5,10 @@ Command: ``python benchmarks/target_detection.py TARGET FOLDER [FOLDER ...] [--p
 [--no-exhaustive]``, for example ``chessboard:8x6:40 photos``. Nothing is random and nothing is
 written. One camera per folder: the hold-out needs that.
 
+``--command`` runs, for each folder, ``armscan calibrate camera`` on its images without cache, and
+OpenCV's finder at full size with its ``calibrateCamera``, each in a process of its own, and prints
+the processor times and their ratio: a loaded machine slows both alike.
+
 Columns: images; found by OpenCV's classic finder and by its sector-based one (circle grids: by
 findCirclesGrid, in the second column with clustering), both on the luminance at full size reduced
 to 1400 px; found by ours, of these whole and in part; missed, of those that OpenCV found; wrong,
@@ -19,6 +23,10 @@ those that only ours found: extra boards that were wrong or misnumbered would sh
 from __future__ import annotations
 
 import argparse
+import resource
+import subprocess
+import sys
+import tempfile
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -142,13 +150,86 @@ def report(folder: Path, found: Found, target: Target) -> None:
         print(f"    {line}")
 
 
+OPENCV_ALONE = """
+import sys
+import cv2
+import numpy as np
+kind, columns, rows, *paths = sys.argv[1:]
+cv2.setNumThreads(1)
+size = (int(columns), int(rows))
+board = np.zeros((size[0] * size[1], 3), np.float32)
+board[:, :2] = np.mgrid[: size[0], : size[1]].T.reshape(-1, 2)
+if kind == "acircles":
+    board[:, 0] = 2 * board[:, 0] + board[:, 1] % 2
+large = cv2.SimpleBlobDetector_Params()
+large.maxArea = 50_000
+flags = cv2.CALIB_CB_ASYMMETRIC_GRID if kind == "acircles" else cv2.CALIB_CB_SYMMETRIC_GRID
+boards, points = [], []
+for path in paths:
+    grey = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    if kind == "corners":
+        found, corners = cv2.findChessboardCornersSB(grey, size)
+    else:
+        finder = cv2.SimpleBlobDetector_create(large)
+        found, corners = cv2.findCirclesGrid(grey, size, flags=flags, blobDetector=finder)
+    if found:
+        boards.append(board)
+        points.append(corners)
+if boards:
+    cv2.calibrateCamera(boards, points, grey.shape[::-1], None, None)
+print(len(boards))
+"""
+
+
+def processor_seconds(command: list[str]) -> tuple[float, float, str]:
+    """Processor and wall-clock seconds of a process and its own children, and what it printed."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return used, wall, done.stdout
+
+
+def beside_opencv(folder: Path, paths: list[Path], text: str) -> None:
+    """Whole command beside OpenCV's finder and calibration, after one run that warms the files."""
+    target = parse_target(text)
+    kind = "corners"
+    if isinstance(target, CircleGrid):
+        kind = "acircles" if target.is_asymmetric else "circles"
+    names = [str(path) for path in paths]
+    size = [str(target.columns), str(target.rows)]
+    theirs = [sys.executable, "-c", OPENCV_ALONE, kind, *size, *names]
+    with tempfile.TemporaryDirectory() as place:
+        out = ["-o", f"{place}/camera.json", "--no-cache", "--force"]
+        program = "from armscan.cli import main; main()"
+        ours = [sys.executable, "-c", program, "calibrate", "camera", *names]
+        ours += ["--target", text, *out]
+        processor_seconds(ours)
+        for _ in range(3):
+            used, wall, _ = processor_seconds(ours)
+            other, other_wall, n = processor_seconds(theirs)
+            print(
+                f"{folder.name:24s} {len(paths):3d} images: ours {used:.2f} s processor, "
+                f"{wall:.2f} s wall; OpenCV {other:.2f} and {other_wall:.2f} s, {n.strip()} found; "
+                f"ratio {used / other:.2f}",
+                flush=True,
+            )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("target")
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--pattern", default="*.[pjbtPJBT][npgmiNPGMI]*")
     parser.add_argument("--no-exhaustive", action="store_true", help="of the sector-based finder")
+    parser.add_argument("--command", action="store_true", help="time the whole command instead")
     options = parser.parse_args()
+    if options.command:
+        for folder in options.folders:
+            beside_opencv(folder, sorted(folder.glob(options.pattern)), options.target)
+        return
     cv2.setNumThreads(1)
     target = parse_target(options.target)
     flags = SECTORS & ~cv2.CALIB_CB_EXHAUSTIVE if options.no_exhaustive else SECTORS

@@ -28,15 +28,15 @@ def skew(vector: FloatArray) -> FloatArray:
 
 
 def rotation_from_vector(rotation_vector_rad: FloatArray) -> FloatArray:
-    """Rodrigues' formula: (3,) rotation vector in rad to a (3, 3) rotation matrix."""
+    """Rodrigues' formula: rotation vectors in rad, (3,) -> (3, 3) or (N, 3) -> (N, 3, 3)."""
     v = np.asarray(rotation_vector_rad, dtype=np.float64)
-    angle = float(np.linalg.norm(v))
+    angle = np.sqrt(np.sum(v * v, axis=-1))[..., None, None]
     cross = skew(v)
-    if angle < _SMALL_ANGLE_RAD:
-        return np.eye(3) + cross + 0.5 * cross @ cross
-    a = np.sin(angle) / angle
-    b = (1.0 - np.cos(angle)) / angle**2
-    return np.asarray(np.eye(3) + a * cross + b * cross @ cross)
+    is_small = angle < _SMALL_ANGLE_RAD
+    safe = np.where(is_small, 1.0, angle)
+    a = np.where(is_small, 1.0, np.sin(safe) / safe)
+    b = np.where(is_small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.asarray(np.eye(3) + a * cross + b * (cross @ cross))
 
 
 def vector_from_rotation(rotation: FloatArray) -> FloatArray:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ridge points: runs of pixels above the background, then Newton steps (eq. 2.41)."""
+"""Ridge points: runs of pixels above the background, then Newton steps (eq. 2.41); and chains of
+them: links, distance to other lines, likeliest sheets (Viterbi).
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,9 @@ from armscan.kernels.arrays import (
     FloatsOut,
     Image,
     ImageOut,
+    Ints,
+    IntsOut,
+    MapOut,
     RowOut,
     Table,
     TableOut,
@@ -424,3 +429,239 @@ def sample_across(
                 lower = image[below, u] + fx * (image[below, right] - image[below, u])
                 total += upper + fy * (lower - upper)
             profiles[i, k] = total / n_along
+
+
+REACH_PX = 2.9
+"""One missing point on a diagonal leaves a distance of 2.83 px."""
+SAME_PX = 1.0
+"""Column points lie at most 1.54 px apart where row points may overlap them."""
+LEAST_COSINE = 0.77
+NONE = -1
+
+
+@compiled()
+def place_points(points: Table, owner: MapOut, is_kept: IntsOut) -> None:
+    """Enter points into a map of pixels, dropping row points that repeat a column point.
+
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) int32 zeros; receives one
+    more than the index of the point in each pixel. ``is_kept``: (N,) output, 1 or 0.
+    """
+    height, width = owner.shape
+    for side in range(2):
+        for i in range(points.shape[0]):
+            if int(points[i, 5]) != side:
+                continue
+            x = int(points[i, 0] + 0.5)
+            y = int(points[i, 1] + 0.5)
+            is_kept[i] = 1
+            if side == ROW:
+                for v in range(max(y - 1, 0), min(y + 2, height)):
+                    for u in range(max(x - 1, 0), min(x + 2, width)):
+                        j = owner[v, u] - 1
+                        if j >= 0 and points[j, 5] != ROW:
+                            distance = math.hypot(
+                                points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+                            )
+                            if distance < SAME_PX:
+                                is_kept[i] = 0
+            if is_kept[i] == 1 and owner[y, x] == 0:
+                owner[y, x] = i + 1
+            else:
+                is_kept[i] = 0
+
+
+@compiled()
+def find_neighbours(points: Table, owner: MapOut, ahead: IntsOut, behind: IntsOut) -> None:
+    """Best continuation of each point to both sides along its tangent.
+
+    ``points``: (N, 6) from `refine_candidates`. ``owner``: (H, W) map from `place_points`.
+    ``ahead``, ``behind``: (N,) output: index of the neighbour, or -1. The tangent is the normal
+    turned by a quarter.
+    """
+    height, width = owner.shape
+    for i in range(points.shape[0]):
+        x = int(points[i, 0] + 0.5)
+        y = int(points[i, 1] + 0.5)
+        if owner[y, x] != i + 1:
+            continue
+        nx = points[i, 2]
+        ny = points[i, 3]
+        best_ahead = best_behind = 1e9
+        for v in range(max(y - 3, 0), min(y + 4, height)):
+            for u in range(max(x - 3, 0), min(x + 4, width)):
+                j = owner[v, u] - 1
+                if j < 0 or j == i:
+                    continue
+                dx = points[j, 0] - points[i, 0]
+                dy = points[j, 1] - points[i, 1]
+                along = dy * nx - dx * ny
+                across = abs(dx * nx + dy * ny)
+                if dx * dx + dy * dy > REACH_PX * REACH_PX or across > 0.6 * abs(along) + 0.4:
+                    continue
+                if abs(nx * points[j, 2] + ny * points[j, 3]) < LEAST_COSINE:
+                    continue
+                cost = abs(along) + 2.0 * across
+                if along > 0.2 and cost < best_ahead:
+                    best_ahead = cost
+                    ahead[i] = j
+                elif along < -0.2 and cost < best_behind:
+                    best_behind = cost
+                    behind[i] = j
+
+
+@compiled()
+def walk_chains(ahead: IntsOut, behind: IntsOut, order: IntsOut, chain: IntsOut) -> int:
+    """Order the points along their chains, ends first, then loops; lone points are left out.
+
+    ``ahead``, ``behind``: (N,) from `find_neighbours`; links that are not mutual are cut here.
+    ``order``, ``chain``: (N,) output: index of the k-th point, and the number of its chain.
+
+    Returns count of points in chains.
+    """
+    n = ahead.shape[0]
+    for i in range(n):
+        for side in range(2):
+            j = ahead[i] if side == 0 else behind[i]
+            if j >= 0 and ahead[j] != i and behind[j] != i:
+                if side == 0:
+                    ahead[i] = NONE
+                else:
+                    behind[i] = NONE
+    is_used = np.zeros(n, np.uint8)
+    count = 0
+    number = 0
+    for want_loops in range(2):
+        for start in range(n):
+            is_end = (ahead[start] < 0) != (behind[start] < 0)
+            is_loop = ahead[start] >= 0 and behind[start] >= 0
+            if is_used[start] or not (is_end or (want_loops == 1 and is_loop)):
+                continue
+            previous = NONE
+            i = start
+            while i >= 0 and not is_used[i]:
+                is_used[i] = 1
+                order[count] = i
+                chain[count] = number
+                count += 1
+                following = ahead[i]
+                if following < 0 or following == previous:
+                    following = behind[i]
+                if following == previous:
+                    following = NONE
+                previous = i
+                i = following
+            number += 1
+    return count
+
+
+OWN_SPAN = 3.0
+"""Along its own chain a point is another line's only after this many times the reach."""
+
+
+@compiled()
+def find_other_lines(
+    points: Table,
+    chain: Ints,
+    start: Ints,
+    stop: Ints,
+    is_line: Ints,
+    height: int,
+    width: int,
+    reach: float,
+    distance: TableOut,
+) -> None:
+    """Find the nearest point of another line, or of a far part of the same, on both sides.
+
+    Points are sorted into square cells; a cell that holds only a point's own part of its chain is
+    passed over, so that the cost is in crossings alone.
+
+    ``points``: (N, 6) ridge points, ordered along chains. ``chain``: (N,) chain numbers. ``start``,
+    ``stop``: (N,) first index, and index after the last, of each point's chain; the two ends of a
+    chain count as neighbours, because it may be a loop. ``is_line``: (N,) 0 for points that do not
+    count as a line to others. ``height``, ``width``: Size of the image. ``reach``: Largest distance
+    that matters, and the side of a cell. ``distance``: (N, 2) output: distance to the nearest other
+    line on the side of smaller and of larger coordinate along the point's column or row; infinite
+    where there is none within reach.
+    """
+    n = points.shape[0]
+    rows = int(height / reach) + 1
+    columns = int(width / reach) + 1
+    head = np.full((rows, columns), -1, np.int64)
+    first = np.zeros((rows, columns), np.int64)
+    last = np.zeros((rows, columns), np.int64)
+    following = np.full(n, -1, np.int64)
+    own = OWN_SPAN * reach + 3.0
+    for i in range(n):
+        distance[i, 0] = np.inf
+        distance[i, 1] = np.inf
+        if is_line[i] == 0:
+            continue
+        r = int(points[i, 1] / reach)
+        c = int(points[i, 0] / reach)
+        if head[r, c] < 0:
+            first[r, c] = i
+        following[i] = head[r, c]
+        head[r, c] = i
+        last[r, c] = i
+    for i in range(n):
+        side_axis = 1 if int(points[i, 5]) == COLUMN else 0
+        row = int(points[i, 1] / reach)
+        column = int(points[i, 0] / reach)
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            for c in range(max(column - 1, 0), min(column + 2, columns)):
+                j = head[r, c]
+                if j < 0:
+                    continue
+                low = first[r, c]
+                high = last[r, c]
+                is_own = chain[low] == chain[i] and chain[high] == chain[i]
+                if is_own and i - low <= own and high - i <= own:
+                    continue
+                size = stop[i] - start[i]
+                while j >= 0:
+                    apart = abs(i - j)
+                    if chain[j] != chain[i] or min(apart, size - apart) > own:
+                        dx = points[j, 0] - points[i, 0]
+                        dy = points[j, 1] - points[i, 1]
+                        far = math.sqrt(dx * dx + dy * dy)
+                        side = 1 if points[j, side_axis] > points[i, side_axis] else 0
+                        if far <= reach and far < distance[i, side]:
+                            distance[i, side] = far
+                    j = following[j]
+
+
+@compiled()
+def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
+    """Sequence of states with the greatest sum of scores less the costs of its changes.
+
+    ``scores``: (N, S) log-likelihood of each state at each place. ``change_cost``: (N,) cost of
+    another state at a place than at the one before; 0 at the first of a stripe. ``state``: (N,)
+    output.
+    """
+    n, s = scores.shape
+    if n == 0:
+        return
+    total = np.zeros((n, s))
+    before = np.zeros((n, s), np.int64)
+    for k in range(s):
+        total[0, k] = scores[0, k]
+    for i in range(1, n):
+        top = 0
+        for k in range(1, s):
+            if total[i - 1, k] > total[i - 1, top]:
+                top = k
+        for k in range(s):
+            changed = total[i - 1, top] - change_cost[i]
+            if total[i - 1, k] >= changed:
+                total[i, k] = total[i - 1, k] + scores[i, k]
+                before[i, k] = k
+            else:
+                total[i, k] = changed + scores[i, k]
+                before[i, k] = top
+    last = 0
+    for k in range(1, s):
+        if total[n - 1, k] > total[n - 1, last]:
+            last = k
+    for i in range(n - 1, -1, -1):
+        state[i] = last
+        last = before[i, last]

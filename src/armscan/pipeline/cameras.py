@@ -13,7 +13,14 @@ import numpy as np
 from armscan.calibration.cameras.calibrate import calibrate_camera
 from armscan.calibration.cameras.calibrate_stereo import calibrate_stereo
 from armscan.calibration.cameras.pairs import MIN_PAIRS, SIDES, StereoOptions, StereoPair
-from armscan.calibration.cameras.result import MIN_VIEWS, BoardWarp, CameraFit, CameraOptions
+from armscan.calibration.cameras.result import (
+    DISTORTION_PARAMETERS,
+    MIN_VIEWS,
+    BoardWarp,
+    CameraFit,
+    CameraOptions,
+    DistortionModel,
+)
 from armscan.calibration.cameras.stereo_result import SideFit, StereoFit
 from armscan.errors import InputError
 from armscan.geometry.estimate import FitFailure
@@ -38,6 +45,9 @@ from armscan.vision.targets.target import Target, TargetView
 CENTRE_ROUNDS = 5
 CENTRES_STABLE = 0.02
 """Circle centres are stable when no camera parameter moves by more than this many sigmas."""
+MODEL_ROUNDS = 3
+"""Circle centres settle for the largest model, then, if another is chosen, for that one."""
+_LARGEST: DistortionModel = "k1k2p1p2k3"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,7 +61,8 @@ class CameraRun:
     not_found
         (source, reason) of exposures without a usable target.
     centre_rounds
-        How often circle centres were measured again with the camera; 0 for other targets.
+        How often circle centres were measured again with cameras of the model that was chosen
+        last; 0 for other targets.
     """
 
     fit: CameraFit
@@ -126,23 +137,60 @@ def calibrate_camera_from_views(
     Parameters, errors and result as `calibrate_camera_from_exposures`, with the target found.
     """
     options = options or CameraOptions()
-    has_circles = any(view.edges is not None for view in views)
-    total = CENTRE_ROUNDS if has_circles else 1
-    fit = calibrate_camera(views, options)
-    progress(ProgressEvent("solve", 1, total))
-    if isinstance(fit, FitFailure):
-        return fit
-    rounds, is_stable = 0, False
-    while rounds < total - 1 and not is_stable:
-        views = [_corrected(view, fit) for view in views]
-        again = calibrate_camera(views, options)
-        if isinstance(again, FitFailure):
-            return again
-        rounds += 1
-        is_stable = _moved_sigmas(fit, again) < CENTRES_STABLE
-        fit = again
-        progress(ProgressEvent("solve", total if is_stable else rounds + 1, total))
-    return CameraRun(fit, (), rounds)
+    total = MODEL_ROUNDS if any(view.edges is not None for view in views) else 1
+    model = _LARGEST if options.distortion == "auto" else options.distortion
+    done = 0
+    while True:
+        done += 1
+        rounds, settled = 0, None
+        if total > 1:
+            plain = replace(options, distortion=model, n_folds=0)
+            try:
+                views, rounds, settled = _with_settled_centres(views, plain)
+            except InputError:
+                # the largest model may fold over where the one that is chosen does not
+                if done > 1 or options.distortion != "auto":
+                    raise
+        fit = calibrate_camera(views, options)
+        if isinstance(fit, FitFailure):
+            return fit
+        is_same = settled is not None and settled.free_parameters == fit.free_parameters
+        if is_same or done == total:
+            progress(ProgressEvent("solve", total, total))
+            return CameraRun(fit, (), rounds)
+        progress(ProgressEvent("solve", done, total))
+        model = _model_of(fit)
+
+
+def _with_settled_centres(
+    views: Sequence[TargetView], options: CameraOptions
+) -> tuple[Sequence[TargetView], int, CameraFit | None]:
+    """Measure circle centres again with the camera until it stays, by one model.
+
+    Which model the views ask for, and how well it predicts, matters only once they are right.
+    Returns the views, how often they were measured again, and the camera that fits them; None
+    where there is none.
+    """
+    before: CameraFit | None = None
+    for rounds in range(CENTRE_ROUNDS):
+        fit = calibrate_camera(views, options)
+        if isinstance(fit, FitFailure):
+            return views, rounds, None
+        if before is not None and _moved_sigmas(before, fit) < CENTRES_STABLE:
+            return views, rounds, fit
+        before = fit
+        if rounds < CENTRE_ROUNDS - 1:
+            views = [_corrected(view, fit) for view in views]
+    return views, CENTRE_ROUNDS - 1, before
+
+
+def _model_of(fit: CameraFit) -> DistortionModel:
+    """The distortion model whose coefficients were free."""
+    free = set(fit.free_parameters)
+    return max(
+        (name for name, terms in DISTORTION_PARAMETERS.items() if free.issuperset(terms)),
+        key=lambda name: len(DISTORTION_PARAMETERS[name]),
+    )
 
 
 def _corrected(view: TargetView, fit: CameraFit) -> TargetView:

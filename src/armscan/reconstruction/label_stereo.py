@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.kernels.chains import best_states
+from armscan.kernels.ridge import best_states
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import (
     Crossings,

@@ -6,7 +6,6 @@ import pytest
 from scipy.ndimage import correlate, map_coordinates
 from scipy.optimize import curve_fit
 
-from armscan.kernels.chains import find_other_lines, walk_chains
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     CENTRE,
@@ -23,11 +22,13 @@ from armscan.kernels.profile_fit import (
 )
 from armscan.kernels.ridge import (
     derivatives_at,
+    find_other_lines,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
+    walk_chains,
 )
 
 FLOAT32 = 3e-5

@@ -4,6 +4,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from armscan.geometry.estimate import FitFailure
 from armscan.simulation.objects.boards import CirclePattern
@@ -74,6 +75,37 @@ def test_centre_covariance_is_that_of_repeated_fits() -> None:
     assert nees.mean() / 2.0 == pytest.approx(1.0, abs=4.0 / np.sqrt(repeats))
     assert ellipses.chi2.mean() == pytest.approx(n - 5, abs=4.0 * np.sqrt(2.0 * n / repeats))
     np.testing.assert_allclose(np.cov(error.T), covariance.mean(axis=0), rtol=0.15, atol=2e-6)
+
+
+def test_fits_and_covariance_are_those_of_a_general_solver() -> None:
+    """SciPy's solver on the Sampson distances in pixels, from the true ellipse."""
+    rng = np.random.default_rng(8)
+    points = np.stack([rim(24), rim(24, 0.3, 4.0)])
+    points += 0.3 * rng.standard_normal(points.shape)
+    sigma = rng.uniform(0.2, 0.6, points.shape[:2])
+    sigma[0, 5] = np.inf
+    fits = fit_ellipses(points, sigma**-2.0)
+    for k in range(2):
+        own = (points[k] - fits.origin_px[k]) / fits.scale_px[k]
+
+        def distances(
+            terms: np.ndarray, own: np.ndarray = own, sigma: np.ndarray = sigma[k], k: int = k
+        ) -> np.ndarray:
+            a, b, c, d, e = terms
+            conic = np.array([[a, b, d], [b, c, e], [d, e, -1.0]])
+            along = np.column_stack([own, np.ones(len(own))]) @ conic
+            value = (along[:, :2] * own).sum(axis=1) + along[:, 2]
+            distance = 0.5 * value / np.hypot(along[:, 0], along[:, 1])
+            return distance * fits.scale_px[k] / sigma
+
+        start = fits.terms[k] * (1.0 + 0.01 * rng.standard_normal(5))
+        oracle = least_squares(distances, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+        covariance = np.linalg.inv(oracle.jac.T @ oracle.jac)
+        step = (fits.terms[k] - oracle.x) / np.sqrt(np.diag(covariance))
+        # Gauss-Newton steps end when they are small; the solver's own end is a thousandth
+        assert np.abs(step).max() < 1e-3
+        np.testing.assert_allclose(fits.covariance[k], covariance, rtol=1e-3, atol=1e-12)
+        assert fits.chi2[k] == pytest.approx(2.0 * oracle.cost, rel=1e-6)
 
 
 def test_pole_of_the_vanishing_line_is_the_image_of_the_circles_centre() -> None:

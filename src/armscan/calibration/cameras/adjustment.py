@@ -341,12 +341,7 @@ def moved(
     state: State, basis: FloatArray, shared_step: FloatArray, pose_steps: FloatArray
 ) -> State:
     """Apply a step; a product of a few dozen rotations stays one to 1e-14."""
-    rotations = np.array(
-        [
-            rotation_from_vector(step[:3]) @ rotation
-            for step, rotation in zip(pose_steps, state.rotations, strict=True)
-        ]
-    )
+    rotations = rotation_from_vector(pose_steps[:, :3]) @ state.rotations
     return State(
         state.shared + basis @ shared_step, rotations, state.translations_mm + pose_steps[:, 3:]
     )

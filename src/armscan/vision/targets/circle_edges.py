@@ -12,17 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import ndtr
 
-from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
+from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
+from armscan.kernels.circle_edges import fit_sectors, order_by_sector
 from armscan.vision.targets.ellipse import BandPixels, Ellipses, Rims, band_pixels, fit_ellipses
 from armscan.vision.targets.saddle import APERTURE_SIGMA_PX, RawGrey
 
 LEVEL_SCATTER = 0.03
 """Scatter of the levels along a rim, as a fraction of the contrast."""
 _STEPS = 5
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,121 +63,37 @@ def fit_profiles(
     pixels to tell its levels from its shift; in a large one this changes nothing.
     """
     n_circles = len(blur_px)
-    turn = np.mod(pixels.angle_rad / (2.0 * np.pi), 1.0)
-    sector = pixels.ellipse * n_sectors + np.minimum(
-        (turn * n_sectors).astype(np.int64), n_sectors - 1
+    starts = np.zeros(n_circles * n_sectors + 1, np.int64)
+    ordered = np.zeros((2, len(pixels.levels)))
+    order_by_sector(
+        pixels.levels,
+        pixels.distance_px,
+        pixels.angle_rad,
+        pixels.ellipse,
+        n_sectors,
+        starts,
+        ordered,
     )
-    fit = _SectorFit(pixels, sector, n_circles, n_sectors)
-    if before is not None:
-        fit.expect(before)
-    parameters, blur = fit.start(blur_px)
-    for _ in range(_STEPS):
-        parameters, blur = fit.step(parameters, blur)
-    return fit.profiles(parameters, blur)
+    expected = np.zeros((n_circles, 3)) if before is None else _expected(before)
+    blur, fits = blur_px.copy(), np.zeros((n_circles * n_sectors, 5))
+    fit_sectors(ordered, starts, expected, APERTURE_SIGMA_PX, _STEPS, blur, fits)
+    inner, outer, shift, share, square = fits.reshape(n_circles, n_sectors, 5).transpose(2, 0, 1)
+    count = np.diff(starts).reshape(n_circles, n_sectors)
+    freedom = np.maximum(count.sum(axis=1) - 3.0 * n_sectors - 1.0, 1.0)
+    variance = np.maximum(square.sum(axis=1) / freedom, 1e-6)
+    own = square / np.maximum(count - 3.0, 1.0)
+    typical = np.maximum(np.median(own, axis=1), 1e-6)
+    sigma = np.sqrt(share) * np.sqrt(variance)[:, None]
+    sigma[count < 5] = np.inf
+    misfit = own / typical[:, None]
+    return EdgeProfiles(shift, sigma, inner, outer, misfit, blur, np.sqrt(variance))
 
 
-class _SectorFit:
-    """Normal equations of the sectors (3 unknowns each), bordered by the circles' blurs."""
-
-    def __init__(
-        self, pixels: BandPixels, sector: IntArray, n_circles: int, n_sectors: int
-    ) -> None:
-        self._pixels = pixels
-        self._sector = sector
-        self._shape = (n_circles, n_sectors)
-        self._n = n_circles * n_sectors
-        self._count = self._sum(np.ones(len(sector)))
-        width = np.zeros(n_circles)
-        np.maximum.at(width, pixels.ellipse, np.abs(pixels.distance_px))
-        self._width = width
-        self._expected = np.zeros((self._n, 2))
-        self._expectation_weight = np.zeros(self._n)
-
-    def expect(self, before: EdgeProfiles) -> None:
-        """Expect the levels of an earlier fit, with the weight of that many pixels."""
-        n_sectors = self._shape[1]
-        levels = np.stack(
-            [np.median(before.inner, axis=1), np.median(before.outer, axis=1)], axis=-1
-        )
-        contrast = np.maximum(np.abs(levels[:, 1] - levels[:, 0]), 1e-6)
-        weight = (before.noise / (LEVEL_SCATTER * contrast)) ** 2
-        self._expected = np.repeat(levels, n_sectors, axis=0)
-        self._expectation_weight = np.repeat(weight, n_sectors)
-
-    def start(self, blur_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Levels from the two halves of each sector, no shift."""
-        outside = (self._pixels.distance_px > 0.0).astype(np.float64)
-        levels = self._pixels.levels
-        n_outer = self._sum(outside)
-        outer = self._sum(levels * outside) / np.maximum(n_outer, 1.0)
-        inner = self._sum(levels * (1.0 - outside)) / np.maximum(self._count - n_outer, 1.0)
-        return np.stack([inner, outer, np.zeros(self._n)], axis=-1), blur_px.copy()
-
-    def step(self, parameters: FloatArray, blur: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """One step; the blurs' own equations come from eliminating the sectors (Schur)."""
-        residual, columns, by_blur = self._linearise(parameters, blur)
-        inverse = self._inverse(columns)
-        rhs = np.stack([self._sum(c * residual) for c in columns], axis=-1)
-        rhs[:, :2] += self._expectation_weight[:, None] * (self._expected - parameters[:, :2])
-        border = np.stack([self._sum(c * by_blur) for c in columns], axis=-1)
-        eliminated = np.einsum("nij,nj->ni", inverse, border)
-        stiffness = self._sum(by_blur * by_blur) - (border * eliminated).sum(axis=1)
-        pull = self._sum(by_blur * residual) - (rhs * eliminated).sum(axis=1)
-        stiffness, pull = (x.reshape(self._shape).sum(axis=1) for x in (stiffness, pull))
-        blur_step = np.clip(pull / np.maximum(stiffness, 1e-9), -0.4 * blur, 0.6 * blur)
-        new_blur = np.clip(blur + blur_step, APERTURE_SIGMA_PX, 0.8 * self._width)
-        shared = np.repeat(new_blur - blur, self._shape[1])
-        change = np.einsum("nij,nj->ni", inverse, rhs) - eliminated * shared[:, None]
-        changed = parameters + change
-        limit = 0.6 * np.repeat(self._width, self._shape[1])
-        changed[:, 2] = np.clip(changed[:, 2], -limit, limit)
-        return changed, new_blur
-
-    def profiles(self, parameters: FloatArray, blur: FloatArray) -> EdgeProfiles:
-        """Sigma and misfit at the solution."""
-        residual, columns, _ = self._linearise(parameters, blur)
-        inverse = self._inverse(columns)
-        square = self._sum(residual**2).reshape(self._shape)
-        count = self._count.reshape(self._shape)
-        freedom = np.maximum(count.sum(axis=1) - 3.0 * self._shape[1] - 1.0, 1.0)
-        variance = np.maximum(square.sum(axis=1) / freedom, 1e-6)
-        own = square / np.maximum(count - 3.0, 1.0)
-        typical = np.maximum(np.median(own, axis=1), 1e-6)
-        sigma = np.sqrt(inverse[:, 2, 2]).reshape(self._shape) * np.sqrt(variance)[:, None]
-        sigma[count < 5] = np.inf
-        by_sector = parameters.reshape(*self._shape, 3)
-        return EdgeProfiles(
-            by_sector[..., 2],
-            sigma,
-            by_sector[..., 0],
-            by_sector[..., 1],
-            own / typical[:, None],
-            blur,
-            np.sqrt(variance),
-        )
-
-    def _linearise(
-        self, parameters: FloatArray, blur: FloatArray
-    ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-        inner, outer, shift = np.ascontiguousarray(parameters.T)[:, self._sector]
-        s = blur[self._pixels.ellipse]
-        z = (self._pixels.distance_px - shift) / s
-        share = ndtr(z)
-        slope = (outer - inner) * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * s)
-        residual = self._pixels.levels - inner - (outer - inner) * share
-        return residual, [1.0 - share, share, -slope], -slope * z
-
-    def _inverse(self, columns: list[FloatArray]) -> FloatArray:
-        normal = np.zeros((self._n, 3, 3))
-        for i, j in _PAIRS:
-            normal[:, i, j] = normal[:, j, i] = self._sum(columns[i] * columns[j])
-        normal[:, 0, 0] += self._expectation_weight
-        normal[:, 1, 1] += self._expectation_weight
-        trace = np.trace(normal, axis1=1, axis2=2)
-        return np.asarray(np.linalg.inv(normal + (1e-9 * trace + 1e-9)[:, None, None] * np.eye(3)))
-
-    def _sum(self, values: FloatArray) -> FloatArray:
-        return np.bincount(self._sector, values, self._n).astype(np.float64)
+def _expected(before: EdgeProfiles) -> FloatArray:
+    """Levels (N, 2) of an earlier fit and, in column 3, the weight in pixels that they have."""
+    inner, outer = np.median(before.inner, axis=1), np.median(before.outer, axis=1)
+    contrast = np.maximum(np.abs(outer - inner), 1e-6)
+    return np.stack([inner, outer, (before.noise / (LEVEL_SCATTER * contrast)) ** 2], axis=-1)
 
 
 SECTOR_PX = 4.0

@@ -8,6 +8,7 @@ round again, the four nearest neighbours are equally far and at right angles, at
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, bools, floats
-from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.least_squares import MAD_TO_SIGMA
 from armscan.vision.targets.saddle import MIN_CONTRAST, Grey8
 from armscan.vision.targets.target import CircleGrid, rightness
 
@@ -74,13 +75,13 @@ def find_blobs(
             difference = cv2.subtract(grey8, mean) if is_light else cv2.subtract(mean, grey8)
             _, binary = cv2.threshold(difference, margin, 255, cv2.THRESH_BINARY)
             contours, hierarchy = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+            # noise makes tens of thousands of the shortest
+            lengths = np.fromiter(map(len, contours), np.int64, len(contours))
+            is_likely = (lengths >= 2.0 * smallest_px) & (_links(hierarchy)[:, _PARENT] < 0)
             rows += [
                 (*ellipse, float(is_light))
-                for contour, links in zip(contours, _links(hierarchy), strict=True)
-                # noise makes thousands of the shortest
-                if len(contour) >= 2.0 * smallest_px
-                and links[_PARENT] < 0
-                and (ellipse := _ellipse_of(np.asarray(contour), smallest_px, largest_px))
+                for k in np.flatnonzero(is_likely).tolist()
+                if (ellipse := _ellipse_of(np.asarray(contours[k]), smallest_px, largest_px))
                 is not None
             ]
     table = np.array(rows).reshape(-1, 7)
@@ -97,41 +98,39 @@ def _links(hierarchy: object) -> IntArray:
 
 def _noise(grey8: Grey8) -> float:
     """Standard deviation of the pixel noise, from second differences along rows."""
-    rows = grey8[::8].astype(np.float64)
-    second = rows[:, 2:] - 2.0 * rows[:, 1:-1] + rows[:, :-2]
-    return robust_sigma(second) / float(np.sqrt(6.0))
+    second = np.abs(np.diff(grey8[::8].astype(np.int16), 2, axis=1))
+    # as robust_sigma says it: whole numbers are sorted by counting them
+    upto = np.cumsum(np.bincount(second.ravel()))
+    middle = np.searchsorted(upto, [(second.size - 1) // 2, second.size // 2], side="right")
+    return MAD_TO_SIGMA * float(middle.mean() / np.sqrt(6.0)) if second.size else 0.0
 
 
 def _ellipse_of(
     contour: np.ndarray[tuple[int, ...], np.dtype[np.int32]], smallest_px: float, largest_px: float
 ) -> tuple[float, float, float, float, float, float] | None:
     """Centre u, v, shape uu, uv, vv and roundness error of a contour, if it is an ellipse."""
-    low = contour.reshape(-1, 2).min(axis=0)
-    high = contour.reshape(-1, 2).max(axis=0)
-    extent = float((high - low).max())
+    outline = contour.reshape(-1, 2)
+    extent = float(np.ptp(outline, axis=0).max())
     if not smallest_px - 2.0 <= extent <= largest_px:
         return None
     moments = cv2.moments(contour)
     area = moments["m00"]
     if area < 0.4 * smallest_px**2:
         return None
-    centre = np.array([moments["m10"], moments["m01"]]) / area
-    inertia = (
-        4.0
-        / area
-        * np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]])
-    )
-    eigenvalues = np.linalg.eigvalsh(inertia)
-    if eigenvalues[0] < MIN_AXIS_RATIO**2 * eigenvalues[1] or eigenvalues[0] < 4.0:
+    u, v = moments["m10"] / area, moments["m01"] / area
+    uu, uv, vv = (4.0 / area * moments[name] for name in ("mu20", "mu11", "mu02"))
+    mean, half = 0.5 * (uu + vv), math.hypot(0.5 * (uu - vv), uv)
+    least = mean - half
+    if least < MIN_AXIS_RATIO**2 * (mean + half) or least < 4.0:
         return None
-    offset = contour.reshape(-1, 2) - centre
-    radius = np.sqrt(np.einsum("ki,ij,kj->k", offset, np.linalg.inv(inertia), offset))
-    error = float(np.abs(radius - 1.0).max())
-    if error > MAX_ROUNDNESS_ERROR + _PIXEL_ERROR / np.sqrt(eigenvalues[0]):
+    du, dv = outline[:, 0] - u, outline[:, 1] - v
+    square = (vv * du * du - 2.0 * uv * du * dv + uu * dv * dv) / (uu * vv - uv * uv)
+    error = max(math.sqrt(square.max()) - 1.0, 1.0 - math.sqrt(square.min()))
+    if error > MAX_ROUNDNESS_ERROR + _PIXEL_ERROR / math.sqrt(least):
         return None
     # The contour runs through the centres of border pixels: half a pixel inside the rim.
-    grown = inertia * (1.0 + 0.5 / np.sqrt(eigenvalues.mean())) ** 2
-    return centre[0], centre[1], grown[0, 0], grown[0, 1], grown[1, 1], error
+    grown = (1.0 + 0.5 / math.sqrt(mean)) ** 2
+    return u, v, grown * uu, grown * uv, grown * vv, error
 
 
 def _first_of_each(table: FloatArray, same_log_area: float) -> BoolArray:

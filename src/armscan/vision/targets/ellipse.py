@@ -13,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats
+from armscan.kernels.circle_edges import collect_band, fit_conics
 from armscan.vision.targets.saddle import RawGrey
 
 _STEPS = 12
+_AT_REST = 1e-10
 _TERMS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2))
 _TERM_MATRICES = np.zeros((5, 3, 3))
 for _k, (_i, _j) in enumerate(_TERMS):
@@ -91,7 +93,7 @@ class Ellipses(RowRecord):
     def distance_px(self, points_px: FloatArray) -> FloatArray:
         """Signed first-order distance (N, K) of points (N, K, 2) to their ellipses, px."""
         own = (points_px - self.origin_px[:, None]) / self.scale_px[:, None, None]
-        return _sampson(own, self.terms)[0] * self.scale_px[:, None]
+        return _sampson(own, self.terms) * self.scale_px[:, None]
 
     def conics_in(
         self, origin_px: FloatArray, unit_px: FloatArray
@@ -156,54 +158,27 @@ def fit_ellipses(points_px: FloatArray, weights_per_px2: FloatArray) -> Ellipses
     offset = np.where(has_weight[:, :, None], points_px - origin[:, None], 0.0)
     scale = np.sqrt(np.maximum((offset**2).sum(axis=(1, 2)) / count, 1e-12))
     own = offset / scale[:, None, None]
-    weights = weights_per_px2 * (scale**2)[:, None]
-    terms = _algebraic(own, has_weight)
-    for _ in range(_STEPS):
-        distance, jacobian = _sampson(own, terms)
-        weighted = jacobian * weights[:, :, None]
-        normal = weighted.transpose(0, 2, 1) @ jacobian
-        rhs = np.einsum("nki,nk->ni", weighted, distance)
-        step = np.einsum("nij,nj->ni", _inverse(normal), rhs)
-        terms = terms - step
-        if float(np.abs(step).max(initial=0.0)) < 1e-10:
-            break
-    distance, jacobian = _sampson(own, terms)
-    normal = (jacobian * weights[:, :, None]).transpose(0, 2, 1) @ jacobian
-    chi2 = (weights * distance**2).sum(axis=1)
+    n = len(own)
+    terms, covariance, chi2 = np.zeros((n, 5)), np.zeros((n, 25)), np.zeros(n)
+    weights = np.ascontiguousarray(weights_per_px2 * (scale**2)[:, None])
+    fit_conics(own.reshape(-1, 2), weights, _STEPS, _AT_REST, terms, covariance, chi2)
     return Ellipses(
         origin_px=origin,
         scale_px=scale,
         terms=terms,
-        covariance=_inverse(normal),
+        covariance=covariance.reshape(n, 5, 5),
         chi2=chi2,
         degrees_of_freedom=has_weight.sum(axis=1) - 5.0,
     )
 
 
-def _algebraic(own: FloatArray, has_weight: BoolArray) -> FloatArray:
-    x, y = own[..., 0], own[..., 1]
-    design = np.stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y], axis=-1)
-    design *= has_weight[:, :, None]
-    normal = design.transpose(0, 2, 1) @ design
-    return np.asarray(np.einsum("nij,nj->ni", _inverse(normal), design.sum(axis=1)))
-
-
-def _sampson(own: FloatArray, terms: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Signed first-order distance (N, K) to the conic, own units, and its derivative (N, K, 5)."""
+def _sampson(own: FloatArray, terms: FloatArray) -> FloatArray:
+    """Signed first-order distance (N, K) to the conic, own units."""
     x, y = own[..., 0], own[..., 1]
     a, b, c, d, e = (terms[:, k : k + 1] for k in range(5))
     value = a * x * x + 2.0 * b * x * y + c * y * y + 2.0 * (d * x + e * y) - 1.0
-    gradient_x = a * x + b * y + d
-    gradient_y = b * x + c * y + e
-    norm = np.maximum(np.hypot(gradient_x, gradient_y), 1e-9)
-    distance = 0.5 * value / norm
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    dvalue = np.stack([x * x, 2.0 * x * y, y * y, 2.0 * x, 2.0 * y], axis=-1)
-    dgx = np.stack([x, y, zero, one, zero], axis=-1)
-    dgy = np.stack([zero, x, y, zero, one], axis=-1)
-    along = gradient_x[..., None] * dgx + gradient_y[..., None] * dgy
-    jacobian = 0.5 * dvalue / norm[..., None] - (distance / norm**2)[..., None] * along
-    return distance, jacobian
+    norm = np.maximum(np.hypot(a * x + b * y + d, b * x + c * y + e), 1e-9)
+    return np.asarray(0.5 * value / norm)
 
 
 def _matrices(terms: FloatArray) -> FloatArray:
@@ -211,16 +186,6 @@ def _matrices(terms: FloatArray) -> FloatArray:
     for k, (i, j) in enumerate(_TERMS):
         matrices[:, i, j] = matrices[:, j, i] = terms[:, k]
     return matrices
-
-
-def _inverse(normal: FloatArray) -> FloatArray:
-    """Inverse of (N, 5, 5) matrices; a tiny ridge keeps degenerate ones finite."""
-    trace = np.trace(normal, axis1=1, axis2=2)
-    ridge = (1e-13 * trace + 1e-300)[:, None, None] * np.eye(5)
-    return np.asarray(np.linalg.inv(normal + ridge))
-
-
-_NEWTON_STEPS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,53 +241,16 @@ def band_pixels(
     the rim. ``gradient``: (N, 2) relative slope of the illumination per px, divided out of the
     levels.
     """
-    parts = [_patch(grey.shape, rims, k, half_width_px[k]) for k in range(len(rims))]
-    ellipse = np.repeat(np.arange(len(rims)), [len(pixels) for pixels, _ in parts])
-    pixels = np.concatenate([np.zeros((0, 2), np.int64), *(one for one, _ in parts)])
-    own = np.concatenate([np.zeros((0, 2)), *(one for _, one in parts)])
-    distance, angle = _nearest(own, rims.half_px[ellipse])
-    kept = np.abs(distance) <= half_width_px[ellipse]
-    ellipse, pixels = ellipse[kept], pixels[kept]
-    slope_u, slope_v = gradient[ellipse].T
-    offset_u, offset_v = (pixels - rims.centres_px[ellipse]).T
-    shade = 1.0 + (slope_u * offset_u + slope_v * offset_v)
-    levels = grey[pixels[:, 1], pixels[:, 0]] / shade
-    return BandPixels(levels, ellipse, distance[kept], angle[kept])
-
-
-def _patch(
-    shape: tuple[int, ...], rims: Rims, k: int, half_width_px: float
-) -> tuple[IntArray, FloatArray]:
-    """Pixels (K, 2), column and row, that may lie in the band of ellipse ``k``.
-
-    With their places (K, 2) along its axes.
-    """
-    centre, half = rims.centres_px[k], rims.half_px[k]
-    reach = np.sqrt(rims.directions[k] ** 2 @ half**2) + half_width_px + 1.0
-    low = np.maximum(np.floor(centre - reach), 0).astype(np.int64)
-    high = np.minimum(np.ceil(centre + reach), [shape[1] - 1, shape[0] - 1]).astype(np.int64)
-    v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
-    pixels = np.stack([u.ravel(), v.ravel()], axis=-1)
-    own = (pixels - centre) @ rims.directions[k]
-    inner = np.maximum(half - half_width_px - 0.5, 0.1)
-    squares = own**2
-    # A parallel curve of an ellipse lies between these two ellipses.
-    kept = squares @ inner**-2.0 >= 1.0
-    kept &= squares @ (half + half_width_px + 0.5) ** -2.0 <= 1.0
-    return pixels[kept], own[kept]
-
-
-def _nearest(own: FloatArray, half: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Signed distance, positive outside, and parametric angle of the nearest rim point."""
-    p, q = half[:, 0], half[:, 1]
-    x, y = own[:, 0], own[:, 1]
-    angle = np.arctan2(p * y, q * x)
-    for _ in range(_NEWTON_STEPS):
-        cosine, sine = np.cos(angle), np.sin(angle)
-        slope = (q**2 - p**2) * sine * cosine + p * x * sine - q * y * cosine
-        curvature = (q**2 - p**2) * (cosine**2 - sine**2) + p * x * cosine + q * y * sine
-        angle = angle - np.clip(slope / np.maximum(curvature, 0.1 * p**2), -0.3, 0.3)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    speed = np.hypot(q * cosine, p * sine)
-    outward = (x - p * cosine) * q * cosine + (y - q * sine) * p * sine
-    return outward / speed, angle
+    n_rows, n_columns = grey.shape
+    table = np.column_stack(
+        [rims.centres_px, rims.half_px, rims.directions[:, :, 0], rims.directions[:, :, 1]]
+    )
+    reach = np.sqrt((rims.directions**2 @ (rims.half_px**2)[:, :, None])[:, :, 0])
+    sides = np.minimum(2.0 * (reach + half_width_px[:, None]) + 5.0, [n_columns, n_rows])
+    most = int(np.nansum(sides.prod(axis=1)))
+    place, ellipse, found = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros((3, most))
+    n = collect_band(
+        np.column_stack([table, gradient]), half_width_px, n_columns, n_rows, place, ellipse, found
+    )
+    levels = np.asarray(grey).reshape(-1)[place[:n]].astype(np.float64) / found[2, :n]
+    return BandPixels(levels, ellipse[:n], found[0, :n], found[1, :n])

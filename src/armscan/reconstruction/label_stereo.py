@@ -24,6 +24,7 @@ from armscan.reconstruction.epipolar import (
     Crossings,
     EpipolarOffset,
     Projections,
+    Residuals,
     RightStripes,
     estimate_offset,
     find_crossings,
@@ -397,21 +398,18 @@ class StereoLabeller:
             If the sensor has one camera.
         """
         sides = _Side.of(profiles[0]), _Side.of(profiles[1])
-        found = _Hypotheses.of(sides, self.sensor, self.depths)
-        at, projected = found.sample, found.projected
         prior = offset = no_offset(self.sensor)
+        found = _Hypotheses.of(sides, self.sensor, self.depths, prior)
+        at, projected = found.sample, found.projected
         doubt = ever = np.zeros(len(at), dtype=np.bool_)
         for _ in range(ROUNDS):
             pairs = found.pairs(doubt, offset)
             left, right = _assign_both(pairs, sides, len(self.sensor.sheets))
             used = pairs.is_match & (left.label[at] == projected.sheet)
             asked = used | doubt | _is_tied(pairs, left)
-            doubt = found.doubtful(used, asked, left.segment[at], prior)
+            doubt = found.doubtful(used, asked, left.segment[at])
             ever = ever | doubt
-            sure = used & ~doubt
-            offset = estimate_offset(
-                projected.select(sure), found.crossings.select(sure), self.sensor, prior
-            )
+            offset = estimate_offset(*found.residuals_of(used & ~doubt), self.sensor, prior)
         withdrawn = used & doubt
         labelled = (
             side.labelled(assigned, sample[withdrawn], sample[ever])
@@ -431,54 +429,79 @@ class StereoLabeller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hypotheses:
-    """Left samples (H,) on sheets, in the right image, with the stripes beside them."""
+    """Left samples (H,) on sheets, in the right image, with the stripes beside them.
+
+    ``beside`` (H,) is the right sample of the stripe beside each, -1 for none, ``is_covered`` (H,)
+    True where the right camera sees stripes around. ``residuals`` and ``design`` are those of the F
+    pairs found, which each round takes anew; ``place`` (H,) is the row of each pair in them.
+    """
 
     sides: tuple[_Side, _Side]
     sensor: SensorCalibration
-    stripes: RightStripes
     sample: IntArray
     projected: Projections
     crossings: Crossings
+    spacing_px: float
+    beside: IntArray
+    is_covered: BoolArray
+    residuals: Residuals
+    design: FloatArray
+    place: IntArray
 
     @staticmethod
     def of(
-        sides: tuple[_Side, _Side], sensor: SensorCalibration, depths: DepthRange
+        sides: tuple[_Side, _Side],
+        sensor: SensorCalibration,
+        depths: DepthRange,
+        prior: EpipolarOffset,
     ) -> _Hypotheses:
         left, row = sides[0].profile, sides[0].row
         at, sheet = possible_sheets(left.points_px[row], sensor, depths)
         projected = project_on_sheets(left.points_px[row[at]], sheet, sensor)
         kept = projected.is_met & depths.holds(projected.points_mm, sheet, sensor)
         at, projected = at[kept], projected.select(kept)
-        stripes = RightStripes.of(sides[1].profile)
+        right = sides[1]
+        stripes = RightStripes.of(right.profile)
         crossings = find_crossings(
             projected, left.normals_px[row[at]], left.sigma_px[row[at]], stripes
         )
-        return _Hypotheses(sides, sensor, stripes, at, projected, crossings)
+        found = np.flatnonzero(crossings.is_found)
+        residuals = Residuals.of(projected.select(found), crossings.select(found), sensor)
+        sample_of_row = np.full(len(right.profile), -1)
+        sample_of_row[right.segments.row] = right.samples.nearest
+        beside, place = np.full((2, len(at)), -1)
+        beside[found], place[found] = sample_of_row[crossings.row[found]], np.arange(len(found))
+        return _Hypotheses(
+            sides=sides,
+            sensor=sensor,
+            sample=at,
+            projected=projected,
+            crossings=crossings,
+            spacing_px=stripes.spacing_px(),
+            beside=beside,
+            is_covered=stripes.covers(projected.q_px),
+            residuals=residuals,
+            design=residuals.moved(prior.factor),
+            place=place,
+        )
+
+    def residuals_of(self, chosen: BoolArray | IntArray) -> tuple[Residuals, FloatArray]:
+        """Residuals and their derivatives by the whitened errors, of pairs that were found."""
+        rows = self.place[chosen]
+        return self.residuals.select(rows), self.design[rows]
 
     def pairs(self, doubted: BoolArray, offset: EpipolarOffset) -> _Pairs:
         """Log-likelihood ratio of each left sample on each sheet, given the offset so far."""
-        projected, crossings, right = self.projected, self.crossings, self.sides[1]
-        n = len(self.sample)
-        found = np.flatnonzero(crossings.is_found)
-        ratio = np.where(self.stripes.covers(projected.q_px), MISSING, 0.0)
-        is_match = np.zeros(n, dtype=np.bool_)
-        beside = np.full(n, -1)
-        if len(found):
-            crossed = crossings.select(found)
-            residual, sigma = residual_and_sigma(
-                projected.select(found), crossed, self.sensor, offset
-            )
-            ratio[found] = log_ratio(residual, sigma, self.stripes.spacing_px())
-            is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (ratio[found] > 0.0)
-            sample_of_row = np.full(len(right.profile), -1)
-            sample_of_row[right.segments.row] = right.samples.nearest
-            beside[found] = sample_of_row[crossed.row]
+        found = np.flatnonzero(self.place >= 0)
+        ratio = np.where(self.is_covered, MISSING, 0.0)
+        is_match = np.zeros(len(self.sample), dtype=np.bool_)
+        residual, sigma = residual_and_sigma(self.residuals, offset)
+        ratio[found] = log_ratio(residual, sigma, self.spacing_px)
+        is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (ratio[found] > 0.0)
         ratio = np.where(doubted, MISSING, ratio)
-        return _Pairs(self.sample, beside, projected.sheet, ratio, is_match & ~doubted)
+        return _Pairs(self.sample, self.beside, self.projected.sheet, ratio, is_match & ~doubted)
 
-    def doubtful(
-        self, used: BoolArray, asked: BoolArray, segment: IntArray, prior: EpipolarOffset
-    ) -> BoolArray:
+    def doubtful(self, used: BoolArray, asked: BoolArray, segment: IntArray) -> BoolArray:
         """(H,) segments on sheets that do not fit the others, by their offset or by the surface.
 
         ``used`` pairs are those of certain sheets; ``asked`` ones are also those in doubt before,
@@ -491,14 +514,7 @@ class _Hypotheses:
             return doubt
         projected, n_sheets = self.projected, len(self.sensor.sheets)
         keys, key_of = np.unique(segment[at] * n_sheets + projected.sheet[at], return_inverse=True)
-        scores = left_out_scores(
-            projected.select(at),
-            self.crossings.select(at),
-            key_of,
-            used[at],
-            sensor=self.sensor,
-            prior=prior,
-        )
+        scores = left_out_scores(*self.residuals_of(at), key_of, used[at])
         is_bad = scores > OFFSET_CHI_SQUARE
         known = at[used[at] & ~is_bad[key_of]]
         left = self.sides[0]

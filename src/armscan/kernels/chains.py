@@ -463,3 +463,81 @@ def meet_sheets(
                 by_sensor[i, 17 * a + c] = dx * by_camera[0, c] + dy * by_camera[1, c]
             for c in range(8):
                 by_sensor[i, 17 * a + 9 + c] = ray * surface[4 + c] / along
+
+
+@compiled(error_model="numpy")
+def sum_off_planes(
+    samples: Table, key: Ints, planes: Table, scale_px: float, off: TableOut, sigma: TableOut
+) -> None:
+    """Sums, over the samples of each key, of the size and sigma of their depths off planes.
+
+    ``samples``: (H, 3) pixel and depth. ``key``: (H,) column of the output. ``planes``: (B, 14)
+    middle, inverse depth and its slopes, their covariance. ``off``, ``sigma``: (B, K) zeros.
+    """
+    for b in range(planes.shape[0]):
+        plane = planes[b]
+        for i in range(samples.shape[0]):
+            x = (samples[i, 0] - plane[0]) / scale_px
+            y = (samples[i, 1] - plane[1]) / scale_px
+            depth = samples[i, 2]
+            square = depth * depth
+            expected = plane[2] + x * plane[3] + y * plane[4]
+            variance = plane[5] + x * x * plane[9] + y * y * plane[13]
+            variance += x * (plane[6] + plane[8]) + y * (plane[7] + plane[11])
+            variance += x * y * (plane[10] + plane[12])
+            off[b, key[i]] += abs(expected - 1.0 / depth) * square
+            sigma[b, key[i]] += math.sqrt(variance) * square
+
+
+@compiled(fastmath=True)
+def add_propagated(
+    by_sensor: Table, by_hand_eye: Table, factor: Table, turn: Table, rows: Ints, out: TableOut
+) -> None:
+    """Add J F F' J' of the points of one sheet, J the derivatives by the sensor and the hand-eye.
+
+    ``by_sensor``: (N, 3 Q) in Sensor. ``by_hand_eye``: (N, 18) in Base. ``factor``: (Q + 6, K) F.
+    ``turn``: (3, 3) Base from Sensor. ``rows``: (M,) of the points. ``out``: (N, 9) covariances.
+    """
+    q = by_sensor.shape[1] // 3
+    width = factor.shape[1]
+    moved = np.zeros((3, width))
+    turned = np.zeros((3, width))
+    for i in rows:
+        for a in range(3):
+            for k in range(width):
+                moved[a, k] = 0.0
+        for c in range(q):
+            x = by_sensor[i, c]
+            y = by_sensor[i, q + c]
+            z = by_sensor[i, 2 * q + c]
+            # what one camera alone saw does not depend on the other
+            if x == 0.0 and y == 0.0 and z == 0.0:
+                continue
+            for k in range(width):
+                f = factor[c, k]
+                moved[0, k] += x * f
+                moved[1, k] += y * f
+                moved[2, k] += z * f
+        for a in range(3):
+            t0 = turn[a, 0]
+            t1 = turn[a, 1]
+            t2 = turn[a, 2]
+            for k in range(width):
+                turned[a, k] = t0 * moved[0, k] + t1 * moved[1, k] + t2 * moved[2, k]
+        for c in range(6):
+            x = by_hand_eye[i, c]
+            y = by_hand_eye[i, 6 + c]
+            z = by_hand_eye[i, 12 + c]
+            for k in range(width):
+                f = factor[q + c, k]
+                turned[0, k] += x * f
+                turned[1, k] += y * f
+                turned[2, k] += z * f
+        for a in range(3):
+            for b in range(a + 1):
+                total = 0.0
+                for k in range(width):
+                    total += turned[a, k] * turned[b, k]
+                out[i, 3 * a + b] += total
+                if a != b:
+                    out[i, 3 * b + a] += total

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.kernels.chains import best_states
+from armscan.kernels.chains import best_states, sum_off_planes
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import (
     Crossings,
@@ -118,8 +118,8 @@ def fit_planes(points_px: FloatArray, depth_mm: FloatArray, segment: IntArray) -
     if len(thin) < NEIGHBOURS:
         return none
     numbers = np.unique(segment)
-    middle = np.stack([np.median(points_px[segment == b], axis=0) for b in numbers])
-    middle_mm = np.array([np.median(depth_mm[segment == b]) for b in numbers])
+    middle = np.stack([_medians(one, segment) for one in points_px.T], axis=1)
+    middle_mm = _medians(depth_mm, segment)
     n_asked = min(ASKED * NEIGHBOURS, len(thin))
     _, nearest = cKDTree(points_px[thin]).query(middle, n_asked)
     near = thin[nearest]
@@ -135,12 +135,20 @@ def fit_planes(points_px: FloatArray, depth_mm: FloatArray, segment: IntArray) -
     normal[~is_spread] = np.eye(3)
     fitted = np.linalg.solve(normal, (design.transpose(0, 2, 1) @ inverse[:, :, None]))[:, :, 0]
     misfit = inverse - np.einsum("nkj,nj->nk", design, fitted)
-    scatter = np.sqrt((misfit**2).mean(axis=1)) * np.median(depth_mm[near], axis=1) ** 2
-    n_lines = np.array([len(np.unique(row)) for row in segment[near]])
-    kept = is_spread & (scatter < FLAT_MM) & (n_lines > 1)
-    noise = np.maximum(scatter, NOISE_MM) / np.median(depth_mm[near], axis=1) ** 2
+    square = np.median(depth_mm[near], axis=1) ** 2
+    scatter = np.sqrt((misfit**2).mean(axis=1)) * square
+    has_lines = (segment[near] != segment[near[:, :1]]).any(axis=1)
+    kept = is_spread & (scatter < FLAT_MM) & has_lines
+    noise = np.maximum(scatter, NOISE_MM) / square
     covariance = np.linalg.inv(normal) * (noise**2)[:, None, None]
     return Planes(middle[kept], fitted[kept], covariance[kept], numbers[kept])
+
+
+def _medians(values: FloatArray, group: IntArray) -> FloatArray:
+    """(G,) median of the values (N,) of each group (N,), in the order of the groups' numbers."""
+    count = np.unique(group, return_counts=True)[1]
+    ordered, first = values[np.lexsort((values, group))], np.cumsum(count) - count
+    return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
 
 
 def depths_off(
@@ -187,18 +195,23 @@ def surface_distance(
     distance, is_on = np.full(size, np.inf), np.zeros(size, dtype=np.bool_)
     if not len(planes.inverse) or not len(segment):
         return distance.reshape(shape), is_on.reshape(shape)
-    off, sigma = depths_off(points_px, depth_mm, planes)
     key = segment * shape[1] + sheet
-    is_asked = np.bincount(key, minlength=size) > 0
-    count = np.maximum(np.bincount(key, minlength=size), 1)
-    of_segment = np.repeat(np.arange(shape[0]), shape[1])
-    for b in range(len(planes.inverse)):
-        # a tilted line is off at its ends only: the mean of the sizes, not of the signs
-        mean = np.bincount(key, np.abs(off[:, b]), size) / count
-        std = np.bincount(key, sigma[:, b], size) / count
-        is_known = is_asked & (std < KNOWN_MM) & (of_segment != planes.segment[b])
-        distance = np.where(is_known, np.minimum(distance, mean), distance)
-        is_on |= is_known & (mean <= np.maximum(ON_MM, SIGMAS * std))
+    count = np.bincount(key, minlength=size)
+    mean, std = np.zeros((2, len(planes.inverse), size))
+    sum_off_planes(
+        np.column_stack([points_px, depth_mm]),
+        key,
+        np.column_stack([planes.middle_px, planes.inverse, planes.covariance.reshape(-1, 9)]),
+        SCALE_PX,
+        mean,
+        std,
+    )
+    asked = np.flatnonzero(count)
+    # a tilted line is off at its ends only: the mean of the sizes, not of the signs
+    mean, std = mean[:, asked] / count[asked], std[:, asked] / count[asked]
+    is_known = (std < KNOWN_MM) & (asked // shape[1] != planes.segment[:, None])
+    distance[asked] = np.where(is_known, mean, np.inf).min(axis=0)
+    is_on[asked] = (is_known & (mean <= np.maximum(ON_MM, SIGMAS * std))).any(axis=0)
     return distance.reshape(shape), is_on.reshape(shape)
 
 

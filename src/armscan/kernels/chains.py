@@ -301,7 +301,7 @@ def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
         if abs(step_x) < RAY_TOLERANCE and abs(step_y) < RAY_TOLERANCE:
             out[5] = x
             out[6] = y
-            return x * x + y * y < camera[9] * camera[9]
+            return bool(x * x + y * y < camera[9] * camera[9])
     return False
 
 
@@ -397,6 +397,8 @@ def meet_sheets(
     by_camera = np.zeros((2, 9))
     has_ray = False
     is_differentiated = False
+    number = 0
+    of_sheet = sheets[number]
     fx = camera[0]
     fy = camera[1]
     is_full = by_px.shape[0] > 0
@@ -411,7 +413,10 @@ def meet_sheets(
             continue
         x = lens[5]
         y = lens[6]
-        depth = _meet(x, y, sheets[sheet[i]], surface)
+        if sheet[i] != number:
+            number = sheet[i]
+            of_sheet = sheets[number]
+        depth = _meet(x, y, of_sheet, surface)
         if not depth > 0.0:
             continue
         is_met[i] = 1
@@ -449,7 +454,7 @@ def meet_sheets(
             for j in range(2):
                 by_camera[j, 0] = by_camera[j, 2] * lens[0]
                 by_camera[j, 1] = by_camera[j, 3] * lens[1]
-        _height(x * depth, y * depth, depth, sheets[sheet[i]], surface)
+        _height(x * depth, y * depth, depth, of_sheet, surface)
         along = x * surface[1] + y * surface[2] + surface[3]
         ddepth[0] = -surface[1] * depth / along
         ddepth[1] = -surface[2] * depth / along

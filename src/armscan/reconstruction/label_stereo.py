@@ -148,19 +148,8 @@ def _medians(values: FloatArray, group: IntArray) -> FloatArray:
     """(G,) median of the values (N,) of each group (N,), in the order of the groups' numbers."""
     count = np.unique(group, return_counts=True)[1]
     ordered, first = values[np.lexsort((values, group))], np.cumsum(count) - count
-    return 0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2])
-
-
-def depths_off(
-    points_px: FloatArray, depth_mm: FloatArray, planes: Planes
-) -> tuple[FloatArray, FloatArray]:
-    """How far points are off each plane in depth (N, B), mm, and its standard deviation (N, B)."""
-    place = (points_px[:, None, :] - planes.middle_px[None, :, :]) / SCALE_PX
-    design = np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2)
-    expected = np.einsum("nbj,bj->nb", design, planes.inverse)
-    variance = np.einsum("nbj,bjk,nbk->nb", design, planes.covariance, design)
-    square = depth_mm[:, None] ** 2
-    return (expected - 1.0 / depth_mm[:, None]) * square, np.sqrt(variance) * square
+    middle = ordered[first + (count - 1) // 2] + ordered[first + count // 2]
+    return np.asarray(0.5 * middle)
 
 
 def surface_distance(

@@ -143,7 +143,9 @@ def intersect_with_jacobian(
     points = np.tile([0.0, 0.0, 1.0], (n, 1))
     by_px, by_sensor = np.zeros((n, 3 * 2)), np.zeros((n, 3 * (N_CAMERA + N_SHEET)))
     is_met = _meet(points_px, sheet_of_point, sensor, points, by_px, by_sensor)
-    return SheetPoints(points, is_met, by_px.reshape(n, 3, 2), by_sensor.reshape(n, 3, N_CAMERA + N_SHEET))
+    return SheetPoints(
+        points, is_met, by_px.reshape(n, 3, 2), by_sensor.reshape(n, 3, N_CAMERA + N_SHEET)
+    )
 
 
 class StripePoints(RowRecord):
@@ -277,8 +279,10 @@ def triangulate_stripe(
     across = np.einsum("nij,nj->ni", met.dpoint_dpx, profile.normals_px[asked])
     noise = across * profile.sigma_px[asked, None]
     length = profile.noise_length
-    rest = np.zeros((len(asked), 3, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET))
-    by_sensor = np.concatenate([met.dpoint_dsensor, rest], axis=2)
+    by_sensor, n_rest = met.dpoint_dsensor, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET
+    if n_rest:
+        rest = np.zeros((len(asked), 3, n_rest))
+        by_sensor = np.concatenate([by_sensor, rest], axis=2)
     found = StripePoints(
         row=asked,
         points_mm=met.points_mm,
@@ -288,7 +292,7 @@ def triangulate_stripe(
         sheet=sheets[asked],
         noise_length=None if length is None else length[asked],
     )
-    return found.select(met.is_met)
+    return found if met.is_met.all() else found.select(met.is_met)
 
 
 OLD_SHAPE_SHARE = 0.3

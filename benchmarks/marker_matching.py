@@ -22,7 +22,7 @@ import numpy as np
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.markers.alignments import Matched
 from armscan.markers.match_3d import match_markers
-from armscan.thesis.marker_rules import match_after_thesis
+from armscan.thesis.two_cameras import match_after_thesis
 from rigs.marker_scenes import NOISE_MM, TwoViews, marker_set, random_pose, two_views
 
 LIMIT_MM = 8.0 * NOISE_MM

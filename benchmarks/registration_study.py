@@ -36,7 +36,7 @@ from armscan.geometry.rotations import rotation_from_vector, vector_from_rotatio
 from armscan.markers.join_views import JoinedViews, join_views
 from armscan.pipeline.register import register_place
 from armscan.storage.points import MarkerList
-from armscan.thesis.marker_rules import match_after_thesis
+from armscan.thesis.two_cameras import match_after_thesis
 from rigs.marker_scenes import DISTANCE_MM, FIELD_MM, NOISE_MM, Walk, marker_set, random_pose, walk
 
 AnyPose = Pose[Frame, Frame]

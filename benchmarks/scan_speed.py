@@ -3,11 +3,17 @@
 
 Command: ``OMP_NUM_THREADS=1 python benchmarks/scan_speed.py [repeats]`` (default 15; seed 0).
 
-Median milliseconds of processor time over the repeats, one thread:
+Median milliseconds of processor time over the repeats, one thread; beside work on many points the
+millions of them a second:
 
 - *triangulate*: 3000 stripe points of one exposure, with the derivatives of their covariance;
 - *place*: the same points in Base with full covariance;
 - *poses*: 2000 exposures looked up by time among 20,000 samples of the arm;
+- *naming*, *points of pairs*: twelve exposures of the thesis's head of eleven lines (the scenes of
+  `multi_naming.py`), each of both cameras: names and epipolar offset, then points; a pair;
+- *undistort, sheet, pose*: 100,000 pixels to points in Base without covariance; *with covariance*:
+  triangulate and place; *NumPy and OpenCV*: the same without covariance by
+  `cv2.undistortPoints`, the plane's formula and a matrix product, which knows no bow;
 - *normals*: 200,000 points of a plate, and of a ball, scanned in 200 lines;
 - *arm forward*, *arm Jacobian*: 10,000 joint vectors of seven axes; Jacobian by 28 parameters.
 """
@@ -18,19 +24,26 @@ import sys
 import time
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, homogeneous
 from armscan.models.arm import forward, parameter_jacobian, thesis_arm
+from armscan.models.calibration import SensorCalibration
+from armscan.reconstruction.label_stereo import StereoLabeller
 from armscan.reconstruction.place import BaseTransform, estimate_normals, propagate_to_base
+from armscan.reconstruction.points import measure_points
 from armscan.reconstruction.sync import exposure_poses
-from armscan.reconstruction.triangulate import triangulate_stripe
+from armscan.reconstruction.triangulate import LABEL_DEPTHS, intersect_sheets, triangulate_stripe
 from armscan.records.recording import ArmTrack, ExposureRow
 from rigs import placing_rig as rig
 from rigs.sheet_rig import thesis_rig
+from rigs.stereo_head import StereoHead
+from rigs.stereo_scenes import KINDS, Noise, draw_surfaces, expose
 
 ARM = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
 RNG = np.random.default_rng(0)
+MANY = 100_000
 
 
 def median_ms(work: Callable[[], object], repeats: int) -> float:
@@ -62,6 +75,60 @@ def track(n: int = 20_000) -> ArmTrack:
         translations_mm=translations,
         is_known=np.ones(n, dtype=bool),
     )
+
+
+Row = tuple[str, Callable[[], object], int, int]
+
+
+def pair_rows(repeats: int) -> list[Row]:
+    """Exposures of two cameras: name, work, repeats, and count of pairs."""
+    head = StereoHead.thesis()
+    sensor = head.drawn_calibration(RNG)
+    pairs = []
+    for kind in KINDS:
+        for _ in range(3):
+            left, right = expose(head, draw_surfaces(kind, RNG), Noise(), RNG)
+            pairs.append([left.profile, right.profile])
+    labeller = StereoLabeller(sensor)
+    named = [labeller.label(pair) for pair in pairs]
+    return [
+        ("naming, a pair", lambda: [labeller.label(pair) for pair in pairs], repeats, len(pairs)),
+        (
+            "points of pairs, a pair",
+            lambda: [measure_points(one, sensor, LABEL_DEPTHS) for one in named],
+            repeats,
+            len(pairs),
+        ),
+    ]
+
+
+def ray_rows(sensor: SensorCalibration, placing: BaseTransform, repeats: int) -> list[Row]:
+    """Pixels to Base: name, work, repeats, and 0: the work is one."""
+    pixels = RNG.uniform([200.0, 600.0], [1800.0, 800.0], (MANY, 2))
+    profile, sheet = rig.profile_at(pixels), np.zeros(MANY, dtype=np.int64)
+    camera, plane = sensor.camera.camera, sensor.sheets[0].sheet.plane
+    base_from_sensor = rig.BASE_FROM_TOOL @ placing.scanner.hand_eye.tool_from_sensor
+
+    def by_opencv() -> object:
+        xy = cv2.undistortPoints(pixels[:, None], camera.matrix, camera.distortion)[:, 0]
+        rays = homogeneous(xy)
+        points = rays * (-plane[3] / (rays @ plane[:3]))[:, None]
+        return points @ base_from_sensor.rotation.T + base_from_sensor.translation_mm
+
+    def with_covariance() -> object:
+        stripe = triangulate_stripe(profile, sheet, sensor)
+        return propagate_to_base(stripe, profile, rig.BASE_FROM_TOOL, placing)
+
+    return [
+        (
+            "undistort, sheet, pose",
+            lambda: base_from_sensor.apply(intersect_sheets(pixels, sheet, sensor)[0]),
+            repeats,
+            0,
+        ),
+        ("NumPy and OpenCV", by_opencv, repeats, 0),
+        ("with covariance", with_covariance, repeats, 0),
+    ]
 
 
 def main() -> None:
@@ -96,6 +163,11 @@ def main() -> None:
     ]
     for name, work, count in table:
         print(f"{name:24} {median_ms(work, count):10.2f} ms")
+    for name, work, count, n_pairs in pair_rows(few):
+        print(f"{name:24} {median_ms(work, count) / n_pairs:10.2f} ms")
+    for name, work, count, _ in ray_rows(sensor, placing, repeats):
+        taken = median_ms(work, count)
+        print(f"{name:24} {taken:10.2f} ms {1e-3 * MANY / taken:7.2f} million/s")
 
 
 if __name__ == "__main__":

@@ -15,8 +15,7 @@ from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Pose
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.label_single import SingleLabeller
-from armscan.reconstruction.labels import PointStatus
+from armscan.reconstruction.labels import PointStatus, SingleLabeller
 from armscan.records.profile import Profile, StripeFlag
 from rigs.instrument_stages import Outcome
 from rigs.instruments import Instrument, Light, Placement, seen_stripe

@@ -12,7 +12,7 @@ import pytest
 
 from armscan.cli import main
 from armscan.storage.points import read_marker_list
-from armscan.thesis.marker_rules import cross_ratio, match_after_thesis
+from armscan.thesis.two_cameras import cross_ratio, match_after_thesis
 
 INPUTS = Path(__file__).parents[1] / "net" / "inputs"
 

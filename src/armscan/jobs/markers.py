@@ -28,7 +28,7 @@ from armscan.storage.documents import read_stereo_calibration
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import markers_csv
-from armscan.thesis.marker_rules import DecodedLine, find_coded_lines, parse_code
+from armscan.thesis.two_cameras import DecodedLine, find_coded_lines, parse_code
 from armscan.vision.rings import RingDetection, RingOptions, detect_rings, perimeter_limits
 
 FEW_MARKERS = 4

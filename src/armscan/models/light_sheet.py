@@ -79,6 +79,11 @@ class LightSheet(ArrayRecord):
         """True if any bow coefficient differs from zero."""
         return bool(np.any(self.bow_mm != 0.0))
 
+    @property
+    def numbers(self) -> FloatArray:
+        """(20,) origin, axes row by row, scale, bow and fan, as compiled kernels read them."""
+        return np.array([*self.origin_mm, *self.axes.flat, self.scale_mm, *self.bow_mm, *self.fan])
+
     def height_with_jacobian(
         self, points_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:

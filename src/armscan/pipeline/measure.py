@@ -29,9 +29,13 @@ from armscan.pipeline.instants import (
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.pipeline.targets import cached_profile
 from armscan.reconstruction.label_cross import CrossLabeller
-from armscan.reconstruction.label_single import SingleLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
-from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeLabeller
+from armscan.reconstruction.labels import (
+    LabelledProfile,
+    PointStatus,
+    SingleLabeller,
+    StripeLabeller,
+)
 from armscan.reconstruction.place import merge_clouds
 from armscan.reconstruction.points import MeasuredProfile, measure_points, points_again
 from armscan.reconstruction.triangulate import (

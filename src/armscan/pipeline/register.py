@@ -27,7 +27,7 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.points import MarkerSet
 from armscan.storage.points import ASSUMED_SIGMA_MM, MarkerList
-from armscan.thesis.marker_rules import match_after_thesis
+from armscan.thesis.two_cameras import match_after_thesis
 
 MOVED_LEVEL = 1e-3
 """Chance that any marker of a list in which none moved is called moved."""

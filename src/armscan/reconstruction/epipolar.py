@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import pairwise
@@ -241,6 +242,7 @@ ROUNDS = 4
 HUBER_SIGMAS = 2.0
 CORRELATION = 3.0
 """Samples along a stripe err together: their sigma counts as this much larger."""
+N_DRIFT = 3
 SLOPE_SHARE = 0.5
 """Drift from the image's middle to its rim, as a part of the drift in the middle."""
 HALF_IMAGE = 0.5
@@ -316,26 +318,84 @@ def drift_directions(projected: Projections, sensor: SensorCalibration) -> Float
     return np.asarray(across[:, :, None] * basis[:, None, :])
 
 
-def _residual_jacobian(
-    projected: Projections, crossings: Crossings, sensor: SensorCalibration
-) -> FloatArray:
-    """(H, P + 3) of the residuals by steps of the parameters and of the right picture.
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Distances of projected points from the stripes beside them, and what moves them.
 
     The true steps take the residuals to zero: what the calibration's errors made is undone by
     adding them to its parameters, what a drift made by shifting the projected points with it.
+
+    Parameters
+    ----------
+    px, sigma_px
+        (H,) as in `Crossings`.
+    sheet
+        (H,) index into the sensor's sheets.
+    by_errors
+        (H, Q + 3) derivative by what the points of one sheet depend on (`sensor_columns`) and by
+        the drift's three numbers; by all else it is zero.
+    columns
+        (sheets, Q + 3) places of these among the sensor's P parameters and the drift.
     """
-    dq_dsensor = np.concatenate(
-        [projected.dq_dpoint @ projected.dpoint_dsensor, projected.dq_dsecond], axis=2
-    )
-    n = len(projected.sheet)
-    jacobian = np.zeros((n, len(sensor.covariance) + 3))
-    columns = np.stack([sensor_columns(sensor, k) for k in range(len(sensor.sheets))])
-    jacobian[np.arange(n)[:, None], columns[projected.sheet]] = np.einsum(
-        "ni,nij->nj", crossings.normal, dq_dsensor
-    )
-    drift = drift_directions(projected, sensor)
-    jacobian[:, -3:] = np.einsum("ni,nij->nj", crossings.normal, drift)
-    return jacobian
+
+    px: FloatArray
+    sigma_px: FloatArray
+    sheet: IntArray
+    by_errors: FloatArray
+    columns: IntArray
+
+    @staticmethod
+    def of(projected: Projections, crossings: Crossings, sensor: SensorCalibration) -> Residuals:
+        """Of the same (H,) points."""
+        normal = crossings.normal[:, None, :]
+        by_point = normal @ projected.dq_dpoint
+        by_errors = [
+            by_point @ projected.dpoint_dsensor,
+            normal @ projected.dq_dsecond,
+            normal @ drift_directions(projected, sensor),
+        ]
+        n = len(sensor.covariance)
+        columns = [
+            np.r_[sensor_columns(sensor, k), n : n + N_DRIFT] for k in range(len(sensor.sheets))
+        ]
+        return Residuals(
+            px=crossings.residual_px,
+            sigma_px=crossings.sigma_px,
+            sheet=projected.sheet,
+            by_errors=np.concatenate(by_errors, axis=2)[:, 0],
+            columns=np.stack(columns),
+        )
+
+    def select(self, rows: BoolArray | IntArray) -> Residuals:
+        """Those that a mask or an index names."""
+        return replace(
+            self,
+            px=self.px[rows],
+            sigma_px=self.sigma_px[rows],
+            sheet=self.sheet[rows],
+            by_errors=self.by_errors[rows],
+        )
+
+    def by_sheet(self) -> Iterator[tuple[IntArray, IntArray]]:
+        """Rows of each sheet that has some, and its columns."""
+        for k, columns in enumerate(self.columns):
+            rows = np.flatnonzero(self.sheet == k)
+            if len(rows):
+                yield rows, columns
+
+    def moved(self, steps: FloatArray) -> FloatArray:
+        """(H, K) what steps (P + 3, K) of all parameters and the drift add to the residuals."""
+        moved = np.zeros((len(self.px), steps.shape[1]))
+        for rows, columns in self.by_sheet():
+            moved[rows] = self.by_errors[rows] @ steps[columns]
+        return moved
+
+    def weighted_sum(self, weight: FloatArray) -> FloatArray:
+        """(P + 3,) derivative of the residuals' sum with weights (H,)."""
+        total = np.zeros(int(self.columns.max()) + 1)
+        for rows, columns in self.by_sheet():
+            total[columns] += weight[rows] @ self.by_errors[rows]
+        return total
 
 
 def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
@@ -356,10 +416,7 @@ def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
 
 
 def estimate_offset(
-    projected: Projections,
-    crossings: Crossings,
-    sensor: SensorCalibration,
-    prior: EpipolarOffset,
+    residuals: Residuals, design: FloatArray, sensor: SensorCalibration, prior: EpipolarOffset
 ) -> EpipolarOffset:
     """Most likely errors of the calibration and drift, given the residuals of labelled samples.
 
@@ -367,23 +424,26 @@ def estimate_offset(
 
     Parameters
     ----------
-    projected, crossings
+    residuals
         (H,) of samples whose sheet is certain.
+    design
+        (H, K) their derivatives by the whitened errors: `Residuals.moved` by the prior's factor.
     sensor
         Cameras and sheets.
     prior
         From `no_offset`.
     """
-    if not len(projected.sheet):
+    if not len(residuals.px):
         return prior
-    equations = _Equations.of(projected, crossings, sensor, prior)
+    equations = _Equations.of(residuals, design)
     step = prior.factor @ equations.state
     n = len(sensor.covariance)
-    offset_px, sigma_px, allowed_px = _mean_offset(equations, crossings, sensor)
+    offset_px, sigma_px, allowed_px = _mean_offset(equations, residuals, sensor)
+    lower = np.linalg.cholesky(equations.information)
     return EpipolarOffset(
         parameter_step=step[:n],
         drift=step[n:],
-        factor=prior.factor @ np.linalg.cholesky(np.linalg.inv(equations.information())),
+        factor=solve_triangular(lower, prior.factor.T, lower=True, check_finite=False).T,
         offset_px=offset_px,
         sigma_px=sigma_px,
         allowed_px=allowed_px,
@@ -394,57 +454,46 @@ def estimate_offset(
 class _Equations:
     """Weighted linear equations of the residuals in whitened errors, and their solution.
 
-    ``jacobian`` (H, P + 3) and ``design`` (H, K) are derivatives by the errors and by the whitened
-    errors, ``wanted`` (H,) what undoes the residuals.
+    ``design`` (H, K) is the derivative by the whitened errors, ``wanted`` (H,) what undoes the
+    residuals, ``information`` (K, K) that of all equations with the prior's unit matrix.
     """
 
-    jacobian: FloatArray
     design: FloatArray
     wanted: FloatArray
     sigma: FloatArray
     weight: FloatArray
     state: FloatArray
+    information: FloatArray
 
     @staticmethod
     def of(
-        projected: Projections,
-        crossings: Crossings,
-        sensor: SensorCalibration,
-        prior: EpipolarOffset,
-        is_used: BoolArray | None = None,
+        residuals: Residuals, design: FloatArray, is_used: BoolArray | None = None
     ) -> _Equations:
-        jacobian = _residual_jacobian(projected, crossings, sensor)
-        design = jacobian @ prior.factor
-        sigma = CORRELATION * np.hypot(crossings.sigma_px, FLOOR_PX)
-        wanted = -crossings.residual_px
+        sigma = CORRELATION * np.hypot(residuals.sigma_px, FLOOR_PX)
+        wanted = -residuals.px
         used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
-        found = _Equations(jacobian, design, wanted, sigma, used, np.zeros(design.shape[1]))
-        for _ in range(ROUNDS):
-            weight = found.weight
-            state = np.linalg.solve(found.information(), found.right_side())
+        weight, state = used, np.zeros(design.shape[1])
+        scaled = design * (np.sqrt(weight) / sigma)[:, None]
+        information = scaled.T @ scaled + np.eye(design.shape[1])
+        for k in range(ROUNDS):
+            right_side = (wanted * weight / sigma**2) @ design
+            state = np.asarray(np.linalg.solve(information, right_side))
+            if k == ROUNDS - 1:
+                break
             score = np.abs(wanted - design @ state) / sigma * CORRELATION
             next_weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
-            found = replace(found, weight=next_weight, state=np.asarray(state))
-        return replace(found, weight=weight)
-
-    def information(self) -> FloatArray:
-        """(K, K) with the prior's unit matrix."""
-        scaled = self.design * (self.weight / self.sigma**2)[:, None]
-        return np.asarray(self.design.T @ scaled + np.eye(self.design.shape[1]))
-
-    def right_side(self) -> FloatArray:
-        """(K,)."""
-        return np.asarray(self.design.T @ (self.wanted * self.weight / self.sigma**2))
+            # few lie beyond the limit: only these change the sum
+            changed = np.flatnonzero(next_weight != weight)
+            if not len(changed):
+                break
+            step = (next_weight - weight)[changed] / sigma[changed] ** 2
+            information += (design[changed] * step[:, None]).T @ design[changed]
+            weight = next_weight
+        return _Equations(design, wanted, sigma, weight, state, information)
 
 
 def left_out_scores(
-    projected: Projections,
-    crossings: Crossings,
-    segment: IntArray,
-    is_used: BoolArray,
-    *,
-    sensor: SensorCalibration,
-    prior: EpipolarOffset,
+    residuals: Residuals, design: FloatArray, segment: IntArray, is_used: BoolArray
 ) -> FloatArray:
     """How badly each segment's residuals fit what all the others say of the offset.
 
@@ -453,22 +502,20 @@ def left_out_scores(
 
     Parameters
     ----------
-    projected, crossings
-        (H,) as for `estimate_offset`.
+    residuals, design
+        (H,), (H, K) as for `estimate_offset`.
     segment
         (H,) number of the segment of stripe, counted from 0.
     is_used
         (H,) False for segments that are asked but have no say.
-    sensor, prior
-        As for `estimate_offset`.
 
     Returns
     -------
     FloatArray
         (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
-    equations = _Equations.of(projected, crossings, sensor, prior, is_used)
-    lower = np.linalg.cholesky(equations.information())
+    equations = _Equations.of(residuals, design, is_used)
+    lower = np.linalg.cholesky(equations.information)
     seen = solve_triangular(lower, equations.design.T, lower=True, check_finite=False)
     weight = equations.weight / equations.sigma**2
     missed = equations.wanted - equations.design @ equations.state
@@ -479,13 +526,14 @@ def left_out_scores(
         rows = order[first:last]
         if not len(rows):
             continue
-        known = seen[:, rows].T @ seen[:, rows]
+        of_rows = seen[:, rows]
+        known = of_rows.T @ of_rows
+        moments = _moments(len(rows))
         # (I - G W)^-1 takes what these rows said themselves out of state and covariance
         own = np.eye(len(rows)) - known * weight[rows]
-        left_out = np.linalg.solve(own, np.column_stack([known, missed[rows]]))
-        moments = _moments(len(rows))
-        shape = moments @ left_out[:, -1]
-        covariance = moments @ left_out[:, :-1] @ moments.T
+        left_out = np.linalg.solve(own.T, moments.T).T
+        shape = left_out @ missed[rows]
+        covariance = left_out @ known @ moments.T
         covariance += (moments * equations.sigma[rows] ** 2) @ moments.T
         covariance[0, 0] += FLOOR_PX**2
         scores[b] = float(shape @ np.linalg.solve(covariance, shape)) / len(shape)
@@ -503,28 +551,31 @@ def _moments(n: int) -> FloatArray:
 
 
 def _mean_offset(
-    equations: _Equations, crossings: Crossings, sensor: SensorCalibration
+    equations: _Equations, residuals: Residuals, sensor: SensorCalibration
 ) -> tuple[float, float, float]:
     """Weighted mean of the residuals across the epipolar lines, its sigma, and that allowed."""
-    unit = equations.jacobian[:, -3]
+    unit = residuals.by_errors[:, -N_DRIFT]
     weight = equations.weight / equations.sigma**2
     share = np.where(np.abs(unit) > LEAST_SHARE, unit, 0.0) * weight
     total = float(share @ unit)
     if total <= 0.0:
         return 0.0, float(np.inf), 0.0
     share = share / total
-    dmean_dsensor = share @ equations.jacobian[:, :-3]
+    dmean_dsensor = residuals.weighted_sum(share)[:-N_DRIFT]
     allowed = float(dmean_dsensor @ sensor.covariance @ dmean_dsensor)
-    mean = -float(share @ crossings.residual_px)
+    mean = -float(share @ residuals.px)
     return mean, float(np.sqrt(1.0 / total)), float(np.sqrt(max(allowed, 0.0)))
 
 
 def residual_and_sigma(
-    projected: Projections, crossings: Crossings, sensor: SensorCalibration, offset: EpipolarOffset
+    residuals: Residuals, offset: EpipolarOffset
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (H,) beyond what calibration errors and drift explain, and its sigma (H,), px."""
-    jacobian = _residual_jacobian(projected, crossings, sensor)
     step = np.concatenate([offset.parameter_step, offset.drift])
-    variance = np.sum((jacobian @ offset.factor) ** 2, axis=1)
-    sigma = np.sqrt(crossings.sigma_px**2 + variance + FLOOR_PX**2)
-    return crossings.residual_px + jacobian @ step, sigma
+    explained, variance = np.zeros((2, len(residuals.px)))
+    for rows, columns in residuals.by_sheet():
+        by_errors, factor = residuals.by_errors[rows], offset.factor[columns]
+        explained[rows] = by_errors @ step[columns]
+        variance[rows] = np.sum((by_errors @ (factor @ factor.T)) * by_errors, axis=1)
+    sigma = np.sqrt(residuals.sigma_px**2 + np.maximum(variance, 0.0) + FLOOR_PX**2)
+    return residuals.px + explained, sigma

@@ -18,12 +18,14 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor
-from armscan.kernels.ridge import best_states
+from armscan.kernels.chains import best_states
+from armscan.kernels.rays import sum_off_planes
 from armscan.models.calibration import SensorCalibration
 from armscan.reconstruction.epipolar import (
     Crossings,
     EpipolarOffset,
     Projections,
+    Residuals,
     RightStripes,
     estimate_offset,
     find_crossings,
@@ -117,8 +119,8 @@ def fit_planes(points_px: FloatArray, depth_mm: FloatArray, segment: IntArray) -
     if len(thin) < NEIGHBOURS:
         return none
     numbers = np.unique(segment)
-    middle = np.stack([np.median(points_px[segment == b], axis=0) for b in numbers])
-    middle_mm = np.array([np.median(depth_mm[segment == b]) for b in numbers])
+    middle = np.stack([_medians(one, segment) for one in points_px.T], axis=1)
+    middle_mm = _medians(depth_mm, segment)
     n_asked = min(ASKED * NEIGHBOURS, len(thin))
     _, nearest = cKDTree(points_px[thin]).query(middle, n_asked)
     near = thin[nearest]
@@ -134,24 +136,21 @@ def fit_planes(points_px: FloatArray, depth_mm: FloatArray, segment: IntArray) -
     normal[~is_spread] = np.eye(3)
     fitted = np.linalg.solve(normal, (design.transpose(0, 2, 1) @ inverse[:, :, None]))[:, :, 0]
     misfit = inverse - np.einsum("nkj,nj->nk", design, fitted)
-    scatter = np.sqrt((misfit**2).mean(axis=1)) * np.median(depth_mm[near], axis=1) ** 2
-    n_lines = np.array([len(np.unique(row)) for row in segment[near]])
-    kept = is_spread & (scatter < FLAT_MM) & (n_lines > 1)
-    noise = np.maximum(scatter, NOISE_MM) / np.median(depth_mm[near], axis=1) ** 2
+    square = np.median(depth_mm[near], axis=1) ** 2
+    scatter = np.sqrt((misfit**2).mean(axis=1)) * square
+    has_lines = (segment[near] != segment[near[:, :1]]).any(axis=1)
+    kept = is_spread & (scatter < FLAT_MM) & has_lines
+    noise = np.maximum(scatter, NOISE_MM) / square
     covariance = np.linalg.inv(normal) * (noise**2)[:, None, None]
     return Planes(middle[kept], fitted[kept], covariance[kept], numbers[kept])
 
 
-def depths_off(
-    points_px: FloatArray, depth_mm: FloatArray, planes: Planes
-) -> tuple[FloatArray, FloatArray]:
-    """How far points are off each plane in depth (N, B), mm, and its standard deviation (N, B)."""
-    place = (points_px[:, None, :] - planes.middle_px[None, :, :]) / SCALE_PX
-    design = np.concatenate([np.ones((*place.shape[:2], 1)), place], axis=2)
-    expected = np.einsum("nbj,bj->nb", design, planes.inverse)
-    variance = np.einsum("nbj,bjk,nbk->nb", design, planes.covariance, design)
-    square = depth_mm[:, None] ** 2
-    return (expected - 1.0 / depth_mm[:, None]) * square, np.sqrt(variance) * square
+def _medians(values: FloatArray, group: IntArray) -> FloatArray:
+    """(G,) median of the values (N,) of each group (N,), in the order of the groups' numbers."""
+    count = np.unique(group, return_counts=True)[1]
+    ordered, first = values[np.lexsort((values, group))], np.cumsum(count) - count
+    middle = ordered[first + (count - 1) // 2] + ordered[first + count // 2]
+    return np.asarray(0.5 * middle)
 
 
 def surface_distance(
@@ -186,18 +185,23 @@ def surface_distance(
     distance, is_on = np.full(size, np.inf), np.zeros(size, dtype=np.bool_)
     if not len(planes.inverse) or not len(segment):
         return distance.reshape(shape), is_on.reshape(shape)
-    off, sigma = depths_off(points_px, depth_mm, planes)
     key = segment * shape[1] + sheet
-    is_asked = np.bincount(key, minlength=size) > 0
-    count = np.maximum(np.bincount(key, minlength=size), 1)
-    of_segment = np.repeat(np.arange(shape[0]), shape[1])
-    for b in range(len(planes.inverse)):
-        # a tilted line is off at its ends only: the mean of the sizes, not of the signs
-        mean = np.bincount(key, np.abs(off[:, b]), size) / count
-        std = np.bincount(key, sigma[:, b], size) / count
-        is_known = is_asked & (std < KNOWN_MM) & (of_segment != planes.segment[b])
-        distance = np.where(is_known, np.minimum(distance, mean), distance)
-        is_on |= is_known & (mean <= np.maximum(ON_MM, SIGMAS * std))
+    count = np.bincount(key, minlength=size)
+    mean, std = np.zeros((2, len(planes.inverse), size))
+    sum_off_planes(
+        np.column_stack([points_px, depth_mm]),
+        key,
+        np.column_stack([planes.middle_px, planes.inverse, planes.covariance.reshape(-1, 9)]),
+        SCALE_PX,
+        mean,
+        std,
+    )
+    asked = np.flatnonzero(count)
+    # a tilted line is off at its ends only: the mean of the sizes, not of the signs
+    mean, std = mean[:, asked] / count[asked], std[:, asked] / count[asked]
+    is_known = (std < KNOWN_MM) & (asked // shape[1] != planes.segment[:, None])
+    distance[asked] = np.where(is_known, mean, np.inf).min(axis=0)
+    is_on[asked] = (is_known & (mean <= np.maximum(ON_MM, SIGMAS * std))).any(axis=0)
     return distance.reshape(shape), is_on.reshape(shape)
 
 
@@ -397,21 +401,18 @@ class StereoLabeller:
             If the sensor has one camera.
         """
         sides = _Side.of(profiles[0]), _Side.of(profiles[1])
-        found = _Hypotheses.of(sides, self.sensor, self.depths)
-        at, projected = found.sample, found.projected
         prior = offset = no_offset(self.sensor)
+        found = _Hypotheses.of(sides, self.sensor, self.depths, prior)
+        at, projected = found.sample, found.projected
         doubt = ever = np.zeros(len(at), dtype=np.bool_)
         for _ in range(ROUNDS):
             pairs = found.pairs(doubt, offset)
             left, right = _assign_both(pairs, sides, len(self.sensor.sheets))
             used = pairs.is_match & (left.label[at] == projected.sheet)
             asked = used | doubt | _is_tied(pairs, left)
-            doubt = found.doubtful(used, asked, left.segment[at], prior)
+            doubt = found.doubtful(used, asked, left.segment[at])
             ever = ever | doubt
-            sure = used & ~doubt
-            offset = estimate_offset(
-                projected.select(sure), found.crossings.select(sure), self.sensor, prior
-            )
+            offset = estimate_offset(*found.residuals_of(used & ~doubt), self.sensor, prior)
         withdrawn = used & doubt
         labelled = (
             side.labelled(assigned, sample[withdrawn], sample[ever])
@@ -431,54 +432,79 @@ class StereoLabeller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Hypotheses:
-    """Left samples (H,) on sheets, in the right image, with the stripes beside them."""
+    """Left samples (H,) on sheets, in the right image, with the stripes beside them.
+
+    ``beside`` (H,) is the right sample of the stripe beside each, -1 for none, ``is_covered`` (H,)
+    True where the right camera sees stripes around. ``residuals`` and ``design`` are those of the F
+    pairs found, which each round takes anew; ``place`` (H,) is the row of each pair in them.
+    """
 
     sides: tuple[_Side, _Side]
     sensor: SensorCalibration
-    stripes: RightStripes
     sample: IntArray
     projected: Projections
     crossings: Crossings
+    spacing_px: float
+    beside: IntArray
+    is_covered: BoolArray
+    residuals: Residuals
+    design: FloatArray
+    place: IntArray
 
     @staticmethod
     def of(
-        sides: tuple[_Side, _Side], sensor: SensorCalibration, depths: DepthRange
+        sides: tuple[_Side, _Side],
+        sensor: SensorCalibration,
+        depths: DepthRange,
+        prior: EpipolarOffset,
     ) -> _Hypotheses:
         left, row = sides[0].profile, sides[0].row
         at, sheet = possible_sheets(left.points_px[row], sensor, depths)
         projected = project_on_sheets(left.points_px[row[at]], sheet, sensor)
         kept = projected.is_met & depths.holds(projected.points_mm, sheet, sensor)
         at, projected = at[kept], projected.select(kept)
-        stripes = RightStripes.of(sides[1].profile)
+        right = sides[1]
+        stripes = RightStripes.of(right.profile)
         crossings = find_crossings(
             projected, left.normals_px[row[at]], left.sigma_px[row[at]], stripes
         )
-        return _Hypotheses(sides, sensor, stripes, at, projected, crossings)
+        found = np.flatnonzero(crossings.is_found)
+        residuals = Residuals.of(projected.select(found), crossings.select(found), sensor)
+        sample_of_row = np.full(len(right.profile), -1)
+        sample_of_row[right.segments.row] = right.samples.nearest
+        beside, place = np.full((2, len(at)), -1)
+        beside[found], place[found] = sample_of_row[crossings.row[found]], np.arange(len(found))
+        return _Hypotheses(
+            sides=sides,
+            sensor=sensor,
+            sample=at,
+            projected=projected,
+            crossings=crossings,
+            spacing_px=stripes.spacing_px(),
+            beside=beside,
+            is_covered=stripes.covers(projected.q_px),
+            residuals=residuals,
+            design=residuals.moved(prior.factor),
+            place=place,
+        )
+
+    def residuals_of(self, chosen: BoolArray | IntArray) -> tuple[Residuals, FloatArray]:
+        """Residuals and their derivatives by the whitened errors, of pairs that were found."""
+        rows = self.place[chosen]
+        return self.residuals.select(rows), self.design[rows]
 
     def pairs(self, doubted: BoolArray, offset: EpipolarOffset) -> _Pairs:
         """Log-likelihood ratio of each left sample on each sheet, given the offset so far."""
-        projected, crossings, right = self.projected, self.crossings, self.sides[1]
-        n = len(self.sample)
-        found = np.flatnonzero(crossings.is_found)
-        ratio = np.where(self.stripes.covers(projected.q_px), MISSING, 0.0)
-        is_match = np.zeros(n, dtype=np.bool_)
-        beside = np.full(n, -1)
-        if len(found):
-            crossed = crossings.select(found)
-            residual, sigma = residual_and_sigma(
-                projected.select(found), crossed, self.sensor, offset
-            )
-            ratio[found] = log_ratio(residual, sigma, self.stripes.spacing_px())
-            is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (ratio[found] > 0.0)
-            sample_of_row = np.full(len(right.profile), -1)
-            sample_of_row[right.segments.row] = right.samples.nearest
-            beside[found] = sample_of_row[crossed.row]
+        found = np.flatnonzero(self.place >= 0)
+        ratio = np.where(self.is_covered, MISSING, 0.0)
+        is_match = np.zeros(len(self.sample), dtype=np.bool_)
+        residual, sigma = residual_and_sigma(self.residuals, offset)
+        ratio[found] = log_ratio(residual, sigma, self.spacing_px)
+        is_match[found] = (np.abs(residual) < MATCH_SIGMAS * sigma) & (ratio[found] > 0.0)
         ratio = np.where(doubted, MISSING, ratio)
-        return _Pairs(self.sample, beside, projected.sheet, ratio, is_match & ~doubted)
+        return _Pairs(self.sample, self.beside, self.projected.sheet, ratio, is_match & ~doubted)
 
-    def doubtful(
-        self, used: BoolArray, asked: BoolArray, segment: IntArray, prior: EpipolarOffset
-    ) -> BoolArray:
+    def doubtful(self, used: BoolArray, asked: BoolArray, segment: IntArray) -> BoolArray:
         """(H,) segments on sheets that do not fit the others, by their offset or by the surface.
 
         ``used`` pairs are those of certain sheets; ``asked`` ones are also those in doubt before,
@@ -491,14 +517,7 @@ class _Hypotheses:
             return doubt
         projected, n_sheets = self.projected, len(self.sensor.sheets)
         keys, key_of = np.unique(segment[at] * n_sheets + projected.sheet[at], return_inverse=True)
-        scores = left_out_scores(
-            projected.select(at),
-            self.crossings.select(at),
-            key_of,
-            used[at],
-            sensor=self.sensor,
-            prior=prior,
-        )
+        scores = left_out_scores(*self.residuals_of(at), key_of, used[at])
         is_bad = scores > OFFSET_CHI_SQUARE
         known = at[used[at] & ~is_bad[key_of]]
         left = self.sides[0]

@@ -15,6 +15,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
+from armscan.kernels.rays import add_propagated
 from armscan.models.calibration import ArmNoise, ScannerCalibration
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, stripe_cloud
 from armscan.records.cloud import PointCloud
@@ -142,21 +143,27 @@ def propagate_to_base(
         fact = "no camera" if transform.scanner.sensor is None else "a camera"
         raise InputError(f"this scanner has {fact}", remedy="give the scanner of these points")
     placed = place_with_jacobian(stripe.points_mm, base_from_tool, hand_eye.tool_from_sensor)
-    by_sensor = placed.by_sensor_point @ stripe.by_sensor
-    by_all = np.concatenate([by_sensor, placed.by_hand_eye], axis=2)
-    covariance = np.zeros((len(stripe), 3, 3))
-    for k, factor in enumerate(transform.factors):
-        of_sheet = np.flatnonzero(stripe.sheet == k)
-        covariance[of_sheet] = _propagated(by_all[of_sheet], factor)
+    n, turn = len(stripe), placed.by_sensor_point
     if transform.scan_point_mm is None:
         middle = placed.points_base_mm.mean(axis=0) if len(stripe) else np.zeros(3)
     else:
         middle = base_from_tool.apply(hand_eye.tool_from_sensor.apply(transform.scan_point_mm))
-    turn = placed.by_sensor_point
-    arm = arm_covariance(
+    covariance = arm_covariance(
         placed.points_base_mm, middle, base_from_tool.translation_mm, hand_eye.arm_noise
     )
-    covariance += arm + turn @ stripe.own_covariance_mm2 @ turn.T
+    own = np.concatenate([stripe.noise_mm, stripe.shape_mm[:, :, None]], axis=2)
+    turned = turn @ own
+    covariance += turned @ turned.transpose(0, 2, 1)
+    by_sensor = stripe.by_sensor.reshape(n, 3 * stripe.by_sensor.shape[2])
+    for k, factor in enumerate(transform.factors):
+        add_propagated(
+            by_sensor,
+            np.ascontiguousarray(placed.by_hand_eye).reshape(n, 18),
+            np.ascontiguousarray(factor),
+            turn,
+            np.flatnonzero(stripe.sheet == k),
+            covariance.reshape(n, 9),
+        )
     return stripe_cloud(
         "Base",
         stripe,
@@ -204,21 +211,11 @@ def arm_covariance(
     ``scan_point_base_mm`` and ``tool_base_mm``, the origin of Tool, are (3,).
     """
     position, at_scan_point, at_tool = noise.variances
-    covariance = np.tile(position * np.eye(3), (len(points_base_mm), 1, 1))
-    for centre, rotation in ((scan_point_base_mm, at_scan_point), (tool_base_mm, at_tool)):
-        lever = points_base_mm - centre
-        square = np.einsum("ni,ni->n", lever, lever)
-        turned = square[:, None, None] * np.eye(3) - lever[:, :, None] * lever[:, None, :]
-        covariance += rotation * turned
-    return covariance
-
-
-def _propagated(jacobian: FloatArray, factor: FloatArray) -> FloatArray:
-    """(N, 3, 3) J F F' J' of (N, 3, P) derivatives."""
-    n_points, _, n_parameters = jacobian.shape
-    moved = jacobian.reshape(3 * n_points, n_parameters) @ factor
-    moved = moved.reshape(n_points, 3, factor.shape[1])
-    return np.asarray(moved @ moved.transpose(0, 2, 1))
+    levers = np.stack([points_base_mm - scan_point_base_mm, points_base_mm - tool_base_mm], axis=2)
+    scaled = levers * np.sqrt([at_scan_point, at_tool])
+    covariance = -(scaled @ scaled.transpose(0, 2, 1))
+    covariance[:, np.arange(3), np.arange(3)] += position + (scaled**2).sum(axis=(1, 2))[:, None]
+    return np.asarray(covariance)
 
 
 def merge_clouds(clouds: Sequence[PointCloud]) -> PointCloud:

@@ -22,6 +22,7 @@ from armscan.reconstruction.epipolar import (
     Crossings,
     EpipolarOffset,
     Projections,
+    Residuals,
     RightStripes,
     drift_directions,
     find_crossings,
@@ -202,7 +203,7 @@ def measure_stereo(
     )
     other = np.where(crossings.is_found, right.sheet[crossings.row], -1)
     is_pair = crossings.is_found & ((other == projected.sheet) | (other == -1))
-    residual, sigma = residual_and_sigma(projected, crossings, sensor, offset)
+    residual, sigma = residual_and_sigma(Residuals.of(projected, crossings, sensor), offset)
     is_fused = is_pair & (np.abs(residual) <= CONSISTENCY_SIGMAS * sigma)
     is_inside = depths.holds(projected.points_mm, projected.sheet, sensor)
     is_alone = ~is_pair & is_inside

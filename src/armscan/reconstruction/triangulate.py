@@ -9,11 +9,13 @@ import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
+from armscan.kernels.rays import meet_sheets
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
     SheetCalibration,
 )
+from armscan.models.camera import fold_radius
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.records.profile import PointProfile, Profile
 
@@ -84,13 +86,31 @@ def intersect_sheets(
     is_valid
         (N,) False without sheet, without inverse of the distortion, and where the ray misses.
     """
-    xy, is_valid = sensor.camera.camera.undistort(points_px)
     points = np.zeros((len(points_px), 3))
-    is_met = np.zeros(len(points_px), dtype=np.bool_)
-    for k, calibrated in enumerate(sensor.sheets):
-        of_sheet = is_valid & (sheet_of_point == k)
-        points[of_sheet], is_met[of_sheet] = calibrated.sheet.intersect(xy[of_sheet])
-    return points, is_met
+    none = np.zeros((0, 0))
+    return points, _meet(points_px, sheet_of_point, sensor, points, none, none)
+
+
+def _meet(
+    points_px: FloatArray,
+    sheet_of_point: IntArray,
+    sensor: SensorCalibration,
+    *written: FloatArray,
+) -> BoolArray:
+    """Call the kernel `meet_sheets`, which writes points and derivatives; (N,) True where met."""
+    camera = sensor.camera.camera
+    is_met = np.zeros(len(points_px), dtype=np.int64)
+    meet_sheets(
+        np.ascontiguousarray(points_px, dtype=np.float64),
+        np.ascontiguousarray(sheet_of_point, dtype=np.int64),
+        np.append(camera.parameters, fold_radius(camera.distortion)),
+        np.stack([one.sheet.numbers for one in sensor.sheets]),
+        written[0],
+        is_met,
+        written[1],
+        written[2],
+    )
+    return is_met.astype(np.bool_)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,18 +140,12 @@ def intersect_with_jacobian(
 ) -> SheetPoints:
     """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
     n = len(points_px)
-    xy, has_ray, dxy_dpx, dxy_dcamera = sensor.camera.camera.undistort_with_jacobian(points_px)
-    points, is_met = np.tile([0.0, 0.0, 1.0], (n, 1)), np.zeros(n, dtype=np.bool_)
-    by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, N_CAMERA + N_SHEET))
-    for k, calibrated in enumerate(sensor.sheets):
-        rows = np.flatnonzero(has_ray & (sheet_of_point == k))
-        found, met, dpoint_dxy, dpoint_dsheet = calibrated.sheet.intersect_with_jacobian(xy[rows])
-        rows, dpoint_dxy = rows[met], dpoint_dxy[met]
-        points[rows], is_met[rows] = found[met], True
-        by_px[rows] = dpoint_dxy @ dxy_dpx[rows]
-        by_sensor[rows, :, :N_CAMERA] = dpoint_dxy @ dxy_dcamera[rows]
-        by_sensor[rows, :, N_CAMERA:] = dpoint_dsheet[met]
-    return SheetPoints(points, is_met, by_px, by_sensor)
+    points = np.tile([0.0, 0.0, 1.0], (n, 1))
+    by_px, by_sensor = np.zeros((n, 3 * 2)), np.zeros((n, 3 * (N_CAMERA + N_SHEET)))
+    is_met = _meet(points_px, sheet_of_point, sensor, points, by_px, by_sensor)
+    return SheetPoints(
+        points, is_met, by_px.reshape(n, 3, 2), by_sensor.reshape(n, 3, N_CAMERA + N_SHEET)
+    )
 
 
 class StripePoints(RowRecord):
@@ -265,8 +279,10 @@ def triangulate_stripe(
     across = np.einsum("nij,nj->ni", met.dpoint_dpx, profile.normals_px[asked])
     noise = across * profile.sigma_px[asked, None]
     length = profile.noise_length
-    rest = np.zeros((len(asked), 3, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET))
-    by_sensor = np.concatenate([met.dpoint_dsensor, rest], axis=2)
+    by_sensor, n_rest = met.dpoint_dsensor, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET
+    if n_rest:
+        rest = np.zeros((len(asked), 3, n_rest))
+        by_sensor = np.concatenate([by_sensor, rest], axis=2)
     found = StripePoints(
         row=asked,
         points_mm=met.points_mm,
@@ -276,7 +292,7 @@ def triangulate_stripe(
         sheet=sheets[asked],
         noise_length=None if length is None else length[asked],
     )
-    return found.select(met.is_met)
+    return found if met.is_met.all() else found.select(met.is_met)
 
 
 OLD_SHAPE_SHARE = 0.3

@@ -11,7 +11,7 @@ import pytest
 from armscan.errors import InputError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
-from armscan.thesis.marker_rules import (
+from armscan.thesis.two_cameras import (
     DecodedLine,
     LineCode,
     cross_ratio,

@@ -12,7 +12,7 @@ from armscan.geometry.rotations import vector_from_rotation
 from armscan.markers.alignments import MarkerMatchOptions, Matched, NoMatch, NotUnique
 from armscan.markers.match_3d import match_markers
 from armscan.records.points import MarkerSet
-from armscan.thesis.marker_rules import match_after_thesis
+from armscan.thesis.two_cameras import match_after_thesis
 from rigs.marker_scenes import NOISE_MM, marker_set, random_pose, scattered, two_views
 
 SOLID = np.array([200.0, 150.0, 80.0])

@@ -19,7 +19,7 @@ from armscan.models.two_views import (
     sampson_distances_px,
     triangulate_points,
 )
-from armscan.thesis.two_views import triangulate_directly
+from armscan.thesis.two_cameras import triangulate_directly
 from rigs.stereo_rig import CONVERGING, LEFT, RIGHT, project_right
 
 VIEWS = TwoViews(LEFT, RIGHT, CONVERGING)

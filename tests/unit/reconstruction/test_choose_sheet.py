@@ -8,8 +8,7 @@ from armscan.errors import EstimationError, OptionError
 from armscan.models.calibration import CameraCalibration, SensorCalibration, SheetCalibration
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
-from armscan.reconstruction.label_single import SingleLabeller
-from armscan.reconstruction.labels import LabelledProfile
+from armscan.reconstruction.labels import LabelledProfile, SingleLabeller
 from armscan.reconstruction.triangulate import DepthRange
 from armscan.records.profile import Profile, StripeFlag
 from rigs.sheet_rig import PROVENANCE, make_profile

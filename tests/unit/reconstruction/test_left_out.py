@@ -12,6 +12,7 @@ from armscan.geometry.arrays import FloatArray
 from armscan.reconstruction import epipolar
 from armscan.reconstruction.epipolar import (
     FLOOR_PX,
+    Residuals,
     RightStripes,
     find_crossings,
     left_out_scores,
@@ -53,16 +54,20 @@ def test_scores_are_those_of_solving_without_each_segment() -> None:
     off = segment == 3
     crossings = replace(crossings, residual_px=crossings.residual_px + SHIFTED_PX * off)
     is_used = segment % 4 != 2
-    prior = no_offset(sensor)
-    scores = left_out_scores(projected, crossings, segment, is_used, sensor=sensor, prior=prior)
+    residuals = Residuals.of(projected, crossings, sensor)
+    whitened = residuals.moved(no_offset(sensor).factor)
+    scores = left_out_scores(residuals, whitened, segment, is_used)
 
-    equations = epipolar._Equations.of(projected, crossings, sensor, prior, is_used)
+    equations = epipolar._Equations.of(residuals, whitened, is_used)
+    all_weight = equations.weight / equations.sigma**2
+    whole = np.eye(whitened.shape[1]) + (whitened.T * all_weight) @ whitened
+    np.testing.assert_allclose(equations.information, whole, rtol=1e-9, atol=1e-6)
+    right_side = whitened.T @ (all_weight * equations.wanted)
     naive, own = np.zeros(len(scores)), np.zeros(len(scores))
     for b in np.unique(segment):
         at = segment == b
         design, wanted = equations.design[at], equations.wanted[at]
         sigma, weight = equations.sigma[at], equations.weight[at] / equations.sigma[at] ** 2
-        whole, right_side = equations.information(), equations.right_side()
         others = whole - (design.T * weight) @ design
         state = np.linalg.solve(others, right_side - design.T @ (weight * wanted))
         covariance = design @ np.linalg.solve(others, design.T) + np.diag(sigma**2)

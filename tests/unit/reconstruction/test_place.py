@@ -12,6 +12,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
 from armscan.geometry.rotations import rotation_from_vector
+from armscan.kernels.rays import add_propagated
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
@@ -239,3 +240,25 @@ def test_volume() -> None:
             Box.parse(wrong, "--volume")
     with pytest.raises(OptionError):
         Box(np.zeros(3), np.zeros(3))
+
+
+def test_propagation_in_one_pass_is_that_of_the_whole_product() -> None:
+    """Some columns are zero for some points, as where one camera of two saw nothing."""
+    rng = np.random.default_rng(5)
+    by_sensor, by_hand_eye = rng.normal(size=(40, 3, 11)), rng.normal(size=(40, 3, 6))
+    by_sensor[::3, :, 4:9] = 0.0
+    by_sensor[1::3, 0] = 0.0
+    factor, turn = rng.normal(size=(17, 13)), rotation_from_vector(np.array([0.3, -0.8, 0.5]))
+    rows, covariance = np.arange(1, 40, 2), np.zeros((40, 3, 3))
+    add_propagated(
+        by_sensor.reshape(40, 33),
+        by_hand_eye.reshape(40, 18),
+        factor,
+        turn,
+        rows,
+        covariance.reshape(40, 9),
+    )
+    moved = np.concatenate([turn @ by_sensor, by_hand_eye], axis=2) @ factor
+    expected = moved @ moved.transpose(0, 2, 1)
+    np.testing.assert_allclose(covariance[rows], expected[rows], rtol=1e-10, atol=1e-10)
+    assert not covariance[::2].any()

@@ -12,9 +12,14 @@ from armscan.models.calibration import CameraCalibration, SensorCalibration, She
 from armscan.models.camera import CameraModel
 from armscan.models.light_sheet import LightSheet
 from armscan.reconstruction.place import merge_clouds
-from armscan.reconstruction.triangulate import intersect_sheets, triangulate
+from armscan.reconstruction.triangulate import (
+    intersect_sheets,
+    intersect_with_jacobian,
+    triangulate,
+)
 from armscan.records.profile import Profile
 from rigs.sheet_rig import CAMERA_SIGMA, PROVENANCE, THESIS_PLANE, make_profile, thesis_rig
+from rigs.stereo_head import StereoHead
 
 SHEET_SIGMA_MM = np.array([0.02, 0.03, 0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
 SIGMA_PX = 0.1
@@ -238,3 +243,51 @@ def test_merged_clouds_keep_order_and_exposures() -> None:
         merge_clouds([])
     with pytest.raises(InputError):
         merge_clouds([clouds[0], replace(clouds[1], frame="Base")])
+
+
+def test_rays_meet_sheets_as_in_the_models_of_camera_and_sheet() -> None:
+    """Each pixel on every sheet in turn, on none, and at places that no ray reaches.
+
+    On sheet 0, which stands behind the camera, nothing is met: what is kept from one sheet to the
+    next of a pixel must not be what another pixel left. Sheets bend and their light fans out.
+    """
+    head = StereoHead.thesis().calibration()
+    rng = np.random.default_rng(3)
+    bent = [
+        replace(
+            one,
+            sheet=replace(one.sheet, bow_mm=rng.normal(0.0, 0.3, 5), fan=rng.uniform(-0.5, 0.5, 2)),
+        )
+        for one in head.sheets
+    ]
+    behind = replace(
+        bent[0], sheet=replace(bent[0].sheet, origin_mm=bent[0].sheet.origin_mm - [0.0, 0.0, 900.0])
+    )
+    head = replace(head, sheets=(behind, *bent[1:]))
+    camera, n_sheets = head.camera.camera, len(head.sheets)
+    size = [camera.width_px, camera.height_px]
+    pixels = np.concatenate([rng.uniform(-0.2, 1.2, (300, 2)) * size, [[np.nan, 5.0], [1e7, 1e7]]])
+    sheet = np.tile(np.arange(-1, n_sheets), len(pixels))
+    pixels = np.repeat(pixels, n_sheets + 1, axis=0)
+    found = intersect_with_jacobian(pixels, sheet, head)
+    points, is_met = intersect_sheets(pixels, sheet, head)
+    xy, has_ray, dxy_dpx, dxy_dcamera = camera.undistort_with_jacobian(pixels)
+    assert not found.is_met[sheet < 0].any()
+    assert not found.is_met[~has_ray].any()
+    np.testing.assert_array_equal(found.is_met, is_met)
+    np.testing.assert_array_equal(found.points_mm[is_met], points[is_met])
+    for k, one in enumerate(head.sheets):
+        rows = np.flatnonzero(has_ray & (sheet == k))
+        expected, met, by_xy, by_sheet = one.sheet.intersect_with_jacobian(xy[rows])
+        np.testing.assert_array_equal(found.is_met[rows], met)
+        rows, by_xy = rows[met], by_xy[met]
+        np.testing.assert_allclose(points[rows], expected[met], rtol=1e-10)
+        by_sensor = np.concatenate([by_xy @ dxy_dcamera[rows], by_sheet[met]], axis=2)
+        for have, want in (
+            (found.dpoint_dpx[rows], by_xy @ dxy_dpx[rows]),
+            (found.dpoint_dsensor[rows], by_sensor),
+        ):
+            largest = np.abs(want).max(axis=1, keepdims=True)
+            assert np.all(np.abs(have - want) <= 1e-8 * largest)
+    assert (sheet[is_met] == 1).sum() > 100
+    assert not is_met[sheet == 0].all()

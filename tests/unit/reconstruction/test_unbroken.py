@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from armscan.geometry.arrays import FloatArray
-from armscan.kernels.ridge import best_states
+from armscan.kernels.chains import best_states
 from armscan.reconstruction.segments import cut_segments, take_samples
 from armscan.records.profile import Profile
 from rigs.sheet_rig import make_profile

@@ -6,29 +6,31 @@ import pytest
 from scipy.ndimage import correlate, map_coordinates
 from scipy.optimize import curve_fit
 
+from armscan.kernels.chains import (
+    SHIFT,
+    SMOOTH_SIGMA,
+    find_other_lines,
+    smooth_chains,
+    walk_chains,
+)
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     CENTRE,
-    SHIFT,
     SIGMA,
-    SMOOTH_SIGMA,
     VARIANCE,
     bin_residuals,
     common_terms,
     fit_profiles,
     read_sides,
-    smooth_chains,
     weigh_section,
 )
 from armscan.kernels.ridge import (
     derivatives_at,
-    find_other_lines,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
-    walk_chains,
 )
 
 FLOAT32 = 3e-5

@@ -11,6 +11,7 @@ from scipy.optimize import nnls
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.arrays import COLUMN, ROW
+from armscan.kernels.chains import find_other_lines
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     BIN_MEANS,
@@ -35,7 +36,6 @@ from armscan.kernels.profile_fit import (
     read_sides,
     weigh_section,
 )
-from armscan.kernels.ridge import find_other_lines
 from armscan.vision.stripe.image import StripePlane
 from armscan.vision.stripe.ridge import (
     SHORTEST_PX,

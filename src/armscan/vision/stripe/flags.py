@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
+from armscan.kernels.chains import REACH_PX
 from armscan.kernels.profile_fit import AMPLITUDE, REACH_SIGMAS, SKEW, SKEW_NORM
-from armscan.kernels.ridge import REACH_PX
 from armscan.vision.stripe.fit import ProfileFits, axis_component
 from armscan.vision.stripe.ridge import (
     SHORTEST_PX,

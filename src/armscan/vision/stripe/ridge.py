@@ -12,16 +12,9 @@ from numpy.typing import NDArray
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
-from armscan.kernels.ridge import REACH_PX as CHAINS_REACH_PX
-from armscan.kernels.ridge import (
-    find_neighbours,
-    find_runs,
-    gaussian_taps,
-    place_points,
-    refine_candidates,
-    sample_across,
-    walk_chains,
-)
+from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
+from armscan.kernels.chains import find_neighbours, place_points, walk_chains
+from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates, sample_across
 
 FloatImage: TypeAlias = NDArray[np.float32]
 

@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.kernels.profile_fit import (
+from armscan.kernels.chains import (
     BEND,
     BEND_SIGMA,
     PREDICTED,

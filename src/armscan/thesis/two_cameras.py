@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Markers as printed: coded lines (eqs. 4.22 to 4.25), and the eight steps of matching (4.3.1).
+"""Two cameras as printed: a point from two pixels (eqs. 4.6, 4.7), coded lines of markers (4.22 to
+4.25), and the eight steps of matching (4.3.1).
 
 With A, B, C, D in order along the line the cross ratio of eq. 4.24, ``(AC / BC) / (AD / BD)``, does
 not change when the line is read from its other end, so that it names a code of four points but
@@ -15,9 +16,10 @@ from itertools import combinations
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.geometry.arrays import FloatArray, IntArray, homogeneous
 from armscan.geometry.estimate import FitFailure
 from armscan.markers.alignments import LabelledMarkers, label_markers, paired_count
+from armscan.models.two_views import PARALLEL_SINE, TwoViews
 from armscan.records.points import MarkerSet
 
 CODE_POINTS = 4
@@ -304,3 +306,38 @@ def _grown(
             pairs.append((i, k))
             taken.add(k)
     return np.array(pairs, dtype=np.int64)
+
+
+def triangulate_directly(views: TwoViews, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
+    """Points by the closed form of eq. 4.7.
+
+    It uses both coordinates of the left pixel and the first one of the right; what the second one
+    says against them is not looked at. Ideal normalised coordinates take the place of
+    ``u / f``, so that the two focal lengths of a camera may differ and the lens may distort.
+
+    Parameters
+    ----------
+    views
+        The cameras.
+    left_px, right_px
+        (N, 2) pixels as taken, row by row of one point.
+
+    Returns
+    -------
+    points_sensor_mm
+        (N, 3); NaN where a pixel cannot be undistorted, the point lies behind the left camera, or
+        the epipolar line runs along v in the right image, so that its u says nothing.
+    """
+    left, left_ok = views.left.undistort(left_px)
+    right, right_ok = views.right.undistort(right_px)
+    rotation = views.right_from_left.rotation
+    translation = views.right_from_left.translation_mm
+    rays = homogeneous(left)
+    turned = rays @ rotation.T
+    u = right[:, 0]
+    below = u * turned[:, 2] - turned[:, 0]
+    above = translation[0] - u * translation[2]
+    is_known = left_ok & right_ok & (np.abs(below) > PARALLEL_SINE)
+    depth = np.where(is_known, above / np.where(is_known, below, 1.0), np.nan)
+    depth = np.where(depth > 0.0, depth, np.nan)
+    return np.asarray(depth[:, None] * rays)

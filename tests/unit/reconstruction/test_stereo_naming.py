@@ -69,8 +69,9 @@ def n_wrong(sheet: IntArray, truth: SeenProfile) -> int:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_shared_points_get_their_sheets_and_hardly_any_a_wrong_one(kind: str) -> None:
+    """Over eight heads: one line of 88 may be dropped as a whole where its depth cannot be told."""
     shared = right_names = wrong = named = 0
-    for seed in (0, 1):
+    for seed in range(8):
         found, left, right = measured(kind, seed)
         both = left.is_shared & left.profile.is_accepted
         shared += int(both.sum())

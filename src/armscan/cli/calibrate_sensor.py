@@ -229,11 +229,12 @@ def hand_eye(
     euler: EulerAngles = None,
     arm: ArmFile = None,
     arm_position_mm: Annotated[
-        float | None, typer.Option(help="Scatter of the arm, mm an axis; left out, estimated.")
+        float | None,
+        typer.Option(help="Scatter of Tool's origin, mm an axis; left out, estimated."),
     ] = None,
     arm_rotation_deg: Annotated[
         float | None,
-        typer.Option(help="Scatter of its orientation; left out, estimated."),
+        typer.Option(help="Scatter of its orientation about there; left out, estimated."),
     ] = None,
     plate_flatness_mm: Annotated[
         float | None,

@@ -252,7 +252,7 @@ def run(
         try:
             summary = work(job)
         except KeyboardInterrupt:
-            if job.cache is not None:
+            if job.cache is not None and job.cache.folder.is_dir():
                 typer.echo("what was found in images is kept: the same command uses it", err=True)
             raise
     show(summary, as_json=as_json)

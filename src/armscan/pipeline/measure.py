@@ -53,6 +53,8 @@ from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
+TRIMMED_AFTER = 100
+"""Instants after which the cache is kept small."""
 LEAST_APART_RAD = 0.5
 """Stripes whose directions differ by more are told from each other by direction."""
 MOST_THREADS = 8
@@ -199,13 +201,19 @@ def measure_instants(
         pairs = zip(images.pairs, cameras, strict=True)
         return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
 
-    for images, profiles in _in_order(instants, extract, reads_ahead=reads_ahead):
-        if not is_pass:
-            labeller.reset()
-        labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
-        yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
-    if cache is not None:
-        cache.trim()
+    try:
+        for n, (images, profiles) in enumerate(
+            _in_order(instants, extract, reads_ahead=reads_ahead)
+        ):
+            if not is_pass:
+                labeller.reset()
+            if cache is not None and n % TRIMMED_AFTER == 0:
+                cache.trim()
+            labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
+            yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
+    finally:
+        if cache is not None:
+            cache.trim()
 
 
 def _in_order(

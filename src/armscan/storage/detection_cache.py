@@ -37,8 +37,8 @@ from armscan.vision.targets.target import CircleEdges, OtherCountSeen, TargetVie
 
 FOLDER_NAME = "armscan-cache"
 SUFFIX = ".found"
-MOST_BYTES = 256 * 2**20
-"""The folder is kept below this: some thousand images; what was not used for longest goes."""
+MOST_BYTES = 2**30
+"""The folder is trimmed to this: some thousand images; what was not used for longest goes."""
 STALE_SECONDS = 3600.0
 """A temporary file that is older was left by a program that was stopped."""
 CODE = ("vision", "kernels", "records", "geometry", "models")
@@ -91,7 +91,7 @@ class DetectionCache:
         temporary = self.folder / f".{uuid4().hex}.part"
         try:
             if not self.folder.is_dir():
-                self.folder.mkdir()
+                self.folder.mkdir(exist_ok=True)
                 (self.folder / "CACHEDIR.TAG").write_text(TAG, "utf-8")
             temporary.write_bytes(content)
             temporary.replace(self.folder / f"{key}{SUFFIX}")

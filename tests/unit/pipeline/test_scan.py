@@ -206,10 +206,12 @@ def test_an_interrupted_scan_looks_at_each_image_once(
 
     whole = measure_scan(as_source(fake_scan(6)), device, options)
     monkeypatch.setattr(targets, "extract_stripes", counted)
-    cache = DetectionCache(tmp_path / "kept")
+    cache, trimmed = DetectionCache(tmp_path / "kept"), []
+    monkeypatch.setattr(DetectionCache, "trim", lambda *_: trimmed.append(len(looked)))
     with pytest.raises(KeyboardInterrupt):
         measure_scan(as_source(fake_scan(6)), device, options, progress=interrupt, cache=cache)
     assert 0 < len(looked) < 6
+    assert trimmed[-1] == len(looked), "the folder is kept small after an interrupt too"
     again = measure_scan(as_source(fake_scan(6)), device, options, cache=cache)
     assert sorted(looked) == sorted(image.profile.source for image in whole.images)
     np.testing.assert_array_equal(again.cloud.points_mm, whole.cloud.points_mm)

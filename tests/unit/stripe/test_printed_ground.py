@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines that are wider than a print leaves room for, photographed with and without laser."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -134,3 +136,14 @@ def test_points_whose_print_is_known_are_not_left_out_along_its_edges() -> None:
             profile.points_px + 3.0 * profile.normals_px, profile.normals_px[:, ::-1] * [-1.0, 1.0]
         )
         assert runs_along_edge(profile, edge).any() == (not flag)
+
+
+def test_a_black_view_without_laser_says_nothing_of_the_print() -> None:
+    on, off = photographs(0, 6.0)
+    black = replace(off, image=np.zeros_like(off.image))
+    with_print, without = (
+        extract_stripes(on, StripeOptions(on_print=flag), black) for flag in (True, False)
+    )
+    assert relative_reflectance(black, "auto").size == 1
+    np.testing.assert_array_equal(with_print.points_px, without.points_px)
+    assert len(without) > 0

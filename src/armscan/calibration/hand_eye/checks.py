@@ -517,7 +517,8 @@ def agreement_warnings(fit: HandEyeSolution, plate: PlateSurface) -> tuple[str, 
 
 def scatter_warnings(fit: HandEyeSolution) -> tuple[str, ...]:
     """Warn where the stripes hardly tell how much the arm scatters."""
-    if fit.log_arm_mm < UNKNOWN_ARM:
+    is_given = fit.problem.options.arm_position_mm is not None
+    if fit.log_arm_mm < UNKNOWN_ARM or is_given:
         return ()
     return (
         f"{len(fit.problem.observations.used_postures)} postures hardly tell how much the arm "

@@ -240,6 +240,7 @@ def fit_ridge(
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     guess = noise = start_noise(background_noise)
+    bare, black = plane, 0.0
     section = np.zeros(4)
     pick = np.arange(0, len(table), max(len(table) // NOISE_SAMPLE, 1))
     sample = np.zeros((len(pick), FIT_COLUMNS))
@@ -271,7 +272,9 @@ def fit_ridge(
         section = estimate_section(said, section, is_usable, axis, ridge.chain[at])
         if plane.reflectance.size > 1:
             said, _ = _weighed(*fitted, noise=noise, section=section)
-            plane = plane.with_black(estimate_black(said))
+            black += estimate_black(said)
+            plane = bare.with_black(black)
+            sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
     values = np.zeros((len(table), FIT_COLUMNS))
     values[pick] = sample
     ground = plane.reflectance

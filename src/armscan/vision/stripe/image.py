@@ -151,6 +151,8 @@ def relative_reflectance(background: Exposure, colour: str) -> FloatImage:
     mean = uniform_filter(dark, GROUND_PX)
     variance = np.maximum(uniform_filter(dark * dark, GROUND_PX) - mean * mean, 1e-3)
     white = float(np.quantile(mean, WHITE_QUANTILE))
+    if not white > 0.0:
+        return EVEN
     is_light = mean > 0.5 * white
     flattest = np.quantile(variance[is_light] / np.maximum(mean[is_light], 1e-3), FLATTEST)
     per_level = float(flattest) / FLATTEST_VARIANCE

@@ -22,7 +22,6 @@ from armscan.calibration.hand_eye.search import (
     descend_all,
     distinct,
     find_start,
-    find_start_within,
     many_placed,
     minima_on_plate,
     minima_on_sphere,
@@ -172,14 +171,3 @@ def test_a_swapped_pose_is_found_among_postures_of_unequal_count() -> None:
     assert np.flatnonzero(start.is_wrong).tolist() == [9]
     apart = start.tool_from_sensor.translation_mm - TOOL_FROM_SENSOR.translation_mm
     assert np.linalg.norm(apart) < 0.3
-
-
-def test_a_start_is_told_to_be_hopeless_only_beyond_its_limit() -> None:
-    stripes, plate = PlateRig(good_postures(10, np.random.default_rng(8))).draw(9)
-    observations = condense_plate(stripes, straight_stripes(stripes), 12)
-    surface = PlateSurface(plate)
-    start = find_start(observations, surface)
-    found = find_start_within(observations, surface, 1.01 * start.typical_mm)
-    assert found is not None
-    np.testing.assert_array_equal(found.tool_from_sensor.rotation, start.tool_from_sensor.rotation)
-    assert find_start_within(observations, surface, 0.5 * start.typical_mm) is None

@@ -30,7 +30,6 @@ from armscan.calibration.hand_eye.observations import CondensedObservations, Pla
 from armscan.calibration.hand_eye.search import (
     Start,
     find_start,
-    find_start_within,
     linear_hand_eye,
     posture_rms,
     posture_rms_at,
@@ -84,10 +83,8 @@ LIKELIER = 10.0
 SMALLER = 0.7
 """And they leave less than this part of what the data as given leave."""
 HOPELESS = 2.0
-"""Mirrored data that leave more than so many times what the data as given leave, at every minimum
-of the plain sum of squares, are no reason to refuse. Of 114 drawn plates, 48 of them mirrored, none
-was judged otherwise for it: what was beyond kept 1.86 times as much when it was estimated all the
-same, and what a refusal rests on left 0.73 times as much at most."""
+"""Mirrored data whose start, with wrong postures left out, leaves more than so many times what the
+data as given leave are no reason to refuse: what a refusal rests on leaves less than `SMALLER`."""
 LARGEST_SHIFT = 0.1
 """Of the middle of a mirrored image, over the focal length."""
 NO_FIT_MM = 1e6
@@ -427,12 +424,12 @@ def _likeliest_mirrored(
 ) -> tuple[float, float, str, str] | None:
     """`_likelihood`, words and remedy of the likeliest of the mirrored readings.
 
-    Those that leave more than ``most_mm`` at every plain minimum are not estimated.
+    Those whose start leaves more than ``most_mm``, wrong postures left out, are not estimated.
     """
     best: tuple[float, float, str, str] | None = None
     for words, remedy, mirrored in _all_mirrored(problem.observations, plate):
-        start = find_start_within(mirrored, plate, most_mm)
-        if start is None:
+        start = find_start(mirrored, plate)
+        if start.typical_mm > most_mm:
             continue
         found = _likelihood(replace(problem, observations=mirrored), start.tool_from_sensor)
         if found is not None and (best is None or found[0] > best[0]):

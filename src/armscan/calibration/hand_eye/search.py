@@ -235,36 +235,10 @@ def find_start(observations: CondensedObservations, plate: PlateSurface) -> Star
     Of all minima of the sum of squares: those that descents from all over the rotations end in,
     that of the linear solution, and, where a posture is wrong, those of subsets of the postures.
     """
-    return _start_among(observations, plate, *_plain_minima(observations, plate))
-
-
-def find_start_within(
-    observations: CondensedObservations, plate: PlateSurface, most_mm: float
-) -> Start | None:
-    """`find_start`; None, for less, where no minimum of all postures leaves ``most_mm`` or less."""
-    linear, candidates = _plain_minima(observations, plate)
-    left = [np.nanmedian(posture_rms_at(observations, plate, pose)) for pose in candidates]
-    return None if min(left) > most_mm else _start_among(observations, plate, linear, candidates)
-
-
-def _plain_minima(
-    observations: CondensedObservations, plate: PlateSurface
-) -> tuple[Pose[Tool, Sensor] | None, list[Pose[Tool, Sensor]]]:
-    """The linear solution, and the minima of all postures."""
     linear = linear_hand_eye(observations, plate.plane)
     candidates = list(minima_on_plate(observations, plate))
     if linear is not None:
         candidates.append(_descend(observations, plate, linear))
-    return linear, candidates
-
-
-def _start_among(
-    observations: CondensedObservations,
-    plate: PlateSurface,
-    linear: Pose[Tool, Sensor] | None,
-    candidates: list[Pose[Tool, Sensor]],
-) -> Start:
-    """The start among these minima, and among those of subsets where a posture is wrong."""
     used = observations.used_postures
     is_many = len(used) >= LEAST_FOR_SUBSETS
     if is_many and _has_wrong(posture_rms_at(observations, plate, candidates[0])):

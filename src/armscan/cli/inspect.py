@@ -69,7 +69,7 @@ def plane(
     """Distances of points to a plane: fitted to them, and nominal if one is given."""
     from armscan.calibration.hand_eye.probed_plate import ProbeSide
     from armscan.inspection.selection import InspectionOptions
-    from armscan.jobs.inspect import inspect_plane
+    from armscan.jobs.inspection.shapes import inspect_plane
 
     box = numbers(region, "--region")
     options = given(InspectionOptions, feature_mm=feature_mm)
@@ -98,7 +98,7 @@ def sphere(
 ) -> None:
     """Find a ball in a cloud; compare it with the standard, and with the fitted ball."""
     from armscan.inspection.selection import InspectionOptions
-    from armscan.jobs.inspect import inspect_sphere
+    from armscan.jobs.inspection.shapes import inspect_sphere
 
     box = numbers(region, "--region")
     options = given(InspectionOptions, feature_mm=feature_mm)
@@ -136,7 +136,7 @@ def step(
 ) -> None:
     """Find two parallel faces in a cloud and measure the distance between them."""
     from armscan.inspection.selection import InspectionOptions, StepOptions
-    from armscan.jobs.inspect import inspect_step
+    from armscan.jobs.inspection.shapes import inspect_step
 
     box = numbers(region, "--region")
     direction = numbers(normal, "--normal")

@@ -23,7 +23,7 @@ from armscan.inspection.sphere import inspect_sphere
 from armscan.inspection.step import inspect_step
 from armscan.jobs.camera import calibrate_camera
 from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye
-from armscan.jobs.inspect import read_plate
+from armscan.jobs.inspection.shapes import read_plate
 from armscan.jobs.job import Job, solved
 from armscan.jobs.probe import probe
 from armscan.jobs.reconstruct import StillPaths

@@ -14,7 +14,7 @@ from armscan.geometry.arrays import Box, FloatArray
 from armscan.inspection.conformity import RULE, Check, Verdict
 from armscan.inspection.results import SphereInspection
 from armscan.inspection.selection import InspectionOptions
-from armscan.jobs.inspect import read_plate, region_of
+from armscan.jobs.inspection.shapes import read_plate, region_of
 from armscan.jobs.job import Job
 from armscan.pipeline.progress import Progress
 from armscan.pipeline.scan import ScanOptions, measure_scan
@@ -25,7 +25,12 @@ from armscan.pipeline.verify import (
     verify_on_ball,
     verify_on_plate,
 )
-from armscan.report.inspect import InspectionReport, inspection_page, plane_report, sphere_report
+from armscan.report.inspection.shapes import (
+    InspectionReport,
+    inspection_page,
+    plane_report,
+    sphere_report,
+)
 from armscan.report.page import Section, Text
 from armscan.report.quantity import (
     Quantity,

@@ -19,7 +19,12 @@ from armscan.records.exposure import Exposure
 from armscan.report.cloud import cloud_view
 from armscan.report.drawing import Marks, photo_markup, scene_markup, uniform_dots
 from armscan.report.hand_eye import hand_eye_quantities, total_covariance
-from armscan.report.inspect import deviation_histogram, deviation_view, height_histogram, share_text
+from armscan.report.inspection.shapes import (
+    deviation_histogram,
+    deviation_view,
+    height_histogram,
+    share_text,
+)
 from armscan.report.page import Facts, Gallery, Page, Picture, Section, Text
 from armscan.report.photographs import sheet_colour
 from armscan.report.quantity import Quantity, Table, fact, for_people, significant

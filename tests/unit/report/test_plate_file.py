@@ -12,7 +12,7 @@ import pytest
 from armscan.cli.run import main
 from armscan.errors import ArmscanError, EstimationError, InputError
 from armscan.geometry.arrays import FloatArray
-from armscan.jobs.inspect import read_plate
+from armscan.jobs.inspection.shapes import read_plate
 from armscan.records.points import ProbedPoints
 from armscan.storage.clouds import ply_bytes
 from armscan.storage.points import probed_points_csv

@@ -27,7 +27,7 @@ from armscan.inspection.step import inspect_step as step_of
 from armscan.jobs.job import Job, solved
 from armscan.records.cloud import PointCloud
 from armscan.records.points import ProbedPoints
-from armscan.report.inspect import (
+from armscan.report.inspection.shapes import (
     InspectionReport,
     inspection_page,
     plane_report,

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
+from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points, twin
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -71,8 +71,8 @@ inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
-app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)
-app.command("simulate", epilog=measure.SIMULATE_EXAMPLE)(measure.simulate)
+app.command("demo", epilog=twin.DEMO_EXAMPLE)(twin.demo)
+app.command("simulate", epilog=twin.SIMULATE_EXAMPLE)(twin.simulate)
 app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
 app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)

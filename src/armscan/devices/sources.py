@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.poses import Base, CameraRight, Pose, Sensor, Tool
+from armscan.geometry.poses import Base, CameraRight, Part, Pose, Sensor, Tool
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 
@@ -55,6 +55,7 @@ TwinScene = Literal[
     "markers-moved",
     "probing",
     "still-part",
+    "workpiece",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
 
@@ -107,6 +108,13 @@ class TwinTruth(Protocol):
 
     def part_normals(self, points_base_mm: FloatArray) -> FloatArray:
         """(N, 3) unit normals of that surface next to points (N, 3)."""
+
+    @property
+    def base_from_workpiece(self) -> Pose[Base, Part]:
+        """Where the workpiece, or the part in its place, stands."""
+
+    def workpiece_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) in Base from its surface as it was made."""
 
     def document(self) -> bytes:
         """All of it as JSON, with the mark ``"simulated": true``."""
@@ -195,7 +203,8 @@ class Twin(Protocol):
         during scans; `SimulatedScan.expose` takes an exposure with others. ``markers`` shows a
         part with ring markers from places named as views, each in the light of the room and then
         with the lasers; in ``markers-moved`` the part is still there, but the arm stands in
-        another place, and so does Base.
+        another place, and so does Base. ``workpiece`` is the part of the CAD model that comes with
+        the simulator, made with two faults, or another part in its place.
         """
 
     def probe_plate(self) -> Probing:

@@ -233,13 +233,18 @@ class Instrument:
     mechanics: Mechanics
 
     @staticmethod
-    def build(head: str, preset: Preset, seed: int) -> Instrument:
-        """Draw one instrument; everything follows from the seed."""
+    def build(
+        head: str, preset: Preset, seed: int, part_mm: FloatArray | None = None
+    ) -> Instrument:
+        """Draw one instrument; everything follows from the seed.
+
+        ``part_mm`` (T, 3, 3) are the triangles of a part in place of the workpiece.
+        """
         mechanics = MECHANICS[preset]
         return Instrument(
             head=build_head(head, preset, seed),
             arm=MeasuringArm.build(mechanics.arm, np.random.default_rng([seed, 2])),
-            fixtures=Fixtures.build(preset, np.random.default_rng([seed, 3])),
+            fixtures=Fixtures.build(preset, np.random.default_rng([seed, 3]), part_mm),
             target=made_target(mechanics.target_mm, np.random.default_rng([seed, 4])),
             mechanics=mechanics,
         )

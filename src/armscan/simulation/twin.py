@@ -12,7 +12,7 @@ import numpy as np
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
-from armscan.geometry.poses import Base, CameraRight, Pose, Sensor, Tool
+from armscan.geometry.poses import Base, CameraRight, Part, Pose, Sensor, Tool
 from armscan.records.recording import SessionKind
 from armscan.simulation.arm.hand import SweptScene
 from armscan.simulation.head import HEADS, RIGHT, sheet_points_mm
@@ -116,6 +116,16 @@ class InstrumentTruth:
         """(N, 3) unit normals of that surface next to points (N, 3)."""
         return self.instrument.fixtures.part_normals(points_base_mm)
 
+    @property
+    def base_from_workpiece(self) -> Pose[Base, Part]:
+        """Where the workpiece, or the part in its place, stands."""
+        return self.instrument.fixtures.base_from_workpiece
+
+    def workpiece_distance_mm(self, points_base_mm: FloatArray) -> FloatArray:
+        """Distance (N,) of points (N, 3) in Base from its surface as it was made."""
+        points = self.base_from_workpiece.inverse().apply(points_base_mm)
+        return self.instrument.fixtures.workpiece.distance_mm(points)
+
     def document(self) -> bytes:
         """All of it as JSON, with the mark ``"simulated": true``."""
         arm, fixtures, head = self.instrument.arm, self.instrument.fixtures, self.instrument.head
@@ -145,6 +155,7 @@ class InstrumentTruth:
                 "base_from_ground": _pose(fixtures.base_from_ground),
             },
             "base_from_part": _pose(fixtures.base_from_part),
+            "base_from_workpiece": _pose(self.base_from_workpiece),
             "base_from_waves": _pose(fixtures.base_from_waves),
             "waves": [asdict(wave) for wave in fixtures.waves.waves],
             "markers": {
@@ -271,7 +282,10 @@ class SimulatedInstrument:
 
 
 def build_twin(
-    head: str = "thesis-single", preset: Preset = "thesis", seed: int = 1
+    head: str = "thesis-single",
+    preset: Preset = "thesis",
+    seed: int = 1,
+    part_mm: FloatArray | None = None,
 ) -> SimulatedInstrument:
     """Draw one instrument.
 
@@ -283,6 +297,8 @@ def build_twin(
         How good it is and how kind the surroundings are.
     seed
         Everything random follows from it.
+    part_mm
+        (T, 3, 3) triangles of a part that stands in place of the workpiece; None for the workpiece.
 
     Raises
     ------
@@ -300,4 +316,4 @@ def build_twin(
         )
     if seed < 0:
         raise OptionError(f"seed {seed} is negative", remedy="give 0 or more")
-    return SimulatedInstrument(Instrument.build(head, preset, seed), preset, seed)
+    return SimulatedInstrument(Instrument.build(head, preset, seed, part_mm), preset, seed)

@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from armscan.cli.measure import PresetName, Scene
+from armscan.cli.twin import PresetName, Scene
 from armscan.devices.sources import Preset, TwinScene
 from armscan.errors import OptionError, OutputError
 from armscan.jobs import simulate as simulate_job_simulate

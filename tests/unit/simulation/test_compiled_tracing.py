@@ -12,6 +12,8 @@ from armscan.geometry.poses import Base, Board, Pose, Sensor
 from armscan.simulation.head import build_head, sheet_middle_mm
 from armscan.simulation.objects.boards import CirclePattern
 from armscan.simulation.objects.body import free_form_part
+from armscan.simulation.objects.fixtures import made_workpiece
+from armscan.simulation.objects.mesh import Mesh
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Wave, WavyPlate
 from armscan.simulation.optics.lasers import TracedLight, in_sources
 from armscan.simulation.optics.render import Region
@@ -46,6 +48,7 @@ SHAPES: dict[str, tuple[Surface, ...]] = {
         Sphere(np.array([1.0, 2.0, -3.0]), 9.0),
     ),
     "body": (Placed(free_form_part(), TILTED),),
+    "triangles": (Placed(Mesh(made_workpiece() - [0.0, 0.0, 10.0]), TILTED),),
 }
 LIGHTS: dict[str, TracedLight] = {
     "one line": in_sources(HEAD.lasers[5:6])[0],

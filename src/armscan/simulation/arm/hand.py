@@ -388,12 +388,14 @@ def _poses(
     return poses
 
 
-SweptScene = Literal["plate", "ball", "steps", "part", "waves"]
+SweptScene = Literal["plate", "ball", "steps", "part", "waves", "workpiece"]
 Way = tuple[FloatArray, FloatArray, FloatArray, list[float], float]
 """Face (3, 3), start and end (3,) of the middle of the stripe in Base, tilts and roll, speed."""
 
 _OVER_STEPS_MM = 10.0
 _OVER_PART_MM = 13.0
+_UP_THE_WORKPIECE = 0.75
+"""Where the middle of the stripe is led over it, as a part of its height."""
 _OVER_BALL_MM = 0.8 * 0.5 * BALL_DIAMETER_MM
 
 
@@ -406,6 +408,8 @@ def scan_passes(scene: SweptScene, head: Head, fixtures: Fixtures) -> list[ScanP
         ways = _around_ball(fixtures.ball.centre_mm, plan, 0 if is_stereo else 1)
     elif scene == "part":
         ways = _along_part(fixtures.base_from_part, plan, is_stereo)
+    elif scene == "workpiece":
+        ways = _over_workpiece(fixtures, plan, is_stereo)
     elif scene == "steps":
         ways = _over_face(fixtures.base_from_ground, _OVER_STEPS_MM, plan)
     else:
@@ -446,6 +450,24 @@ def _along_part(pose: Pose[Base, Any], plan: dict[str, Any], is_stereo: bool) ->
             for x in (-half, half)
         )
         yield face, start, end, [plan["tilt_deg"], 0.0, 0.0], speed
+
+
+def _over_workpiece(fixtures: Fixtures, plan: dict[str, Any], is_stereo: bool) -> Iterator[Way]:
+    """In lanes along the x of a part of any size, from each of the sides that are planned."""
+    pose, bounds = fixtures.base_from_workpiece, fixtures.workpiece.bounds_mm
+    middle, size = 0.5 * (bounds[0] + bounds[1]), bounds[1] - bounds[0]
+    height = bounds[0, 2] + _UP_THE_WORKPIECE * size[2]
+    n_lanes = max(1, int(np.ceil(size[1] / plan["lane_mm"])))
+    lanes = middle[1] + size[1] * ((np.arange(n_lanes) + 0.5) / n_lanes - 0.5)
+    for tilt, azimuth, speed in plan["passes"]:
+        face = pose.rotation @ leaning(tilt, azimuth)
+        if not is_stereo:
+            face = face @ quarter_turn()
+        for y in lanes:
+            start, end = (
+                pose.apply(np.array([x, y, height])) for x in (bounds[0, 0], bounds[1, 0])
+            )
+            yield face, start, end, [plan["tilt_deg"], 0.0, 0.0], speed
 
 
 def still_step(fixtures: Fixtures, head: Head) -> tuple[FloatArray, FloatArray, HeadOrientation]:

@@ -6,6 +6,7 @@ plate of markers.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.poses import Base, Part, Plate, Pose
 from armscan.geometry.rotations import rotation_from_vector
 from armscan.simulation.objects.body import Body, free_form_part
+from armscan.simulation.objects.mesh import Mesh
 from armscan.simulation.objects.rings import RING_DIAMETER_MM, RingMarker
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, Wave, WavyPlate
 from armscan.simulation.optics.scene import (
@@ -118,6 +120,7 @@ PLATE_SIZE_MM = (200.0, 200.0)
 _PLATE_MM = (620.0, -160.0, -6.4)
 _BALL_MM = (610.0, -140.0, 60.0)
 _PART_MM = (610.0, -150.0, 20.0)
+_WORKPIECE_MM = (610.0, -150.0, 4.0)
 _WAVES_MM = (612.0, -150.0, 10.0)
 _MARKED_MM = (612.0, -152.0, 6.0)
 _MARKED_AFTER_MOVE_MM = (585.0, 95.0, 21.0)
@@ -156,6 +159,8 @@ class Fixtures:
         The plate with ring markers in its own frame, and where it stands.
     moved_from_base
         From Base to what Base is after the arm was put down in another place.
+    workpiece, base_from_workpiece
+        The part as it was made, in the frame of its CAD model, and where it stands.
     """
 
     plate: FlatPlate
@@ -170,10 +175,17 @@ class Fixtures:
     marked: MarkedPlate
     base_from_marked: Pose[Base, Part]
     moved_from_base: Pose[Base, Base]
+    workpiece: Mesh
+    base_from_workpiece: Pose[Base, Part]
 
     @staticmethod
-    def build(preset: Preset, rng: np.random.Generator) -> Fixtures:
-        """Draw the things and put them down by hand: a little aside, not quite level."""
+    def build(
+        preset: Preset, rng: np.random.Generator, part_mm: FloatArray | None = None
+    ) -> Fixtures:
+        """Draw the things and put them down by hand: a little aside, not quite level.
+
+        ``part_mm`` (T, 3, 3) are the triangles of a part in place of the workpiece.
+        """
         plate = FlatPlate.draw(PLATE_SIZE_MM, _FLATNESS_MM[preset], rng, _WHITE)
         ground = FlatPlate.draw(_GROUND_SIZE_MM, _GROUND_FLATNESS_MM, rng, _STEEL)
         ball = np.array(_BALL_MM) + _PLACE_MM * rng.uniform(-1.0, 1.0, 3)
@@ -185,6 +197,7 @@ class Fixtures:
         waves = [replace(w, phase_rad=float(p)) for w, p in zip(_WAVES, phases, strict=True)]
         base_from_marked = _put_down(_MARKED_MM, rng)
         moved_from_marked = _put_down(_MARKED_AFTER_MOVE_MM, rng, _TURN_OF_MOVE_RAD)
+        workpiece = Mesh(made_workpiece() if part_mm is None else part_mm, _GREY)
         return Fixtures(
             plate=plate,
             base_from_plate=base_from_plate,
@@ -198,6 +211,8 @@ class Fixtures:
             marked=MarkedPlate.draw(rng),
             base_from_marked=base_from_marked,
             moved_from_base=moved_from_marked @ base_from_marked.inverse(),
+            workpiece=workpiece,
+            base_from_workpiece=_put_down(_WORKPIECE_MM, rng) @ _from_foot(workpiece.bounds_mm),
         )
 
     @property
@@ -227,6 +242,11 @@ class Fixtures:
     def with_part(self) -> Station:
         """The free-form part alone."""
         return Station((SceneObject("part", Placed(self.part, self.base_from_part), MATT_PAINT),))
+
+    def with_workpiece(self) -> Station:
+        """The workpiece alone, or the part in its place."""
+        placed = Placed(self.workpiece, self.base_from_workpiece)
+        return Station((SceneObject("workpiece", placed, MATT_PAINT),))
 
     def with_waves(self) -> Station:
         """The wavy plate alone."""
@@ -268,6 +288,19 @@ class Fixtures:
     def _in_part(self, points_base_mm: FloatArray) -> FloatArray:
         pose = self.base_from_part
         return np.asarray((points_base_mm - pose.translation_mm) @ pose.rotation)
+
+
+def made_workpiece() -> FloatArray:
+    """(T, 3, 3) triangles of the workpiece as it was made, its two faults included."""
+    raw = (files("armscan.simulation") / "workpiece" / "as_made.stl").read_bytes()
+    facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    return np.frombuffer(raw, facet, offset=84)["corners"].astype(np.float64)
+
+
+def _from_foot(bounds_mm: FloatArray) -> Pose[Any, Part]:
+    """From a part's frame to one in the middle of its underside."""
+    foot = np.array([*bounds_mm[:, :2].mean(axis=0), bounds_mm[0, 2]])
+    return Pose(np.eye(3), -foot)
 
 
 def _put_down(

@@ -31,6 +31,7 @@ from armscan.simulation.kernels import (
 )
 from armscan.simulation.objects.boards import FLAT, CirclePattern, PrintedBoard
 from armscan.simulation.objects.body import GRADIENT_STEP_MM, HIT_MM, Body, distance, marched
+from armscan.simulation.objects.mesh import Mesh, meet_mesh, mesh_normal
 from armscan.simulation.objects.shapes import Box, FlatPlate, Placed, WavyPlate
 from armscan.simulation.optics.camera import RenderCamera
 from armscan.simulation.optics.lasers import LaserSource, LineLaser, TracedLight
@@ -50,7 +51,7 @@ from armscan.simulation.optics.scene import (
 )
 from armscan.simulation.optics.stray_light import CentreSpot
 
-_BOX, _PLATE, _SPHERE, _WAVES, _BODY, _PRINT, _FLOOR = range(7)
+_BOX, _PLATE, _SPHERE, _WAVES, _BODY, _PRINT, _FLOOR, _MESH = range(8)
 _KIND, _TEXTURE, _CELLS, _GLOSS, _GLOSS_WIDTH, _COLOUR, _START, _STOP = (
     0,
     13,
@@ -107,6 +108,8 @@ def _meet(
         return meet_print(data, at, own, along)
     if kind == _FLOOR:
         return meet_floor(data, at, own, along)
+    if kind == _MESH:
+        return meet_mesh(data, at, own, along)
     line = np.array([own[0], own[1], own[2], along[0], along[1], along[2]])
     stop = int(row[_STOP])
     room = np.zeros(stop - at, np.int64)
@@ -144,6 +147,8 @@ def _normal(row: Floats, data: Floats, limbs: Floats, x: float, y: float, z: flo
         nz = -1.0
     elif kind == _FLOOR:
         nx, ny, nz = data[at + 3], data[at + 4], data[at + 5]
+    elif kind == _MESH:
+        nx, ny, nz = mesh_normal(data, at, px, py, pz)
     elif kind == _BOX:
         pz -= 0.5 * data[at + 2]
         beyond_x, beyond_y = abs(px) - 0.5 * data[at], abs(py) - 0.5 * data[at + 1]
@@ -428,7 +433,7 @@ class SceneNumbers:
     def of(scene: Scene, finishes: tuple[Material, ...]) -> SceneNumbers | None:
         """None if a surface is none of those that the loops know."""
         rows, base = [], np.zeros(13)
-        data: list[float] = []
+        data: list[FloatArray] = []
         bodies: list[Body] = []
         for surface, finish in zip(scene.surfaces, finishes, strict=False):
             row = _row(surface, data, bodies)
@@ -442,7 +447,7 @@ class SceneNumbers:
         return SceneNumbers(
             np.array(rows).reshape(-1, 20),
             base,
-            np.array([*data, 0.0]),
+            np.concatenate([*data, np.zeros(1)]),
             np.concatenate([np.zeros((0, 12)), *(body.rows for body in bodies)]),
             np.concatenate([np.zeros((0, 4)), *(body.balls for body in bodies)]),
             np.array([lamp.even, lamp.direct, *lamp.position_mm, *lamp.up]),
@@ -534,7 +539,7 @@ def _place(pose: Pose[Any, Any]) -> Floats:
     return np.concatenate([pose.rotation.ravel(), pose.translation_mm])
 
 
-def _row(surface: Any, data: list[float], bodies: list[Body]) -> Floats | None:
+def _row(surface: Any, data: list[FloatArray], bodies: list[Body]) -> Floats | None:
     """Row of a surface, whose numbers are put behind the others'; None if it is not known."""
     row = np.zeros(20)
     pose: Pose[Any, Any] = Pose(np.eye(3), np.zeros(3))
@@ -552,8 +557,8 @@ def _row(surface: Any, data: list[float], bodies: list[Body]) -> Floats | None:
     shape = _shape(surface)
     if shape is None:
         return None
-    row[_KIND], row[_START], row[1:13] = shape[0], len(data), _place(pose)
-    data += shape[1]
+    row[_KIND], row[_START], row[1:13] = shape[0], sum(map(len, data)), _place(pose)
+    data.append(np.asarray(shape[1], dtype=np.float64))
     if isinstance(surface, Body):
         row[_START] = sum(len(body.rows) for body in bodies)
         row[_STOP] = row[_START] + len(surface.rows)
@@ -563,9 +568,9 @@ def _row(surface: Any, data: list[float], bodies: list[Body]) -> Floats | None:
     return row
 
 
-def _shape(surface: Any) -> tuple[int, list[float]] | None:
+def _shape(surface: Any) -> tuple[int, list[float] | FloatArray] | None:
     """Kind of a shape, and what it is made of."""
-    found: tuple[int, list[float]] | None = None
+    found: tuple[int, list[float] | FloatArray] | None = None
     if isinstance(surface, FlatPlate):
         terms = _in_powers(surface.waves_mm)
         found = _PLATE, [*surface.size_mm, *surface.tilt, len(terms), *terms.ravel()]
@@ -579,6 +584,8 @@ def _shape(surface: Any) -> tuple[int, list[float]] | None:
         found = _FLOOR, [*surface.point_mm, *surface.normal]
     elif isinstance(surface, Body):
         found = _BODY, []
+    elif isinstance(surface, Mesh):
+        found = _MESH, surface.numbers
     elif (
         isinstance(surface, PrintedBoard)
         and isinstance(surface.pattern, CirclePattern)

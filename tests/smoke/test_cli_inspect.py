@@ -202,3 +202,26 @@ def test_a_plane_of_one_sheet_in_the_sensor_frame_says_nothing_and_is_told_so(
         assert main(["inspect", "plane", str(path), "--json"]) == 0
         said = json.loads(capsys.readouterr().out)["warnings"]
         assert any("light sheet" in warning for warning in said) == is_told
+
+
+def test_a_mesh_and_what_stands_in_its_way(
+    clouds: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Fails
+) -> None:
+    exposure = np.repeat(np.arange(100), 100)
+    outward = ball_stripes(100, 100)
+    cloud = cloud_of(outward * RADIUS_MM, exposure, normals=outward)
+    (tmp_path / "normals.ply").write_bytes(ply_bytes(cloud))
+    whole, mesh = tmp_path / "normals.ply", tmp_path / "ball.stl"
+    assert main(["mesh", str(whole), "-o", str(mesh), "--cell", "0.8", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    data = mesh.read_bytes()
+    assert int.from_bytes(data[80:84], "little") == found["n_triangles"] > 1000
+    # the cap of 140 by 140 degrees, a border of a cell more or less
+    rim_mm2 = 2.0 * np.pi * RADIUS_MM * 0.8
+    lune = np.deg2rad(140.0) * 2.0 * np.sin(np.deg2rad(70.0)) * RADIUS_MM**2
+    assert abs(found["area_mm2"] - lune) < rim_mm2
+    assert "no point has a normal" in fails("mesh", clouds / "ball.ply", "-o", tmp_path / "n.stl")
+    assert "ends in '.obj'" in fails("mesh", whole, "-o", tmp_path / "n.obj")
+    assert "--cell is -1.0 mm" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--cell", "-1")
+    assert "give 4 or more" in fails("mesh", whole, "-o", tmp_path / "n.stl", "--triangles", "2")
+    assert not (tmp_path / "n.stl").exists()

@@ -9,13 +9,22 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points, twin
+from armscan.cli import (
+    calibrate_cameras,
+    calibrate_sensor,
+    files,
+    inspect,
+    measure,
+    points,
+    surface,
+    twin,
+)
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
-    *("inspect", "verify"),
+    *("inspect", "verify", "mesh"),
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -78,6 +87,7 @@ app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstru
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
+app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)
 app.command("doctor", epilog=files.DOCTOR_EXAMPLE)(files.doctor)

@@ -537,7 +537,10 @@ OPENCV_NAMES = (
     "opencv-contrib-python-headless",
     "opencv-contrib-python",
 )
-OPTIONAL = {"mrcal": "a second opinion on camera calibrations"}
+OPTIONAL = {
+    "mrcal": "a second opinion on camera calibrations",
+    "scikit-image": "meshes",
+}
 
 
 def examine_installation(*, warm: bool = False) -> Summary:

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a cloud to a file of triangles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from armscan.errors import EstimationError, OptionError
+from armscan.jobs.job import Job
+from armscan.reconstruction.surface import (
+    ScannedSurface,
+    SurfaceOptions,
+    draw_surface,
+    thinned_surface,
+)
+from armscan.report.quantity import Quantity, Summary, sentences
+from armscan.storage.clouds import read_cloud
+from armscan.storage.files import path_text
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.parts.surfaces import SURFACE_SUFFIXES, encoded_surface
+
+LEAST_TRIANGLES = 4
+MANY_WITHOUT = 0.2
+"""Part of the points without a normal from which it is said."""
+
+
+def draw_mesh(
+    job: Job,
+    path: Path,
+    *,
+    options: SurfaceOptions | None = None,
+    n_triangles: int | None = None,
+) -> Summary:
+    """Draw triangles over a cloud and write them.
+
+    Parameters
+    ----------
+    job
+        Where to write: ``.stl`` or ``.ply``.
+    path
+        A cloud with normals.
+    options
+        Cell and reach.
+    n_triangles
+        Triangles that are kept, the flattest joined first; None for all.
+
+    Raises
+    ------
+    ArmscanError
+        If the cloud is unreadable or has no surface, or an option is wrong; nothing is written.
+    """
+    if n_triangles is not None and n_triangles < LEAST_TRIANGLES:
+        raise OptionError(f"--triangles is {n_triangles}", remedy="give 4 or more")
+    job.places(*SURFACE_SUFFIXES)
+    cloud = read_cloud(path)
+    try:
+        full = draw_surface(cloud, options)
+    except EstimationError as error:
+        raise EstimationError(error.what, where=path_text(path), remedy=error.remedy) from error
+    surface, quantities = full, _quantities(full)
+    if n_triangles is not None and n_triangles < len(full.triangles):
+        surface = thinned_surface(full, n_triangles)
+        kept = Quantity("n_triangles_kept", "Kept", len(surface.triangles), unit="triangles")
+        quantities = (*quantities, kept)
+    is_simulated = cloud.is_simulated or are_simulated((path,))
+    written: tuple[Path, ...] = ()
+    if job.output is not None:
+        title = f"armscan mesh of {path.name}, mm" + (", simulated data" if is_simulated else "")
+        content = encoded_surface(
+            job.output.suffix.lower(), surface.vertices_mm, surface.triangles, title
+        )
+        written = job.write({job.output: content})
+    return Summary(
+        title="Mesh" + (" (simulated data)." if is_simulated else "."),
+        quantities=quantities,
+        warnings=sentences(_warnings(full)),
+        written=written,
+        next_step=f"open {job.output} in any program for meshes" if written else "",
+        forced=cloud.forced,
+        extra={"kind": "mesh", "simulated": is_simulated, "frame": cloud.frame},
+    )
+
+
+def _quantities(surface: ScannedSurface) -> tuple[Quantity, ...]:
+    return (
+        Quantity("n_triangles", "Triangles", len(surface.triangles)),
+        Quantity("n_vertices", "Vertices", len(surface.vertices_mm)),
+        Quantity("area_mm2", "Area", surface.area_mm2, unit="mm²"),
+        Quantity(
+            "cell_mm", "Cell", surface.cell_mm, unit="mm", meaning="what is smaller is smoothed"
+        ),
+        Quantity(
+            "reach_mm",
+            "Reach",
+            surface.reach_mm,
+            unit="mm",
+            meaning="no corner lies farther from a measured point",
+        ),
+        Quantity(
+            "n_border_edges",
+            "Border",
+            surface.n_border_edges,
+            unit="edges",
+            meaning="rims of holes and of what was scanned",
+        ),
+        Quantity("n_points", "Points", surface.n_points, meaning="with a normal"),
+    )
+
+
+def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
+    part = surface.n_without_normal / (surface.n_points + surface.n_without_normal)
+    if part < MANY_WITHOUT:
+        return ()
+    return (
+        f"{part:.0%} of the points have no normal and are left out: they lie on single lines, or "
+        "on no plane",
+    )

@@ -85,7 +85,8 @@ def test_a_ply_file_of_another_program(tmp_path: Path) -> None:
         ("named.csv", "x,y,z\n1,5,2,5,3,5\n", "commas"),
         ("letter.xyz", "1.0 2.0 3.O\n4 5 6\n7 8 9\n", "first line"),
         ("letters.xyz", "1.O 2.O 3.O\n4 5 6\n7 8 9\n", "first line"),
-        ("cloud.stl", "1 2 3\n", "no point cloud that armscan knows"),
+        ("cloud.stl", "1 2 3\n", "not an STL file"),
+        ("cloud.wrl", "1 2 3\n", "no point cloud that armscan knows"),
     ],
 )
 def test_what_is_no_cloud_is_refused(tmp_path: Path, name: str, text: str, message: str) -> None:

@@ -11,7 +11,11 @@ import typer
 from armscan.cli.options import AsJson, Force, show
 
 INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
-CONVERT_EXAMPLE = "\b\nExample:\n  armscan convert camera.json camera_info.yaml"
+CONVERT_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan convert cloud.ply cloud.e57\n"
+    "  armscan convert camera.json camera_info.yaml"
+)
 DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
 
 
@@ -31,23 +35,33 @@ def info(
 
 
 def convert(
-    source: Annotated[Path, typer.Argument(help="Calibration, or cloud .ply.", show_default=False)],
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A cloud: .ply, .e57, .laz, .las, .pcd, .csv, .xyz, .asc, .txt; vertices of .stl, "
+            ".obj; or a calibration.",
+            show_default=False,
+        ),
+    ],
     output: Annotated[
         Path,
-        typer.Argument(help=".yaml (ROS camera_info) or .xyz.", show_default=False),
+        typer.Argument(
+            help="A cloud: the same but .stl; of a calibration .yaml (ROS camera_info).",
+            show_default=False,
+        ),
     ],
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a calibration's camera for ROS, or a cloud as plain XYZ."""
+    """Write a cloud in another format, or a calibration's camera for ROS."""
     from armscan.report.quantity import Summary
     from armscan.storage.clouds import convert_file
 
     done = convert_file(source, output, is_overwriting=force)
-    losses = f"the new file does not hold: {', '.join(done.losses)}"
+    losses = (f"the new file does not hold: {', '.join(done.losses)}",) if done.losses else ()
     summary = Summary(
         title=f"Converted: {done.what}.",
-        warnings=(losses,),
+        warnings=(*done.remarks, *losses),
         written=(output,),
         forced=done.forced,
         extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},

@@ -41,7 +41,7 @@ EXIT_NOT_PASSED = 1
 CloudArgument = Annotated[
     Path,
     typer.Argument(
-        help="A cloud of `armscan reconstruct`, or any .ply, .xyz, .csv with x y z in mm.",
+        help="A cloud of `armscan reconstruct`, or any that `armscan convert` reads, in mm.",
         show_default=False,
     ),
 ]

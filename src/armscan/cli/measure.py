@@ -101,7 +101,7 @@ def reconstruct(
     poses: ProfilePoses = None,
     euler: EulerAngles = None,
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
+        Path, typer.Option("-o", "--output", help="Cloud to write: .ply, or as `convert`.")
     ] = Path("cloud.ply"),
     method: MethodOption = None,
     stripe_method: StripeMethodOption = None,

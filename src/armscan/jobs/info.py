@@ -32,10 +32,11 @@ from armscan.models.calibration import (
 from armscan.models.camera import PARAMETER_NAMES
 from armscan.models.two_views import StereoCalibration
 from armscan.reconstruction.sync import exposure_poses, largest_gap_ns
+from armscan.records.cloud import PointCloud
 from armscan.records.recording import NO_TRIGGER, ArmTrack, CameraSetup
 from armscan.report.quantity import Summary, fact, with_sigma
 from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, PROBE_FILE, read_arm_model, read_probe_tip
-from armscan.storage.clouds import parse_ply, read_ply
+from armscan.storage.clouds import parse_ply, read_cloud, read_ply
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import (
     REGISTRATION_SCHEMA,
@@ -337,6 +338,8 @@ def _file(path: Path) -> dict[str, Any]:
         return _ply(path, data)
     if data.startswith(b"PK"):
         return _observations(path)
+    if path.suffix.lower() in BINARY_CLOUDS:
+        return _cloud(read_cloud(path))
     return _text(path, data)
 
 
@@ -379,13 +382,7 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
     fields = list(vertices.table.dtype.names or ())
     content: dict[str, Any] = {"what": f"point cloud, {len(vertices.table)} points"}
     if "cov_xx_mm2" in fields:
-        cloud = read_ply(path)
-        content["frame"] = cloud.frame
-        content["simulated"] = cloud.is_simulated
-        content |= {"forced": list(cloud.forced)} if cloud.forced else {}
-        content["sheets"] = list(cloud.sheet_names)
-        content["exposures"] = list(cloud.exposure_sources)
-        content["median_sigma_mm"] = float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0
+        content |= _carried(read_ply(path))
     if len(vertices.table) and {"x", "y", "z"} <= set(fields):
         for axis in "xyz":
             values = vertices.table[axis]
@@ -395,6 +392,31 @@ def _ply(path: Path, data: bytes) -> dict[str, Any]:
             ]
     content["properties"] = fields
     return content
+
+
+BINARY_CLOUDS = (".e57", ".laz", ".las", ".pcd")
+
+
+def _cloud(cloud: PointCloud) -> dict[str, Any]:
+    return {"what": f"point cloud, {len(cloud)} points", **_carried(cloud), **_extent(cloud)}
+
+
+def _carried(cloud: PointCloud) -> dict[str, Any]:
+    return {
+        "frame": cloud.frame,
+        "simulated": cloud.is_simulated,
+        **({"forced": list(cloud.forced)} if cloud.forced else {}),
+        "sheets": list(cloud.sheet_names),
+        "exposures": list(cloud.exposure_sources),
+        "median_sigma_mm": float(np.median(cloud.sigma_mm)) if len(cloud) else 0.0,
+    }
+
+
+def _extent(cloud: PointCloud) -> dict[str, Any]:
+    if not len(cloud):
+        return {}
+    low, high = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
+    return {f"{axis}_range": [round(low[k], 4), round(high[k], 4)] for k, axis in enumerate("xyz")}
 
 
 def _observations(path: Path) -> dict[str, Any]:
@@ -540,6 +562,8 @@ OPENCV_NAMES = (
 OPTIONAL = {
     "mrcal": "a second opinion on camera calibrations",
     "scikit-image": "meshes",
+    "pye57": "E57 clouds",
+    "laspy": "LAS and LAZ clouds",
 }
 
 

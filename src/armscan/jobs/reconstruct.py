@@ -39,7 +39,7 @@ from armscan.report.page import Page
 from armscan.report.photographs import evenly_chosen
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.clouds import XYZ_LOSES, ply_bytes, xyz_bytes
+from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_bytes, cloud_losses
 from armscan.storage.documents import (
     is_scanner_document,
     read_scanner_calibration,
@@ -143,7 +143,8 @@ def reconstruct(
     Parameters
     ----------
     job
-        Where to write the cloud ``NAME.ply`` or ``NAME.xyz``; ``NAME.html`` is written beside it.
+        Where to write the cloud, ``NAME.ply`` or another of `CLOUD_SUFFIXES`; ``NAME.html`` is
+        written beside it.
     calibration
         The sensor's calibration ``sensor.json``, or a ``scanner.json``.
     paths
@@ -197,7 +198,7 @@ def _stills(
     options: MeasureOptions,
     image_options: ImageOptions,
 ) -> Summary:
-    places = job.places(".ply", ".xyz", beside=(".html",))
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     sensor = _sensor(calibration)
     read = read_stills(paths, image_options, len(cameras_of(sensor)))
     result = reconstruct_images(
@@ -267,17 +268,16 @@ def _write(
     job: Job, places: Sequence[Path], cloud: PointCloud, page: Page
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files written, and what they do not hold."""
-    is_ply = places[0].suffix.lower() == ".ply"
-    content = ply_bytes(cloud) if is_ply else xyz_bytes(cloud)
-    written = job.write({places[0]: content, places[1]: page})
-    losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
-    return written, losses
+    written = job.write({places[0]: cloud_bytes(cloud, places[0]), places[1]: page})
+    losses = cloud_losses(cloud, places[0])
+    kind = places[0].suffix.lstrip(".").upper()
+    return written, (f"the {kind} file does not hold {', '.join(losses)}",) if losses else ()
 
 
 def _scan(
     job: Job, calibration: Path, folder: Path, arm: Path | None, options: ScanOptions
 ) -> Summary:
-    places = job.places(".ply", ".xyz", beside=(".html",))
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
     scan = measure_scan(recording, scanner, options, progress=job.progress, cache=job.cache)
@@ -306,7 +306,7 @@ def _delivered(
     job: Job, calibration: Path, names: Sequence[str], table: PoseTable, volume: Box | None
 ) -> Summary:
     """Place profiles that a sensor delivered."""
-    places = job.places(".ply", ".xyz", beside=(".html",))
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     profiles = read_profiles(names)
     scan = place_profiles(profiles, read_robot_poses(table.path, table.euler), scanner, volume)

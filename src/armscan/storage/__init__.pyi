@@ -4,6 +4,7 @@ from .arm import read_arm_model as read_arm_model
 from .arm import read_probe_tip as read_probe_tip
 from .clouds import ply_bytes as ply_bytes
 from .clouds import read_cloud as read_cloud
+from .clouds import write_cloud as write_cloud
 from .clouds import xyz_bytes as xyz_bytes
 from .documents import camera_document as camera_document
 from .documents import new_provenance as new_provenance

@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where in a cloud a feature is: candidates through a few points, judged by how many lie on them.
+
+Points are thinned evenly and given the normals of their neighbourhoods; a candidate goes through
+one, two or three of them with their normals (Schnabel, Wahl, Klein, Comput. Graph. Forum 26
+(2007) 214).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.errors import OptionError
+from armscan.geometry.arrays import BoolArray, Box, FloatArray, IntArray
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.features import (
+    SHAPE_KINDS,
+    Shape,
+    ShapeKind,
+    across,
+    fit_shape,
+    starts_of,
+)
+from armscan.inspection.selection import MIN_POINTS, SEARCH_BAND_MM, Selection
+
+N_SAMPLE = 6000
+"""Points that candidates are made of and judged by."""
+N_NEIGHBOURS = 14
+"""Points whose plane gives a normal."""
+N_TRIALS = {
+    "plane": 300,
+    "line": 600,
+    "circle": 1500,
+    "sphere": 600,
+    "cylinder": 1200,
+    "cone": 1500,
+}
+NOISE_BAND, LEAST_BAND_MM = 4.0, 0.02
+"""A candidate's band, in thicknesses of neighbourhoods: a wide one would be filled by flat faces
+that a large cylinder touches.
+"""
+SAME_SIDE = math.cos(math.radians(30.0))
+"""Normals of a point and of the surface that differ by more than 30 degrees are of two faces."""
+SAME_AXIS = math.cos(math.radians(20.0))
+"""How far a candidate's axis may be off the one that was given: it is a rough direction."""
+RADIUS_SLACK = 0.2
+"""How far a diameter may be from the nominal one, as a part of it, where no range is given."""
+SEED_POINTS = 120
+"""Sample points about a seed from which candidates are made."""
+ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class WantedFeature:
+    """What is looked for, and what is known of it.
+
+    Parameters
+    ----------
+    kind
+        Plane, line, circle, sphere, cylinder or cone.
+    diameter_mm
+        Nominal diameter of a circle, sphere or cylinder; None if there is none.
+    diameter_range_mm
+        Least and largest diameter that it may have; None for 20 % about the nominal one.
+    half_angle_deg
+        Nominal half angle of a cone; None if there is none.
+    axis
+        Rough direction of the axis, line or normal; None for any.
+    seed_mm
+        A point on it; None to look everywhere. With it only what hangs together with it counts.
+    region
+        Only points inside are looked at; None for all.
+    """
+
+    kind: ShapeKind
+    diameter_mm: float | None = None
+    diameter_range_mm: tuple[float, float] | None = None
+    half_angle_deg: float | None = None
+    axis: tuple[float, ...] | None = None
+    seed_mm: tuple[float, ...] | None = None
+    region: Box | None = field(default=None)
+
+    def __post_init__(self) -> None:
+        is_round = self.kind in ("circle", "sphere", "cylinder")
+        low, high = self.diameter_range_mm or (1.0, 2.0)
+        faults = (
+            (self.kind not in SHAPE_KINDS, f"there is no feature '{self.kind}'",
+             f"give one of {', '.join(SHAPE_KINDS)}"),
+            (not is_round and (self.diameter_mm or self.diameter_range_mm) is not None,
+             f"a {self.kind} has no diameter", "leave it out"),
+            (self.kind != "cone" and self.half_angle_deg is not None,
+             f"a {self.kind} has no half angle", "leave it out"),
+            (self.diameter_mm is not None and not 0.0 < self.diameter_mm < 1e4,
+             f"a diameter of {self.diameter_mm} mm", "give it in mm, above 0"),
+            (not 0.0 < low < high < 1e4, f"diameters from {low:g} to {high:g} mm",
+             "give the least and the largest diameter"),
+            (self.half_angle_deg is not None and not 0.0 < self.half_angle_deg < 85.0,
+             f"a half angle of {self.half_angle_deg} degrees", "give 0 to 85"),
+            (self.axis is not None and not (_are_three(self.axis) and any(self.axis)),
+             "the axis is no direction", "give three numbers x,y,z, not all 0"),
+            (self.seed_mm is not None and not _are_three(self.seed_mm),
+             "the seed is no point", "give three numbers x,y,z in mm"),
+        )  # fmt: skip
+        for is_wrong, what, remedy in faults:
+            if is_wrong:
+                raise OptionError(what, remedy=remedy)
+
+    @property
+    def radii_mm(self) -> tuple[float, float]:
+        """Least and largest radius that is looked for."""
+        if self.diameter_range_mm is not None:
+            return self.diameter_range_mm[0] / 2.0, self.diameter_range_mm[1] / 2.0
+        if self.diameter_mm is None:
+            return 0.0, math.inf
+        half = self.diameter_mm / 2.0
+        return half * (1.0 - RADIUS_SLACK), half * (1.0 + RADIUS_SLACK)
+
+    def may_be(self, shape: Shape) -> bool:
+        """Whether a shape fits what is known."""
+        if self.axis is not None:
+            direction = np.asarray(self.axis) / np.linalg.norm(self.axis)
+            if abs(float(shape.direction @ direction)) < SAME_AXIS:
+                return False
+        if self.kind == "cone":
+            wanted = self.half_angle_deg
+            found = math.degrees(shape.half_angle_rad)
+            return wanted is None or abs(found - wanted) <= max(3.0, RADIUS_SLACK * wanted)
+        low, high = self.radii_mm
+        return self.kind in ("plane", "line") or low <= shape.radius_mm <= high
+
+    def __str__(self) -> str:
+        size = "" if self.diameter_mm is None else f" of {self.diameter_mm:g} mm"
+        return f"{self.kind}{size}"
+
+
+def _are_three(values: tuple[float, ...]) -> bool:
+    return len(values) == 3 and all(math.isfinite(value) for value in values)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """Points drawn evenly in space, with the normals of their neighbourhoods.
+
+    Parameters
+    ----------
+    points_mm, normals
+        (M, 3) each; a normal's sign is any.
+    band_mm
+        (M,) how far off the shape each may lie by its own sigma.
+    noise_mm
+        How far off a candidate of a surface they may lie: what neighbourhoods are thick.
+    spacing_mm
+        Typical distance of neighbours.
+    """
+
+    points_mm: FloatArray
+    normals: FloatArray
+    band_mm: FloatArray
+    noise_mm: float
+    spacing_mm: float
+
+    def normals_at(self, points_mm: FloatArray) -> FloatArray:
+        """(N, 3) normals of the sample points nearest to points (N, 3)."""
+        return np.asarray(self.normals[cKDTree(self.points_mm).query(points_mm)[1]])
+
+
+def sample_of(selection: Selection) -> Sample:
+    """Thin the points that are looked at, and estimate normals."""
+    points = selection.points_mm
+    rng = np.random.default_rng(0)
+    chosen = rng.permutation(len(points))[:N_SAMPLE]
+    drawn = points[chosen]
+    _, near = cKDTree(drawn).query(drawn, min(N_NEIGHBOURS, len(drawn)))
+    about = drawn[near] - drawn[near].mean(axis=1, keepdims=True)
+    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
+    thickness = np.sqrt(np.maximum(values[:, 0], 0.0) / max(about.shape[1] - 3, 1))
+    wide = selection.search_band_mm[chosen]
+    narrow = NOISE_BAND * float(np.median(thickness))
+    spacing = float(np.median(np.linalg.norm(about, axis=2).max(axis=1)))
+    return Sample(
+        drawn, axes[:, :, 0], wide, min(max(narrow, LEAST_BAND_MM), SEARCH_BAND_MM), spacing
+    )
+
+
+def find_shape(selection: Selection, wanted: WantedFeature, sample: Sample) -> Shape | FitFailure:
+    """The shape of a kind that most points lie on, as far as it fits what is known of it."""
+    pool = _pool(sample, wanted)
+    best, most = None, 0
+    for shape in _candidates(sample, wanted, pool):
+        if not wanted.may_be(shape):
+            continue
+        n = int(_support(sample, shape).sum())
+        if n > most:
+            best, most = shape, n
+    if best is None:
+        return FitFailure(
+            f"there is no {wanted}: no candidate fits what is known of it",
+            "check the nominal values, or show where it is with --region or --seed",
+        )
+    shape = best
+    for _ in range(ROUNDS):
+        is_near = _support(sample, shape)
+        if int(is_near.sum()) < max(MIN_POINTS // 3, 6):
+            break
+        fit = fit_shape(wanted.kind, sample.points_mm[is_near], shape)
+        if isinstance(fit, FitFailure) or not wanted.may_be(fit.value):
+            break
+        shape = fit.value
+    return shape
+
+
+def _pool(sample: Sample, wanted: WantedFeature) -> IntArray:
+    """Sample points that candidates go through."""
+    if wanted.seed_mm is None:
+        return np.arange(len(sample.points_mm))
+    far = np.linalg.norm(sample.points_mm - np.asarray(wanted.seed_mm), axis=1)
+    return np.argsort(far)[:SEED_POINTS]
+
+
+def _support(sample: Sample, shape: Shape) -> BoolArray:
+    """(M,) sample points on a shape that look the way its surface does there."""
+    off = np.abs(shape.distance_mm(sample.points_mm))
+    if shape.kind in ("line", "circle"):
+        return np.asarray(off <= sample.band_mm)
+    is_near = off <= sample.noise_mm
+    facing = np.einsum("ni,ni->n", shape.outward(sample.points_mm), sample.normals)
+    return np.asarray(is_near & (np.abs(facing) >= SAME_SIDE))
+
+
+def _candidates(sample: Sample, wanted: WantedFeature, pool: IntArray) -> Iterator[Shape]:
+    rng = np.random.default_rng(0)
+    p, n = sample.points_mm, sample.normals
+    yield from _by_all(p[pool], wanted)
+    for _ in range(N_TRIALS[wanted.kind]):
+        i, j, k = (int(v) for v in pool[rng.integers(0, len(pool), 3)])
+        shape = _through(wanted.kind, p[[i, j, k]], n[[i, j, k]])
+        if shape is not None:
+            yield shape
+
+
+def _by_all(points: FloatArray, wanted: WantedFeature) -> Iterator[Shape]:
+    """Where nothing else is in the region or about the seed: all points at once."""
+    middle = points.mean(axis=0)
+    for shape in starts_of(wanted.kind, points - middle):
+        yield Shape(
+            kind=shape.kind,
+            point_mm=shape.point_mm + middle,
+            axes=shape.axes,
+            radius_mm=shape.radius_mm,
+            half_angle_rad=shape.half_angle_rad,
+        )
+
+
+def _through(kind: ShapeKind, p: FloatArray, n: FloatArray) -> Shape | None:
+    """The shape through up to three points (3, 3) with normals (3, 3); None if there is none."""
+    if kind in ("plane", "line"):
+        along = n[0] if kind == "plane" else p[1] - p[0]
+        return Shape(kind=kind, point_mm=p[0], axes=across(along)) if along.any() else None
+    if kind in ("circle", "cone"):
+        return _circle_through(p) if kind == "circle" else _cone_through(p, n)
+    axis = np.cross(n[0], n[1])
+    if float(np.linalg.norm(axis)) < 0.1:
+        return None
+    axes = across(axis)
+    # where both normals meet: across the axis for a cylinder, nearest to each other for a ball
+    middle, radius = _meeting(p[:2] - p[0], n[:2])
+    if radius is None:
+        return None
+    return Shape(kind=kind, point_mm=p[0] + middle, axes=axes, radius_mm=radius)
+
+
+def _meeting(p: FloatArray, n: FloatArray) -> tuple[FloatArray, float | None]:
+    """Where two lines (2, 3) along normals (2, 3) come nearest, and how far that is from both."""
+    cosine = float(n[0] @ n[1])
+    between = p[1] - p[0]
+    determinant = 1.0 - cosine**2
+    if determinant < 1e-6:
+        return np.zeros(3), None
+    s = (float(between @ n[0]) - cosine * float(between @ n[1])) / determinant
+    t = (cosine * float(between @ n[0]) - float(between @ n[1])) / determinant
+    if s * t * cosine < 0.0 and abs(cosine) > 0.5:
+        return np.zeros(3), None
+    middle = 0.5 * (p[0] + s * n[0] + p[1] + t * n[1])
+    radius = 0.5 * (abs(s) + abs(t))
+    if abs(abs(s) - abs(t)) > 0.2 * radius:
+        return np.zeros(3), None
+    return middle, radius
+
+
+def _circle_through(p: FloatArray) -> Shape | None:
+    a, b = p[1] - p[0], p[2] - p[0]
+    normal = np.cross(a, b)
+    square = float(normal @ normal)
+    if square < 1e-4 * float(a @ a) * float(b @ b) or square == 0.0:
+        return None
+    middle = np.cross(float(a @ a) * b - float(b @ b) * a, normal) / (2.0 * square)
+    radius = float(np.linalg.norm(middle))
+    return Shape(kind="circle", point_mm=p[0] + middle, axes=across(normal), radius_mm=radius)
+
+
+def _cone_through(p: FloatArray, n: FloatArray) -> Shape | None:
+    """Its tip is where the three tangent planes meet."""
+    if abs(float(np.linalg.det(n))) < 1e-3:
+        return None
+    tip = p[0] + np.linalg.solve(n, np.einsum("ij,ij->i", n, p - p[0]))
+    rays = p - tip
+    length = np.linalg.norm(rays, axis=1)
+    if not length.min() > 0.0:
+        return None
+    rays /= length[:, None]
+    normal = np.cross(rays[1] - rays[0], rays[2] - rays[0])
+    size = float(np.linalg.norm(normal))
+    if size < 1e-4:
+        return None
+    axis = normal / size
+    cosine = float(rays[0] @ axis)
+    axis, cosine = (axis, cosine) if cosine > 0.0 else (-axis, -cosine)
+    angle = math.acos(min(1.0, cosine))
+    if not 0.01 < angle < 1.45:
+        return None
+    along = float(((p - tip) @ axis).mean())
+    return Shape(
+        kind="cone",
+        point_mm=tip + along * axis,
+        axes=across(axis),
+        radius_mm=along * math.tan(angle),
+        half_angle_rad=angle,
+    )
+
+
+def connected(points_mm: FloatArray, seed_mm: FloatArray, step_mm: float) -> BoolArray:
+    """(N,) points (N, 3) that hang together with the one nearest to a seed, gaps up to a step."""
+    cells, cell = np.unique(
+        np.floor(points_mm / step_mm).astype(np.int64), axis=0, return_inverse=True
+    )
+    cell = cell.ravel()
+    first = int(cell[int(np.argmin(np.linalg.norm(points_mm - seed_mm, axis=1)))])
+    tree = cKDTree(cells.astype(np.float64))
+    reached = np.zeros(len(cells), dtype=np.bool_)
+    reached[first] = True
+    edge = np.array([first])
+    while len(edge):
+        near = np.concatenate(tree.query_ball_point(cells[edge].astype(np.float64), 1.8))
+        edge = np.unique(near[~reached[near.astype(np.int64)]].astype(np.int64))
+        reached[edge] = True
+    return np.asarray(reached[cell])

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A cloud as named columns and notes, which is how every file of points holds it.
+
+A format that keeps all columns and notes loses nothing; others keep those that they know.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.storage.files import path_text, told_of
+from armscan.storage.tables import refuse_beyond_reach
+
+Column = NDArray[Any]
+
+POINT = ("x", "y", "z")
+NORMAL = ("nx", "ny", "nz")
+COVARIANCE = {
+    "cov_xx_mm2": (0, 0),
+    "cov_xy_mm2": (0, 1),
+    "cov_xz_mm2": (0, 2),
+    "cov_yy_mm2": (1, 1),
+    "cov_yz_mm2": (1, 2),
+    "cov_zz_mm2": (2, 2),
+}
+INDICES = ("sheet", "exposure", "segment")
+NOISE_LENGTH = "noise_length_points"
+SIMULATED = "simulated"
+"""Note of a cloud that was measured on rendered images."""
+FORCED = "forced"
+"""Note with a reason for which the cloud's calibration was refused, and used all the same."""
+FOREIGN_FRAME: CloudFrame = "Part"
+"""Frame of points about which a file says nothing."""
+
+DAMAGED = "copy the file again; it may be cut or damaged"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudColumns:
+    """What a file of points holds.
+
+    Parameters
+    ----------
+    columns
+        (N,) values of each column by its name, in the order of the file.
+    notes
+        Lines beside them: ``frame Sensor``, ``sheet 0 "A"``, ``exposure 0 "laser.png"``.
+    sources
+        Names of the exposures of a file that is not armscan's; empty for the file's own.
+    remarks
+        What a person should know of the reading, in words.
+    """
+
+    columns: Mapping[str, Column]
+    notes: tuple[str, ...] = ()
+    sources: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether armscan wrote it, with all that a cloud carries."""
+        return set(COVARIANCE) <= set(self.columns)
+
+
+def cloud_columns(cloud: PointCloud) -> CloudColumns:
+    """All that a cloud carries.
+
+    ``sigma_mm`` is there for other programs; it follows from the covariance.
+    """
+    columns: dict[str, Column] = {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
+    if cloud.normals is not None:
+        columns |= {name: cloud.normals[:, k] for k, name in enumerate(NORMAL)}
+    columns["sigma_mm"] = cloud.sigma_mm
+    columns["sigma_noise_mm"] = cloud.sigma_noise_mm
+    if cloud.noise_length is not None:
+        columns[NOISE_LENGTH] = cloud.noise_length
+    columns |= {name: cloud.covariance_mm2[:, i, j] for name, (i, j) in COVARIANCE.items()}
+    columns["intensity"] = cloud.intensity
+    columns |= {name: getattr(cloud, name) for name in INDICES}
+    notes = ["written by armscan", "unit mm", f"frame {cloud.frame}"]
+    if cloud.is_simulated:
+        notes.append(SIMULATED)
+    for word, names in (
+        ("sheet", cloud.sheet_names),
+        ("exposure", cloud.exposure_sources),
+        (FORCED, cloud.forced),
+    ):
+        notes += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
+    return CloudColumns(columns, tuple(notes))
+
+
+def structured(found: CloudColumns, names: Sequence[str] = ()) -> NDArray[Any]:
+    """(N,) structured array of columns, float64 and int32; all of them if none is named."""
+    chosen = names or tuple(found.columns)
+    kinds = [(name, "<i4" if name in INDICES else "<f8") for name in chosen]
+    table = np.zeros(len(found.columns["x"]), dtype=kinds)
+    for name in chosen:
+        table[name] = found.columns[name]
+    return table
+
+
+def columns_of(table: NDArray[Any]) -> dict[str, Column]:
+    """Columns of a structured array."""
+    return {name: table[name] for name in table.dtype.names or ()}
+
+
+def cloud_of_columns(found: CloudColumns, path: Path) -> PointCloud:
+    """The cloud of columns that armscan wrote, or of another program's x, y, z.
+
+    Points of other programs come with covariances of zero, which stands for "not known". Their
+    normals and intensities are kept.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no x, y or z, or what is there makes no cloud.
+    """
+    where = path_text(path)
+    if found.is_own:
+        return own_cloud(found, where)
+    if missing := sorted(set(POINT) - set(found.columns)):
+        kind = path.suffix.lstrip(".").upper()
+        raise FileFormatError(
+            f"the {kind} file's points have no {missing[0]}",
+            where=where,
+            remedy="give a cloud with x, y and z in mm",
+        )
+    points = _joined(found.columns, POINT)
+    refuse_beyond_reach(points, where)
+    n = len(points)
+    zeros = np.zeros(n, dtype=np.int64)
+    exposure = found.columns.get("exposure") if found.sources else None
+    has_intensity = "intensity" in found.columns
+    with told_of(where):
+        return PointCloud(
+            frame=_frame(found.notes) or FOREIGN_FRAME,
+            points_mm=points,
+            covariance_mm2=np.zeros((n, 3, 3)),
+            sigma_noise_mm=np.zeros(n),
+            sheet=zeros,
+            sheet_names=("",),
+            exposure=zeros if exposure is None else exposure,
+            exposure_sources=found.sources or (path.name,),
+            segment=zeros,
+            intensity=_finite(found.columns["intensity"]) if has_intensity else np.zeros(n),
+            normals=_unit(found.columns),
+            is_simulated=SIMULATED in found.notes,
+            forced=_names(found.notes, FORCED),
+        )
+
+
+def own_cloud(found: CloudColumns, where: str) -> PointCloud:
+    """The cloud of columns that armscan wrote.
+
+    Raises
+    ------
+    FileFormatError
+        If they lack what armscan writes, or make no cloud.
+    """
+    columns = found.columns
+    needed = {*POINT, *COVARIANCE, *INDICES, "sigma_noise_mm", "intensity"}
+    if missing := sorted(needed - set(columns)):
+        raise FileFormatError(
+            f"the file has no {missing[0]}, so it was not written by armscan",
+            where=where,
+            remedy="use the cloud that `armscan reconstruct` wrote",
+        )
+    covariance = np.zeros((len(columns["x"]), 3, 3))
+    for name, (i, j) in COVARIANCE.items():
+        covariance[:, i, j] = covariance[:, j, i] = columns[name]
+    covariance.setflags(write=False)
+    points = _joined(columns, POINT)
+    refuse_beyond_reach(points, where)
+    with told_of(where):
+        frame = _frame(found.notes)
+        if frame is None:
+            raise InputError("the header does not name the frame of the points")
+        return PointCloud(
+            frame=frame,
+            points_mm=points,
+            covariance_mm2=covariance,
+            sigma_noise_mm=columns["sigma_noise_mm"],
+            sheet=columns["sheet"],
+            sheet_names=_names(found.notes, "sheet"),
+            exposure=columns["exposure"],
+            exposure_sources=_names(found.notes, "exposure"),
+            segment=columns["segment"],
+            intensity=columns["intensity"],
+            normals=_joined(columns, NORMAL) if set(NORMAL) <= set(columns) else None,
+            noise_length=columns.get(NOISE_LENGTH),
+            is_simulated=SIMULATED in found.notes,
+            forced=_names(found.notes, FORCED),
+        )
+
+
+def missing_package(extra: str, kind: str, error: ImportError) -> NoReturn:
+    """Raise for a format whose package is not installed.
+
+    Raises
+    ------
+    OptionError
+        Always.
+    """
+    raise OptionError(
+        f"{kind} files need packages that are not installed ({error.name})",
+        remedy=f"pip install 'armscan[{extra}]'",
+    ) from error
+
+
+def _joined(columns: Mapping[str, Column], names: Sequence[str]) -> FloatArray:
+    """(N, 3) of three columns, read-only so that a record takes it as it is."""
+    joined = np.zeros((len(columns[names[0]]), len(names)))
+    for k, name in enumerate(names):
+        joined[:, k] = columns[name]
+    joined.setflags(write=False)
+    return joined
+
+
+def _finite(values: Column) -> FloatArray:
+    """Values of another program, zero where it had none."""
+    return np.nan_to_num(np.asarray(values, dtype=np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _unit(columns: Mapping[str, Column]) -> FloatArray | None:
+    """(N, 3) normals of another program at unit length, zero where it had none."""
+    if not set(NORMAL) <= set(columns):
+        return None
+    normals = _finite(_joined(columns, NORMAL))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.asarray(normals / np.where(length > 0.0, length, 1.0))
+
+
+def _frame(notes: Sequence[str]) -> CloudFrame | None:
+    found = [text[6:] for text in notes if text.startswith("frame ")]
+    if len(found) != 1 or found[0] not in get_args(CloudFrame):
+        return None
+    return cast(CloudFrame, found[0])
+
+
+def _names(notes: Sequence[str], word: str) -> tuple[str, ...]:
+    names = []
+    for text in notes:
+        if text.startswith(f"{word} "):
+            try:
+                names.append(str(json.loads(text.split(" ", 2)[2])))
+            except (IndexError, ValueError, RecursionError) as error:
+                raise InputError(f"the header's comment {text!r} is damaged") from error
+    return tuple(names)

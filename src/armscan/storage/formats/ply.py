@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PLY: armscan's own clouds, which lose nothing, and the vertices of other programs' files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from armscan.errors import FileFormatError
+from armscan.records.cloud import PointCloud
+from armscan.storage.files import path_text, read_bytes
+from armscan.storage.formats.columns import (
+    DAMAGED,
+    CloudColumns,
+    cloud_columns,
+    columns_of,
+    own_cloud,
+    structured,
+)
+
+TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+WRITTEN_TYPES = {"f8": "double", "i4": "int"}
+BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+END_HEADER = re.compile(rb"end_header\r?\n")
+MOST_HEADER_BYTES = 16 * 2**20
+"""A comment for each of a hundred thousand exposures."""
+MOST_PROPERTIES, MOST_DIGITS = 1000, 15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlyVertices:
+    """Vertices of a PLY file.
+
+    Parameters
+    ----------
+    table
+        (N,) structured array, one field a property.
+    comments
+        Comment lines of the header, without the word ``comment``.
+    n_faces
+        Faces that follow, which are not read.
+    """
+
+    table: NDArray[Any]
+    comments: tuple[str, ...]
+    n_faces: int = 0
+
+
+def ply_header(kind: np.dtype[Any], count: int, comments: Iterable[str]) -> bytes:
+    """Header of a binary little-endian file with ``count`` vertices of a structured type."""
+    properties = [
+        f"property {WRITTEN_TYPES[kind[name].str[1:]]} {name}" for name in kind.names or ()
+    ]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {text}" for text in comments),
+        f"element vertex {count}",
+        *properties,
+        "end_header",
+    ]
+    return ("\n".join(lines) + "\n").encode("ascii")
+
+
+def parse_ply(data: bytes, where: str) -> PlyVertices:
+    """Read the vertices of any PLY file whose first element they are.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no PLY file, its vertices are lists or not first, or it is cut short.
+    """
+    end = data.find(b"\nend_header", 0, MOST_HEADER_BYTES)
+    start = data.find(b"\n", end + 1) + 1
+    if END_HEADER.fullmatch(data[end + 1 : start]) is None or data[:3] != b"ply":
+        raise FileFormatError(
+            "this is not a PLY file with a complete header", where=where, remedy=DAMAGED
+        )
+    try:
+        text = data[:end].decode("latin-1")
+        order, count, kind, comments = _header(text)
+    except (ValueError, KeyError, IndexError) as error:
+        raise FileFormatError(
+            "the PLY header is not understood", where=where, remedy=DAMAGED
+        ) from error
+    if order == "ascii":
+        table = _ascii_table(data[start:], kind, count, where)
+    else:
+        table = np.frombuffer(data, kind, min(count, (len(data) - start) // kind.itemsize), start)
+    if len(table) < count:
+        raise FileFormatError(
+            f"the PLY file holds {len(table)} of {count} points",
+            where=where,
+            remedy="copy the file again",
+        )
+    faces = re.search(r"^element face (\d{1,15})\b", text, re.MULTILINE)
+    return PlyVertices(table, comments, int(faces[1]) if faces is not None else 0)
+
+
+def _header(text: str) -> tuple[str, int, np.dtype[Any], tuple[str, ...]]:
+    """Format, count and type of the vertices, and comments; `ValueError` for what is no header."""
+    order, count, element = "", -1, ""
+    fields: list[tuple[str, str]] = []
+    comments: list[str] = []
+    for line in text.split("\n"):
+        words = line.split()
+        if line.startswith("comment "):
+            comments.append(line[8:].rstrip("\r"))
+        elif words[:1] == ["format"]:
+            order = words[1]
+        elif words[:1] == ["element"]:
+            element = words[1]
+            if element == "vertex":
+                count = int(words[2][:MOST_DIGITS])
+            elif count < 0:
+                raise ValueError("vertices are not the first element")
+        elif words[:1] == ["property"] and element == "vertex":
+            fields.append((words[2], BYTE_ORDERS[order] + TYPES[words[1]]))
+    if count < 0 or not 0 < len(fields) <= MOST_PROPERTIES:
+        raise ValueError("the header names no vertices")
+    # a name that occurs twice is a ValueError of numpy
+    return order, count, np.dtype(fields), tuple(comments)
+
+
+def _ascii_table(body: bytes, kind: np.dtype[Any], count: int, where: str) -> NDArray[Any]:
+    most = min(count, len(body))
+    rows = [line.split() for line in body.split(b"\n", most)[:most] if line.strip()]
+    try:
+        return np.array([tuple(float(word) for word in row) for row in rows], dtype=kind)
+    except (ValueError, OverflowError) as error:
+        raise FileFormatError(
+            "the points of the PLY file are not understood", where=where, remedy=DAMAGED
+        ) from error
+
+
+def ply_bytes(cloud: PointCloud) -> bytes:
+    """Content of a binary little-endian PLY file that holds all of a cloud, in float64 and int32.
+
+    Names stand in the header: ``comment frame Sensor``, ``comment sheet 0 "A"``,
+    ``comment exposure 0 "laser.png"``; of points measured on rendered images also
+    ``comment simulated``, of those of a calibration that was refused and forced
+    ``comment forced 0 "why"``.
+    """
+    found = cloud_columns(cloud)
+    table = structured(found)
+    return b"".join((ply_header(table.dtype, len(table), found.notes), table.data))
+
+
+def ply_columns(data: bytes, path: Path) -> CloudColumns:
+    """What the vertices of any PLY file carry."""
+    vertices = parse_ply(data, path_text(path))
+    remarks = (vertices_remark(vertices.n_faces),) if vertices.n_faces else ()
+    return CloudColumns(columns_of(vertices.table), vertices.comments, remarks=remarks)
+
+
+def vertices_remark(n_triangles: int) -> str:
+    """What it means that a cloud was made from a mesh, in words."""
+    return (
+        f"the file is a mesh of {n_triangles:,} faces: its vertices are taken for points, as "
+        "dense or sparse as they are; nothing is sampled between them"
+    )
+
+
+def read_ply(path: Path) -> PointCloud:
+    """Read a cloud that armscan wrote.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is cut short, is no PLY, or lacks what armscan writes.
+    """
+    return own_cloud(ply_columns(read_bytes(path), path), path_text(path))

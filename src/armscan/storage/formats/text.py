@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points as text: XYZ and ASC with positions alone, CSV with all columns, and tables of other
+programs.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import FileFormatError
+from armscan.geometry.arrays import FloatArray
+from armscan.records.cloud import PointCloud
+from armscan.storage.files import path_text
+from armscan.storage.formats.columns import (
+    COVARIANCE,
+    FORCED,
+    INDICES,
+    NOISE_LENGTH,
+    NORMAL,
+    POINT,
+    SIMULATED,
+    CloudColumns,
+    cloud_columns,
+    structured,
+)
+
+XYZ_LOSES = (
+    "normals",
+    "sigma_mm and covariance",
+    "sheet, exposure and segment",
+    "intensity",
+    "digits beyond 0.1 nm",
+)
+"""What an XYZ file does not hold."""
+CSV_LOSES = ("digits beyond 0.1 nm of a position, and beyond nine of anything else",)
+
+KNOWN = {
+    **{name: name for name in (*POINT, *NORMAL, *COVARIANCE, *INDICES, NOISE_LENGTH)},
+    **{name: name for name in ("sigma_noise_mm", "intensity")},
+    **{f"{name}_mm": name for name in POINT},
+}
+"""Columns that are read, by their names in a heading."""
+LOOKED_AT = 1000
+"""Lines in which decimal commas are sought: a table that has them has them everywhere."""
+OWN_HEADER = "x_mm y_mm z_mm in frame "
+
+
+def xyz_bytes(cloud: PointCloud) -> bytes:
+    """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
+    buffer = io.StringIO()
+    frame = f"{cloud.frame}; {SIMULATED}" if cloud.is_simulated else cloud.frame
+    header = f"{OWN_HEADER}{frame}; not in this file: {'; '.join(XYZ_LOSES)}"
+    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in cloud.forced)))
+    np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header)
+    return buffer.getvalue().encode()
+
+
+def csv_bytes(cloud: PointCloud) -> bytes:
+    """Content of a table with a heading, notes in ``#`` lines below it, and all columns."""
+    found = cloud_columns(cloud)
+    heading = ",".join(f"{name}_mm" if name in POINT else name for name in found.columns)
+    formats = {**dict.fromkeys(POINT, "%.7f"), **dict.fromkeys(INDICES, "%d")}
+    notes = "".join(f"# {note}\n" for note in found.notes)
+    buffer = io.StringIO()
+    row = ",".join(formats.get(name, "%.9g") for name in found.columns)
+    np.savetxt(buffer, structured(found), fmt=row)
+    return f"{heading}\n{notes}{buffer.getvalue()}".encode()
+
+
+def text_columns(data: bytes, path: Path) -> CloudColumns:
+    """Columns of a table of numbers: those that its heading names, else the first three as x, y, z.
+
+    Raises
+    ------
+    FileFormatError
+        If it holds no points, or numbers that are not understood.
+    """
+    lines = data.decode("utf-8-sig", errors="replace").splitlines()
+    start = 1 if _is_heading(lines, path) else 0
+    body = [line.partition("#")[0] for line in lines[start:]]
+    filled = list(islice((line for line in body if line.strip()), LOOKED_AT))
+    if not filled:
+        raise FileFormatError(
+            "the file holds no points", where=path_text(path), remedy="write lines of x y z in mm"
+        )
+    for line in filled:
+        _refuse_decimal_commas(line, path)
+    heading = _words(lines[0]) if start else []
+    if len(heading) > 1 and len(_words(filled[0])) == 2 * len(heading):
+        raise FileFormatError(
+            f"twice as many numbers as columns, as of commas in them: '{filled[0][:60]}'",
+            where=path_text(path),
+            remedy="write numbers with points: 1.5,2.5,3.5",
+        )
+    named = _named(heading)
+    values = _values("\n".join(body), tuple(named.values()), path)
+    columns = {name: values[:, k] for k, name in enumerate(named)}
+    return CloudColumns(columns, _notes(lines))
+
+
+def _named(heading: list[str]) -> dict[str, int]:
+    """Numbers of the columns that are read, by name; without x, y and z in it the first three."""
+    named: dict[str, int] = {}
+    for k, word in enumerate(heading):
+        name = KNOWN.get(word.strip("#/\"'").lower())
+        if name is not None:
+            named.setdefault(name, k)
+    return named if set(POINT) <= set(named) else {name: k for k, name in enumerate(POINT)}
+
+
+def _values(body: str, columns: tuple[int, ...], path: Path) -> FloatArray:
+    """(N, C) numbers of some columns."""
+    text = io.StringIO(body.replace(",", " ").replace(";", " "))
+    try:
+        return np.loadtxt(text, usecols=columns, ndmin=2)
+    except (ValueError, IndexError) as error:
+        raise FileFormatError(
+            f"the points are not understood ({error})",
+            where=path_text(path),
+            remedy="give one point a line: x y z in mm, with a point as decimal sign",
+        ) from error
+
+
+def _notes(lines: list[str]) -> tuple[str, ...]:
+    """Notes of a table that armscan wrote; of an XYZ file its first line says them all."""
+    notes = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
+    if not notes or not notes[0].startswith(OWN_HEADER):
+        return tuple(notes)
+    words = notes[0].removeprefix(OWN_HEADER).split("; ")
+    found = [f"frame {words[0]}", *([SIMULATED] if words[1:2] == [SIMULATED] else [])]
+    reasons = [note.removeprefix(f"{FORCED}: ") for note in notes if note.startswith(f"{FORCED}: ")]
+    return (*found, *(f"{FORCED} {k} {json.dumps(text)}" for k, text in enumerate(reasons)))
+
+
+def _is_heading(lines: list[str], path: Path) -> bool:
+    """Whether the first line is no point but a count of points, or names of columns.
+
+    Raises
+    ------
+    FileFormatError
+        If it is none of these: a damaged point is not to be dropped in silence.
+    """
+    words = _words(lines[0]) if lines else []
+    if not words or lines[0].startswith("#"):
+        return False
+    if len(words) == 1 and words[0].isdecimal():
+        return True
+    if all(_is_number(word) for word in words):
+        return False
+    if not all(re.match(r"[\W_]*[A-Za-z]", word) for word in words):
+        raise FileFormatError(
+            f"the first line is neither a point nor a heading: '{lines[0][:60]}'",
+            where=path_text(path),
+            remedy="correct the line, or put # before it",
+        )
+    return True
+
+
+def _refuse_decimal_commas(line: str, path: Path) -> None:
+    """Raise for a line whose commas can only be decimal signs, or may be.
+
+    ``1,5;2,5;3,5`` and ``1,5 2,5 3,5`` hold commas and another separator between numbers; so do
+    six whole numbers ``1,5,2,5,3,5`` from a table of three columns, which is not told from one of
+    six: only what is certain is refused.
+    """
+    fields = [word for word in re.split(r"[;\s]+", line.strip().strip(",;")) if word]
+    with_comma = [word for word in fields if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word)]
+    if len(fields) >= 2 and with_comma:
+        raise FileFormatError(
+            f"the numbers have commas as decimal signs: '{line.strip()[:60]}'",
+            where=path_text(path),
+            remedy="write them with points: 1.5 2.5 3.5",
+        )
+
+
+def _words(line: str) -> list[str]:
+    return [word for word in re.split(r"[,;\s]+", line.strip()) if word]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds in other programs' formats: what each keeps, what others write, what is refused."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pye57
+import pytest
+import trimesh
+
+from armscan.cli import main
+from armscan.errors import FileFormatError, OptionError
+from armscan.jobs.info import describe_files
+from armscan.records.cloud import PointCloud, largest_eigenvalue
+from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_losses, read_cloud, write_cloud
+from armscan.storage.formats.las import FINEST_STEP_MM, step_mm
+
+NAMES = ("A.1", 'B "ü"\n2')
+LOSSLESS = {".ply": 0.0, ".e57": 1e-12, ".pcd": 0.0, ".laz": 0.51e-6, ".las": 0.51e-6, ".csv": 1e-7}
+POINTS = np.array([[1.5, -2.0, 3.25], [4.0, 5.0, -6.5], [0.0, 1.0, 2.0]])
+
+
+def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
+    rng = np.random.default_rng(3)
+    factor = rng.normal(size=(n, 3, 3)) * 0.01
+    normals = rng.normal(size=(n, 3))
+    return PointCloud(
+        frame="Base",
+        points_mm=rng.normal(size=(n, 3)) * 100 + [500.0, -300.0, 80.0],
+        covariance_mm2=factor @ np.swapaxes(factor, 1, 2),
+        sigma_noise_mm=rng.uniform(0.001, 0.1, n),
+        sheet=rng.integers(0, 2, n),
+        sheet_names=NAMES,
+        exposure=rng.integers(0, 3, n),
+        exposure_sources=("on 1.png", "on2.png", "größe.png"),
+        segment=rng.integers(0, 9, n),
+        intensity=rng.uniform(0, 255, n),
+        normals=normals / np.linalg.norm(normals, axis=1)[:, None] if has_normals else None,
+        noise_length=rng.uniform(1.0, 12.0, n) if has_normals else None,
+        is_simulated=True,
+        forced=("rms 9 px", "f unknown"),
+    )
+
+
+@pytest.mark.parametrize(
+    ("suffix", "n", "has_normals"),
+    [
+        (suffix, n, has_normals)
+        for suffix in LOSSLESS
+        for n, has_normals in ((60, True), (60, False), (1, True), (0, False))
+        if n or suffix != ".csv"  # a table without points is refused
+    ],
+)
+def test_all_that_a_cloud_carries_comes_back(
+    tmp_path: Path, suffix: str, n: int, has_normals: bool
+) -> None:
+    before, path = cloud(n, has_normals), tmp_path / f"cloud{suffix}"
+    write_cloud(path, before)
+    after = read_cloud(path)
+    names = ("frame", "sheet_names", "exposure_sources", "is_simulated", "forced")
+    assert [getattr(after, name) for name in names] == [getattr(before, name) for name in names]
+    for name in ("sheet", "exposure", "segment"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    np.testing.assert_allclose(after.points_mm, before.points_mm, rtol=0, atol=LOSSLESS[suffix])
+    nine_digits = 5e-9 if suffix == ".csv" else 0.0
+    for name in ("covariance_mm2", "sigma_noise_mm", "intensity", "normals", "noise_length"):
+        was, found = getattr(before, name), getattr(after, name)
+        assert (found is None) is (was is None)
+        if was is not None:
+            np.testing.assert_allclose(found, was, rtol=nine_digits, atol=0)
+
+
+@pytest.mark.parametrize("suffix", CLOUD_SUFFIXES)
+def test_positions_frame_and_marks_stand_in_every_file(tmp_path: Path, suffix: str) -> None:
+    before, path = cloud(), tmp_path / f"cloud{suffix}"
+    write_cloud(path, before)
+    after = read_cloud(path)
+    np.testing.assert_allclose(after.points_mm, before.points_mm, rtol=0, atol=5.1e-7)
+    assert (after.frame, after.is_simulated, after.forced) == ("Base", True, before.forced)
+    assert bool(cloud_losses(before, path)) is (suffix not in (".ply", ".e57", ".pcd"))
+
+
+def test_converting_says_what_is_lost_and_what_a_mesh_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_cloud(tmp_path / "cloud.ply", cloud())
+    trimesh.creation.box((3, 4, 5)).export(tmp_path / "box.stl")
+    assert main(["convert", str(tmp_path / "cloud.ply"), str(tmp_path / "cloud.e57")]) == 0
+    assert "does not hold" not in capsys.readouterr().out
+    assert main(["convert", str(tmp_path / "cloud.e57"), str(tmp_path / "cloud.obj")]) == 0
+    assert "does not hold: sigma_mm and covariance" in capsys.readouterr().out
+    assert main(["convert", str(tmp_path / "box.stl"), str(tmp_path / "box.laz")]) == 0
+    out = capsys.readouterr().out
+    assert "12 faces" in out
+    assert "multiples of 1e-06 mm" in out
+    assert main(["convert", str(tmp_path / "cloud.ply"), str(tmp_path / "cloud.stl")]) == 2
+    assert "a cloud has none" in capsys.readouterr().err
+    (item,) = describe_files([str(tmp_path / "cloud.e57")]).data["items"]
+    assert item["what"] == "point cloud, 60 points"
+    assert item["frame"] == "Base"
+
+
+def test_the_grid_of_a_laz_file_is_as_fine_as_the_cloud_allows(tmp_path: Path) -> None:
+    assert step_mm(cloud()) == FINEST_STEP_MM
+    wide = replace(cloud(), points_mm=cloud().points_mm * 1000.0)
+    assert step_mm(wide) == pytest.approx(1e-3)
+    (lost,) = cloud_losses(wide, Path("x.laz"))
+    assert "0.001 mm" in lost
+    path = tmp_path / "wide.laz"
+    write_cloud(path, wide)
+    np.testing.assert_allclose(read_cloud(path).points_mm, wide.points_mm, rtol=0, atol=0.51e-3)
+
+
+def test_largest_eigenvalues_are_those_of_a_general_solver() -> None:
+    """Two equal eigenvalues are the hardest: 2e-8 there, rounding elsewhere."""
+    rng = np.random.default_rng(5)
+    turn = np.linalg.qr(rng.normal(size=(300, 3, 3)))[0]
+    for values in ([1e-6, 1e-6, 1e-10], [1e-4, 1e-5, 0.0], [1e-6] * 3, [0.0] * 3):
+        matrices = np.einsum("nij,j,nkj->nik", turn, values, turn)
+        oracle = np.linalg.eigvalsh(matrices)[:, -1]
+        np.testing.assert_allclose(largest_eigenvalue(matrices), oracle, rtol=2e-8, atol=1e-30)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".obj", ".ply"])
+def test_meshes_of_another_library_give_their_vertices(tmp_path: Path, suffix: str) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=10.0)
+    path = tmp_path / f"ball{suffix}"
+    mesh.export(path)
+    found = read_cloud(path).points_mm
+    assert len(found) == len(mesh.vertices)
+    assert np.linalg.norm(found, axis=1) == pytest.approx(10.0, abs=1e-5)
+    np.testing.assert_allclose(found.mean(axis=0), mesh.vertices.mean(axis=0), atol=1e-5)
+
+
+def test_an_ascii_stl(tmp_path: Path) -> None:
+    path = tmp_path / "one.stl"
+    mesh = trimesh.Trimesh(POINTS, [[0, 1, 2]])
+    path.write_text(trimesh.exchange.stl.export_stl_ascii(mesh))
+    assert sorted(read_cloud(path).points_mm.tolist()) == sorted(POINTS.tolist())
+
+
+def test_las_files_of_another_program(tmp_path: Path) -> None:
+    """Written by laspy in its oldest point format, with its own grid and grey levels."""
+    file = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
+    file.header.scales = [0.001] * 3
+    file.x, file.y, file.z = POINTS.T
+    file.intensity = np.array([7, 8, 9])
+    for name in ("old.las", "old.laz"):
+        file.write(str(tmp_path / name))
+        found = read_cloud(tmp_path / name)
+        np.testing.assert_allclose(found.points_mm, POINTS, atol=1e-9)
+        assert found.intensity.tolist() == [7.0, 8.0, 9.0]
+        assert found.frame == "Part"
+        assert not found.covariance_mm2.any()
+
+
+def test_e57_scans_of_another_program_stand_in_their_places(tmp_path: Path) -> None:
+    """Metres, two scans, the second turned by 90 degrees about z and moved; one invalid point."""
+    path = tmp_path / "two.e57"
+    metres = {f"cartesian{axis}": POINTS[:, k] / 1000 for k, axis in enumerate("XYZ")}
+    file = pye57.E57(str(path), mode="w")
+    file.write_scan_raw({**metres, "intensity": np.array([1.0, 2.0, 3.0])})
+    half = np.sqrt(0.5)
+    file.write_scan_raw(
+        {**metres, "cartesianInvalidState": np.array([0, 0, 1])},
+        rotation=np.array([half, 0, 0, half]),
+        translation=np.array([1.0, 0.0, 0.0]),
+    )
+    file.close()
+    found = read_cloud(path)
+    assert found.exposure_sources == ("two.e57 scan 1", "two.e57 scan 2")
+    assert found.exposure.tolist() == [0, 0, 0, 1, 1]
+    turned = np.stack([1000 - POINTS[:2, 1], POINTS[:2, 0], POINTS[:2, 2]], axis=1)
+    np.testing.assert_allclose(found.points_mm, np.concatenate([POINTS, turned]), atol=2e-4)
+
+
+PCD = """# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z normal_x normal_y normal_z _ intensity
+SIZE 4 4 4 4 4 4 1 4
+TYPE F F F F F F U F
+COUNT 1 1 1 1 1 1 4 1
+WIDTH {width}
+HEIGHT {height}
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {count}
+DATA {form}
+"""
+
+
+def pcd_file(form: str, points: np.ndarray, height: int = 1) -> bytes:
+    """Bytes after the format's description; fields one after another where compressed."""
+    n = len(points)
+    header = PCD.format(width=n // height, height=height, count=n, form=form).encode()
+    kind = np.dtype([("p", "<f4", 3), ("n", "<f4", 3), ("_", "u1", 4), ("i", "<f4")])
+    table = np.zeros(n, kind)
+    table["p"], table["n"], table["i"] = points, [0.0, 0.0, 2.0], np.arange(n)
+    if form == "binary":
+        return header + table.tobytes()
+    if form == "ascii":
+        rows = (" ".join(map(str, [*row["p"], *row["n"], *row["_"], row["i"]])) for row in table)
+        return header + "\n".join(rows).encode()
+    fields = [table["p"][:, k].tobytes() for k in range(3)]
+    fields += [table["n"][:, k].tobytes() for k in range(3)]
+    plain = b"".join(fields) + table["_"].tobytes() + table["i"].tobytes()
+    packed = lzf(plain)
+    return header + struct.pack("<II", len(packed), len(plain)) + packed
+
+
+def lzf(plain: bytes) -> bytes:
+    """LZF by its description: the longest match of three bytes or more within 8 KiB, at once."""
+    out, literals, i = bytearray(), bytearray(), 0
+    while i <= len(plain):
+        best, back = 0, 0
+        for j in range(max(0, i - 8191), i) if i < len(plain) else ():
+            length = 0
+            while (
+                length < 264 and i + length < len(plain) and plain[j + length] == plain[i + length]
+            ):
+                length += 1
+            if length > best:
+                best, back = length, i - j - 1
+        if (best >= 3 or i == len(plain) or len(literals) == 32) and literals:
+            out += bytes([len(literals) - 1]) + literals
+            literals = bytearray()
+        if i == len(plain):
+            break
+        if best >= 3:
+            n = best - 2
+            out += bytes([(min(n, 7) << 5) | back >> 8])
+            out += bytes([n - 7]) if n >= 7 else b""
+            out += bytes([back & 255])
+            i += best
+        else:
+            literals.append(plain[i])
+            i += 1
+    return bytes(out)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_pcd_files_of_other_programs(tmp_path: Path, form: str) -> None:
+    points = np.round(np.random.default_rng(1).normal(size=(40, 3)) * 8) / 4
+    path = tmp_path / "cloud.pcd"
+    path.write_bytes(pcd_file(form, points))
+    found = read_cloud(path)
+    assert found.points_mm.tolist() == points.tolist()
+    assert found.intensity.tolist() == list(range(40))
+    assert found.normals is not None
+    assert found.normals.tolist() == [[0.0, 0.0, 1.0]] * 40
+
+
+def test_empty_places_of_a_grid_are_no_points_but_nan_in_a_list_is_wrong(tmp_path: Path) -> None:
+    points = POINTS.copy()
+    points[1] = np.nan
+    points = np.concatenate([points, POINTS[:1]])
+    path = tmp_path / "grid.pcd"
+    path.write_bytes(pcd_file("binary", points, height=2))
+    assert len(read_cloud(path)) == 3
+    path.write_bytes(pcd_file("binary", points))
+    with pytest.raises(FileFormatError, match="not finite"):
+        read_cloud(path)
+
+
+def test_columns_of_a_table_are_found_by_their_names(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("id,X,Y,Z,nx,ny,nz\n1,1.5,-2,3.25,0,0,3\n2,4,5,-6.5,0,1,0\n")
+    found = read_cloud(path)
+    assert found.points_mm.tolist() == POINTS[:2].tolist()
+    assert found.normals is not None
+    assert found.normals.tolist() == [[0, 0, 1], [0, 1, 0]]
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".e57", ".laz", ".las", ".pcd", ".stl"])
+@pytest.mark.parametrize("kept", [0, 3, 60, 0.3, 0.7, 0.98])
+def test_a_file_cut_short_is_refused(tmp_path: Path, suffix: str, kept: float) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    if suffix == ".stl":
+        trimesh.creation.icosphere(subdivisions=2).export(path)
+    else:
+        write_cloud(path, cloud(500))
+    data = path.read_bytes()
+    path.write_bytes(data[: kept if isinstance(kept, int) else int(kept * len(data))])
+    with pytest.raises(FileFormatError) as caught:
+        read_cloud(path)
+    assert caught.value.remedy
+
+
+@pytest.mark.parametrize("suffix", [".e57", ".laz", ".las", ".pcd"])
+def test_damaged_bytes_never_end_in_a_traceback(tmp_path: Path, suffix: str) -> None:
+    """Either they are refused in words, or the damage lies where nothing can tell."""
+    path = tmp_path / f"cloud{suffix}"
+    write_cloud(path, cloud(300))
+    whole = path.read_bytes()
+    rng = np.random.default_rng(2)
+    refused = 0
+    for _ in range(60):
+        data = bytearray(whole)
+        for place in rng.integers(0, min(len(data), 4000), 6):
+            data[place] = rng.integers(0, 256)
+        path.write_bytes(bytes(data))
+        try:
+            read_cloud(path)
+        except FileFormatError:
+            refused += 1
+    assert refused > 10
+
+
+@pytest.mark.parametrize(("package", "suffix"), [("pye57", ".e57"), ("laspy", ".laz")])
+def test_a_missing_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str, suffix: str
+) -> None:
+    path = tmp_path / f"cloud{suffix}"
+    write_cloud(path, cloud())
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(OptionError, match=r"armscan\[formats\]"):
+        read_cloud(path)
+    with pytest.raises(OptionError, match=r"armscan\[formats\]"):
+        write_cloud(tmp_path / f"other{suffix}", cloud())

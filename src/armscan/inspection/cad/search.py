@@ -135,7 +135,6 @@ def spread_rows(points_mm: FloatArray, count: int, seed: int = 0) -> IntArray:
 def fit_step(
     placed_mm: FloatArray,
     normals: FloatArray,
-    distances_mm: FloatArray,
     weights: FloatArray,
     centre_mm: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
@@ -156,6 +155,19 @@ def tukey_weights(distances_mm: FloatArray, scale_mm: float) -> FloatArray:
     return np.asarray(np.clip(1.0 - np.minimum(share**2, 1.0), 0.0, 1.0) ** 2)
 
 
+def is_significant(distances_mm: FloatArray, best_mm: FloatArray, scale_mm: float) -> bool:
+    """Whether distances of the same points are larger than the best ones, beyond their noise."""
+    more = _clipped(distances_mm, scale_mm) - _clipped(best_mm, scale_mm)
+    noise = float(more.std()) * float(np.sqrt(NEIGHBOURS / max(len(more), 1)))
+    return float(more.mean()) > EQUAL_SIGMAS * noise
+
+
+def _clipped(distances_mm: FloatArray, scale_mm: float) -> FloatArray:
+    """(N,) squares over the scale's, clipped; a point without a distance is as far as can be."""
+    share = np.where(np.isfinite(distances_mm), distances_mm, np.inf) / scale_mm
+    return np.minimum(np.abs(share), CLIPPED) ** 2
+
+
 def closer(
     surface: PartSurface,
     points_mm: FloatArray,
@@ -172,7 +184,7 @@ def closer(
         scale = max(robust_scale(d), 1e-9 * surface.part.diagonal_mm)
         centre = placed.mean(axis=0)
         weights = tukey_weights(d, scale)
-        jacobian, normal = fit_step(placed, found.normals, d, weights, centre)
+        jacobian, normal = fit_step(placed, found.normals, weights, centre)
         radius = float(np.sqrt(np.mean((placed - centre) ** 2) * 3.0))
         unit = np.repeat([radius, 1.0], 3)
         scaled = normal / np.outer(unit, unit)
@@ -323,19 +335,17 @@ def _rated(
     distances = [_distances(surface, points, normals, pose) for pose in poses]
     scales = [robust_scale(d) for d in distances]
     unit = max(min(scales), 1e-7 * surface.part.diagonal_mm)
-    squares = [np.minimum((d / unit) ** 2, CLIPPED**2) for d in distances]
+    squares = [_clipped(d, unit) for d in distances]
     costs = np.array([float(one.mean()) for one in squares])
     order = np.argsort(costs, kind="stable")
     best = int(order[0])
     found: list[PoseCandidate] = []
     for k in order.tolist():
-        more = squares[k] - squares[best]
-        noise = float(more.std()) * np.sqrt(NEIGHBOURS / len(more))
-        is_equal = float(more.mean()) <= EQUAL_SIGMAS * noise
+        is_equal = not is_significant(distances[k], distances[best], unit)
         if not found or (
             costs[k] < NEARLY * costs[best] + 1e-12 and _is_new(poses[k], found, points, surface)
         ):
-            found.append(PoseCandidate(poses[k], float(costs[k]), scales[k], bool(is_equal)))
+            found.append(PoseCandidate(poses[k], float(costs[k]), scales[k], is_equal))
     return tuple(found[:FINAL])
 
 

@@ -117,7 +117,7 @@ def _propagated_mm(
     """
     if n < 2 or not cloud.covariance_mm2[rows].any():
         return math.nan
-    covariance, axis, share = _without_noise(cloud, rows)
+    covariance, axis, share = without_noise(cloud, rows)
     influence = influence_along(fit)
     by_point = influence[:, None] * fit.directions
     pull = np.stack([np.bincount(block, by_point[:, k], n) for k in range(3)], axis=1)
@@ -134,7 +134,7 @@ def _propagated_mm(
     return math.sqrt(max(variance, 0.0))
 
 
-def _without_noise(cloud: PointCloud, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def without_noise(cloud: PointCloud, rows: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Covariances (N, 3, 3) of points less their own noise, as far as a cloud tells.
 
     It keeps the noise's length, not its direction. The longest axis stands for that: its variance

@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deviations of a cloud from the model of its part: per point, per face, and against tolerances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from armscan.errors import OptionError
+from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, ints
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.cad.alignment import Alignment, measured
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.point_errors import PointErrors
+from armscan.inspection.conformity import COVERAGE, judge
+from armscan.inspection.conformity import Verdict as Validity
+from armscan.records.cloud import PointCloud
+
+Decision = Literal["pass", "fail", "undecided"]
+DECISIONS: tuple[Decision, ...] = ("pass", "undecided", "fail")
+"""In the order of their numbers in files, 0, 1, 2, and from best to worst."""
+OF_VALIDITY: Mapping[Validity, Decision] = {
+    "still valid": "pass",
+    "not valid": "fail",
+    "inconclusive": "undecided",
+}
+RULE = (
+    "passed if the deviation's size is at most the tolerance minus U, failed if it is above the "
+    "tolerance plus U, else undecided (ISO 14253-1); U is the deviation's expanded uncertainty "
+    "(k = 2)"
+)
+SPOT_SHARE = 0.02
+"""Width of a spot over the part's diagonal: small enough to show a dent, large enough for noise to
+average out."""
+LEAST_SPOT_POINTS = 10
+NOT_SEEN_POINTS = 3
+"""A face with fewer points is not judged."""
+
+
+@dataclass(frozen=True, slots=True)
+class CadOptions:
+    """What belongs to the part, and what is allowed.
+
+    Parameters
+    ----------
+    reach_mm
+        Points farther than this from the model are not of the part: table, fixtures, strays.
+    tolerance_mm
+        Largest deviation allowed either way; NaN for none.
+    face_tolerances_mm
+        The same for single faces by their names.
+    uncertainty_mm
+        U (k = 2) of a deviation, for clouds that carry no standard deviations; NaN for none.
+    """
+
+    reach_mm: float = 2.0
+    tolerance_mm: float = math.nan
+    face_tolerances_mm: Mapping[str, float] = field(default_factory=dict)
+    uncertainty_mm: float = math.nan
+
+    def __post_init__(self) -> None:
+        named = [
+            ("--reach-mm", self.reach_mm, False),
+            ("--tolerance", self.tolerance_mm, True),
+            ("--uncertainty-mm", self.uncertainty_mm, True),
+            *((f"tolerance of {name}", one, False) for name, one in self.face_tolerances_mm.items()),
+        ]
+        for name, value, may_miss in named:
+            if not (0.0 < value < math.inf) and not (may_miss and math.isnan(value)):
+                raise OptionError(f"a length of {value:g} mm", where=name, remedy="give it above 0")
+
+    @property
+    def has_tolerance(self) -> bool:
+        """True if anything is to be decided."""
+        return math.isfinite(self.tolerance_mm) or bool(self.face_tolerances_mm)
+
+    def tolerance_of(self, face: str) -> float:
+        """Tolerance of a face in mm; NaN for none."""
+        return self.face_tolerances_mm.get(face, self.tolerance_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class DeviationStatistics:
+    """Of signed deviations of points from the model; see `DEFINITIONS`."""
+
+    n: int
+    mean_mm: float
+    std_mm: float
+    rms_mm: float
+    p05_mm: float
+    p95_mm: float
+    min_mm: float
+    max_mm: float
+
+
+DEFINITIONS: Mapping[str, tuple[str, str]] = {
+    "n": ("points", "points whose closest surface is this one and nearer than the reach"),
+    "mean_mm": ("mean", "arithmetic mean, with sign"),
+    "std_mm": ("std", "standard deviation about their mean, divided by n - 1"),
+    "rms_mm": ("rms", "deviation rms: root mean square about the model, divided by n"),
+    "p05_mm": ("5 %", "value that 5 % of the points lie below, linear between points"),
+    "p95_mm": ("95 %", "value that 95 % of the points lie below, linear between points"),
+    "min_mm": ("min", "smallest, with sign: the farthest inside"),
+    "max_mm": ("max", "largest, with sign: the farthest outside"),
+}
+"""Label and meaning of each statistic, everywhere the same."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaceComparison:
+    """One face of the part.
+
+    Parameters
+    ----------
+    name
+        The face's.
+    statistics
+        Of its points.
+    u_mean_mm
+        U (k = 2) of the mean; NaN where not known.
+    spot_mm, u_spot_mm, spot_place_mm
+        Median deviation of the spot that deviates most, its U, and (3,) where in Cad it is; NaN
+        where no spot has enough points.
+    tolerance_mm
+        Of the face; NaN for none.
+    decision
+        The worse of those on the mean and on every spot; empty without a tolerance.
+    """
+
+    name: str
+    statistics: DeviationStatistics
+    u_mean_mm: float
+    spot_mm: float
+    u_spot_mm: float
+    spot_place_mm: FloatArray
+    tolerance_mm: float
+    decision: Decision | Literal["", "not seen"]
+
+
+class CadComparison(RowRecord):
+    """A cloud against the model of its part.
+
+    Parameters
+    ----------
+    alignment
+        Where the cloud was laid.
+    options
+        In force.
+    rows
+        (N,) rows of the cloud within reach; the rest of the fields are of these.
+    points_mm, closest_mm, normals
+        (N, 3) places in Cad, closest points of the surface, and outward directions there.
+    deviation_mm
+        (N,) signed distance, positive outside.
+    u_mm
+        (N,) expanded uncertainty (k = 2) of each; NaN where not known.
+    face
+        (N,) number of the face.
+    decision
+        (N,) number in `DECISIONS`; -1 without a tolerance.
+    overall
+        Statistics over all.
+    faces
+        Each face.
+    n_given
+        Points of the cloud.
+    spot_width_mm
+        Width of a spot.
+    """
+
+    alignment: Alignment
+    options: CadOptions
+    rows: IntArray = ints("N")
+    points_mm: FloatArray = floats("N", 3)
+    closest_mm: FloatArray = floats("N", 3)
+    normals: FloatArray = floats("N", 3)
+    deviation_mm: FloatArray = floats("N")
+    u_mm: FloatArray = floats("N", nan=True)
+    face: IntArray = ints("N")
+    decision: IntArray = ints("N")
+    overall: DeviationStatistics
+    faces: tuple[FaceComparison, ...]
+    n_given: int
+    spot_width_mm: float
+
+    @property
+    def verdict(self) -> Decision | Literal[""]:
+        """The worst decision of all faces that were seen; empty without a tolerance."""
+        found = [one.decision for one in self.faces if one.decision in DECISIONS]
+        if not found:
+            return ""
+        return max((d for d in DECISIONS if d in found), key=DECISIONS.index)
+
+
+def deviation_statistics(deviations_mm: FloatArray) -> DeviationStatistics:
+    """Statistics of (N,) deviations; NaN where there are none."""
+    d = deviations_mm
+    n = len(d)
+    if n == 0:
+        return DeviationStatistics(0, *(math.nan,) * 7)
+    low, high = np.percentile(d, [5.0, 95.0])
+    return DeviationStatistics(
+        n=n,
+        mean_mm=float(d.mean()),
+        std_mm=float(d.std(ddof=1)) if n > 1 else math.nan,
+        rms_mm=float(np.sqrt(d @ d / n)),
+        p05_mm=float(low),
+        p95_mm=float(high),
+        min_mm=float(d.min()),
+        max_mm=float(d.max()),
+    )
+
+
+def compare_with_part(
+    surface: PartSurface,
+    cloud: PointCloud,
+    alignment: Alignment,
+    options: CadOptions,
+    errors_known: bool,
+) -> CadComparison | FitFailure:
+    """Deviations of an aligned cloud.
+
+    Parameters
+    ----------
+    surface
+        The part.
+    cloud
+        Its points.
+    alignment
+        Where they lie.
+    options
+        What belongs to the part and what is allowed.
+    errors_known
+        True if the cloud's covariances are to be used.
+
+    Returns
+    -------
+    FitFailure
+        If no point lies near the model.
+    """
+    part = surface.part
+    found = measured(surface, cloud, alignment.cad_from_part)
+    near = np.abs(found.signed_mm) <= options.reach_mm
+    rows = np.flatnonzero(near)
+    if len(rows) == 0:
+        return FitFailure(
+            f"no point of the cloud lies within {options.reach_mm:g} mm of the model",
+            "leave --align none out, or give a larger --reach-mm",
+        )
+    placed = alignment.cad_from_part.apply(cloud.points_mm)
+    normals, d = found.normals, found.signed_mm
+    face = np.where(near, part.face[found.triangle], -1)
+    spot_width = SPOT_SHARE * part.diagonal_mm
+    spot, n_spots = _spots(found.closest_mm, face, spot_width)
+    jacobian = np.concatenate([np.cross(placed - alignment.centre_mm, normals), normals], axis=1)
+    n_faces = len(part.face_names)
+    if errors_known:
+        u_point, u_face, u_spot = _uncertainties(
+            cloud, alignment, normals, jacobian, ((face, n_faces), (spot, n_spots))
+        )
+    else:
+        u = options.uncertainty_mm
+        u_point, u_face, u_spot = (np.full(n, u) for n in (len(cloud), n_faces, n_spots))
+    limits = np.array([options.tolerance_of(name) for name in part.face_names])
+    spots = _spot_results(spot, face, d, found.closest_mm, u_spot)
+    by_face = _rows_by(face, n_faces)
+    faces = tuple(
+        _face(name, float(limits[k]), d[by_face[k]], float(u_face[k]), spots.of_face(k))
+        for k, name in enumerate(part.face_names)
+    )
+    limit = limits[face[rows]]
+    return CadComparison(
+        alignment=alignment,
+        options=options,
+        rows=rows,
+        points_mm=placed[rows],
+        closest_mm=found.closest_mm[rows],
+        normals=normals[rows],
+        deviation_mm=d[rows],
+        u_mm=u_point[rows],
+        face=face[rows],
+        decision=_decisions(d[rows], limit, u_point[rows]),
+        overall=deviation_statistics(d[rows]),
+        faces=faces,
+        n_given=len(cloud),
+        spot_width_mm=spot_width,
+    )
+
+
+class _Spots(RowRecord):
+    """Spots with enough points: face, median deviation, U, and where they are."""
+
+    face: IntArray = ints("N")
+    deviation_mm: FloatArray = floats("N")
+    u_mm: FloatArray = floats("N", nan=True)
+    place_mm: FloatArray = floats("N", 3)
+
+    def of_face(self, k: int) -> _Spots:
+        return self.select(self.face == k)
+
+
+def _spots(closest_mm: FloatArray, face: IntArray, width_mm: float) -> tuple[IntArray, int]:
+    """(N,) number of the spot of each point, -1 for points of no face, and how many there are.
+
+    A spot is what one face has in a cube of the width.
+    """
+    inside = np.flatnonzero(face >= 0)
+    cells = np.floor(closest_mm[inside] / width_mm).astype(np.int64)
+    cells -= cells.min(axis=0)
+    size = cells.max(axis=0) + 1
+    key = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    key = key * (int(face.max()) + 1) + face[inside]
+    label = np.full(len(face), -1, dtype=np.int64)
+    used, number = np.unique(key, return_inverse=True)
+    label[inside] = number
+    return label, len(used)
+
+
+def _rows_by(label: IntArray, count: int) -> list[IntArray]:
+    """Rows of each label, 0 to count - 1; rows of label -1 are in none."""
+    order = np.argsort(label, kind="stable")
+    ends = np.searchsorted(label[order], np.arange(count + 1))
+    return [order[ends[k] : ends[k + 1]] for k in range(count)]
+
+
+def _spot_results(
+    spot: IntArray, face: IntArray, d: FloatArray, closest_mm: FloatArray, u: FloatArray
+) -> _Spots:
+    """Spots with enough points; the median, so that a stray point makes no dent."""
+    count = np.bincount(spot[spot >= 0], minlength=len(u))
+    order = np.lexsort((d, spot))[int((spot < 0).sum()) :]
+    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    enough = np.flatnonzero(count >= LEAST_SPOT_POINTS)
+    low = order[start[enough] + (count[enough] - 1) // 2]
+    high = order[start[enough] + count[enough] // 2]
+    return _Spots(
+        face=face[low],
+        deviation_mm=(d[low] + d[high]) / 2.0,
+        u_mm=u[enough],
+        place_mm=closest_mm[low],
+    )
+
+
+def _uncertainties(
+    cloud: PointCloud,
+    alignment: Alignment,
+    normals: FloatArray,
+    jacobian: FloatArray,
+    groups: tuple[tuple[IntArray, int], ...],
+) -> list[FloatArray]:
+    """U of each point's deviation, and of the mean deviation of each group of points.
+
+    A point's is of its own covariance and the alignment's, as if these were independent: the
+    alignment takes part of what the points have in common away, so that it is rather too large.
+    """
+    pose = alignment.cad_from_part
+    covariance = pose.rotate_covariance(cloud.covariance_mm2)
+    own = np.einsum("ni,nij,nj->n", normals, covariance, normals)
+    by_pose = np.einsum("nk,kl,nl->n", jacobian, alignment.step_covariance, jacobian)
+    found = [COVERAGE * np.sqrt(np.maximum(own + by_pose, 0.0))]
+    influence = np.zeros((6, len(cloud)))
+    influence[:, alignment.rows] = alignment.influence
+    errors = PointErrors.of(cloud, pose, normals)
+    for label, count in groups:
+        inside = label >= 0
+        n = np.maximum(np.bincount(label[inside], minlength=count), 1)
+        mean = np.stack(
+            [np.bincount(label[inside], jacobian[inside, k], count) / n for k in range(6)], axis=1
+        )
+        found.append(COVERAGE * np.sqrt(errors.group_variances(label, count, mean, influence)))
+    return found
+
+
+def _decisions(d: FloatArray, limit: FloatArray, u: FloatArray) -> IntArray:
+    """(N,) numbers in `DECISIONS` by `RULE`; -1 without a limit."""
+    size = np.abs(d)
+    decided = np.where(size > limit + u, 2, np.where(size <= limit - u, 0, 1))
+    return np.where(np.isfinite(limit), decided, -1).astype(np.int64)
+
+
+def _face(
+    name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots
+) -> FaceComparison:
+    statistics = deviation_statistics(d)
+    worst = int(np.argmax(np.abs(spots.deviation_mm))) if len(spots) else -1
+    decision: Decision | Literal["", "not seen"] = ""
+    if statistics.n < NOT_SEEN_POINTS:
+        decision, u_mean = "not seen", math.nan
+    elif math.isfinite(limit):
+        whole = OF_VALIDITY[judge(statistics.mean_mm, limit, u_mean)]
+        local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)
+        decision = DECISIONS[max(DECISIONS.index(whole), int(local.max(initial=0)))]
+    return FaceComparison(
+        name=name,
+        statistics=statistics,
+        u_mean_mm=u_mean,
+        spot_mm=float(spots.deviation_mm[worst]) if worst >= 0 else math.nan,
+        u_spot_mm=float(spots.u_mm[worst]) if worst >= 0 else math.nan,
+        spot_place_mm=spots.place_mm[worst] if worst >= 0 else np.full(3, math.nan),
+        tolerance_mm=limit,
+        decision=decision,
+    )

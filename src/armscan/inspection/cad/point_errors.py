@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What points' errors, own and common, do to an alignment and to means of deviations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats
+from armscan.geometry.poses import Cad, Part, Pose
+from armscan.inspection.uncertainty import COARSE_BLOCKS, exposure_blocks, without_noise
+from armscan.records.cloud import PointCloud
+
+MOST_BLOCKS = 200
+"""Neighbouring exposures beyond so many are taken together."""
+REGIONS = 2
+"""Along each axis, of a cloud of one exposure, whose points are taken to err together."""
+
+
+class PointErrors(RowRecord):
+    """Errors of N points along the normals of a part.
+
+    Parameters
+    ----------
+    normals
+        (N, 3) unit, in Cad.
+    private_mm2
+        (N,) variance along the normal that each point has of its own, times the points along the
+        stripe that share it.
+    covariance_mm2
+        (N, 3, 3) the rest, in Cad, which points of a block share.
+    blocks
+        Ways of dividing the points into blocks that err together: (N,) numbers each. The larger
+        result counts.
+    """
+
+    normals: FloatArray = floats("N", 3)
+    private_mm2: FloatArray = floats("N")
+    covariance_mm2: FloatArray = floats("N", 3, 3)
+    blocks: tuple[IntArray, ...]
+
+    @staticmethod
+    def of(
+        cloud: PointCloud,
+        pose: Pose[Cad, Part],
+        normals: FloatArray,
+        rows: IntArray | None = None,
+    ) -> PointErrors:
+        """Errors of a cloud's points, or of some of its rows.
+
+        Parameters
+        ----------
+        cloud
+            The points.
+        pose
+            Where they lie on the part.
+        normals
+            (M, 3) of the part at each of the rows, in Cad.
+        rows
+            (M,) rows; None for all.
+        """
+        chosen = np.arange(len(cloud)) if rows is None else rows
+        covariance, axis, share = without_noise(cloud, chosen)
+        along = share * np.einsum("ni,ni->n", pose.rotate(axis), normals) ** 2 + 1.0 - share
+        shared = np.ones(len(chosen))
+        if cloud.noise_length is not None:
+            # of neighbours that share their noise, a thinned cloud keeps so many
+            thinned = len(chosen) / max(len(cloud), 1)
+            shared = 1.0 + np.maximum(cloud.noise_length[chosen] - 1.0, 0.0) * thinned
+        return PointErrors(
+            normals=normals,
+            private_mm2=cloud.sigma_noise_mm[chosen] ** 2 * along * shared,
+            covariance_mm2=pose.rotate_covariance(covariance),
+            blocks=tuple(_blocks(cloud, chosen)),
+        )
+
+    def covariance(self, influence: FloatArray) -> FloatArray:
+        """(K, K) of K sums of the points' errors along their normals, (K, N) their weights."""
+        private = influence * self.private_mm2 @ influence.T
+        found = []
+        for block in self.blocks:
+            n = int(block.max()) + 1
+            pulls = _pulls(influence, self.normals, block, n)
+            mean = _block_means(self.covariance_mm2, block, n)
+            found.append(np.einsum("kbi,bij,lbj->kl", pulls, mean, pulls))
+        size = [float(np.trace(one)) for one in found]
+        return np.asarray(private + found[int(np.argmax(size))])
+
+    def group_variances(
+        self, label: IntArray, count: int, jacobian: FloatArray, influence: FloatArray
+    ) -> FloatArray:
+        """(count,) variances of the mean deviation of groups of points, after the alignment.
+
+        A mean is of its points' own errors, less what the alignment took from all points.
+
+        Parameters
+        ----------
+        label, count
+            (N,) group of each point, -1 for none, and how many groups there are.
+        jacobian
+            (count, 6) derivative of each group's mean by a step of the alignment.
+        influence
+            (6, N) derivative of the step by each point's distance.
+        """
+        inside = np.flatnonzero(label >= 0)
+        group = label[inside]
+        n = np.maximum(np.bincount(group, minlength=count), 1)
+        v = self.private_mm2
+        own = np.bincount(group, v[inside], count) / n**2
+        cross = np.stack(
+            [np.bincount(group, influence[k, inside] * v[inside], count) / n for k in range(6)],
+            axis=1,
+        )
+        both = influence * v @ influence.T
+        private = own - 2.0 * np.einsum("fk,fk->f", jacobian, cross)
+        private += np.einsum("fk,kl,fl->f", jacobian, both, jacobian)
+        largest = np.zeros(count)
+        for block in self.blocks:
+            b = int(block.max()) + 1
+            if b * count > 20_000_000:
+                continue
+            place = group * b + block[inside]
+            mean = [
+                np.bincount(place, self.normals[inside, k], count * b).reshape(count, b)
+                for k in range(3)
+            ]
+            pull = np.stack(mean, axis=2) / n[:, None, None]
+            pull -= np.einsum("fk,kbi->fbi", jacobian, _pulls(influence, self.normals, block, b))
+            covariance = _block_means(self.covariance_mm2, block, b)
+            largest = np.maximum(largest, np.einsum("fbi,bij,fbj->f", pull, covariance, pull))
+        return np.maximum(private, 0.0) + largest
+
+
+def _blocks(cloud: PointCloud, rows: IntArray) -> list[IntArray]:
+    """Exposures, blocks of neighbouring ones, or regions where there is one exposure only."""
+    numbers = cloud.exposure[rows]
+    n = len(np.unique(numbers))
+    if n < 2:
+        points = cloud.points_mm[rows]
+        low, extent = points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-9)
+        cell = np.minimum((REGIONS * (points - low) / extent).astype(np.int64), REGIONS - 1)
+        return [np.unique(cell @ np.array([4, 2, 1]), return_inverse=True)[1].astype(np.int64)]
+    found = [exposure_blocks(numbers, min(n, MOST_BLOCKS))[0]]
+    found += [exposure_blocks(numbers, most)[0] for most in COARSE_BLOCKS if n >= 2 * most]
+    return found
+
+
+def _pulls(influence: FloatArray, normals: FloatArray, block: IntArray, n: int) -> FloatArray:
+    """(K, B, 3) derivative of K sums by a shift of each block."""
+    return np.stack(
+        [
+            np.stack([np.bincount(block, row * normals[:, k], n) for k in range(3)], axis=1)
+            for row in influence
+        ]
+    )
+
+
+def _block_means(covariance: FloatArray, block: IntArray, n: int) -> FloatArray:
+    """(B, 3, 3) mean covariance of each block."""
+    count = np.maximum(np.bincount(block, minlength=n), 1)
+    mean = np.zeros((n, 3, 3))
+    for i in range(3):
+        for j in range(3):
+            mean[:, i, j] = np.bincount(block, covariance[:, i, j], n) / count
+    return mean

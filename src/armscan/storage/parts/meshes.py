@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Triangle meshes from STL (text and binary), PLY and OBJ files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import FileFormatError
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.inspection.cad.part import PartModel, part_of
+from armscan.storage.clouds import BYTE_ORDERS, TYPES, parse_ply
+from armscan.storage.files import path_text, read_bytes
+from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
+
+MESH_SUFFIXES = (".stl", ".ply", ".obj")
+UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
+"""Length of each unit that a mesh may be in; mesh files do not tell."""
+STL_HEADER, STL_RECORD = 84, 50
+STL_TYPE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(.*)$", re.MULTILINE)
+CUT = "copy the file again; it may be cut or damaged"
+MOST_CORNERS = 1000
+"""Corners of one polygon."""
+
+
+def read_part(path: Path, *, unit: str = "mm", chord: ChordError | None = None) -> PartModel:
+    """Read the model of a part.
+
+    Parameters
+    ----------
+    path
+        ``.stl``, ``.ply``, ``.obj``, ``.step`` or ``.stp``.
+    unit
+        Unit of a mesh's numbers, of `UNITS_MM`; STEP files say theirs.
+    chord
+        How finely a STEP file's faces are made into triangles.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is none of these, is cut short, or is not understood.
+    InputError
+        If it holds no surface.
+    """
+    suffix, where = path.suffix.lower(), path_text(path)
+    if suffix in STEP_SUFFIXES:
+        return read_step(path, chord or ChordError())
+    if suffix not in MESH_SUFFIXES:
+        raise FileFormatError(
+            "this is no model of a part that armscan knows",
+            where=where,
+            remedy=f"give one of {', '.join((*MESH_SUFFIXES, *STEP_SUFFIXES))}",
+        )
+    data = read_bytes(path)
+    if not data.strip():
+        raise FileFormatError("the file is empty", where=where, remedy=CUT)
+    face: IntArray | None = None
+    names: tuple[str, ...] = ()
+    if suffix == ".obj":
+        corners, face, names = _obj(data, where)
+    else:
+        corners = _stl(data, where) if suffix == ".stl" else _ply(data, where)
+    return part_of(corners * UNITS_MM[unit], source=path.name, face=face, face_names=names)
+
+
+def _stl(data: bytes, where: str) -> FloatArray:
+    """(F, 3, 3) corners; the normals in the file are not used: the order of corners tells them."""
+    count = int.from_bytes(data[80:84], "little") if len(data) >= STL_HEADER else -1
+    is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096]
+    if count >= 0 and len(data) == STL_HEADER + STL_RECORD * count:
+        is_text = False
+    if is_text:
+        return _stl_text(data, where)
+    held = (len(data) - STL_HEADER) // STL_RECORD
+    if count < 0 or held < count:
+        raise FileFormatError(
+            f"the STL file holds {max(held, 0):,} of {count:,} triangles"
+            if count >= 0
+            else "this is no STL file",
+            where=where,
+            remedy=CUT,
+        )
+    if held > count + 1 and count == 0:
+        raise FileFormatError("this is no STL file", where=where, remedy=CUT)
+    table = np.frombuffer(data, STL_TYPE, count, STL_HEADER)
+    return np.asarray(table["corners"], dtype=np.float64)
+
+
+def _stl_text(data: bytes, where: str) -> FloatArray:
+    if b"endsolid" not in data[-4096:].lower():
+        raise FileFormatError("the STL file does not end with endsolid", where=where, remedy=CUT)
+    words = b" ".join(VERTEX.findall(data.replace(b"\r", b"\n").lower())).split()
+    numbers = _numbers(words, where, "STL")
+    if len(numbers) % 9:
+        raise FileFormatError(
+            f"the STL file holds {len(numbers)} coordinates, which make no whole triangles",
+            where=where,
+            remedy=CUT,
+        )
+    return numbers.reshape(-1, 3, 3)
+
+
+def _numbers(words: list[bytes], where: str, kind: str) -> FloatArray:
+    try:
+        return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
+    except ValueError as error:
+        raise FileFormatError(
+            f"numbers of the {kind} file are not understood", where=where, remedy=CUT
+        ) from error
+
+
+def _ply(data: bytes, where: str) -> FloatArray:
+    """(F, 3, 3) corners of a PLY mesh whose elements are vertices, then faces."""
+    table = parse_ply(data, where).table
+    if not {"x", "y", "z"} <= set(table.dtype.names or ()):
+        raise FileFormatError("the PLY file's vertices have no x, y, z", where=where, remedy=CUT)
+    points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
+    start = data.find(b"\n", data.find(b"\nend_header") + 1) + 1
+    header = data[:start].decode("latin-1").split("\n")
+    words = [line.split() for line in header]
+    order = next(line[1] for line in words if line[:1] == ["format"])
+    elements = [line for line in words if line[:1] == ["element"]]
+    count = int(elements[1][2]) if len(elements) > 1 and elements[1][1] == "face" else 0
+    if count == 0:
+        raise FileFormatError(
+            "the PLY file holds points but no faces: it is a cloud, not the model of a part",
+            where=where,
+            remedy="give a mesh",
+        )
+    at = next(k for k, line in enumerate(words) if line == elements[1])
+    kinds = [line[1:] for line in words[at + 1 :] if line[:1] == ["property"]]
+    if order == "ascii":
+        lines = [line for line in data[start:].split(b"\n") if line.strip()]
+        rows = [line.split() for line in lines[len(table) : len(table) + count]]
+        polygons = _text_polygons(rows, count, where)
+    else:
+        body = start + len(table) * table.dtype.itemsize
+        polygons = _binary_polygons(
+            data, body, count, kinds=kinds, order=BYTE_ORDERS[order], where=where
+        )
+    return _triangulated(points, polygons, where)
+
+
+def _text_polygons(rows: list[list[bytes]], count: int, where: str) -> list[IntArray]:
+    try:
+        found = [np.array([int(word) for word in row[1 : 1 + int(row[0])]]) for row in rows]
+        is_whole = all(len(one) == int(row[0]) for one, row in zip(found, rows, strict=True))
+    except (ValueError, IndexError) as error:
+        raise FileFormatError(
+            "the faces of the PLY file are not understood", where=where, remedy=CUT
+        ) from error
+    if len(found) < count or not is_whole:
+        raise _short("PLY", len(found), count, where)
+    return found
+
+
+def _binary_polygons(
+    data: bytes, at: int, count: int, *, kinds: list[list[str]], order: str, where: str
+) -> list[IntArray]:
+    """Lists of corners; a table where all are triangles, which most are."""
+    fields = []
+    for k, kind in enumerate(kinds):
+        if kind[0] == "list":
+            fields += [(f"n{k}", order + TYPES[kind[1]]), (f"v{k}", order + TYPES[kind[2]], 3)]
+        else:
+            fields.append((f"s{k}", order + TYPES[kind[0]]))
+    lists = [k for k, kind in enumerate(kinds) if kind[0] == "list"]
+    if not lists:
+        raise FileFormatError("the PLY file's faces list no corners", where=where, remedy=CUT)
+    name = lists[0]
+    triangles = np.dtype(fields)
+    if len(lists) == 1 and at + count * triangles.itemsize <= len(data):
+        table = np.frombuffer(data, triangles, count, at)
+        if (table[f"n{name}"] == 3).all():
+            return list(table[f"v{name}"].astype(np.int64))
+    found: list[IntArray] = []
+    for _ in range(count):
+        corners = np.zeros(0, dtype=np.int64)
+        for k, kind in enumerate(kinds):
+            length = 1
+            if kind[0] == "list":
+                head = np.dtype(order + TYPES[kind[1]])
+                if at + head.itemsize > len(data):
+                    raise _short("PLY", len(found), count, where)
+                length = int(np.frombuffer(data, head, 1, at)[0])
+                at += head.itemsize
+            item = np.dtype(order + TYPES[kind[2] if kind[0] == "list" else kind[0]])
+            if not 0 <= length <= MOST_CORNERS or at + length * item.itemsize > len(data):
+                raise _short("PLY", len(found), count, where)
+            if k == name:
+                corners = np.frombuffer(data, item, length, at).astype(np.int64)
+            at += length * item.itemsize
+        found.append(corners)
+    return found
+
+
+def _short(kind: str, held: int, count: int, where: str) -> FileFormatError:
+    return FileFormatError(
+        f"the {kind} file holds {held:,} of {count:,} faces", where=where, remedy=CUT
+    )
+
+
+def _triangulated(points: FloatArray, polygons: list[IntArray], where: str) -> FloatArray:
+    """Corners of triangles, polygons with more corners cut from their first one."""
+    fans = [
+        np.stack([np.full(len(one) - 2, one[0]), one[1:-1], one[2:]], axis=1)
+        for one in polygons
+        if len(one) >= 3
+    ]
+    rows = np.concatenate(fans) if fans else np.zeros((0, 3), dtype=np.int64)
+    if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < len(points):
+        raise FileFormatError(
+            f"a face names a corner beyond the {len(points):,} of the file",
+            where=where,
+            remedy=CUT,
+        )
+    return np.asarray(points[rows])
+
+
+def _obj(data: bytes, where: str) -> tuple[FloatArray, IntArray | None, tuple[str, ...]]:
+    """Corners, and the groups ``g`` or ``o`` as faces where there are several."""
+    vertices: list[list[bytes]] = []
+    polygons: list[IntArray] = []
+    owner: list[int] = []
+    names: dict[str, int] = {}
+    group = 0
+    for line in data.splitlines():
+        words = line.split()
+        if not words:
+            continue
+        if words[0] == b"v":
+            vertices.append(words[1:4])
+        elif words[0] == b"f":
+            try:
+                rows = np.array([int(word.partition(b"/")[0]) for word in words[1:]])
+            except ValueError as error:
+                raise FileFormatError(
+                    "the faces of the OBJ file are not understood", where=where, remedy=CUT
+                ) from error
+            polygons.append(np.where(rows < 0, len(vertices) + rows, rows - 1))
+            owner.append(group)
+        elif words[0] in (b"g", b"o"):
+            name = b" ".join(words[1:]).decode("utf-8", "replace") or "unnamed"
+            group = names.setdefault(name, len(names))
+    if any(len(row) != 3 for row in vertices):
+        raise FileFormatError(
+            "a vertex of the OBJ file has no three numbers", where=where, remedy=CUT
+        )
+    words_of_all = [word for row in vertices for word in row]
+    points = _numbers(words_of_all, where, "OBJ").reshape(-1, 3)
+    corners = _triangulated(points, polygons, where)
+    if len(set(owner)) < 2:
+        return corners, None, ()
+    counts = [max(len(one) - 2, 0) for one in polygons]
+    face = np.repeat(np.array(owner, dtype=np.int64), counts)
+    used, face = np.unique(face, return_inverse=True)
+    listed = list(names) or ["unnamed"]
+    return corners, face.astype(np.int64), tuple(listed[k] for k in used.tolist())

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""STEP files, their faces made into triangles within a stated chord error."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.errors import FileFormatError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray
+from armscan.inspection.cad.part import PartModel, part_of
+from armscan.storage.files import path_text, read_bytes
+
+STEP_SUFFIXES = (".step", ".stp")
+LEAST_CHORD_MM = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class ChordError:
+    """How far triangles may lie from the surface that they stand for.
+
+    Parameters
+    ----------
+    chord_mm
+        Largest distance. A fifth of what a scanner of 0.01 mm tells.
+    angle_deg
+        Largest turn of the normal along an edge.
+    """
+
+    chord_mm: float = 0.002
+    angle_deg: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not LEAST_CHORD_MM <= self.chord_mm < math.inf or not 0.1 <= self.angle_deg <= 90.0:
+            raise OptionError(
+                f"a chord error of {self.chord_mm:g} mm and {self.angle_deg:g} degrees",
+                where="--chord-mm",
+                remedy="give a length in mm, such as 0.002",
+            )
+
+
+def read_step(path: Path, chord: ChordError) -> PartModel:
+    """Read a STEP file; lengths are in mm whatever the file's unit, and faces stay as they are.
+
+    Parameters
+    ----------
+    path
+        The file.
+    chord
+        How finely faces are made into triangles.
+
+    Raises
+    ------
+    OptionError
+        If the extra ``cad`` is not installed.
+    FileFormatError
+        If the file is cut short or holds no faces.
+    """
+    where = path_text(path)
+    data = read_bytes(path)
+    if not data.lstrip().startswith(b"ISO-10303-21"):
+        raise FileFormatError("this is no STEP file", where=where, remedy="export it again")
+    if b"END-ISO-10303-21" not in data[-4096:]:
+        raise FileFormatError(
+            "the STEP file is cut short: its last line is missing",
+            where=where,
+            remedy="copy the file again",
+        )
+    shape = _shape(data, path.name, where)
+    corners, kinds = _triangles_of_faces(shape, chord)
+    if not corners:
+        raise InputError("the STEP file holds no faces", where=where, remedy="export a solid")
+    number = np.repeat(np.arange(len(corners)), [len(one) for one in corners])
+    return part_of(
+        np.concatenate(corners),
+        source=path.name,
+        face=number.astype(np.int64),
+        face_names=[f"{kind} {k + 1}" for k, kind in enumerate(kinds)],
+    )
+
+
+def _shape(data: bytes, name: str, where: str) -> Any:
+    """The solids and surfaces of a file."""
+    try:
+        from OCP.IFSelect import IFSelect_RetDone
+        from OCP.Message import Message
+        from OCP.STEPControl import STEPControl_Reader
+    except ImportError as error:
+        raise OptionError(
+            "STEP files need the extra 'cad', which is not installed",
+            where=where,
+            remedy="pip install 'armscan[cad]', or export the model as STL",
+        ) from error
+    # its messages would go to the terminal, between ours
+    messenger = Message.DefaultMessenger_s()
+    for printer in list(messenger.Printers()):
+        messenger.RemovePrinter(printer)
+    reader = STEPControl_Reader()
+    status = reader.ReadStream(name, io.BytesIO(data))
+    if status != IFSelect_RetDone or reader.TransferRoots() == 0:
+        raise FileFormatError(
+            "the STEP file is not understood", where=where, remedy="export it again"
+        )
+    return reader.OneShape()
+
+
+def _triangles_of_faces(shape: Any, chord: ChordError) -> tuple[list[FloatArray], list[str]]:
+    """(F, 3, 3) corners of the triangles of each face, and the kind of each face."""
+    from OCP.BRep import BRep_Tool
+    from OCP.BRepAdaptor import BRepAdaptor_Surface
+    from OCP.BRepMesh import BRepMesh_IncrementalMesh
+    from OCP.TopAbs import TopAbs_FACE, TopAbs_REVERSED
+    from OCP.TopExp import TopExp_Explorer
+    from OCP.TopLoc import TopLoc_Location
+    from OCP.TopoDS import TopoDS
+
+    BRepMesh_IncrementalMesh(shape, chord.chord_mm, False, math.radians(chord.angle_deg), False)
+    corners: list[FloatArray] = []
+    kinds: list[str] = []
+    faces = TopExp_Explorer(shape, TopAbs_FACE)
+    # of older versions the method has another name
+    as_face = getattr(TopoDS, "Face_s", None) or TopoDS.Face
+    while faces.More():
+        face, location = as_face(faces.Current()), TopLoc_Location()
+        mesh = BRep_Tool.Triangulation_s(face, location)
+        if mesh is not None:
+            is_turned = face.Orientation() == TopAbs_REVERSED
+            corners.append(_corners(mesh, location.Transformation(), is_turned))
+            kinds.append(BRepAdaptor_Surface(face).GetType().name.removeprefix("GeomAbs_").lower())
+        faces.Next()
+    return corners, kinds
+
+
+def _corners(mesh: Any, transformation: Any, is_turned: bool) -> FloatArray:
+    """(F, 3, 3) corners, anticlockwise seen from outside."""
+    nodes = [mesh.Node(k + 1) for k in range(mesh.NbNodes())]
+    points = np.array([(node.X(), node.Y(), node.Z()) for node in nodes])
+    matrix = np.array([[transformation.Value(i + 1, j + 1) for j in range(4)] for i in range(3)])
+    points = points @ matrix[:, :3].T + matrix[:, 3]
+    rows = np.array([mesh.Triangle(k + 1).Get() for k in range(mesh.NbTriangles())]) - 1
+    return np.asarray(points[rows[:, ::-1] if is_turned else rows])

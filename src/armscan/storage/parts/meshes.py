@@ -11,8 +11,8 @@ import numpy as np
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.cad.part import PartModel, part_of
-from armscan.storage.clouds import BYTE_ORDERS, TYPES, parse_ply
 from armscan.storage.files import path_text, read_bytes
+from armscan.storage.formats.ply import BYTE_ORDERS, TYPES, parse_ply
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")

@@ -9,7 +9,15 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
+from armscan.cli import (
+    calibrate_cameras,
+    calibrate_sensor,
+    files,
+    inspect,
+    inspect_cad,
+    measure,
+    points,
+)
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -59,7 +67,7 @@ calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_c
 calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 inspect_group = typer.Typer(
-    help="Compare measured points with a plane, a ball or a step.",
+    help="Compare measured points with a plane, a ball, a step or a part's model.",
     epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
@@ -69,6 +77,7 @@ inspect_group = typer.Typer(
 inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
+inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)

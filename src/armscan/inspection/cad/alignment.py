@@ -287,9 +287,7 @@ def measured(
     return surface.distance(pose.apply(cloud.points_mm[chosen]), towards=towards)
 
 
-def _foreign(
-    surface: PartSurface, cloud: PointCloud, best: PoseCandidate
-) -> FitFailure | None:
+def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> FitFailure | None:
     """Notice a cloud of another part, or of the mirrored one."""
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     d = np.abs(measured(surface, cloud, best.cad_from_part, rows).signed_mm)
@@ -375,7 +373,7 @@ def _fit_sigma(
     own = np.einsum("ni,nij,nj->n", found.normals, covariance, found.normals)
     scale = max(robust_scale(found.signed_mm), SETTLED_MM)
     rest = max(scale**2 - float(np.median(own)), 0.0)
-    return np.sqrt(np.maximum(own + rest, (0.1 * scale) ** 2))
+    return np.asarray(np.sqrt(np.maximum(own + rest, (0.1 * scale) ** 2)))
 
 
 def _middle(placed: FloatArray) -> tuple[FloatArray, float]:
@@ -461,9 +459,7 @@ def screwed(pose: Pose[Cad, Part], twist: FloatArray, centre: FloatArray) -> Pos
     return moved(pose, np.concatenate([twist[:3], bent @ twist[3:]]), centre)
 
 
-def named_motions(
-    free: FloatArray, centre: FloatArray, radius: float
-) -> tuple[FreeMotion, ...]:
+def named_motions(free: FloatArray, centre: FloatArray, radius: float) -> tuple[FreeMotion, ...]:
     """Turns and shifts that span free motions (6, K): rows a turn vector and a shift at a centre.
 
     As many turns as the turn vectors span, each with its axis; what is left are shifts.

@@ -32,6 +32,14 @@ CAD = "armscan.inspection.cad.comparison:CadOptions."
 CHORD = "armscan.storage.parts.step:ChordError."
 
 
+PartArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="The part's model: .step (extra 'cad'), .stl, .ply or .obj.", show_default=False
+    ),
+]
+
+
 class AlignOption(StrEnum):
     """How the cloud is laid on the model."""
 
@@ -51,12 +59,7 @@ class UnitOption(StrEnum):
 
 def cad(
     cloud: CloudArgument,
-    part: Annotated[
-        Path,
-        typer.Argument(
-            help="The part's model: .step (extra 'cad'), .stl, .ply or .obj.", show_default=False
-        ),
-    ],
+    part: PartArgument,
     *,
     align: Annotated[
         AlignOption | None,

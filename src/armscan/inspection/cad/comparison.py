@@ -35,7 +35,7 @@ RULE = (
 )
 SPOT_SHARE = 0.02
 """Width of a spot over the part's diagonal: small enough to show a dent, large enough for noise to
-average out."""
+average out. Of thin clouds spots are larger, so that they hold points enough."""
 LEAST_SPOT_POINTS = 10
 """A face none of whose spots has so many is not seen, and not judged."""
 
@@ -256,7 +256,8 @@ def compare_with_part(
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
     face = np.where(near, part.face[found.triangle], -1)
-    spot_width = SPOT_SHARE * part.diagonal_mm
+    by_density = math.sqrt(2 * LEAST_SPOT_POINTS * float(part.areas_mm2.sum()) / len(rows))
+    spot_width = max(SPOT_SHARE * part.diagonal_mm, by_density)
     spot, n_spots = _spots(found.closest_mm, face, spot_width)
     jacobian = np.concatenate([np.cross(placed - alignment.centre_mm, normals), normals], axis=1)
     n_faces = len(part.face_names)

@@ -57,7 +57,8 @@ def block() -> Any:
 def bracket() -> Any:
     """Two plates at a right angle with a rib and holes."""
     return cut(
-        fused(box((0, 0, 0), (70, 40, 6)), box((0, 0, 0), (6, 40, 45)), box((6, 12, 6), (25, 5, 18))),
+        fused(box((0, 0, 0), (70, 40, 6)), box((0, 0, 0), (6, 40, 45)),
+              box((6, 12, 6), (25, 5, 18))),
         cylinder((50, 12, -1), (0, 0, 1), 4.0, 10.0),
         cylinder((55, 30, -1), (0, 0, 1), 2.5, 10.0),
         cylinder((-1, 26, 32), (1, 0, 0), 5.0, 10.0),

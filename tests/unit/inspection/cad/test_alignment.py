@@ -20,7 +20,7 @@ from armscan.inspection.cad.alignment import (
     free_text,
     scale_mismatch,
 )
-from armscan.inspection.cad.comparison import CadOptions, CadComparison, compare_with_part
+from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare_with_part
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.inspection.cad.search import even_turns, spread_rows

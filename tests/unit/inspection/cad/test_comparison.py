@@ -26,7 +26,7 @@ from rigs.parts import box_corners
 BOX = PartSurface(part_of(box_corners([0, 0, 0.0], [60, 40, 20]), source="box"))
 
 
-def top_points(n: int, height: object = 20.0, seed: int = 0) -> np.ndarray:
+def top_points(n: int, height: float = 20.0, seed: int = 0) -> np.ndarray:
     random = np.random.default_rng(seed)
     points = random.uniform(2.0, [58.0, 38.0, 2.0], (n, 3))
     points[:, 2] = height
@@ -139,7 +139,8 @@ def test_no_overlap_is_refused() -> None:
 
 
 @pytest.mark.parametrize("options", [{"reach_mm": 0.0}, {"tolerance_mm": -1.0},
-                                     {"uncertainty_mm": math.inf}, {"reach_mm": math.nan}])  # fmt: skip
+                                     {"uncertainty_mm": math.inf}, {"reach_mm": math.nan}],
+)  # fmt: skip
 def test_lengths_that_make_no_sense_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(OptionError):
         CadOptions(**options)

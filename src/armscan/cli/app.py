@@ -14,6 +14,7 @@ from armscan.cli import (
     calibrate_sensor,
     files,
     inspect,
+    inspect_cad,
     measure,
     points,
     surface,
@@ -68,7 +69,7 @@ calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_c
 calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 inspect_group = typer.Typer(
-    help="Compare measured points with a plane, a ball or a step.",
+    help="Compare measured points with a plane, a ball, a step or a part's model.",
     epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
@@ -78,6 +79,7 @@ inspect_group = typer.Typer(
 inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
+inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=twin.DEMO_EXAMPLE)(twin.demo)

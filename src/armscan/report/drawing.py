@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -19,7 +19,7 @@ from matplotlib.colors import Colormap, to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.exposure import Exposure
 
 ACCENT = "#0b6e87"
@@ -252,6 +252,22 @@ class SceneLines:
     colour: str
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneValues:
+    """What a click on a dot tells.
+
+    Parameters
+    ----------
+    numbers
+        (N,) numbers by name; NaN is told as not known.
+    names
+        (N,) index and the list that it points into, by name.
+    """
+
+    numbers: Mapping[str, FloatArray]
+    names: Mapping[str, tuple[IntArray, Sequence[str]]]
+
+
 def uniform_dots(points_mm: FloatArray, colour: str) -> SceneDots:
     """Dots of one CSS colour."""
     return SceneDots(points_mm, np.tile(_bytes(colour), (len(points_mm), 1)))
@@ -293,6 +309,7 @@ def scene_markup(
     alt: str,
     *,
     is_z_up: bool = False,
+    values: SceneValues | None = None,
 ) -> str:
     """``<canvas>`` with its data; positions are in the Sensor frame, or in one with Z up.
 
@@ -306,6 +323,8 @@ def scene_markup(
         What it shows, in words.
     is_z_up
         True for frames like Base, whose Z points up; in Sensor Y points down and Z away.
+    values
+        What a click on one of all dots tells; None for nothing.
     """
     points = np.concatenate([item.points_mm for item in dots])
     segments = np.concatenate([item.points_mm for item in lines] or [np.zeros((0, 3))])
@@ -323,8 +342,19 @@ def scene_markup(
         f'data-lines="{_packed(segments)}" data-line-colours="{_encoded(line_colours)}" '
         f'data-centre="{_packed((low + high) / 2)}" '
         f'data-labels="{escape(texts)}" data-yaw="-0.65" data-pitch="0.42" '
-        f'data-up="{"z" if is_z_up else "-y"}"></canvas>'
+        f'data-up="{"z" if is_z_up else "-y"}"{_values_markup(values)}></canvas>'
     )
+
+
+def _values_markup(values: SceneValues | None) -> str:
+    """Attributes of a canvas with a row of float32 a dot: numbers, then indices of names."""
+    if values is None:
+        return ""
+    columns = [*values.numbers.values(), *(index for index, _ in values.names.values())]
+    told: list[list[object]] = [[name] for name in values.numbers]
+    told += [[name, list(names)] for name, (_, names) in values.names.items()]
+    table = np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)
+    return f' data-values="{_packed(table)}" data-told="{escape(json.dumps(told))}"'
 
 
 def _packed(values: FloatArray) -> str:

@@ -52,6 +52,8 @@ NEAR = 0.01
 """What near means, over the diagonal: distances of a wrong part are larger."""
 WELL_FITTING = 0.98
 """Below this part the mirrored model is tried as well."""
+HOPELESS = 0.2
+"""Below this part not even that: another part."""
 MIRRORED = 0.5
 """A mirrored cloud of which fewer than this part of the points lie off is the mirrored part's."""
 UNIT_RATIOS = (("metres", 1000.0), ("inches", 25.4))
@@ -225,7 +227,7 @@ def align_best(
     failure = _foreign(surface, cloud, found[0])
     if failure is not None:
         return failure
-    best = _refined(surface, cloud, found[0].cad_from_part, errors_known)
+    best = fit_to_part(surface, cloud, found[0].cad_from_part, errors_known)
     rivals = tuple(one for one in found[1:] if not _along_free(best, one, cloud, surface))
     return replace(best, rivals=rivals)
 
@@ -287,9 +289,7 @@ def measured(
     return surface.distance(pose.apply(cloud.points_mm[chosen]), towards=towards)
 
 
-def _foreign(
-    surface: PartSurface, cloud: PointCloud, best: PoseCandidate
-) -> FitFailure | None:
+def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> FitFailure | None:
     """Notice a cloud of another part, or of the mirrored one."""
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     d = np.abs(measured(surface, cloud, best.cad_from_part, rows).signed_mm)
@@ -298,17 +298,10 @@ def _foreign(
     share = float((d <= near).mean())
     if share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise):
         return None
-    mirror = np.array([-1.0, 1.0, 1.0])
-    normals = None if cloud.normals is None else cloud.normals * mirror
-    turned = search_pose(surface, cloud.points_mm * mirror, normals)[0]
-    mirrored = surface.distance(turned.cad_from_part.apply(cloud.points_mm[rows] * mirror))
-    off, off_mirrored = 1.0 - share, float((np.abs(mirrored.signed_mm) > near).mean())
-    if off_mirrored < MIRRORED * off and off - off_mirrored > 1.0 - WELL_FITTING:
-        return FitFailure(
-            f"the cloud fits the model's mirror image: {100 * off:.0f} % of its points lie farther "
-            f"than {near:.3g} mm off the model, {100 * off_mirrored:.0f} % off its mirror image",
-            "give the model of this hand of the part, or look whether the scan is mirrored",
-        )
+    if share > HOPELESS:
+        failure = _mirrored(surface, cloud, rows, near, 1.0 - share)
+        if failure is not None:
+            return failure
     if share >= FITTING:
         return None
     return FitFailure(
@@ -318,10 +311,36 @@ def _foreign(
     )
 
 
-def _refined(
+def _mirrored(
+    surface: PartSurface, cloud: PointCloud, rows: IntArray, near: float, off: float
+) -> FitFailure | None:
+    """Notice a cloud that fits the mirrored model; ``off`` of its points lie off the model."""
+    mirror = np.array([-1.0, 1.0, 1.0])
+    normals = None if cloud.normals is None else cloud.normals * mirror
+    turned = search_pose(surface, cloud.points_mm * mirror, normals)[0]
+    mirrored = surface.distance(turned.cad_from_part.apply(cloud.points_mm[rows] * mirror))
+    off_mirrored = float((np.abs(mirrored.signed_mm) > near).mean())
+    if off_mirrored < MIRRORED * off and off - off_mirrored > 1.0 - WELL_FITTING:
+        return FitFailure(
+            f"the cloud fits the model's mirror image: {100 * off:.0f} % of its points lie farther "
+            f"than {near:.3g} mm off the model, {100 * off_mirrored:.0f} % off its mirror image",
+            "give the model of this hand of the part, or look whether the scan is mirrored",
+        )
+    return None
+
+
+def fit_to_part(
     surface: PartSurface, cloud: PointCloud, pose: Pose[Cad, Part], errors_known: bool
 ) -> Alignment:
-    """The robust fit by the points' sigmas, its covariance, and what it does not hold."""
+    """Fit a cloud that lies nearly right: the robust fit of `align_best` without its search.
+
+    Parameters
+    ----------
+    surface, cloud, errors_known
+        As of `align_best`.
+    pose
+        Where the cloud lies, to a few hundredths of the part's size.
+    """
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     normals = None if cloud.normals is None else cloud.normals[rows]
     pose = closer(surface, cloud.points_mm[rows], normals, pose, 3)
@@ -375,7 +394,7 @@ def _fit_sigma(
     own = np.einsum("ni,nij,nj->n", found.normals, covariance, found.normals)
     scale = max(robust_scale(found.signed_mm), SETTLED_MM)
     rest = max(scale**2 - float(np.median(own)), 0.0)
-    return np.sqrt(np.maximum(own + rest, (0.1 * scale) ** 2))
+    return np.asarray(np.sqrt(np.maximum(own + rest, (0.1 * scale) ** 2)))
 
 
 def _middle(placed: FloatArray) -> tuple[FloatArray, float]:
@@ -461,9 +480,7 @@ def screwed(pose: Pose[Cad, Part], twist: FloatArray, centre: FloatArray) -> Pos
     return moved(pose, np.concatenate([twist[:3], bent @ twist[3:]]), centre)
 
 
-def named_motions(
-    free: FloatArray, centre: FloatArray, radius: float
-) -> tuple[FreeMotion, ...]:
+def named_motions(free: FloatArray, centre: FloatArray, radius: float) -> tuple[FreeMotion, ...]:
     """Turns and shifts that span free motions (6, K): rows a turn vector and a shift at a centre.
 
     As many turns as the turn vectors span, each with its axis; what is left are shifts.

@@ -35,10 +35,9 @@ RULE = (
 )
 SPOT_SHARE = 0.02
 """Width of a spot over the part's diagonal: small enough to show a dent, large enough for noise to
-average out."""
+average out. Of thin clouds spots are larger, so that they hold points enough."""
 LEAST_SPOT_POINTS = 10
-NOT_SEEN_POINTS = 3
-"""A face with fewer points is not judged."""
+"""A face none of whose spots has so many is not seen, and not judged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +66,10 @@ class CadOptions:
             ("--reach-mm", self.reach_mm, False),
             ("--tolerance", self.tolerance_mm, True),
             ("--uncertainty-mm", self.uncertainty_mm, True),
-            *((f"tolerance of {name}", one, False) for name, one in self.face_tolerances_mm.items()),
+            *(
+                (f"tolerance of {name}", one, False)
+                for name, one in self.face_tolerances_mm.items()
+            ),
         ]
         for name, value, may_miss in named:
             if not (0.0 < value < math.inf) and not (may_miss and math.isnan(value)):
@@ -254,7 +256,8 @@ def compare_with_part(
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
     face = np.where(near, part.face[found.triangle], -1)
-    spot_width = SPOT_SHARE * part.diagonal_mm
+    by_density = math.sqrt(2 * LEAST_SPOT_POINTS * float(part.areas_mm2.sum()) / len(rows))
+    spot_width = max(SPOT_SHARE * part.diagonal_mm, by_density)
     spot, n_spots = _spots(found.closest_mm, face, spot_width)
     jacobian = np.concatenate([np.cross(placed - alignment.centre_mm, normals), normals], axis=1)
     n_faces = len(part.face_names)
@@ -382,14 +385,12 @@ def _decisions(d: FloatArray, limit: FloatArray, u: FloatArray) -> IntArray:
     return np.where(np.isfinite(limit), decided, -1).astype(np.int64)
 
 
-def _face(
-    name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots
-) -> FaceComparison:
+def _face(name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots) -> FaceComparison:
     statistics = deviation_statistics(d)
     worst = int(np.argmax(np.abs(spots.deviation_mm))) if len(spots) else -1
     decision: Decision | Literal["", "not seen"] = ""
-    if statistics.n < NOT_SEEN_POINTS:
-        decision, u_mean = "not seen", math.nan
+    if worst < 0:
+        decision = "not seen"
     elif math.isfinite(limit):
         whole = OF_VALIDITY[judge(statistics.mean_mm, limit, u_mean)]
         local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)

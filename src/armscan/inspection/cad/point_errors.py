@@ -127,7 +127,7 @@ class PointErrors(RowRecord):
             pull -= np.einsum("fk,kbi->fbi", jacobian, _pulls(influence, self.normals, block, b))
             covariance = _block_means(self.covariance_mm2, block, b)
             largest = np.maximum(largest, np.einsum("fbi,bij,fbj->f", pull, covariance, pull))
-        return np.maximum(private, 0.0) + largest
+        return np.asarray(np.maximum(private, 0.0) + largest)
 
 
 def _blocks(cloud: PointCloud, rows: IntArray) -> list[IntArray]:

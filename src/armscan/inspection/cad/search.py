@@ -30,8 +30,8 @@ NODES = 64
 """Of the grid of distances along its longest side."""
 MARGIN = 0.2
 """Of the grid about the part, over its diagonal."""
-FEW, SOME, MANY = 150, 600, 3000
-"""Points that rate all starts, the better ones, and the last ones."""
+FEW, SOME, MANY, ALL = 150, 600, 3000, 20_000
+"""Points that rate all starts, the better ones, refine the last ones, and compare these."""
 KEPT, LAST, FINAL = 400, 24, 6
 """Starts kept after each round."""
 APART = 0.05
@@ -110,7 +110,10 @@ def search_pose(
         costs = _descended(centred[few], _part_of(facing, few), grid, widths, poses)
         poses = _distinct(poses, costs, centred, APART * diagonal, kept)
     candidates = [_typed(pose, middle) for pose in poses]
-    return _rated(surface, points, towards, candidates)
+    compared = spread_rows(points_mm, ALL)
+    facing = None if normals is None else normals[compared]
+    refined = _refined(surface, points, towards, candidates)
+    return _rated(surface, points_mm[compared], facing, refined)
 
 
 def spread_rows(points_mm: FloatArray, count: int, seed: int = 0) -> IntArray:
@@ -314,24 +317,32 @@ def _orthonormal(matrix: FloatArray) -> FloatArray:
     return np.asarray(u @ vt)
 
 
+def _refined(
+    surface: PartSurface,
+    points: FloatArray,
+    normals: FloatArray | None,
+    poses: list[Pose[Cad, Part]],
+) -> list[Pose[Cad, Part]]:
+    """Refine on the surface itself, with a few points first; the better ones with all."""
+    few = _thinned(len(points), SOME)
+    facing = None if normals is None else normals[few]
+    poses = [closer(surface, points[few], facing, pose, 6) for pose in poses]
+    sizes = [_distances(surface, points[few], facing, pose) for pose in poses]
+    by_scale = np.argsort([robust_scale(d) for d in sizes])
+    return [closer(surface, points, normals, poses[k], 12) for k in by_scale[: 2 * FINAL]]
+
+
 def _rated(
     surface: PartSurface,
     points: FloatArray,
     normals: FloatArray | None,
     poses: list[Pose[Cad, Part]],
 ) -> tuple[PoseCandidate, ...]:
-    """Refine on the surface itself, a few points first; keep what fits nearly as well as the best.
+    """The best pose, and those that fit nearly as well.
 
-    The last word has every point's squared deviation, clipped: a hole that one pose meets and
-    another does not is a few points far off.
+    Every point's squared deviation counts, clipped: a hole that one pose meets and another does
+    not is a few points far off.
     """
-    few = _thinned(len(points), SOME)
-    facing = None if normals is None else normals[few]
-    poses = [closer(surface, points[few], facing, pose, 6) for pose in poses]
-    sizes = [_distances(surface, points[few], facing, pose) for pose in poses]
-    by_scale = np.argsort([robust_scale(d) for d in sizes])
-    poses = [poses[k] for k in by_scale[: 2 * FINAL]]
-    poses = [closer(surface, points, normals, pose, 12) for pose in poses]
     distances = [_distances(surface, points, normals, pose) for pose in poses]
     scales = [robust_scale(d) for d in distances]
     unit = max(min(scales), 1e-7 * surface.part.diagonal_mm)

@@ -9,12 +9,21 @@ function drawScenes() {
     const lines = floats(data.lines), lineColours = bytes(data.lineColours);
     const centre = floats(data.centre);
     const ink = "#5d6b7a", labels = JSON.parse(data.labels);
+    const told = data.told ? JSON.parse(data.told) : [], values = told.length ? floats(data.values) : null;
+    let picked = -1, moved = 0;
     let yaw = Number(data.yaw), pitch = Number(data.pitch), zoom = 1, reach = null;
 
     function turned() {
       const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
       const seen = (x, y, z) => [cy * x + sy * z, cp * y - sp * (cy * z - sy * x)];
       return data.up === "z" ? (x, y, z) => seen(x, -z, y) : seen;
+    }
+
+    // how far behind the middle a point lies: of dots in one place, the one in front is seen
+    function depthOf() {
+      const [cy, sy, cp, sp] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
+      const depth = (x, y, z) => cp * (cy * z - sy * x) + sp * y;
+      return data.up === "z" ? (x, y, z) => depth(x, -z, y) : depth;
     }
 
     function reachOf(turn) {
@@ -51,11 +60,15 @@ function drawScenes() {
         context.stroke();
       }
       const image = context.getImageData(0, 0, width, height), pixels = image.data;
-      const size = Math.max(2, Math.round(1.6 * ratio));
+      const size = Math.max(2, Math.round((values ? 2.4 : 1.6) * ratio));
+      const depths = new Float32Array(width * height).fill(Infinity), depthAt = depthOf();
       for (let k = 0; k < points.length; k += 3) {
         const [px, py] = place(points, k).map(Math.round);
+        const depth = depthAt(points[k] - centre[0], points[k + 1] - centre[1], points[k + 2] - centre[2]);
         for (let j = py; j < py + size; j++) for (let i = px; i < px + size; i++) {
           if (i < 0 || j < 0 || i >= width || j >= height) continue;
+          if (depth >= depths[j * width + i]) continue;
+          depths[j * width + i] = depth;
           const q = 4 * (j * width + i);
           pixels[q] = colours[k]; pixels[q + 1] = colours[k + 1]; pixels[q + 2] = colours[k + 2];
         }
@@ -70,8 +83,46 @@ function drawScenes() {
         context.strokeText(text, ...place(at, 0));
         context.fillText(text, ...place(at, 0));
       }
+      if (picked >= 0) drawPicked(context, place(points, 3 * picked), width, ratio);
       drawAxes(context, turn, 46 * ratio, height - 46 * ratio, 30 * ratio, ratio);
       drawBar(context, width, height, scale, ratio);
+    }
+
+    // what a dot is, beside a ring about it
+    function drawPicked(context, [px, py], width, ratio) {
+      const row = values.subarray(told.length * picked, told.length * (picked + 1));
+      const lines = told.map(([name, names], k) =>
+        `${name}: ${names ? names[row[k]] || "-" : isNaN(row[k]) ? "not known" : row[k].toFixed(4)}`);
+      context.strokeStyle = context.fillStyle = "#000";
+      context.lineWidth = 2 * ratio;
+      context.beginPath();
+      context.arc(px, py, 6 * ratio, 0, 7);
+      context.stroke();
+      const wide = Math.max(...lines.map((line) => context.measureText(line).width)) + 16 * ratio;
+      const left = Math.max(0, Math.min(px + 12 * ratio, width - wide)), top = Math.max(0, py - 50 * ratio);
+      context.fillStyle = "rgba(255, 255, 255, 0.94)";
+      context.fillRect(left, top, wide, (16 * lines.length + 10) * ratio);
+      context.lineWidth = ratio;
+      context.strokeRect(left, top, wide, (16 * lines.length + 10) * ratio);
+      context.fillStyle = "#1d2733";
+      lines.forEach((line, k) => context.fillText(line, left + 8 * ratio, top + 16 * (k + 1) * ratio));
+    }
+
+    // the dot nearest to a click; of those as near, the one in front
+    function pick(event) {
+      const box = canvas.getBoundingClientRect(), scale = zoom * 0.44 * Math.min(box.width / reach[0], box.height / reach[1]);
+      const turn = turned(), depthAt = depthOf();
+      let best = 12;
+      picked = -1;
+      let front = Infinity;
+      for (let k = 0; k < points.length; k += 3) {
+        const d = [points[k] - centre[0], points[k + 1] - centre[1], points[k + 2] - centre[2]];
+        const [x, y] = turn(...d);
+        const off = Math.hypot(box.width / 2 + scale * x - (event.clientX - box.left), box.height / 2 + scale * y - (event.clientY - box.top));
+        const depth = depthAt(...d), near = off < 3 ? 3 : off;
+        if (near < best || (near === best && depth < front)) { best = near; front = depth; picked = k / 3; }
+      }
+      draw();
     }
 
     function drawAxes(context, turn, x0, y0, length, ratio) {
@@ -97,9 +148,11 @@ function drawScenes() {
       context.textAlign = "left";
     }
 
-    canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
+    canvas.addEventListener("pointerdown", (event) => { moved = 0; canvas.setPointerCapture(event.pointerId); });
+    canvas.addEventListener("pointerup", (event) => { if (values && moved < 4) pick(event); });
     canvas.addEventListener("pointermove", (event) => {
       if (!event.buttons) return;
+      moved += Math.abs(event.movementX) + Math.abs(event.movementY);
       yaw -= event.movementX / 160;
       pitch = Math.max(-1.57, Math.min(1.57, pitch - event.movementY / 160));
       draw();

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan inspect cad``: a cloud against the model of its part."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.inspect import EXIT_NOT_PASSED, CloudArgument
+from armscan.cli.options import (
+    AsJson,
+    DefaultOf,
+    Force,
+    PageOption,
+    RegionOption,
+    given,
+    numbers,
+    run,
+)
+
+CAD_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan inspect cad cloud.ply part.step --tolerance 0.05 -o part-inspection.html\n\n"
+    "\b\nWith a tolerance, exit code 0: every face that was seen passed. 1: one failed or is\n"
+    "undecided. 2: the input stood in the way."
+)
+PART = "armscan.jobs.inspection.cad:PartOptions."
+CAD = "armscan.inspection.cad.comparison:CadOptions."
+CHORD = "armscan.storage.parts.step:ChordError."
+
+
+PartArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="The part's model: .step (extra 'cad'), .stl, .ply or .obj.", show_default=False
+    ),
+]
+
+
+class AlignOption(StrEnum):
+    """How the cloud is laid on the model."""
+
+    BEST = "best"
+    NONE = "none"
+    DATUMS = "321"
+
+
+class UnitOption(StrEnum):
+    """Unit of a mesh's numbers."""
+
+    MM = "mm"
+    CM = "cm"
+    M = "m"
+    INCH = "inch"
+
+
+def cad(
+    cloud: CloudArgument,
+    part: PartArgument,
+    *,
+    align: Annotated[
+        AlignOption | None,
+        typer.Option(
+            help="best fit without a guess; none: the cloud is in the model's frame; 321: by "
+            "--datums.",
+            show_default=DefaultOf(PART + "align"),
+        ),
+    ] = None,
+    datums: Annotated[
+        str, typer.Option(help="Three faces for 321, FACE,FACE,FACE.", show_default=False)
+    ] = "",
+    tolerance: Annotated[
+        str,
+        typer.Option(
+            help="Largest deviation either way, mm; or a .toml or .csv file of tolerances by face.",
+            show_default=False,
+        ),
+    ] = "",
+    uncertainty_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="U (k = 2) of a deviation, instead of what the cloud says.", show_default=False
+        ),
+    ] = None,
+    reach_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Points farther from the model than this are not of the part.",
+            show_default=DefaultOf(CAD + "reach_mm"),
+        ),
+    ] = None,
+    unit: Annotated[
+        UnitOption | None,
+        typer.Option(
+            help="Unit of a mesh; STEP says its own.", show_default=DefaultOf(PART + "unit")
+        ),
+    ] = None,
+    chord_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Triangles of STEP faces lie within this.",
+            show_default=DefaultOf(CHORD + "chord_mm"),
+        ),
+    ] = None,
+    region: RegionOption = "",
+    output: PageOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Deviations of a part from its model, face by face, with a verdict."""
+    from armscan.inspection.cad.comparison import CadOptions
+    from armscan.jobs.inspection.cad import PartOptions, inspect_cad
+    from armscan.storage.parts.step import ChordError
+
+    box = numbers(region, "--region")
+    options = given(CadOptions, reach_mm=reach_mm, uncertainty_mm=uncertainty_mm)
+    how = given(
+        PartOptions,
+        align=None if align is None else align.value,
+        unit=None if unit is None else unit.value,
+        datums=datums,
+    )
+    chord = given(ChordError, chord_mm=chord_mm)
+    summary = run(
+        lambda job: inspect_cad(
+            job, cloud, part, tolerance=tolerance, region=box, part_options=how,
+            options=options, chord=chord,
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )  # fmt: skip
+    return 0 if summary.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED

@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a cloud and the model of its part to deviations, verdict and page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from armscan.errors import InputError, OptionError
+from armscan.inspection.cad.alignment import (
+    Alignment,
+    AlignMethod,
+    align_best,
+    align_datums,
+    align_none,
+    scale_mismatch,
+)
+from armscan.inspection.cad.comparison import CadOptions, compare_with_part
+from armscan.inspection.cad.distance import PartSurface
+from armscan.jobs.inspection.shapes import region_of
+from armscan.jobs.job import Job, solved
+from armscan.pipeline.progress import ProgressEvent
+from armscan.records.cloud import PointCloud
+from armscan.report.inspection.cad import (
+    cad_page,
+    cad_quantities,
+    cad_warnings,
+    statistics_table,
+    verdict_table,
+)
+from armscan.report.quantity import Summary, sentences
+from armscan.storage.clouds import read_cloud
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.parts.meshes import UNITS_MM, read_part
+from armscan.storage.parts.step import ChordError
+from armscan.storage.parts.tables import (
+    datum_faces,
+    deviation_ply_bytes,
+    face_table_bytes,
+    read_tolerances,
+)
+
+STAGES = ("model", "cloud", "alignment", "deviations")
+
+
+@dataclass(frozen=True, slots=True)
+class PartOptions:
+    """How the model is read and the cloud laid on it.
+
+    Parameters
+    ----------
+    align
+        ``best``: wherever the cloud fits best; ``none``: it is in the part's frame; ``321``: by
+        three faces.
+    datums
+        Names of the three faces, between commas.
+    unit
+        Unit of a mesh: mm, cm, m or inch.
+    """
+
+    align: AlignMethod = "best"
+    datums: str = ""
+    unit: str = "mm"
+
+
+def inspect_cad(
+    job: Job,
+    cloud_path: Path,
+    part_path: Path,
+    *,
+    tolerance: str = "",
+    region: Sequence[float] = (),
+    part_options: PartOptions | None = None,
+    options: CadOptions | None = None,
+    chord: ChordError | None = None,
+) -> Summary:
+    """Compare a cloud with the model of its part.
+
+    Beside the page go ``NAME.csv``, a row a face, and ``NAME.ply``, the points with their
+    deviations.
+
+    Parameters
+    ----------
+    job
+        Where to write the page, if anywhere.
+    cloud_path
+        A cloud of ``armscan reconstruct``, or any file that `armscan.storage.read_cloud` reads.
+    part_path
+        The model: STL, PLY, OBJ or STEP.
+    tolerance
+        A length in mm, or a table of them as of `armscan.storage.parts.tables.read_tolerances`.
+    region
+        ``xmin, xmax, ymin, ymax, zmin, zmax`` in mm of the cloud's frame; empty for all of it.
+    part_options, options, chord
+        How to read, lay and judge; tolerances are those of ``tolerance``.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, an option is wrong, or the cloud is not of this part; nothing is
+        written then.
+    """
+    how, options = part_options or PartOptions(), options or CadOptions()
+    _check_options(how)
+    job.places(".html", beside=(".csv", ".ply"))
+    box = region_of(region)
+    _tell(job, 0, part_path.name)
+    part = read_part(part_path, unit=how.unit, chord=chord)
+    limit, by_face = read_tolerances(tolerance, part)
+    options = replace(options, tolerance_mm=limit, face_tolerances_mm=by_face)
+    datums = datum_faces(how.datums, part) if how.align == "321" else ()
+    _tell(job, 1, cloud_path.name)
+    cloud = read_cloud(cloud_path)
+    if box is not None:
+        cloud = cloud.select(box.holds(cloud.points_mm))
+    errors_known = bool(cloud.covariance_mm2.any()) and not np.isfinite(options.uncertainty_mm)
+    surface = PartSurface(part)
+    _tell(job, 2, how.align)
+    alignment = _aligned(surface, cloud, how, datums, errors_known, where=cloud_path)
+    _tell(job, 3)
+    found = solved(compare_with_part(surface, cloud, alignment, options, errors_known), cloud_path)
+    _tell(job, 4)
+    is_simulated = cloud.is_simulated or are_simulated((cloud_path, part_path))
+    warnings = (*part.notes, *cad_warnings(found, errors_known))
+    told = cad_quantities(found, part)
+    written: tuple[Path, ...] = ()
+    if job.output is not None:
+        inputs = (cloud_path, part_path)
+        shown: Sequence[Any] = (how, options, *(() if chord is None else (chord,)))
+        provenance = job.provenance(inputs, shown, warnings=warnings, forced=cloud.forced)
+        page = cad_page(found, part, cloud, provenance, warnings, is_simulated=is_simulated)
+        written = job.write(
+            {
+                job.output: page,
+                job.output.with_suffix(".csv"): face_table_bytes(found),
+                job.output.with_suffix(".ply"): deviation_ply_bytes(found, cloud, part),
+            }
+        )
+    return Summary(
+        title=f"{cloud_path.name} against {part_path.name}"
+        + (" (simulated data)." if is_simulated else "."),
+        quantities=told,
+        tables=(verdict_table(found), statistics_table(found)),
+        warnings=sentences(warnings),
+        written=written,
+        next_step=f"open {job.output}" if job.output else "",
+        forced=cloud.forced,
+        extra={"kind": "cad inspection", "simulated": is_simulated},
+    )
+
+
+def _check_options(how: PartOptions) -> None:
+    if how.unit not in UNITS_MM:
+        raise OptionError(
+            f"unknown unit '{how.unit}'",
+            where="--unit",
+            remedy=f"give one of {', '.join(UNITS_MM)}",
+        )
+    if (how.align == "321") != bool(how.datums):
+        raise OptionError(
+            "three datum faces go with --align 321, and only with it",
+            where="--datums",
+            remedy="give both or none of them",
+        )
+
+
+def _aligned(
+    surface: PartSurface,
+    cloud: PointCloud,
+    how: PartOptions,
+    datums: Sequence[int],
+    errors_known: bool,
+    *,
+    where: Path,
+) -> Alignment:
+    if len(cloud) == 0:
+        raise InputError(
+            "no point is left of the cloud", where=str(where), remedy="give another --region"
+        )
+    if how.align == "none":
+        mismatch = scale_mismatch(surface, cloud.points_mm)
+        if mismatch is not None:
+            solved(mismatch, where)
+        return align_none(cloud)
+    best = solved(align_best(surface, cloud, errors_known), where)
+    if how.align == "best":
+        return best
+    return solved(align_datums(surface, cloud, datums, best), where)
+
+
+def _tell(job: Job, done: int, item: str = "") -> None:
+    job.progress(ProgressEvent("inspect", done, len(STAGES), item))

@@ -1,0 +1,490 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a cloud against the model of its part, and its numbers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+from numpy.typing import NDArray
+
+from armscan.geometry.arrays import FloatArray
+from armscan.inspection.cad.comparison import (
+    DEFINITIONS,
+    RULE,
+    CadComparison,
+    FaceComparison,
+)
+from armscan.inspection.cad.part import PartModel, edges_of
+from armscan.inspection.cad.search import spread_rows
+from armscan.inspection.results import histogram
+from armscan.models.calibration import Provenance
+from armscan.records.cloud import PointCloud
+from armscan.report.drawing import (
+    ACCENT,
+    INK,
+    MUTED,
+    SceneDots,
+    SceneLines,
+    SceneValues,
+    chart_markup,
+    new_figure,
+    scene_markup,
+    styled,
+)
+from armscan.report.page import Facts, Gallery, Legend, Page, Picture, Section, Text, page_of
+from armscan.report.quantity import Quantity, Table, fact, only, significant
+
+MAX_SHOWN = 30_000
+MAX_EDGES = 6_000
+MAX_IN_SECTION = 4_000
+BANDS = 8
+"""Of colour: six within the tolerance, one beyond it on either side."""
+RAMP = "cividis"
+"""Dark inside, light outside: its lightness alone tells the sign, in grey print too, and its blues
+and yellows stay apart for colour-blind readers."""
+RAMP_ENDS = (0.0, 0.93)
+LEAST_LIMIT_MM = 1e-4
+DRAWN_SHARE = 0.05
+"""Height of the largest deviation drawn in a section, over the part's size."""
+STATEMENT = (
+    "A deviation is the signed distance from a point to the closest point of the model's surface, "
+    "positive outside the material. Alignment rms is of the points that the alignment used, "
+    "outliers left out; deviation rms is of all points within reach, and is not the same thing. "
+    "A face is judged by its mean and by every spot of it: the decision is the worst of these. "
+)
+
+
+def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...]:
+    """All that is told of a comparison."""
+    a, overall = found.alignment, found.overall
+    sigma = np.sqrt(np.maximum(np.diag(a.step_covariance), 0.0))
+    beyond = found.n_given - len(found)
+    seen = sum(one.statistics.n > 0 for one in found.faces)
+    told = [
+        Quantity("part.triangles", "Model", len(part.triangles), meaning=_model_text(part)),
+        Quantity(
+            "points.n", "Points", overall.n,
+            meaning=f"of {found.n_given:,} given; {beyond:,} lie farther than "
+            f"{found.options.reach_mm:g} mm from the model and count nowhere",
+        ),
+        Quantity("points.n_given", "", found.n_given),
+        Quantity("points.n_beyond_reach", "", beyond),
+        Quantity("reach_mm", "", found.options.reach_mm),
+        Quantity("faces.n_seen", "Faces seen", seen, meaning=f"of {len(found.faces)}"),
+        Quantity("alignment.method", "Alignment", a.method, shown=ALIGNMENTS[a.method]),
+        Quantity(
+            "alignment.rms_mm", "Alignment rms", a.rms_mm, unit="mm",
+            meaning=f"of the {len(a.rows):,} points that it used",
+        ),
+        Quantity("alignment.n_used", "", len(a.rows)),
+        Quantity("alignment.cad_from_part", "", a.cad_from_part.matrix.tolist()),
+        Quantity("alignment.covariance", "", a.covariance.tolist()),
+        Quantity("alignment.sigma_turn_rad", "", sigma[:3].tolist()),
+        Quantity("alignment.sigma_shift_mm", "", sigma[3:].tolist()),
+        Quantity("alignment.centre_mm", "", a.centre_mm.tolist()),
+        Quantity("alignment.sigma_rule", "", a.sigma_rule),
+        Quantity("alignment.not_held", "", [one.text for one in a.free]),
+        Quantity("alignment.n_other_poses", "", len(a.rivals)),
+        *_overall_quantities(found),
+    ]  # fmt: skip
+    if a.method != "none":
+        shown = (
+            f"{significant(float(sigma[3:].max()), 'mm', 2)} at the middle of the points, "
+            f"{significant(float(np.degrees(sigma[:3].max())), 'degrees', 2)}"
+        )
+        told.append(fact("Sigma of the alignment", shown, a.sigma_rule))
+    if found.options.has_tolerance:
+        told += _verdict_quantities(found)
+    told.append(Quantity("faces.each", "", [_face_data(one) for one in found.faces]))
+    return tuple(told)
+
+
+UNSIGNED = ("std_mm", "rms_mm")
+ALIGNMENTS = {
+    "best": "best fit of the whole cloud, found without a guess",
+    "none": "none: the cloud's frame is taken for that of the part",
+    "321": "3-2-1, by three datum faces",
+}
+
+
+def _model_text(part: PartModel) -> str:
+    size = " × ".join(f"{value:.4g}" for value in part.high_mm - part.low_mm)
+    return f"triangles of {part.source} in {len(part.face_names)} faces, {size} mm"
+
+
+def _overall_quantities(found: CadComparison) -> list[Quantity]:
+    overall = found.overall
+    told = []
+    for key, (label, meaning) in DEFINITIONS.items():
+        name = "Deviation rms" if key == "rms_mm" else f"Deviation, {label}"
+        if key != "n":
+            value = float(getattr(overall, key))
+            told.append(
+                Quantity(
+                    f"deviation.{key}",
+                    name,
+                    value,
+                    shown=f"{_statistic(key, value)} mm",
+                    meaning=meaning,
+                )
+            )
+    told.append(
+        Quantity("deviation.definitions", "", {k: text for k, (_, text) in DEFINITIONS.items()})
+    )
+    u = float(np.median(found.u_mm))
+    told.append(
+        Quantity(
+            "deviation.u_median_mm", "U of a point's deviation", u, unit="mm",
+            meaning="median, k = 2: the point's own and the alignment's",
+        )
+    )  # fmt: skip
+    return told
+
+
+def _verdict_quantities(found: CadComparison) -> list[Quantity]:
+    counts = dict.fromkeys(("pass", "undecided", "fail", "not seen"), 0)
+    for one in found.faces:
+        if one.decision:
+            counts[one.decision] += 1
+    shares = 100.0 * np.bincount(found.decision[found.decision >= 0], minlength=3)
+    shares = shares / max(int((found.decision >= 0).sum()), 1)
+    text = ", ".join(f"{n} {word}" for word, n in counts.items() if n)
+    return [
+        Quantity("verdict", "Verdict", found.verdict, shown=found.verdict or "nothing to decide"),
+        Quantity("verdict_faces", "Faces", counts, shown=text),
+        Quantity("verdict_rule", "", RULE),
+        Quantity(
+            "points.percent_pass_undecided_fail", "Points", shares.tolist(),
+            shown=f"{shares[0]:.2f} % pass, {shares[1]:.2f} % undecided, {shares[2]:.2f} % fail",
+        ),
+    ]  # fmt: skip
+
+
+def _face_data(one: FaceComparison) -> dict[str, object]:
+    return {
+        "face": one.name,
+        **{key: getattr(one.statistics, key) for key in DEFINITIONS},
+        "u_mean_mm": one.u_mean_mm,
+        "spot_mm": one.spot_mm,
+        "u_spot_mm": one.u_spot_mm,
+        "spot_place_mm": one.spot_place_mm.tolist(),
+        "tolerance_mm": one.tolerance_mm,
+        "decision": one.decision,
+    }
+
+
+def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
+    """What a person should read first, in words."""
+    texts = list(found.alignment.warnings)
+    if not errors_known and math.isnan(found.options.uncertainty_mm):
+        texts.append(
+            "the cloud carries no standard deviations, so no deviation's U is known and nothing "
+            "can be decided; state U with --uncertainty-mm"
+        )
+    beyond = 1.0 - len(found) / max(found.n_given, 1)
+    if beyond > 0.1:
+        texts.append(
+            f"{100.0 * beyond:.0f} % of the points lie farther than {found.options.reach_mm:g} mm "
+            "from the model and count nowhere; see whether they are of the part"
+        )
+    unseen = [one.name for one in found.faces if one.decision == "not seen"]
+    if unseen:
+        named = ", ".join(unseen[:6]) + (" and others" if len(unseen) > 6 else "")
+        texts.append(f"not seen by the scan, so not judged: {named}")
+    return tuple(texts)
+
+
+def verdict_table(found: CadComparison) -> Table:
+    """A row a face: decision, tolerance, mean and worst spot, each with its U."""
+    has_limit = found.options.has_tolerance
+    heads = ("face", "points", "mean", "U of mean", "spot", "U of spot")
+    rows = []
+    for one in found.faces:
+        pairs = ((one.statistics.mean_mm, one.u_mean_mm), (one.spot_mm, one.u_spot_mm))
+        cells = [text for value, u in pairs for text in (_length(value), _length(u, sign=""))]
+        limit = (_length(one.tolerance_mm, sign=""), one.decision) if has_limit else ()
+        rows.append((one.name, f"{one.statistics.n:,}", *cells, *limit))
+    more = ("tolerance", "decision") if has_limit else ()
+    title = "Decision by face, mm" if has_limit else "Faces, mm"
+    return Table((*heads, *more), tuple(rows), title, (len(heads) + 1,) if has_limit else ())
+
+
+def statistics_table(found: CadComparison) -> Table:
+    """A row a face, and one for all points: every statistic of `DEFINITIONS`."""
+    each = (("all points", found.overall), *((one.name, one.statistics) for one in found.faces))
+    rows = []
+    for name, statistics in each:
+        cells = [_statistic(key, getattr(statistics, key)) for key in DEFINITIONS]
+        rows.append((name, *cells))
+    heads = ("face", *(label for label, _ in DEFINITIONS.values()))
+    return Table(heads, tuple(rows), "Statistics of the deviations, mm")
+
+
+def _statistic(key: str, value: float) -> str:
+    if key == "n":
+        return f"{value:,}"
+    return _length(value, sign="" if key in UNSIGNED else "+")
+
+
+def _length(value: float, *, sign: str = "+") -> str:
+    """A length to a tenth of a micrometre, with its sign; a dash for none."""
+    return f"{value:{sign}.4f}" if math.isfinite(value) else "-"
+
+
+def cad_page(
+    found: CadComparison,
+    part: PartModel,
+    cloud: PointCloud,
+    provenance: Provenance,
+    warnings: Sequence[str] = (),
+    *,
+    is_simulated: bool = False,
+) -> Page:
+    """Lay out the page.
+
+    Parameters
+    ----------
+    found
+        The comparison.
+    part, cloud
+        What was compared.
+    provenance
+        How it came to be.
+    warnings
+        What is odd.
+    is_simulated
+        True if the images were rendered.
+    """
+    told = cad_quantities(found, part)
+    limit = colour_limit_mm(found)
+    definitions = tuple((label, meaning) for label, meaning in DEFINITIONS.values())
+    spot = (
+        ("spot", f"median deviation of the spot that deviates most, of all spots {_width(found)} "
+         "wide with ten points or more"),
+        ("U", "expanded uncertainty, k = 2: of the points, what exposures have in common, and the "
+         "alignment"),
+    )  # fmt: skip
+    return page_of(
+        provenance,
+        "Part against its model",
+        f"{len(found):,} points against {part.source}",
+        (
+            Section("Deviations in space", (Legend(_band_legend(found, limit)), Gallery(
+                (deviation_scene(found, part, cloud, limit),), 560))),
+            Section("Face by face", (
+                Text(STATEMENT + _rule(found)), verdict_table(found), statistics_table(found))),
+            Section("Distribution", (Gallery((deviation_chart(found),)),)),
+            Section("Sections", (Text(_section_text(found, limit, part)), Gallery(
+                tuple(section_chart(found, part, axis, limit) for axis in range(3))))),
+            Section("What the numbers mean", (
+                Table(("statistic", "definition"), (*definitions, *spot), "", (1,)),)),
+            Section("Alignment", (Facts(_alignment_facts(found, told)),)),
+        ),
+        cards=_cards(told),
+        warnings=warnings,
+        is_simulated=is_simulated,
+    )  # fmt: skip
+
+
+def _rule(found: CadComparison) -> str:
+    return f"A deviation is {RULE}." if found.options.has_tolerance else "No tolerance was given."
+
+
+def _width(found: CadComparison) -> str:
+    return significant(found.spot_width_mm, "mm", 2)
+
+
+def _cards(told: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    keys = ("verdict", "deviation.rms_mm", "deviation.mean_mm", "alignment.rms_mm", "points.n")
+    return only(told, *keys)
+
+
+def _alignment_facts(found: CadComparison, told: Sequence[Quantity]) -> tuple[Quantity, ...]:
+    matrix = found.alignment.cad_from_part.matrix
+    rows = "\n".join("  ".join(f"{value:12.7f}" for value in row) for row in matrix[:3])
+    held = ", ".join(one.text for one in found.alignment.free) or "all motions are held"
+    return (
+        *only(told, "alignment.method", "alignment.rms_mm"),
+        *(item for item in told if item.label == "Sigma of the alignment"),
+        fact("Not held", held),
+        fact("Cad from the cloud's frame", rows, "rotation, and translation in mm"),
+    )
+
+
+def colour_limit_mm(found: CadComparison) -> float:
+    """Deviation at which colours end: the tolerance most faces have, else what 98 % stay below."""
+    limits = [one.tolerance_mm for one in found.faces if math.isfinite(one.tolerance_mm)]
+    if limits:
+        return float(np.median(limits))
+    return max(float(np.percentile(np.abs(found.deviation_mm), 98.0)), LEAST_LIMIT_MM)
+
+
+def band_edges_mm(limit_mm: float) -> FloatArray:
+    """(BANDS - 1,) deviations at which the colour changes."""
+    return np.linspace(-limit_mm, limit_mm, BANDS - 1)
+
+
+def band_colours() -> NDArray[np.uint8]:
+    """(BANDS, 3) colours, inside to outside, red green blue."""
+    places = np.linspace(*RAMP_ENDS, BANDS)
+    return np.asarray(colormaps[RAMP](places, bytes=True), dtype=np.uint8)[:, :3]
+
+
+def _band_legend(found: CadComparison, limit: float) -> tuple[tuple[str, str], ...]:
+    edges = band_edges_mm(limit)
+    band = np.searchsorted(edges, found.deviation_mm)
+    shares = 100.0 * np.bincount(band, minlength=BANDS) / max(len(found), 1)
+    # a legend is read from the outside in, as the part is seen
+    texts = [f"below {edges[0]:+.4f} mm"]
+    texts += [f"{a:+.4f} to {b:+.4f} mm" for a, b in pairwise(edges)]
+    texts.append(f"above {edges[-1]:+.4f} mm")
+    colours = [to_hex(colour / 255.0) for colour in band_colours().astype(np.float64)]
+    rows = [
+        (colour, f"{text} ({share:.1f} %)")
+        for colour, text, share in zip(colours, texts, shares, strict=True)
+    ]
+    return tuple(rows[::-1])
+
+
+def deviation_scene(
+    found: CadComparison, part: PartModel, cloud: PointCloud, limit_mm: float
+) -> Picture:
+    """The points in space over the model's edges, coloured by deviation; a click tells a point."""
+    rows = spread_rows(found.points_mm, MAX_SHOWN)
+    band = np.searchsorted(band_edges_mm(limit_mm), found.deviation_mm[rows])
+    dots = SceneDots(found.points_mm[rows], band_colours()[band])
+    source = found.rows[rows]
+    values = SceneValues(
+        {
+            "deviation, mm": found.deviation_mm[rows],
+            "U, mm": found.u_mm[rows],
+            "sigma, mm": cloud.select(source).sigma_mm,
+        },
+        {
+            "face": (found.face[rows], part.face_names),
+            "exposure": (cloud.exposure[source], cloud.exposure_sources),
+            "sheet": (cloud.sheet[source], cloud.sheet_names),
+        },
+    )
+    lines = SceneLines(model_edges(part), MUTED)
+    title = "Points coloured by deviation, over the model's edges"
+    scene = scene_markup([dots], [lines], [], title, is_z_up=True, values=values)
+    thinned = (
+        f" {len(rows):,} of the {len(found):,} points are shown, spread evenly; all of them count."
+        if len(rows) < len(found)
+        else ""
+    )
+    return Picture(
+        scene,
+        title="Cad frame",
+        caption="Dark is inside the material or too low, light is outside or too high. Drag to "
+        f"turn; click, then scroll to zoom; a click on a point tells its values.{thinned}",
+    )
+
+
+def model_edges(part: PartModel) -> FloatArray:
+    """(2 L, 3) ends of the edges between faces, thinned where they are very many."""
+    edges, number = edges_of(part.triangles)
+    low = np.full(len(edges), np.iinfo(np.int64).max)
+    high = np.full(len(edges), -1)
+    face = np.repeat(part.face, 3)
+    np.minimum.at(low, number.ravel(), face)
+    np.maximum.at(high, number.ravel(), face)
+    is_single = np.bincount(number.ravel(), minlength=len(edges)) == 1
+    shown = np.flatnonzero((low != high) | is_single)
+    shown = shown[:: max(1, math.ceil(len(shown) / MAX_EDGES))]
+    return np.asarray(part.vertices_mm[edges[shown]].reshape(-1, 3))
+
+
+def deviation_chart(found: CadComparison) -> Picture:
+    """Histogram of the deviations with the tolerance, if all faces have one."""
+    d = found.deviation_mm
+    limits = {one.tolerance_mm for one in found.faces if math.isfinite(one.tolerance_mm)}
+    reach = max(1.15 * float(np.percentile(np.abs(d), 99.5)), *(1.3 * t for t in limits), 1e-3)
+    counted = histogram(d, reach)
+    with styled():
+        figure = new_figure(7.0, 3.4)
+        axes = figure.add_subplot()
+        axes.stairs(counted.counts, counted.edges_mm, fill=True, color=ACCENT)
+        axes.axvline(0.0, color=INK, linewidth=0.7)
+        for limit in sorted(limits):
+            for edge in (-limit, limit):
+                axes.axvline(edge, color=INK, linewidth=0.9, linestyle="--")
+        axes.set_xlim(-reach, reach)
+        axes.set_xlabel("deviation from the model, mm")
+        axes.set_ylabel("points")
+        axes.grid(axis="y")
+    beyond = counted.n_below + counted.n_above
+    outside = f" {beyond:,} lie outside the picture." if beyond else ""
+    dashed = " Dashed: tolerances." if limits else ""
+    return Picture(
+        chart_markup(figure, "Histogram of deviations"),
+        title="Deviations of all points",
+        caption=f"{len(d):,} points within {found.options.reach_mm:g} mm of the model."
+        f"{outside}{dashed}",
+    )
+
+
+def _magnification(found: CadComparison, limit: float, part: PartModel) -> float:
+    """How much deviations are enlarged in sections: a round number."""
+    largest = max(limit, float(np.percentile(np.abs(found.deviation_mm), 99.0)))
+    wanted = DRAWN_SHARE * part.diagonal_mm / largest
+    power = 10.0 ** math.floor(math.log10(max(wanted, 1.0)))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= max(wanted, 1.0))
+
+
+def _section_text(found: CadComparison, limit: float, part: PartModel) -> str:
+    return (
+        "Cuts through the middle of the points. Lines are the model; dots are points near the cut, "
+        f"drawn where their deviation, enlarged {_magnification(found, limit, part):g} times, puts "
+        "them off the model."
+    )
+
+
+def section_chart(found: CadComparison, part: PartModel, axis: int, limit_mm: float) -> Picture:
+    """A cut across one axis of Cad."""
+    name = "XYZ"[axis]
+    low, high = found.closest_mm[:, axis].min(), found.closest_mm[:, axis].max()
+    # a little off the middle: a cut in the plane of a face shows the face, not the part
+    at = float(low + 0.4837 * (high - low))
+    others = [k for k in range(3) if k != axis]
+    near = np.flatnonzero(np.abs(found.closest_mm[:, axis] - at) < 0.01 * part.diagonal_mm)
+    near = near[:: max(1, math.ceil(len(near) / MAX_IN_SECTION))]
+    size = _magnification(found, limit_mm, part)
+    drawn = found.closest_mm[near] + size * found.deviation_mm[near, None] * found.normals[near]
+    colours = band_colours()[np.searchsorted(band_edges_mm(limit_mm), found.deviation_mm[near])]
+    outline = cut_outline(part, axis, at)[:, :, others]
+    with styled():
+        figure = new_figure(5.6, 4.2)
+        axes = figure.add_subplot()
+        for piece in outline:
+            axes.plot(piece[:, 0], piece[:, 1], color=MUTED, linewidth=0.8)
+        across, up = drawn[:, others].T
+        axes.scatter(across, up, c=colours / 255.0, s=4, linewidths=0)
+        axes.set_xlabel(f"{'XYZ'[others[0]]}, mm")
+        axes.set_ylabel(f"{'XYZ'[others[1]]}, mm")
+        axes.set_aspect("equal", adjustable="datalim")
+    title = f"{name} = {at:.2f} mm"
+    return Picture(
+        chart_markup(figure, f"Section at {title}"),
+        title=title,
+        caption=f"{len(near):,} points within {significant(0.01 * part.diagonal_mm, 'mm', 2)}.",
+    )
+
+
+def cut_outline(part: PartModel, axis: int, at_mm: float) -> FloatArray:
+    """(L, 2, 3) pieces of line where a plane across an axis cuts the model's triangles."""
+    corners = part.corners_mm
+    height = corners[:, :, axis] - at_mm
+    crossed = (height.min(axis=1) < 0.0) & (height.max(axis=1) >= 0.0)
+    corners, height = corners[crossed], height[crossed]
+    after, height_after = np.roll(corners, -1, axis=1), np.roll(height, -1, axis=1)
+    meets = (height < 0.0) != (height_after < 0.0)
+    share = height / np.where(meets, height - height_after, 1.0)
+    places = corners + share[:, :, None] * (after - corners)
+    return np.asarray(places[meets].reshape(-1, 2, 3))

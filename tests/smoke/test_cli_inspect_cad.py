@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan inspect cad`` as it is called: files, exit codes, refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from armscan.cli import main
+from armscan.storage.clouds import parse_ply, ply_bytes
+from rigs.inspection_clouds import cloud_of
+from rigs.parts import wedge_part
+
+PART = wedge_part()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model, and a scan of the part in its frame with one face 0.08 mm high."""
+    folder = tmp_path_factory.mktemp("cad")
+    mesh = trimesh.Trimesh(PART.vertices_mm, PART.triangles, process=False)
+    (folder / "part.stl").write_bytes(mesh.export(file_type="stl"))
+    (folder / "metres.stl").write_bytes(mesh.copy().apply_scale(1e-3).export(file_type="stl"))
+    points, triangle = PART.surface_points(30_000)
+    normals = PART.normals[triangle]
+    random = np.random.default_rng(0)
+    off = 0.01 * random.normal(size=len(points)) + 0.08 * (PART.face[triangle] == 3)
+    exposure = random.integers(0, 20, len(points))
+    for name, more in (("high", off), ("good", 0.01 * random.normal(size=len(points)))):
+        cloud = cloud_of(
+            points + more[:, None] * normals, exposure, sigma_mm=0.003, noise_mm=0.01,
+            noise_along=normals, normals=normals,
+        )  # fmt: skip
+        (folder / f"{name}.ply").write_bytes(ply_bytes(cloud))
+    return folder
+
+
+def inspect(files: Path, *words: str, cloud: str = "high.ply", part: str = "part.stl") -> int:
+    return main(["inspect", "cad", str(files / cloud), str(files / part), *words])
+
+
+def test_a_high_face_is_found_and_no_other(
+    files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    assert inspect(files, "--tolerance", "0.05", "--json", "-o", str(page)) == 1
+    told = json.loads(capsys.readouterr().out)
+    decisions = {face["face"]: face["decision"] for face in told["faces"]["each"]}
+    assert [name for name, one in decisions.items() if one != "pass"] == ["face 4"]
+    assert told["faces"]["each"][3]["mean_mm"] == pytest.approx(0.08, abs=0.002)
+    assert told["verdict"] == "fail"
+    assert told["deviation"]["rms_mm"] > told["alignment"]["rms_mm"]
+    with (tmp_path / "report.csv").open() as stream:
+        rows = list(csv.DictReader(line for line in stream if not line.startswith("#")))
+    assert [row["face"] for row in rows if row["decision"] == "fail"] == ["face 4"]
+    table = parse_ply((tmp_path / "report.ply").read_bytes(), "report.ply").table
+    assert len(table) == told["points"]["n"] == 30_000
+    high = table["deviation_mm"][table["face"] == 3]
+    assert high.mean() == pytest.approx(told["faces"]["each"][3]["mean_mm"], abs=1e-9)
+    text = page.read_text()
+    assert "https://" not in text
+    assert "data-values" in text
+
+
+def test_a_good_part_passes(files: Path) -> None:
+    assert inspect(files, "--tolerance", "0.05", "--align", "none", cloud="good.ply") == 0
+    assert inspect(files, "--align", "none", cloud="good.ply") == 0
+
+
+REFUSED = [
+    (("--unit", "furlong"), "part.stl"),
+    (("--tolerance", "-1"), "part.stl"),
+    (("--tolerance", "missing.toml"), "part.stl"),
+    (("--align", "321"), "part.stl"),
+    (("--datums", "face 1,face 2,face 3"), "part.stl"),
+    (("--reach-mm", "0"), "part.stl"),
+    (("--region", "1000,1001,0,1,0,1"), "part.stl"),
+    (("--align", "none"), "metres.stl"),
+    ((), "no-such.stl"),
+]
+
+
+@pytest.mark.parametrize(("words", "part"), REFUSED)
+def test_what_cannot_be_done_is_one_sentence(
+    files: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    part: str,
+) -> None:
+    page = tmp_path / "report.html"
+    assert inspect(files, *words, "-o", str(page), part=part) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_metres_are_noticed_and_cured(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert inspect(files, "--align", "none", part="metres.stl") == 2
+    assert "--unit m" in capsys.readouterr().err
+    assert inspect(files, "--align", "none", "--unit", "m", part="metres.stl") == 0

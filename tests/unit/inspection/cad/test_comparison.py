@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Statistics, spots and decisions of deviations, against NumPy and by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from armscan.errors import OptionError
+from armscan.geometry.estimate import FitFailure
+from armscan.inspection.cad.alignment import align_none
+from armscan.inspection.cad.comparison import (
+    DECISIONS,
+    CadComparison,
+    CadOptions,
+    compare_with_part,
+    deviation_statistics,
+)
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.part import part_of
+from rigs.inspection_clouds import cloud_of
+from rigs.parts import box_corners
+
+BOX = PartSurface(part_of(box_corners([0, 0, 0.0], [60, 40, 20]), source="box"))
+
+
+def top_points(n: int, height: float = 20.0, seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    points = random.uniform(2.0, [58.0, 38.0, 2.0], (n, 3))
+    points[:, 2] = height
+    return points
+
+
+def compared(points: np.ndarray, sigma: float = 0.0, **options: float) -> CadComparison:
+    cloud = cloud_of(points, sigma_mm=sigma)
+    found = compare_with_part(
+        BOX, cloud, align_none(cloud), CadOptions(**options), errors_known=sigma > 0.0
+    )
+    assert isinstance(found, CadComparison)
+    return found
+
+
+def test_statistics_are_those_of_their_definitions() -> None:
+    d = np.random.default_rng(1).normal(0.02, 0.1, 1001)
+    found = deviation_statistics(d)
+    ordered = np.sort(d)
+    assert found.n == 1001
+    assert found.mean_mm == pytest.approx(d.sum() / 1001)
+    assert found.std_mm**2 == pytest.approx(((d - d.mean()) ** 2).sum() / 1000)
+    assert found.rms_mm**2 == pytest.approx((d**2).sum() / 1001)
+    assert (found.p05_mm, found.p95_mm) == pytest.approx((ordered[50], ordered[950]))
+    assert (found.min_mm, found.max_mm) == (ordered[0], ordered[-1])
+    assert math.isnan(deviation_statistics(np.zeros(0)).mean_mm)
+    assert math.isnan(deviation_statistics(np.ones(1)).std_mm)
+
+
+@pytest.mark.parametrize(
+    ("height", "decision"), [(20.02, "pass"), (20.045, "undecided"), (20.055, "undecided"),
+                             (20.08, "fail"), (19.92, "fail")],
+)  # fmt: skip
+def test_a_face_within_its_u_of_the_limit_is_undecided(height: float, decision: str) -> None:
+    """All points err together by 0.01 mm, so U is 0.02 and the limit 0.05."""
+    found = compared(top_points(3000, height), sigma=0.01, tolerance_mm=0.05)
+    top = next(one for one in found.faces if one.statistics.n)
+    assert top.decision == decision
+    assert found.verdict == decision
+    assert top.statistics.mean_mm == pytest.approx(height - 20.0)
+    assert found.u_mm == pytest.approx(np.full(3000, 0.02))
+    assert {DECISIONS[k] for k in found.decision.tolist()} == {decision}
+    unseen = [one for one in found.faces if one.statistics.n == 0]
+    assert {one.decision for one in unseen} == {"not seen"}
+
+
+def test_a_dent_of_a_spot_fails_a_face_whose_mean_passes() -> None:
+    points = top_points(20_000)
+    dent = np.linalg.norm(points[:, :2] - [30.0, 20.0], axis=1) < 2.5
+    points[dent, 2] -= 0.2
+    found = compared(points, sigma=0.005, tolerance_mm=0.05)
+    top = next(one for one in found.faces if one.statistics.n)
+    assert abs(top.statistics.mean_mm) < 0.01
+    assert top.spot_mm == pytest.approx(-0.2, abs=1e-6)
+    assert np.linalg.norm(top.spot_place_mm[:2] - [30.0, 20.0]) < 2.5
+    assert top.decision == "fail"
+
+
+def test_a_stray_point_makes_no_dent() -> None:
+    points = top_points(20_000)
+    points[7, 2] += 1.5
+    found = compared(points, sigma=0.005, tolerance_mm=0.05)
+    top = next(one for one in found.faces if one.statistics.n)
+    assert top.statistics.max_mm == pytest.approx(1.5)
+    assert top.decision == "pass"
+
+
+def test_own_noise_averages_out_of_a_mean_and_common_error_does_not() -> None:
+    points = top_points(2500)
+    up = np.tile([0.0, 0.0, 1.0], (2500, 1))
+    exposure = np.arange(2500) % 5
+    cloud = cloud_of(points, exposure, sigma_mm=0.004, noise_mm=0.05, noise_along=up)
+    found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), True)
+    assert isinstance(found, CadComparison)
+    top = next(one for one in found.faces if one.statistics.n)
+    by_hand = 2.0 * math.sqrt(0.05**2 / 2500 + 0.004**2 / 5)
+    assert top.u_mean_mm == pytest.approx(by_hand, rel=0.05)
+
+
+def test_without_sigmas_nothing_is_decided_unless_u_is_stated() -> None:
+    points = top_points(2000)
+    assert compared(points, tolerance_mm=0.05).verdict == "undecided"
+    assert compared(points, tolerance_mm=0.05, uncertainty_mm=0.01).verdict == "pass"
+    assert compared(points).verdict == ""
+
+
+def test_a_face_may_have_a_tolerance_of_its_own() -> None:
+    cloud = cloud_of(top_points(3000, 20.03), sigma_mm=0.002)
+    open_found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), True)
+    assert isinstance(open_found, CadComparison)
+    top = next(one.name for one in open_found.faces if one.statistics.n)
+    options = CadOptions(tolerance_mm=0.05, face_tolerances_mm={top: 0.01})
+    found = compare_with_part(BOX, cloud, align_none(cloud), options, True)
+    assert isinstance(found, CadComparison)
+    assert next(one for one in found.faces if one.name == top).decision == "fail"
+
+
+def test_points_of_the_table_count_nowhere() -> None:
+    table = np.random.default_rng(2).uniform(-200, 200, (400, 3)) * [1, 1, 0] - [0, 0, 30.0]
+    found = compared(np.concatenate([top_points(1000, 20.01), table]), sigma=0.01)
+    assert found.n_given == 1400
+    assert found.overall.n == len(found) == 1000
+    assert found.overall.mean_mm == pytest.approx(0.01)
+
+
+def test_no_overlap_is_refused() -> None:
+    cloud = cloud_of(top_points(200, 500.0))
+    found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(), True)
+    assert isinstance(found, FitFailure)
+
+
+@pytest.mark.parametrize("options", [{"reach_mm": 0.0}, {"tolerance_mm": -1.0},
+                                     {"uncertainty_mm": math.inf}, {"reach_mm": math.nan}],
+)  # fmt: skip
+def test_lengths_that_make_no_sense_are_refused(options: dict[str, float]) -> None:
+    with pytest.raises(OptionError):
+        CadOptions(**options)

@@ -9,7 +9,15 @@ from typing import Annotated, Any
 import typer
 import typer.main
 
-from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
+from armscan.cli import (
+    calibrate_cameras,
+    calibrate_sensor,
+    files,
+    inspect,
+    inspect_features,
+    measure,
+    points,
+)
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -59,7 +67,7 @@ calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_c
 calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 inspect_group = typer.Typer(
-    help="Compare measured points with a plane, a ball or a step.",
+    help="Find features in measured points, and compare them with what they should be.",
     epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
@@ -69,6 +77,15 @@ inspect_group = typer.Typer(
 inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
+inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(inspect_features.line)
+inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(inspect_features.circle)
+inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(
+    inspect_features.cylinder
+)
+inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(inspect_features.cone)
+inspect_group.command("relation", epilog=inspect_features.RELATION_EXAMPLE)(
+    inspect_features.relation
+)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)

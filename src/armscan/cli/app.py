@@ -12,6 +12,7 @@ import typer.main
 from armscan.cli import (
     calibrate_cameras,
     calibrate_sensor,
+    clean,
     files,
     inspect,
     inspect_features,
@@ -23,7 +24,7 @@ EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
-    *("inspect", "verify"),
+    *("clean", "inspect", "verify"),
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -94,6 +95,7 @@ app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
 app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
+app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)

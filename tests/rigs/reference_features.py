@@ -167,6 +167,8 @@ def reference_set(
                 wide = radius - height * mp.tan(mp.radians(half_angle))
                 made.append((wide * u, wide * v, height))
         exact = [place(*item) for item in made]
+        # a small feature with a large form error has a second minimum, which may be the lower one
+        form_mm = min(form_mm, float(radius) / 200.0)
         form = [number(-form_mm, form_mm) for _ in range(n)]
         if kind == "line":
             points, parameters = _off_line(exact, centre, axis, first, second, form, rng, form_mm)

@@ -43,6 +43,7 @@ def cloud(n: int = 60, has_normals: bool = True) -> PointCloud:
         intensity=rng.uniform(0, 255, n),
         normals=normals / np.linalg.norm(normals, axis=1)[:, None] if has_normals else None,
         noise_length=rng.uniform(1.0, 12.0, n) if has_normals else None,
+        seen_from_mm=rng.normal(size=(3, 3)) * 100 if has_normals else None,
         is_simulated=True,
         forced=("rms 9 px", "f unknown"),
     )
@@ -68,6 +69,7 @@ def test_all_that_a_cloud_carries_comes_back(
     for name in ("sheet", "exposure", "segment"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
     np.testing.assert_allclose(after.points_mm, before.points_mm, rtol=0, atol=LOSSLESS[suffix])
+    assert str(after.seen_from_mm) == str(before.seen_from_mm)
     nine_digits = 5e-9 if suffix == ".csv" else 0.0
     for name in ("covariance_mm2", "sigma_noise_mm", "intensity", "normals", "noise_length"):
         was, found = getattr(before, name), getattr(after, name)

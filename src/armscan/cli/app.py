@@ -12,9 +12,11 @@ import typer.main
 from armscan.cli import (
     calibrate_cameras,
     calibrate_sensor,
+    clean,
     files,
     inspect,
     inspect_cad,
+    inspect_features,
     measure,
     points,
     surface,
@@ -25,7 +27,7 @@ EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
-    *("inspect", "verify", "mesh"),
+    *("clean", "inspect", "verify", "mesh"),
     *("convert", "info", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -69,7 +71,7 @@ calibrate.command("stereo", epilog=calibrate_cameras.STEREO_EXAMPLE)(calibrate_c
 calibrate.command("laser", epilog=calibrate_sensor.LASER_EXAMPLE)(calibrate_sensor.laser)
 calibrate.command("hand-eye", epilog=calibrate_sensor.HAND_EYE_EXAMPLE)(calibrate_sensor.hand_eye)
 inspect_group = typer.Typer(
-    help="Compare measured points with a plane, a ball, a step or a part's model.",
+    help="Find features in measured points, and compare them with what they should be.",
     epilog=inspect.SPHERE_EXAMPLE,
     context_settings=HELP_OPTIONS,
     invoke_without_command=True,
@@ -80,6 +82,15 @@ inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
 inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
+inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(inspect_features.line)
+inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(inspect_features.circle)
+inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(
+    inspect_features.cylinder
+)
+inspect_group.command("cone", epilog=inspect_features.CONE_EXAMPLE)(inspect_features.cone)
+inspect_group.command("relation", epilog=inspect_features.RELATION_EXAMPLE)(
+    inspect_features.relation
+)
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=twin.DEMO_EXAMPLE)(twin.demo)
@@ -88,6 +99,7 @@ app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
 app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
+app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)

@@ -3,6 +3,8 @@
 from .arrays import Box as Box
 from .estimate import Estimate as Estimate
 from .estimate import FitFailure as FitFailure
+from .features import Shape as Shape
+from .features import fit_shape as fit_shape
 from .poses import Base as Base
 from .poses import Board as Board
 from .poses import Cad as Cad

@@ -207,7 +207,7 @@ def _unlike(
         size = "" if not shape.radius_mm else f" of {2.0 * shape.radius_mm:.4g} mm"
         if shape.kind == "cone":
             size = f" of {math.degrees(shape.half_angle_rad):.4g} degrees"
-        what = f"there is no {wanted}: the points lie on a {shape.kind}{size}"
+        what = f"there is no {wanted}: the nearest that the points allow is a {shape.kind}{size}"
         return FitFailure(what, remedy)
     # as far as their own sigma throws points off, else a quarter of what would be filled evenly
     quarter = max(selection.feature_mm / 4.0, SEARCH_BAND_MM / 4.0)

@@ -48,10 +48,16 @@ SAME_SIDE = math.cos(math.radians(30.0))
 """Normals of a point and of the surface that differ by more than 30 degrees are of two faces."""
 SAME_AXIS = math.cos(math.radians(20.0))
 """How far a candidate's axis may be off the one that was given: it is a rough direction."""
-RADIUS_SLACK = 0.2
+RADIUS_SLACK = 0.1
 """How far a diameter may be from the nominal one, as a part of it, where no range is given."""
 SEED_POINTS = 120
 """Sample points about a seed from which candidates are made."""
+NEAR_POINTS = 150
+"""Points of the neighbourhood from which a candidate is made."""
+N_POLISHED = 10
+"""Best candidates that are fitted to the points on them before one is chosen."""
+FULLY_BENT = 0.05
+"""Second moment of normals, 0 of a flat face and 0.5 of half a cylinder: an arc of 45 degrees."""
 ROUNDS = 3
 
 
@@ -66,7 +72,7 @@ class WantedFeature:
     diameter_mm
         Nominal diameter of a circle, sphere or cylinder; None if there is none.
     diameter_range_mm
-        Least and largest diameter that it may have; None for 20 % about the nominal one.
+        Least and largest diameter that it may have; None for 10 % about the nominal one.
     half_angle_deg
         Nominal half angle of a cone; None if there is none.
     axis
@@ -189,29 +195,49 @@ def sample_of(selection: Selection) -> Sample:
 
 def find_shape(selection: Selection, wanted: WantedFeature, sample: Sample) -> Shape | FitFailure:
     """The shape of a kind that most points lie on, as far as it fits what is known of it."""
-    pool = _pool(sample, wanted)
-    best, most = None, 0
-    for shape in _candidates(sample, wanted, pool):
-        if not wanted.may_be(shape):
-            continue
-        n = int(_support(sample, shape).sum())
-        if n > most:
-            best, most = shape, n
-    if best is None:
+    scored = [
+        (_score(sample, shape), -k, shape)
+        for k, shape in enumerate(_candidates(sample, wanted, _pool(sample, wanted)))
+        if wanted.may_be(shape)
+    ]
+    scored = sorted((item for item in scored if item[0] > 0.0), reverse=True)[:N_POLISHED]
+    if not scored:
         return FitFailure(
             f"there is no {wanted}: no candidate fits what is known of it",
             "check the nominal values, or show where it is with --region or --seed",
         )
-    shape = best
+    return max((_polished(sample, wanted, item[2]) for item in scored), key=lambda one: one[0])[1]
+
+
+def _polished(sample: Sample, wanted: WantedFeature, shape: Shape) -> tuple[float, Shape]:
+    """A candidate fitted to what lies on it, and its score; as it was where that is no better."""
+    best = _score(sample, shape), shape
     for _ in range(ROUNDS):
-        is_near = _support(sample, shape)
-        if int(is_near.sum()) < max(MIN_POINTS // 3, 6):
+        is_near = _support(sample, best[1])
+        if int(is_near.sum()) < MIN_POINTS // 3:
             break
-        fit = fit_shape(wanted.kind, sample.points_mm[is_near], shape)
+        fit = fit_shape(wanted.kind, sample.points_mm[is_near], best[1])
         if isinstance(fit, FitFailure) or not wanted.may_be(fit.value):
             break
-        shape = fit.value
-    return shape
+        score = _score(sample, fit.value)
+        if score <= best[0]:
+            break
+        best = score, fit.value
+    return best
+
+
+def _score(sample: Sample, shape: Shape) -> float:
+    """Count of the points on a shape, less where they hardly show that it is curved.
+
+    A strip of a flat face lies on any large cylinder that touches it; its normals are all alike.
+    """
+    is_near = _support(sample, shape)
+    n = float(is_near.sum())
+    if shape.kind in ("plane", "line", "circle") or n == 0.0:
+        return n
+    normals = shape.outward(sample.points_mm[is_near])
+    bent = float(np.linalg.eigvalsh(normals.T @ normals)[1]) / n
+    return n * min(1.0, bent / FULLY_BENT)
 
 
 def _pool(sample: Sample, wanted: WantedFeature) -> IntArray:
@@ -236,8 +262,12 @@ def _candidates(sample: Sample, wanted: WantedFeature, pool: IntArray) -> Iterat
     rng = np.random.default_rng(0)
     p, n = sample.points_mm, sample.normals
     yield from _by_all(p[pool], wanted)
-    for _ in range(N_TRIALS[wanted.kind]):
-        i, j, k = (int(v) for v in pool[rng.integers(0, len(pool), 3)])
+    first = rng.integers(0, len(pool), N_TRIALS[wanted.kind])
+    # every other one from a neighbourhood: a feature may be a small part of the whole
+    near = np.asarray(cKDTree(p[pool]).query(p[pool[first]], min(NEAR_POINTS, len(pool)))[1])
+    for trial, at in enumerate(first.tolist()):
+        others = near[trial] if trial % 2 else np.arange(len(pool))
+        i, j, k = pool[[at, *others[rng.integers(0, len(others), 2)]]].tolist()
         shape = _through(wanted.kind, p[[i, j, k]], n[[i, j, k]])
         if shape is not None:
             yield shape

@@ -299,6 +299,7 @@ def carry_cloud(
     points = cloud.points_mm @ a_from_b.rotation.T + a_from_b.translation_mm
     own = cloud.covariance_mm2
     is_known = bool(np.any(own))
+    seen = cloud.seen_from_mm
     return replace(
         cloud,
         frame=frame,
@@ -307,6 +308,7 @@ def carry_cloud(
             carried_covariance_mm2(cloud.points_mm, own, a_from_b, covariance) if is_known else own
         ),
         normals=None if cloud.normals is None else cloud.normals @ a_from_b.rotation.T,
+        seen_from_mm=None if seen is None else seen @ a_from_b.rotation.T + a_from_b.translation_mm,
     )
 
 

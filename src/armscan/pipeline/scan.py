@@ -430,7 +430,7 @@ def _with_normals(
             f"{100.0 * share:.0f} % of the points have no normal: within {radius_mm:.1f} mm "
             "they lie on single lines, or on no plane",
         )
-    return replace(cloud, normals=normals), warnings
+    return replace(cloud, normals=normals, seen_from_mm=cameras), warnings
 
 
 def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:

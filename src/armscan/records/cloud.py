@@ -53,6 +53,8 @@ class PointCloud(RowRecord):
     noise_length
         (N,) correlation length of that noise along the stripe, in points of the full cloud: a sum
         over a stripe has the variance of independent points times this. None where it is not known.
+    seen_from_mm
+        (E, 3) where the sensor stood at each exposure, in the cloud's frame; None where unknown.
     is_simulated
         True if the points were measured on rendered images.
     forced
@@ -72,6 +74,7 @@ class PointCloud(RowRecord):
     intensity: FloatArray = floats("N")
     normals: FloatArray | None = floats("N", 3, default=None)
     noise_length: FloatArray | None = floats("N", default=None)
+    seen_from_mm: FloatArray | None = floats(None, 3, default=None)
     is_simulated: bool = False
     forced: tuple[str, ...] = ()
 
@@ -83,6 +86,11 @@ class PointCloud(RowRecord):
         ):
             if len(index) and not 0 <= index.min() <= index.max() < len(names):
                 raise InputError(f"{name} points outside its list of {len(names)} names")
+
+        if self.seen_from_mm is not None and len(self.seen_from_mm) != len(self.exposure_sources):
+            raise InputError(
+                f"{len(self.seen_from_mm)} places for {len(self.exposure_sources)} exposures"
+            )
 
     @property
     def sigma_mm(self) -> FloatArray:

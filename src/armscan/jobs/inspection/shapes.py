@@ -84,7 +84,7 @@ def inspect_plane(
     report = plane_report(solved(found, path), cloud)
     report = replace(report, warnings=(*weak, *_flat_by_itself(cloud), *report.warnings))
     inputs = (path, *(() if plate is None else (plate,)))
-    return _finished(job, cloud, report, inputs, (options,))
+    return finished_inspection(job, cloud, report, inputs, (options,))
 
 
 def inspect_sphere(
@@ -101,7 +101,7 @@ def inspect_sphere(
     box, cloud = region_of(region), read_cloud(path)
     found = sphere_of(cloud, diameter_mm, region=box, options=options)
     report = sphere_report(solved(found, path), cloud)
-    return _finished(job, cloud, report, (path,), (options,))
+    return finished_inspection(job, cloud, report, (path,), (options,))
 
 
 def inspect_step(
@@ -127,7 +127,7 @@ def inspect_step(
         cloud, height_mm, normal=given, region=box, options=options, step_options=step_options
     )
     report = step_report(solved(found, path), cloud)
-    return _finished(job, cloud, report, (path,), (options, step_options))
+    return finished_inspection(job, cloud, report, (path,), (options, step_options))
 
 
 def region_of(numbers: Sequence[float]) -> Box | None:
@@ -210,13 +210,14 @@ def _reference(
     return probed.plane, f"the plane of {plate.name}", weak
 
 
-def _finished(
+def finished_inspection(
     job: Job,
     cloud: PointCloud,
     report: InspectionReport,
     inputs: Sequence[Path],
     options: Sequence[Any],
 ) -> Summary:
+    """Write the page, if one is wanted, and sum up."""
     is_simulated = cloud.is_simulated or are_simulated(inputs)
     if cloud.noise_length is None and cloud.sigma_noise_mm.any():
         assumed = (

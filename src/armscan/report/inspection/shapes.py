@@ -126,15 +126,15 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
     references = [("against the fitted plane", found.fitted)]
     told = [
         Quantity("feature", "", "plane"),
-        *_count_quantities(found.counts),
+        *count_quantities(found.counts),
         Quantity(
             "fitted.plane",
             "Plane A, B, C, D",
             [a, b, c, d],
             shown=f"{a:.7f}, {b:.7f}, {c:.7f}, {d:.4f} mm",
         ),
-        fact("Middle of the points", f"{_triple(found.plane.point_mm)} mm"),
-        *_deviation_quantities("fitted", found.fitted),
+        fact("Middle of the points", f"{triple(found.plane.point_mm)} mm"),
+        *deviation_quantities("fitted", found.fitted),
     ]
     if found.nominal is None or found.offset is None:
         told.append(Quantity("nominal", "", None))
@@ -142,7 +142,7 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
         references.insert(0, ("against the nominal plane", found.nominal))
         where = "of the fitted plane over the nominal one, at the middle of the points"
         told += [
-            _length("nominal.offset", "Offset", found.offset, where),
+            length_quantity("nominal.offset", "Offset", found.offset, where),
             Quantity(
                 "nominal.tilt_mrad",
                 "Tilt",
@@ -150,15 +150,15 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
                 unit="mrad",
                 meaning="to the nominal plane",
             ),
-            *_deviation_quantities("nominal", found.nominal),
+            *deviation_quantities("nominal", found.nominal),
         ]
     return InspectionReport(
         title="Plane inspected",
-        subtitle=_subtitle(found.counts, cloud),
+        subtitle=point_subtitle(found.counts, cloud),
         quantities=tuple(told),
         cards=(
-            _share_card(main),
-            _form_card(found.fitted),
+            share_card(main),
+            form_card(found.fitted),
             *only(told, "nominal.offset", "points.n_feature"),
         ),
         references=tuple(references),
@@ -170,9 +170,9 @@ def plane_report(found: PlaneInspection, cloud: PointCloud) -> InspectionReport:
             )
             for _, deviations in references
         ),
-        views=(_view(cloud, found.rows, main),),
+        views=(feature_view(cloud, found.rows, main),),
         counts=found.counts,
-        warnings=_warnings(found.counts, cloud),
+        warnings=point_warnings(found.counts, cloud),
     )
 
 
@@ -182,15 +182,17 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
     error = found.diameter.value_mm - nominal_mm
     told = (
         Quantity("feature", "", "sphere"),
-        *_count_quantities(found.counts),
-        _length("fitted.diameter", "Fitted diameter", found.diameter, f"nominal {nominal_mm:g} mm"),
+        *count_quantities(found.counts),
+        length_quantity(
+            "fitted.diameter", "Fitted diameter", found.diameter, f"nominal {nominal_mm:g} mm"
+        ),
         Quantity("nominal.diameter_mm", "", nominal_mm),
         Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
         Quantity(
             "fitted.centre_mm",
             "Centre",
             found.sphere.centre_mm.tolist(),
-            shown=f"{_triple(found.sphere.centre_mm)} mm",
+            shown=f"{triple(found.sphere.centre_mm)} mm",
         ),
         Quantity(
             "fitted.seen_cap_deg",
@@ -198,11 +200,11 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
             found.seen_cap_deg,
             shown=f"half opening {found.seen_cap_deg:.0f} degrees; the whole ball is 180",
         ),
-        *_sigma_facts(found.diameter, "diameter"),
-        *_deviation_quantities("fitted", found.fitted),
-        *_deviation_quantities("nominal", found.nominal),
+        *sigma_facts(found.diameter, "diameter"),
+        *deviation_quantities("fitted", found.fitted),
+        *deviation_quantities("nominal", found.nominal),
     )
-    warnings = list(_warnings(found.counts, cloud))
+    warnings = list(point_warnings(found.counts, cloud))
     if found.seen_cap_deg < NARROW_CAP_DEG:
         warnings.append(
             f"the points cover a cap of only {found.seen_cap_deg:.0f} degrees half opening, where "
@@ -210,12 +212,12 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
         )
     return InspectionReport(
         title="Ball inspected",
-        subtitle=_subtitle(found.counts, cloud),
+        subtitle=point_subtitle(found.counts, cloud),
         quantities=told,
         cards=(
             *only(told, "fitted.diameter", "diameter_error_mm"),
-            _share_card(found.nominal),
-            _form_card(found.fitted),
+            share_card(found.nominal),
+            form_card(found.fitted),
             *only(told, "points.n_feature"),
         ),
         references=(
@@ -233,7 +235,7 @@ def sphere_report(found: SphereInspection, cloud: PointCloud) -> InspectionRepor
                 (found.fitted, "the fitted radius"),
             )
         ),
-        views=(_view(cloud, found.rows, found.nominal),),
+        views=(feature_view(cloud, found.rows, found.nominal),),
         counts=found.counts,
         warnings=tuple(warnings),
     )
@@ -248,8 +250,8 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
     mean, std = float(found.heights_mm.mean()), float(found.heights_mm.std(ddof=1))
     told = (
         Quantity("feature", "", "step"),
-        *_count_quantities(found.counts),
-        _length(
+        *count_quantities(found.counts),
+        length_quantity(
             "fitted.height",
             "Fitted height",
             found.height,
@@ -269,21 +271,21 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             "fitted.normal",
             "Normal",
             found.normal.tolist(),
-            shown=f"{_triple(found.normal, 6)}: {found.normal_rule}",
+            shown=f"{triple(found.normal, 6)}: {found.normal_rule}",
         ),
         Quantity("fitted.normal_from", "", found.normal_rule),
         fact(
             "On each face",
             f"{len(found.lower):,} points on the lower face, {len(found.upper):,} on the upper",
         ),
-        *((STILL_SIGMA,) if is_still else _sigma_facts(found.height, "height")),
-        *_deviation_quantities("fitted", found.fitted),
-        *_deviation_quantities("nominal", found.nominal),
+        *((STILL_SIGMA,) if is_still else sigma_facts(found.height, "height")),
+        *deviation_quantities("fitted", found.fitted),
+        *deviation_quantities("nominal", found.nominal),
     )
     spread = "of the heights of the upper face's points"
     return InspectionReport(
         title="Step inspected",
-        subtitle=_subtitle(found.counts, cloud),
+        subtitle=point_subtitle(found.counts, cloud),
         quantities=told,
         cards=(
             *only(told, "fitted.height", "height_error_mm"),
@@ -317,11 +319,11 @@ def step_report(found: StepInspection, cloud: PointCloud) -> InspectionReport:
             ),
         ),
         counts=found.counts,
-        warnings=_warnings(found.counts, cloud),
+        warnings=point_warnings(found.counts, cloud),
     )
 
 
-def _length(
+def length_quantity(
     key: str, label: str, length: MeasuredLength, meaning: str, shown: str = ""
 ) -> Quantity:
     """A length with its standard deviation."""
@@ -342,7 +344,8 @@ def length_text(length: MeasuredLength) -> str:
     return with_sigma(length.value_mm, length.sigma_mm, "mm")
 
 
-def _sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
+def sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
+    """Where the standard deviation of a length comes from."""
     return (
         fact(
             f"Sigma of the {name} from scatter",
@@ -361,7 +364,7 @@ def _sigma_facts(length: MeasuredLength, name: str) -> tuple[Quantity, ...]:
     )
 
 
-def _deviation_quantities(place: str, deviations: Deviations) -> tuple[Quantity, ...]:
+def deviation_quantities(place: str, deviations: Deviations) -> tuple[Quantity, ...]:
     """Statistics with their definitions, for programs; the tables show them to people."""
     data: dict[str, Any] = {
         "reference": deviations.reference,
@@ -373,7 +376,8 @@ def _deviation_quantities(place: str, deviations: Deviations) -> tuple[Quantity,
     return tuple(Quantity(f"{place}.{key}", "", value) for key, value in data.items())
 
 
-def _count_quantities(counts: PointCounts) -> tuple[Quantity, ...]:
+def count_quantities(counts: PointCounts) -> tuple[Quantity, ...]:
+    """What became of the points."""
     return (
         Quantity("points.n_given", "", counts.n_given),
         Quantity("points.n_region", "", counts.n_region),
@@ -391,23 +395,27 @@ def _count_quantities(counts: PointCounts) -> tuple[Quantity, ...]:
     )
 
 
-def _share_card(deviations: Deviations) -> Quantity:
+def share_card(deviations: Deviations) -> Quantity:
+    """Share of the points within the band."""
     share = share_text(deviations.value(within_key(BAND_MM)))
     return fact(f"Within {BAND_MM:g} mm", share, f"of the {deviations.reference} surface")
 
 
-def _form_card(fitted: Deviations) -> Quantity:
+def form_card(fitted: Deviations) -> Quantity:
+    """Form as 95 % of the points show it."""
     note = f"95 % of the points; standard deviation {significant(fitted.value('std_mm'))} mm"
     return fact("Form, narrowest shell", significant(fitted.value("d95_mm"), "mm"), note)
 
 
-def _subtitle(counts: PointCounts, cloud: PointCloud) -> str:
+def point_subtitle(counts: PointCounts, cloud: PointCloud) -> str:
+    """How many points, and in which frame."""
     has_frame = bool(cloud.sheet_names[0]) if cloud.sheet_names else False
     frame = f"the {cloud.frame} frame" if has_frame else FOREIGN_FRAME
     return f"{counts.n_feature:,} points in {frame}"
 
 
-def _warnings(counts: PointCounts, cloud: PointCloud) -> tuple[str, ...]:
+def point_warnings(counts: PointCounts, cloud: PointCloud) -> tuple[str, ...]:
+    """What is weak about the points."""
     found = []
     if not cloud.covariance_mm2.any():
         found.append(NO_SIGMA)
@@ -417,7 +425,8 @@ def _warnings(counts: PointCounts, cloud: PointCloud) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _triple(values: FloatArray, digits: int = 4) -> str:
+def triple(values: FloatArray, digits: int = 4) -> str:
+    """Three numbers with commas between them."""
     return ", ".join(f"{value:.{digits}f}" for value in values)
 
 
@@ -578,7 +587,8 @@ def _half_width_mm(values: FloatArray, least: float) -> float:
     return max(1.15 * reach, 1.5 * least, LEAST_HALF_WIDTH_MM)
 
 
-def _view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> Picture:
+def feature_view(cloud: PointCloud, rows: IntArray, deviations: Deviations) -> Picture:
+    """The feature's points (rows (N,) of a cloud) coloured by deviation."""
     return deviation_view(
         cloud.points_mm[rows],
         deviations.deviations_mm,

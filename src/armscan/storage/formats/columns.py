@@ -39,6 +39,8 @@ SIMULATED = "simulated"
 """Note of a cloud that was measured on rendered images."""
 FORCED = "forced"
 """Note with a reason for which the cloud's calibration was refused, and used all the same."""
+SEEN_FROM = "seen_from_mm"
+"""Note of where the sensor stood at an exposure."""
 FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
@@ -96,6 +98,9 @@ def cloud_columns(cloud: PointCloud) -> CloudColumns:
         (FORCED, cloud.forced),
     ):
         notes += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
+    if cloud.seen_from_mm is not None:
+        places = cloud.seen_from_mm.tolist()
+        notes += [f"{SEEN_FROM} {k} {json.dumps(place)}" for k, place in enumerate(places)]
     return CloudColumns(columns, tuple(notes))
 
 
@@ -198,6 +203,7 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
             intensity=columns["intensity"],
             normals=_joined(columns, NORMAL) if set(NORMAL) <= set(columns) else None,
             noise_length=columns.get(NOISE_LENGTH),
+            seen_from_mm=_places(found.notes),
             is_simulated=SIMULATED in found.notes,
             forced=_names(found.notes, FORCED),
         )
@@ -245,6 +251,17 @@ def _frame(notes: Sequence[str]) -> CloudFrame | None:
     if len(found) != 1 or found[0] not in get_args(CloudFrame):
         return None
     return cast(CloudFrame, found[0])
+
+
+def _places(notes: Sequence[str]) -> FloatArray | None:
+    """(E, 3) where the sensor stood, if the notes say so of every exposure."""
+    texts = [text.split(" ", 2)[2] for text in notes if text.startswith(f"{SEEN_FROM} ")]
+    if not texts:
+        return None
+    try:
+        return np.array([json.loads(text) for text in texts], dtype=np.float64)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise InputError(f"the header's places of the sensor ({SEEN_FROM}) are damaged") from error
 
 
 def _names(notes: Sequence[str], word: str) -> tuple[str, ...]:

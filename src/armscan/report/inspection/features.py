@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pages of features and of how two of them stand, and their numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from armscan.geometry.arrays import FloatArray
+from armscan.inspection.features import FeatureInspection, MeasuredAngle, Relation
+from armscan.inspection.results import MeasuredLength
+from armscan.records.cloud import PointCloud
+from armscan.report.inspection.shapes import (
+    InspectionReport,
+    count_quantities,
+    deviation_histogram,
+    deviation_quantities,
+    deviation_view,
+    feature_view,
+    form_card,
+    length_quantity,
+    point_subtitle,
+    point_warnings,
+    share_card,
+    sigma_facts,
+    triple,
+)
+from armscan.report.quantity import Quantity, fact, only, significant, with_sigma
+
+COVERAGE = 2.0
+"""Coverage factor k of U: 95 % of normal errors (GUM 6.3.3)."""
+NARROW_ARC_DEG = 90.0
+"""Less of a turn tells radius and place poorly apart: their errors grow as 1 / arc^2."""
+ANGLE_NOTE = "near 0 and 90 degrees it is the size of a tilt, which noise never makes negative"
+
+
+def feature_report(found: FeatureInspection, cloud: PointCloud) -> InspectionReport:
+    """Report of one feature."""
+    kind = found.shape.kind
+    main = found.nominal or found.fitted
+    told = feature_quantities(found)
+    warnings = list(point_warnings(found.counts, cloud))
+    if kind in ("circle", "cylinder", "cone") and found.seen_deg < NARROW_ARC_DEG:
+        warnings.append(
+            f"the points cover only {found.seen_deg:.0f} degrees of the turn, where radius and "
+            "place are poorly told apart; scan more of it"
+        )
+    references = [(f"against the fitted {kind}", found.fitted)]
+    if found.nominal is not None:
+        references.insert(0, ("against the nominal size", found.nominal))
+    keys = ("fitted.diameter", "fitted.half_angle", "diameter_error_mm")
+    return InspectionReport(
+        title=f"{kind.capitalize()} inspected",
+        subtitle=point_subtitle(found.counts, cloud),
+        quantities=told,
+        cards=(
+            *only(told, *keys),
+            share_card(main),
+            form_card(found.fitted),
+            *only(told, "points.n_feature"),
+        ),
+        references=tuple(references),
+        histograms=tuple(
+            deviation_histogram(one, title=f"Distance to the {one.reference} {kind}")
+            for _, one in references
+        ),
+        views=(feature_view(cloud, found.rows, main),),
+        counts=found.counts,
+        warnings=tuple(warnings),
+    )
+
+
+def feature_quantities(found: FeatureInspection) -> tuple[Quantity, ...]:
+    """What is told of a feature."""
+    shape, kind = found.shape, found.shape.kind
+    told = [Quantity("feature", "", kind), *count_quantities(found.counts)]
+    if found.diameter is not None:
+        told += _diameter(found, found.diameter)
+    if found.half_angle is not None:
+        told += _half_angle(found, found.half_angle)
+    where = {"circle": "Centre", "sphere": "Centre"}.get(kind, "Middle of the points on it")
+    told.append(_place("fitted.point_mm", where, shape.point_mm, found.centre_sigma_mm))
+    if kind == "cone":
+        told.append(_place("fitted.apex_mm", "Tip", shape.apex_mm, math.nan))
+    if kind != "sphere":
+        told.append(_direction(found))
+    if not math.isnan(found.seen_deg):
+        about = "of the widest cap" if kind == "sphere" else "of the turn about the axis"
+        told.append(
+            Quantity(
+                "fitted.seen_deg",
+                "Seen",
+                found.seen_deg,
+                shown=f"{found.seen_deg:.0f} degrees {about}",
+            )
+        )
+    if found.length_mm:
+        told.append(Quantity("fitted.length_mm", "Extent along it", found.length_mm, unit="mm"))
+    extent = found.fitted.value("range_mm")
+    told.append(
+        Quantity(
+            "fitted.form_mm",
+            found.form_name.capitalize(),
+            _width(found, extent),
+            unit="mm",
+            meaning=f"{_form_meaning(kind)}, of all points, outliers included",
+        )
+    )
+    if found.diameter is not None:
+        told += sigma_facts(found.diameter, "diameter")
+    told += deviation_quantities("fitted", found.fitted)
+    if found.nominal is not None:
+        told += deviation_quantities("nominal", found.nominal)
+    return tuple(told)
+
+
+def _width(found: FeatureInspection, extent_mm: float) -> float:
+    """Width of the zone that holds all points; distances to a line have no sign."""
+    if found.shape.kind != "line":
+        return extent_mm
+    return 2.0 * float(found.fitted.deviations_mm.max())
+
+
+def _form_meaning(kind: str) -> str:
+    return "diameter of the tube that holds them" if kind == "line" else "largest minus smallest"
+
+
+def _diameter(found: FeatureInspection, diameter: MeasuredLength) -> list[Quantity]:
+    nominal = found.wanted.diameter_mm
+    meaning = "" if nominal is None else f"nominal {nominal:g} mm"
+    told = [
+        length_quantity("fitted.diameter", "Fitted diameter", diameter, meaning),
+        _expanded("fitted.diameter_u_mm", "diameter", COVERAGE * diameter.sigma_mm, "mm"),
+    ]
+    if nominal is not None:
+        error = diameter.value_mm - nominal
+        told += [
+            Quantity("nominal.diameter_mm", "", nominal),
+            Quantity("diameter_error_mm", "Fitted minus nominal", error, shown=f"{error:+.4f} mm"),
+        ]
+    return told
+
+
+def _half_angle(found: FeatureInspection, angle: MeasuredAngle) -> list[Quantity]:
+    nominal = found.wanted.half_angle_deg
+    meaning = "" if nominal is None else f"nominal {nominal:g} degrees"
+    sigma = math.degrees(angle.sigma_rad)
+    told = [
+        angle_quantity("fitted.half_angle", "Fitted half angle", angle, meaning),
+        _expanded("fitted.half_angle_u_deg", "half angle", COVERAGE * sigma, "degrees"),
+    ]
+    if nominal is not None:
+        told.append(Quantity("nominal.half_angle_deg", "", nominal))
+    return told
+
+
+def angle_quantity(key: str, label: str, angle: MeasuredAngle, meaning: str) -> Quantity:
+    """An angle in degrees with its standard deviation."""
+    value, sigma = math.degrees(angle.value_rad), math.degrees(angle.sigma_rad)
+    shown = f"{value:.4f} degrees" if math.isnan(sigma) else with_sigma(value, sigma, "degrees")
+    return Quantity(
+        key, label, {"value_deg": value, "sigma_deg": sigma}, meaning=meaning, shown=shown
+    )
+
+
+def _expanded(key: str, name: str, value: float, unit: str) -> Quantity:
+    return Quantity(key, f"U (k = 2) of the {name}", value, shown=significant(value, unit, 2))
+
+
+def _place(key: str, label: str, point: FloatArray, sigma_mm: float) -> Quantity:
+    known = (
+        "" if math.isnan(sigma_mm) else f", U (k = 2) {significant(COVERAGE * sigma_mm, 'mm', 2)}"
+    )
+    return Quantity(key, label, point.tolist(), shown=f"{triple(point)} mm{known}")
+
+
+def _direction(found: FeatureInspection) -> Quantity:
+    sigma = 1000.0 * found.direction_sigma_rad
+    known = "" if math.isnan(sigma) else f", U (k = 2) {significant(COVERAGE * sigma, 'mrad', 2)}"
+    name = "Normal" if found.shape.kind in ("plane", "circle") else "Direction"
+    direction = found.shape.direction
+    return Quantity(
+        "fitted.direction", name, direction.tolist(), shown=f"{triple(direction, 6)}{known}"
+    )
+
+
+SHOWN = (
+    "points.n_feature",
+    "fitted.diameter",
+    "fitted.half_angle",
+    "fitted.point_mm",
+    "fitted.direction",
+    "fitted.form_mm",
+)
+"""What a relation tells people of each of its features; programs are told all."""
+
+
+def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
+    """Report of how two features stand to each other."""
+    names = f"{found.first.wanted} and {found.second.wanted}"
+    told = [Quantity("feature", "", "relation")]
+    if found.distance is not None:
+        told += [
+            length_quantity("distance", "Distance", found.distance, found.distance_text),
+            _expanded("distance_u_mm", "distance", COVERAGE * found.distance.sigma_mm, "mm"),
+        ]
+    else:
+        told.append(fact("Distance", f"none: {found.distance_text}"))
+    if found.angle is not None:
+        sigma = math.degrees(found.angle.sigma_rad)
+        told += [
+            angle_quantity("angle", "Angle", found.angle, f"{found.angle_text}; {ANGLE_NOTE}"),
+            _expanded("angle_u_deg", "angle", COVERAGE * sigma, "degrees"),
+        ]
+    for place, one in (("first", found.first), ("second", found.second)):
+        for item in feature_quantities(one):
+            key = f"{place}.{item.key}" if item.key else ""
+            label = f"{place.capitalize()}: {item.label}" if item.key in SHOWN else ""
+            told.append(replace(item, key=key, label=label))
+    both = (found.first, found.second)
+    warnings = {text for one in both for text in point_warnings(one.counts, cloud)}
+    deviations = np.concatenate([one.fitted.deviations_mm for one in both])
+    return InspectionReport(
+        title=f"Relation of {names}",
+        subtitle=f"{len(deviations):,} points of two features",
+        quantities=tuple(told),
+        cards=only(told, "distance", "angle"),
+        references=tuple(
+            (f"{one.wanted} against its fit ({place})", one.fitted)
+            for place, one in zip(("first", "second"), both, strict=True)
+        ),
+        histograms=tuple(
+            deviation_histogram(one.fitted, title=f"Distance to the fitted {one.shape.kind}")
+            for one in both
+        ),
+        views=(
+            deviation_view(
+                cloud.points_mm[np.concatenate([one.rows for one in both])],
+                deviations,
+                title="Both features",
+                frame=cloud.frame,
+                reference="each one's own fit",
+            ),
+        ),
+        counts=found.first.counts,
+        warnings=tuple(sorted(warnings)),
+    )

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each filter takes the points that were planted for it, and no others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from armscan.errors import InputError, OptionError
+from armscan.geometry.arrays import Box, IntArray
+from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
+from armscan.records.cloud import PointCloud
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of
+
+SPACING_MM, N_STRIPES, N_POINTS = 0.1, 20, 300
+
+
+def plate(spacing_mm: float = 0.5) -> PointCloud:
+    """Stripes along x, 0.1 mm from point to point, side by side along y."""
+    x = np.tile(np.arange(N_POINTS) * SPACING_MM, N_STRIPES)
+    exposure = np.repeat(np.arange(N_STRIPES), N_POINTS)
+    return cloud_of(np.stack([x, exposure * spacing_mm, 0.0 * x], axis=1), exposure)
+
+
+def taken(found: Cleaning) -> IntArray:
+    return np.flatnonzero(found.taken_by >= 0)
+
+
+def test_isolated_points() -> None:
+    cloud = plate()
+    lone = np.array([[5.0, 3.0, 2.0], [5.1, 3.0, 2.0], [-9.0, 0.0, 0.0]])
+    whole = replace(
+        cloud_of(np.concatenate([cloud.points_mm, lone]), np.append(cloud.exposure, [1, 1, 2]))
+    )
+    found = clean_cloud(whole, CleaningOptions(isolated_mm=0.6))
+    assert taken(found).tolist() == [6000, 6001, 6002]
+    assert len(found.cloud) == 6000
+    assert found.steps[0].n_taken == 3
+
+
+def test_points_off_their_line() -> None:
+    """On a bent stripe too: its sagitta over five points is far below the limit."""
+    cloud = plate()
+    points = cloud.points_mm.copy()
+    points[:, 2] = 5.0 * np.sin(points[:, 0] / 10.0)
+    spikes = np.array([1050, 2077, 4203])
+    points[spikes, 2] += 0.3
+    found = clean_cloud(replace(cloud, points_mm=points), CleaningOptions(line_deviation_mm=0.15))
+    assert taken(found).tolist() == spikes.tolist()
+
+
+def test_ends_of_pieces() -> None:
+    """0.25 mm at each end are points 0, 0.1 and 0.2 mm from it; a hole of 2 mm makes two more."""
+    cloud = plate()
+    options = CleaningOptions(edge_mm=0.25)
+    assert len(taken(clean_cloud(cloud, options))) == N_STRIPES * 6
+    x = cloud.points_mm[:, 0]
+    holed = cloud.select((x < 9.95) | (x > 11.95))
+    assert len(taken(clean_cloud(holed, options))) == N_STRIPES * 12
+    wide = CleaningOptions(edge_mm=0.25, hole_mm=3.0)
+    assert len(taken(clean_cloud(holed, wide))) == N_STRIPES * 6
+
+
+def test_dust_along_a_stripe() -> None:
+    cloud = plate()
+    kept = np.ones(len(cloud), dtype=np.bool_)
+    kept[100:106] = kept[107:113] = False
+    sparse = cloud.select(kept)
+    assert taken(clean_cloud(sparse, CleaningOptions(line_spacing_mm=0.5))).tolist() == [100]
+
+
+def test_stripes_too_near() -> None:
+    """0.1 mm apart and 0.5 wanted (0.45 for rounding): every fifth stays."""
+    found = clean_cloud(plate(0.1), CleaningOptions(line_to_line_mm=0.45))
+    assert np.unique(found.cloud.exposure).tolist() == [0, 5, 10, 15]
+
+
+def test_of_overlapping_passes_the_better_stays() -> None:
+    """The second pass, 0.1 mm higher, saw half of the plate again and something more."""
+    first = plate()
+    again = first.points_mm + np.array([15.0, 0.0, 0.1])
+    points = np.concatenate([first.points_mm, again])
+    exposure = np.concatenate([first.exposure, first.exposure + 100])
+    for better, n_first in ((0, N_STRIPES * N_POINTS), (1, N_STRIPES * N_POINTS // 2)):
+        cloud = cloud_of(points, exposure)
+        sigma = np.where((exposure >= 100) == bool(better), 0.01, 0.02)
+        cloud = replace(cloud, covariance_mm2=np.eye(3) * sigma[:, None, None] ** 2)
+        found = clean_cloud(cloud, CleaningOptions(overlap_mm=1.0)).cloud
+        assert (found.exposure < 100).sum() == pytest.approx(n_first, abs=2 * N_STRIPES)
+        # one surface everywhere: no place has both
+        x = found.points_mm[:, 0]
+        both = (x > 16.0) & (x < 29.0)
+        assert len(np.unique(found.points_mm[both, 2])) == 1
+        assert x.min() == 0.0
+        assert x.max() > 44.0
+
+
+def test_grazing_points_of_a_ball() -> None:
+    """Seen from far above, the angle of incidence is that from the pole."""
+    outward = ball_stripes(16, 40)
+    exposure = np.repeat(np.arange(16), 40)
+    cloud = cloud_of(RADIUS_MM * outward, exposure, normals=outward)
+    above = np.tile([0.0, 0.0, 1e7], (16, 1))
+    found = clean_cloud(replace(cloud, seen_from_mm=above), CleaningOptions(max_incidence_deg=50.0))
+    assert np.array_equal(found.taken_by >= 0, outward[:, 2] < np.cos(np.radians(50.0)))
+    with pytest.raises(InputError, match="where the sensor stood"):
+        clean_cloud(cloud, CleaningOptions(max_incidence_deg=50.0))
+    with pytest.raises(InputError, match="no normals"):
+        clean_cloud(replace(cloud, normals=None), CleaningOptions(max_incidence_deg=50.0))
+
+
+def test_density_and_region() -> None:
+    cloud = plate()
+    box = Box([-0.05, -1.0, -1.0], [9.95, 20.0, 1.0])
+    found = clean_cloud(cloud, CleaningOptions(region=box, density_mm=0.5))
+    assert [step.name for step in found.steps] == ["region", "density"]
+    assert found.steps[0].n_taken == N_STRIPES * 200
+    # five points of 0.1 mm a cell, of which the middle one stays
+    assert len(found.cloud) == N_STRIPES * 20
+    assert np.allclose(np.diff(np.unique(found.cloud.points_mm[:, 0])), 0.5)
+
+
+def test_filters_work_one_after_the_other() -> None:
+    """A point counts for the first that took it; numbers add up."""
+    options = CleaningOptions(edge_mm=0.25, line_to_line_mm=0.45)
+    found = clean_cloud(plate(0.1), options)
+    taken_in_all = sum(step.n_taken for step in found.steps)
+    assert taken_in_all + len(found.cloud) == N_STRIPES * N_POINTS
+    assert np.bincount(found.taken_by + 1)[1:].tolist() == [s.n_taken for s in found.steps]
+
+
+@pytest.mark.parametrize(
+    "given", [{}, {"hole_mm": 1.0}, {"edge_mm": 0.0}, {"max_incidence_deg": 95.0},
+              {"density_mm": float("nan")}, {"overlap_mm": -1.0}],
+)  # fmt: skip
+def test_options_that_make_no_sense(given: dict[str, float]) -> None:
+    with pytest.raises(OptionError):
+        CleaningOptions(**given)
+
+
+def test_what_a_cloud_does_not_carry_is_said() -> None:
+    bare = cloud_of(plate().points_mm, sigma_mm=0.0)
+    for options in (CleaningOptions(edge_mm=1.0), CleaningOptions(overlap_mm=1.0)):
+        with pytest.raises(InputError, match="of one stripe"):
+            clean_cloud(bare, options)
+    with pytest.raises(InputError, match="no point is left"):
+        clean_cloud(plate(), CleaningOptions(isolated_mm=0.01))

@@ -3,26 +3,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.geometry.arrays import Box
+from armscan.fusion.digest import CloudDigest
+from armscan.fusion.point_spool import PointSpool
+from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.job import Job
-from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
 from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.scan import (
     ScanOptions,
     ScanReconstruction,
-    measure_scan,
+    measure_long_scan,
     place_profiles,
+    scan_spool,
 )
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
@@ -36,15 +39,15 @@ from armscan.report.cloud import (
     status_totals,
 )
 from armscan.report.page import Page
-from armscan.report.photographs import evenly_chosen
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.clouds import XYZ_LOSES, ply_bytes, xyz_bytes
+from armscan.storage.clouds import XYZ_LOSES, ply_parts, xyz_parts
 from armscan.storage.documents import (
     is_scanner_document,
     read_scanner_calibration,
     read_sensor_calibration,
 )
+from armscan.storage.files import scratch_folder
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import profile_files, read_profiles, read_robot_poses
@@ -52,7 +55,6 @@ from armscan.storage.recording import FolderRecording, is_recording, read_record
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
 LISTED = 4
-MAX_SHOWN = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,14 @@ def _stills(
     by_source = {exposure.source: exposure for exposure in read.exposures}
     page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
     measured = replace(result.cloud, is_simulated=is_simulated, forced=provenance.forced)
-    written, losses = _write(job, places, measured, page)
+    written, losses = _write(
+        job,
+        places,
+        marks=measured,
+        n_points=len(measured),
+        pieces=[(measured, measured.sigma_mm)],
+        page=page,
+    )
     return Summary(
         title="Points measured" + (" on simulated images." if is_simulated else "."),
         quantities=cloud_quantities(result),
@@ -263,12 +272,21 @@ def _sensor(path: Path) -> SensorCalibration:
     return sensor
 
 
+Pieces: TypeAlias = Iterable[tuple[PointCloud, FloatArray]]
+
+
 def _write(
-    job: Job, places: Sequence[Path], cloud: PointCloud, page: Page
+    job: Job,
+    places: Sequence[Path],
+    *,
+    marks: PointCloud,
+    n_points: int,
+    pieces: Pieces,
+    page: Page,
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files written, and what they do not hold."""
     is_ply = places[0].suffix.lower() == ".ply"
-    content = ply_bytes(cloud) if is_ply else xyz_bytes(cloud)
+    content = ply_parts(marks, n_points, pieces) if is_ply else xyz_parts(marks, pieces)
     written = job.write({places[0]: content, places[1]: page})
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
     return written, losses
@@ -280,26 +298,31 @@ def _scan(
     places = job.places(".ply", ".xyz", beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
-    scan = measure_scan(recording, scanner, options, progress=job.progress, cache=job.cache)
-    warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
-    tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
-    inputs = [path for path in (*tables, calibration, arm) if path is not None and path.exists()]
-    provenance = job.provenance(
-        inputs, (options,), parents=(scanner.provenance,), warnings=warnings
-    )
-    shown = [recording.exposure(row) for row in evenly_chosen(scan.image_rows, MAX_SHOWN)]
-    by_source = {exposure.source: exposure for exposure in shown}
-    is_simulated = recording.is_simulated
-    page = scan_page(scan, by_source, provenance, warnings, is_simulated=is_simulated)
-    return _told(
-        job,
-        places,
-        scan,
-        page,
-        warnings=warnings,
-        scanner=scanner,
-        is_simulated=is_simulated,
-    )
+    with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
+        scan = measure_long_scan(
+            recording, scanner, points, options, progress=job.progress, cache=job.cache
+        )
+        warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
+        tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
+        inputs = [path for path in (*tables, calibration, arm) if path is not None]
+        provenance = job.provenance(
+            [path for path in inputs if path.exists()],
+            (options,),
+            parents=(scanner.provenance,),
+            warnings=warnings,
+        )
+        shown = [recording.exposure(row) for row in scan.image_rows]
+        return _told(
+            job,
+            places,
+            scan,
+            points,
+            exposures={exposure.source: exposure for exposure in shown},
+            provenance=provenance,
+            warnings=warnings,
+            scanner=scanner,
+            is_simulated=recording.is_simulated,
+        )
 
 
 def _delivered(
@@ -309,7 +332,9 @@ def _delivered(
     places = job.places(".ply", ".xyz", beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     profiles = read_profiles(names)
-    scan = place_profiles(profiles, read_robot_poses(table.path, table.euler), scanner, volume)
+    points = scan_spool(scanner)
+    poses = read_robot_poses(table.path, table.euler)
+    scan = place_profiles(profiles, poses, scanner, volume, points=points)
     files = [path for name in names for path in profile_files(Path(name))]
     provenance = job.provenance(
         (*files, table.path, calibration),
@@ -317,26 +342,47 @@ def _delivered(
         parents=(scanner.provenance,),
         warnings=scan.warnings,
     )
-    page = scan_page(scan, {}, provenance, scan.warnings)
-    return _told(job, places, scan, page, warnings=scan.warnings, scanner=scanner)
+    return _told(
+        job,
+        places,
+        scan,
+        points,
+        exposures={},
+        provenance=provenance,
+        warnings=scan.warnings,
+        scanner=scanner,
+    )
 
 
 def _told(
     job: Job,
     places: Sequence[Path],
     scan: ScanReconstruction,
-    page: Page,
+    points: PointSpool,
     *,
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
     warnings: Sequence[str],
     scanner: ScannerCalibration,
     is_simulated: bool = False,
 ) -> Summary:
     """Write a cloud in Base and say what came out."""
-    written, losses = _write(job, places, scan.cloud, page)
+    digest = CloudDigest.of_spool(points, scan.cloud)
+    page = scan_page(
+        scan, exposures, provenance, warnings, digest=digest, is_simulated=is_simulated
+    )
+    written, losses = _write(
+        job,
+        places,
+        marks=scan.cloud,
+        n_points=len(points),
+        pieces=((piece.cloud, piece.sigma_mm) for piece in points.pieces()),
+        page=page,
+    )
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
-        quantities=scan_quantities(scan),
-        tables=(status_totals(scan),) if scan.images else (),
+        quantities=scan_quantities(scan, digest),
+        tables=(status_totals(scan),) if scan.counts else (),
         warnings=sentences((*warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",

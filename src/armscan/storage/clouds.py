@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -190,11 +190,43 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     of points measured on rendered images also ``comment simulated``, of those of a calibration
     that was refused and forced ``comment forced 0 "why"``.
     """
+    return b"".join(ply_parts(cloud, len(cloud), [(cloud, cloud.sigma_mm)]))
+
+
+def ply_parts(
+    marks: PointCloud, n_points: int, pieces: Iterable[tuple[PointCloud, FloatArray]]
+) -> Iterator[bytes]:
+    """As `ply_bytes`, of a cloud that comes in pieces.
+
+    Parameters
+    ----------
+    marks
+        Names and marks of the cloud, with or without points.
+    n_points
+        Of all pieces.
+    pieces
+        Points and their ``sigma_mm`` (N,), in order.
+    """
+    comments = ["written by armscan", "unit mm", f"frame {marks.frame}"]
+    if marks.is_simulated:
+        comments.append(SIMULATED)
+    for word, names in (
+        ("sheet", marks.sheet_names),
+        ("exposure", marks.exposure_sources),
+        (FORCED, marks.forced),
+    ):
+        comments += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
+    yield ply_header(_ply_table(marks.select(slice(0)), np.zeros(0)).dtype, n_points, comments)
+    for cloud, sigma_mm in pieces:
+        yield _ply_table(cloud, sigma_mm).tobytes()
+
+
+def _ply_table(cloud: PointCloud, sigma_mm: FloatArray) -> NDArray[Any]:
     columns: dict[str, NDArray[Any]] = {}
     columns |= {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
     if cloud.normals is not None:
         columns |= {name: cloud.normals[:, k] for k, name in enumerate(NORMAL)}
-    columns["sigma_mm"] = cloud.sigma_mm
+    columns["sigma_mm"] = sigma_mm
     columns["sigma_noise_mm"] = cloud.sigma_noise_mm
     if cloud.noise_length is not None:
         columns[NOISE_LENGTH] = cloud.noise_length
@@ -205,26 +237,25 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     table = np.zeros(len(cloud), dtype=kinds)
     for name, values in columns.items():
         table[name] = values
-    comments = ["written by armscan", "unit mm", f"frame {cloud.frame}"]
-    if cloud.is_simulated:
-        comments.append(SIMULATED)
-    for word, names in (
-        ("sheet", cloud.sheet_names),
-        ("exposure", cloud.exposure_sources),
-        (FORCED, cloud.forced),
-    ):
-        comments += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
-    return ply_header(table.dtype, len(cloud), comments) + table.tobytes()
+    return table
 
 
 def xyz_bytes(cloud: PointCloud) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
-    buffer = io.StringIO()
-    frame = f"{cloud.frame}; {SIMULATED}" if cloud.is_simulated else cloud.frame
+    return b"".join(xyz_parts(cloud, [(cloud, np.zeros(0))]))
+
+
+def xyz_parts(
+    marks: PointCloud, pieces: Iterable[tuple[PointCloud, FloatArray]]
+) -> Iterator[bytes]:
+    """As `xyz_bytes`, of a cloud that comes in pieces; parameters as of `ply_parts`."""
+    frame = f"{marks.frame}; {SIMULATED}" if marks.is_simulated else marks.frame
     header = f"x_mm y_mm z_mm in frame {frame}; not in this file: {'; '.join(XYZ_LOSES)}"
-    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in cloud.forced)))
-    np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header)
-    return buffer.getvalue().encode()
+    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in marks.forced)))
+    for k, (cloud, _) in enumerate(pieces):
+        buffer = io.StringIO()
+        np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header if k == 0 else "")
+        yield buffer.getvalue().encode()
 
 
 def read_ply(path: Path) -> PointCloud:

@@ -221,7 +221,7 @@ def test_an_interrupted_scan_looks_at_each_image_once(
 def test_a_few_points_without_normal_are_normal(
     device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scan_module, "choose_radius_mm", lambda *_: 0.6)
+    monkeypatch.setattr(scan_module, "choose_scan_radius_mm", lambda *_: 0.6)
     result = measure_scan(as_source(fake_scan(3)), device)
     assert any("have no normal: within 0.6 mm" in warning for warning in result.warnings)
 

@@ -10,6 +10,7 @@ import typer
 import typer.main
 
 from armscan.cli import calibrate_cameras, calibrate_sensor, files, inspect, measure, points
+from armscan.cli import reconstruct as reconstruct_command
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
@@ -74,7 +75,9 @@ app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=measure.DEMO_EXAMPLE)(measure.demo)
 app.command("simulate", epilog=measure.SIMULATE_EXAMPLE)(measure.simulate)
 app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
-app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
+app.command("reconstruct", epilog=reconstruct_command.RECONSTRUCT_EXAMPLE)(
+    reconstruct_command.reconstruct
+)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)

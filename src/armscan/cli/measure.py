@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan demo``, ``simulate`` and ``reconstruct``."""
+"""``armscan demo`` and ``simulate``."""
 
 from __future__ import annotations
 
@@ -9,26 +9,7 @@ from typing import Annotated, cast
 
 import typer
 
-from armscan.cli.options import (
-    ArmFile,
-    AsJson,
-    BitsAlign,
-    BitsUsed,
-    Cache,
-    DefaultOf,
-    EulerAngles,
-    Force,
-    LaserColourOption,
-    Method,
-    MethodOption,
-    StripeMethodOption,
-    given,
-    progress_bar,
-    refuse_given,
-    refuse_vain,
-    run,
-    show,
-)
+from armscan.cli.options import AsJson, DefaultOf, given, progress_bar, show
 
 DEMO_EXAMPLE = "\b\nExample:\n  armscan demo single -o demo"
 SIMULATE_EXAMPLE = (
@@ -36,18 +17,6 @@ SIMULATE_EXAMPLE = (
     "  armscan simulate thesis-single camera -o board\n"
     "  armscan simulate thesis-single ball -o ball --preset harsh --seed 3\n"
     "  armscan simulate thesis-multi markers -o markers"
-)
-OF_IMAGES = (
-    "background right right_background sheet depth_margin arm "
-    "method stripe_method laser_colour bits_used bits_align cache"
-)
-RECONSTRUCT_EXAMPLE = (
-    "\b\nExamples:\n"
-    "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
-    "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
-    "      --sheet A -o cloud.ply\n"
-    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
-    "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
 TWIN = "armscan.pipeline.simulate:SimulateOptions."
 
@@ -182,119 +151,3 @@ def simulate(
     with progress_bar() as progress:
         summary = run_simulation(SimulateRequest(head, scene.value, output, options), progress)
     show(summary, as_json=as_json)
-
-
-DepthMargin = Annotated[
-    float | None,
-    typer.Option(
-        help="Widen the calibrated depth range by this part of its width at either end; "
-        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
-        "extrapolated.",
-        show_default=False,
-    ),
-]
-ProfilePoses = Annotated[
-    Path | None,
-    typer.Option(
-        help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
-        "that delivers points.",
-        show_default=False,
-    ),
-]
-
-
-Volume = Annotated[
-    str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
-]
-
-
-def reconstruct(
-    context: typer.Context,
-    *,
-    images: Annotated[
-        list[str],
-        typer.Argument(
-            help="A recording's folder; or images with the laser on: files, folders, patterns.",
-            show_default=False,
-        ),
-    ],
-    sensor: Annotated[
-        Path,
-        typer.Option(
-            "--sensor",
-            "--scanner",
-            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
-            "the Sensor frame.",
-            show_default=False,
-        ),
-    ],
-    background: Annotated[
-        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
-    ] = None,
-    right: Annotated[
-        list[str] | None,
-        typer.Option(help="Right camera's images of the same instants; of a stereo head."),
-    ] = None,
-    right_background: Annotated[
-        list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
-    ] = None,
-    sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
-    depth_margin: DepthMargin = None,
-    volume: Volume = "",
-    arm: ArmFile = None,
-    poses: ProfilePoses = None,
-    euler: EulerAngles = None,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
-    ] = Path("cloud.ply"),
-    method: MethodOption = None,
-    stripe_method: StripeMethodOption = None,
-    laser_colour: LaserColourOption = None,
-    bits_used: BitsUsed = None,
-    bits_align: BitsAlign = None,
-    cache: Cache = True,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Measure points from a recording of a scan, or from images of laser lines on objects."""
-    from armscan.jobs.reconstruct import PoseTable, StillPaths
-    from armscan.jobs.reconstruct import reconstruct as reconstruct_points
-    from armscan.pipeline.measure import MeasureOptions
-    from armscan.reconstruction.triangulate import DepthRange
-    from armscan.storage.images import ImageOptions
-    from armscan.vision.stripe.image import StripeOptions
-
-    names = (images, background, right, right_background)
-    _check_poses(context, poses, euler)
-    options = MeasureOptions(
-        stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
-        depths=None if depth_margin is None else DepthRange(depth_margin),
-        sheet=sheet,
-        is_by_thesis=method is Method.THESIS,
-    )
-    run(
-        lambda job: reconstruct_points(
-            job,
-            sensor,
-            StillPaths(*(tuple(one or ()) for one in names)),
-            volume=volume,
-            arm=arm,
-            poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
-            options=options,
-            image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
-        ),
-        as_json=as_json,
-        output=output,
-        force=force,
-        cache=cache,
-    )
-
-
-def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:
-    """Refuse options without effect on profiles, and angles of no table."""
-    if poses is None:
-        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
-    else:
-        refuse_given(
-            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
-        )

@@ -109,7 +109,9 @@ def percentiles(
         return np.asarray(np.percentile(np.concatenate(list(parts())), list(wanted)))
     extremes = [(part.min(), part.max()) for part in parts() if len(part)]
     low, high = min(one for one, _ in extremes), max(one for _, one in extremes)
-    scale = PERCENTILE_BINS / max(high - low, np.finfo(float).tiny)
+    if high == low:
+        return np.full(len(wanted), low)
+    scale = PERCENTILE_BINS / (high - low)
 
     def bins(part: FloatArray) -> IntArray:
         number = ((part - low) * scale).astype(np.int64)

@@ -8,7 +8,7 @@ exposure are consecutive; a piece, which is all that is read at a time, holds wh
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -307,20 +307,3 @@ class PointSpool:
             noise_length=rest["noise_length"] if self._has_noise_length else None,
         )
         return SpoolPiece(start, cloud, sigmas[:, 0], np.asarray(rest["pixel_px"]))
-
-
-def spooled(clouds: Iterable[PointCloud], pixels: Iterable[FloatArray | None]) -> PointSpool:
-    """Clouds of one exposure each in memory, for what looks at a spool.
-
-    Raises
-    ------
-    InputError
-        If there is no cloud, or they are of different kinds.
-    """
-    spool: PointSpool | None = None
-    for cloud, pixel_px in zip(clouds, pixels, strict=True):
-        spool = spool or PointSpool(cloud.frame, cloud.sheet_names)
-        spool.add(cloud, pixel_px)
-    if spool is None:
-        raise InputError("no cloud to join")
-    return spool

@@ -32,7 +32,7 @@ from armscan.reconstruction.place import (
     tangent_normals_near,
 )
 
-MOST_KEYS = 2**21
+MOST_KEYS = 2**20
 """Cells of exposures among which the sampled ones are chosen, held in memory; of more, those whose
 numbers' hash ends in zeros, so that the choice does not depend on their order."""
 MIXER = np.uint64(0x9E3779B97F4A7C15)

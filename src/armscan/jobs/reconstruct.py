@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -20,6 +20,7 @@ from armscan.models.calibration import Provenance, ScannerCalibration, SensorCal
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
 from armscan.pipeline.measure import reconstruct as reconstruct_images
+from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
     ScanOptions,
     ScanReconstruction,
@@ -33,12 +34,14 @@ from armscan.records.exposure import Exposure
 from armscan.report.cloud import (
     cloud_page,
     cloud_quantities,
+    profile_quantities,
+    profile_table,
     scan_page,
     scan_quantities,
     status_table,
     status_totals,
 )
-from armscan.report.page import Page
+from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
 from armscan.storage.clouds import XYZ_LOSES, ply_parts, xyz_parts
@@ -137,6 +140,7 @@ def reconstruct(
     poses: PoseTable | None = None,
     options: MeasureOptions | None = None,
     image_options: ImageOptions | None = None,
+    is_profiled: bool = False,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
 
@@ -158,6 +162,8 @@ def reconstruct(
         Of profiles; None for images.
     options, image_options
         Of stripes, depths and sheet, and how pixels are read.
+    is_profiled
+        Say what each stage of a scan took.
 
     Raises
     ------
@@ -181,8 +187,9 @@ def reconstruct(
                 remedy="name one recording at a time",
             )
         _check_own_images(paths)
-        return _scan(job, calibration, recordings[0], arm, ScanOptions(measure=options, volume=box))
-    for option, value in (("--volume", volume), ("--arm", arm)):
+        chosen = ScanOptions(measure=options, volume=box)
+        return _scan(job, calibration, recordings[0], arm, chosen, is_profiled=is_profiled)
+    for option, value in (("--volume", volume), ("--arm", arm), ("--profile", is_profiled)):
         if value:
             raise OptionError(
                 "there is no recording of an arm with a scanner's document",
@@ -229,7 +236,7 @@ def _stills(
         marks=measured,
         n_points=len(measured),
         pieces=[(measured, measured.sigma_mm)],
-        page=page,
+        page=lambda: page,
     )
     return Summary(
         title="Points measured" + (" on simulated images." if is_simulated else "."),
@@ -282,26 +289,34 @@ def _write(
     marks: PointCloud,
     n_points: int,
     pieces: Pieces,
-    page: Page,
+    page: Callable[[], Page],
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """The files written, and what they do not hold."""
+    """The files written, the page last, and what they do not hold."""
     is_ply = places[0].suffix.lower() == ".ply"
     content = ply_parts(marks, n_points, pieces) if is_ply else xyz_parts(marks, pieces)
-    written = job.write({places[0]: content, places[1]: page})
+    written = job.write({places[0]: content, places[1]: (render_page(make()) for make in (page,))})
     losses = () if is_ply else (f"the XYZ file does not hold {', '.join(XYZ_LOSES)}",)
     return written, losses
 
 
 def _scan(
-    job: Job, calibration: Path, folder: Path, arm: Path | None, options: ScanOptions
+    job: Job,
+    calibration: Path,
+    folder: Path,
+    arm: Path | None,
+    options: ScanOptions,
+    *,
+    is_profiled: bool,
 ) -> Summary:
+    clock = StageClock()
     places = job.places(".ply", ".xyz", beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
     with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
         scan = measure_long_scan(
-            recording, scanner, points, options, progress=job.progress, cache=job.cache
-        )
+            recording, scanner, points, options,
+            progress=job.progress, cache=job.cache, clock=clock,
+        )  # fmt: skip
         warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
         tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
         inputs = [path for path in (*tables, calibration, arm) if path is not None]
@@ -322,6 +337,7 @@ def _scan(
             warnings=warnings,
             scanner=scanner,
             is_simulated=recording.is_simulated,
+            clock=clock if is_profiled else None,
         )
 
 
@@ -365,24 +381,43 @@ def _told(
     warnings: Sequence[str],
     scanner: ScannerCalibration,
     is_simulated: bool = False,
+    clock: StageClock | None = None,
 ) -> Summary:
     """Write a cloud in Base and say what came out."""
-    digest = CloudDigest.of_spool(points, scan.cloud)
-    page = scan_page(
-        scan, exposures, provenance, warnings, digest=digest, is_simulated=is_simulated
-    )
+    timer = clock or StageClock()
+    with timer.stage("page", is_alone=True):
+        digest = CloudDigest.of_spool(points, scan.cloud)
+
+    def page() -> Page:
+        return scan_page(
+            scan,
+            exposures,
+            provenance,
+            warnings,
+            digest=digest,
+            profile=None if clock is None else clock.profile(),
+            is_simulated=is_simulated,
+        )
+
+    def pieces() -> Pieces:
+        with timer.stage("writing", is_alone=True):
+            yield from ((piece.cloud, piece.sigma_mm) for piece in points.pieces())
+
     written, losses = _write(
         job,
         places,
         marks=scan.cloud,
         n_points=len(points),
-        pieces=((piece.cloud, piece.sigma_mm) for piece in points.pieces()),
+        pieces=pieces(),
         page=page,
     )
+    profile = None if clock is None else clock.profile()
+    costs = () if profile is None else profile_quantities(scan, digest, profile)
+    tables = (status_totals(scan),) if scan.counts else ()
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
-        quantities=scan_quantities(scan, digest),
-        tables=(status_totals(scan),) if scan.counts else (),
+        quantities=(*scan_quantities(scan, digest), *costs),
+        tables=tables if profile is None else (*tables, profile_table(scan, profile)),
         warnings=sentences((*warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",

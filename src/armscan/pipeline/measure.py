@@ -26,7 +26,7 @@ from armscan.pipeline.instants import (
     check_sizes,
     pair_exposures,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
 from armscan.pipeline.targets import cached_profile
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
@@ -54,6 +54,8 @@ from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
+EXTRACTION, NAMING, PLACING = "extraction", "naming", "placing"
+"""Stages whose processor time is told."""
 TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
 LEAST_APART_RAD = 0.5
@@ -167,6 +169,7 @@ def measure_instants(
     is_pass: bool,
     reads_ahead: bool = True,
     cache: DetectionCache | None = None,
+    clock: StageClock | None = None,
 ) -> Iterator[MeasuredInstant]:
     """Extract the stripes of each instant, label them, and turn them into points.
 
@@ -187,6 +190,8 @@ def measure_instants(
         of the one before.
     cache
         Keeps the stripes of every image for another run; None to keep none.
+    clock
+        Counts what extraction and naming take.
 
     Raises
     ------
@@ -195,12 +200,14 @@ def measure_instants(
     EstimationError
         If the sheet of a stripe is ambiguous.
     """
+    clock = clock or StageClock()
     depths = options.accepted_depths(sensor)
     cameras, stripes = cameras_of(sensor), stripes_for(sensor, options.stripes)
 
     def extract(images: InstantImages) -> list[Profile]:
         pairs = zip(images.pairs, cameras, strict=True)
-        return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
+        with clock.stage(EXTRACTION):
+            return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
 
     try:
         for n, (images, profiles) in enumerate(
@@ -210,8 +217,13 @@ def measure_instants(
                 labeller.reset()
             if cache is not None and n % TRIMMED_AFTER == 0:
                 cache.trim()
-            labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
-            yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
+            with clock.stage(NAMING):
+                labelled = labeller.label(
+                    profiles, images.lasers, images.base_from_sensor, images.t_ns
+                )
+            with clock.stage(PLACING):
+                measured = MeasuredInstant(images, measure_points(labelled, sensor, depths))
+            yield measured
     finally:
         if cache is not None:
             cache.trim()

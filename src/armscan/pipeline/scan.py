@@ -20,6 +20,7 @@ from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
 from armscan.pipeline.measure import (
+    PLACING,
     MeasureOptions,
     SheetDepths,
     cameras_of,
@@ -29,7 +30,7 @@ from armscan.pipeline.measure import (
     nothing_measured,
     summarised,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.reconstruction.place import (
@@ -264,6 +265,7 @@ def measure_long_scan(
     progress: Progress = silent,
     cache: DetectionCache | None = None,
     most_images: int | None = SHOWN_IMAGES,
+    clock: StageClock | None = None,
 ) -> ScanReconstruction:
     """As `measure_scan`, with memory that does not grow with the scan's length.
 
@@ -275,6 +277,8 @@ def measure_long_scan(
         From `scan_spool`; holds the points with their normals afterwards.
     most_images
         Exposures whose stripes are kept, evenly chosen; None for all.
+    clock
+        Counts what the stages take.
 
     Returns
     -------
@@ -288,7 +292,7 @@ def measure_long_scan(
     OutputError
         If the disk is full.
     """
-    options = options or ScanOptions()
+    options, clock = options or ScanOptions(), clock or StageClock()
     sensor = scanner.sensor
     if sensor is None:
         raise InputError(
@@ -301,16 +305,17 @@ def measure_long_scan(
     labeller = labeller_for(sensor, options.measure, is_scan=True)
     found = _Measured(SheetDepths.of(sensor))
     shown = _shown_rows(wanted, most_images)
-    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner))
+    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner), clock=clock)
     for one in measure_instants(
-        instants, labeller, sensor, options.measure, is_pass=True, cache=cache
+        instants, labeller, sensor, options.measure, is_pass=True, cache=cache, clock=clock
     ):
         rows = one.images.instant.rows
         for row, measured in zip(rows, one.profiles, strict=True):
             found.rows.append(row)
-            base_from_tool = poses.pose(rows[0])
-            placed = _place(measured, base_from_tool, transform, options.volume, found)
-            points.add(*placed, instant=rows[0])
+            with clock.stage(PLACING):
+                base_from_tool = poses.pose(rows[0])
+                placed = _place(measured, base_from_tool, transform, options.volume, found)
+                points.add(*placed, instant=rows[0])
             if row in shown:
                 found.images[row] = measured.labelled
     hung = _hung(found.rows, wanted, poses, points)
@@ -323,8 +328,10 @@ def measure_long_scan(
         raise _nothing_placed(found, exposures, options)
     extra: tuple[str, ...] = ()
     if options.has_normals:
-        extra = _add_normals(points, pose_rows, poses, transform, progress)
-    doubt = doubt_scan(source, scanner, poses, points=points, pose_rows=pose_rows)
+        with clock.stage("normals", is_alone=True):
+            extra = _add_normals(points, pose_rows, poses, transform, progress)
+    with clock.stage("passes", is_alone=True):
+        doubt = doubt_scan(source, scanner, poses, points=points, pose_rows=pose_rows)
     counts = tuple(found.counts[k] for k in kept)
     image_rows = tuple(row for row in found.images if row not in hung)
     return ScanReconstruction(

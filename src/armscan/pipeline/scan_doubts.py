@@ -57,9 +57,9 @@ SEARCHED_POINTS = 2500
 SPLIT_RATIO, SPLIT_SHARE = 1.5, 0.7
 """Pairs of passes this far apart, in units of what is expected, are told from the others, and a
 break of the scan is named if so large a part of pairs on either side of it and across it fit."""
-MOST_THINNED, THINNED_SHARE = 500_000, 0.2
-"""Thinned points that are compared, and the part of all points that thinning leaves of a stripe
-with ten points a mm; of longer scans some passes are left out whole."""
+MOST_THINNED, ESTIMATED_BY = 250_000, 50
+"""Thinned points that are compared (30 MB), and exposures by which their count is estimated; of
+longer scans some passes are left out whole."""
 DENSE_NS = 50_000_000
 HAND_EYE_ROUNDS = 6
 SHEET_STEP_MM, LARGEST_SHIFT_MM = 0.01, 5.0
@@ -210,7 +210,15 @@ def _compared_rows(points: PointSpool, pose_rows: IntArray, source: ScanSource) 
     A scan of minutes has more passes than fit into memory with their covariances.
     """
     rows = np.unique(pose_rows)
-    n_expected = len(points) * THINNED_SHARE
+    if len(points) <= MOST_THINNED:
+        return rows
+    n_thinned = n_seen = 0
+    for k in points.kept[:: max(1, len(points.kept) // ESTIMATED_BY)]:
+        cloud = points.of_exposure(int(k))
+        n_seen += len(cloud)
+        if len(cloud):
+            n_thinned += len(thinned_rows(cloud.points_mm, cloud.exposure))
+    n_expected = len(points) * n_thinned / max(n_seen, 1)
     if n_expected <= MOST_THINNED:
         return rows
     times = np.array([source.rows[row].t_ns for row in rows], dtype=np.int64)

@@ -255,7 +255,7 @@ def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     return cloud.select(box.holds(cloud.points_mm))
 
 
-AT_ONCE = 20_000
+AT_ONCE = 8_192
 """Points whose neighbourhoods are held at the same time: 2 KB each."""
 NEIGHBOURS = 32
 """Cells looked at around a point, at most: a full disc of four cells' radius holds 50."""

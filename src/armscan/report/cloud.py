@@ -10,6 +10,7 @@ import numpy as np
 from armscan.fusion.digest import CloudDigest
 from armscan.models.calibration import Provenance, SensorCalibration
 from armscan.pipeline.measure import Reconstruction
+from armscan.pipeline.progress import ChainProfile
 from armscan.pipeline.scan import ExposureStatus, ScanReconstruction
 from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.records.cloud import PointCloud
@@ -183,6 +184,7 @@ def scan_page(
     warnings: Sequence[str] = (),
     *,
     digest: CloudDigest,
+    profile: ChainProfile | None = None,
     is_simulated: bool = False,
 ) -> Page:
     """Lay out the report.
@@ -199,6 +201,8 @@ def scan_page(
         How the cloud came to be.
     warnings
         What is odd about the recording and the scan.
+    profile
+        What the stages took; None to say nothing of it.
     is_simulated
         True if the images were rendered.
     """
@@ -219,6 +223,11 @@ def scan_page(
             Section("The stripes", stripes),
             Section("Exposure by exposure", _exposure_table(scan), is_folded=True),
         ]
+    if profile is not None:
+        rates = profile_quantities(scan, digest, profile)
+        told = "; ".join(f"{one.label.lower()} {one.text}" for one in rates if one.label)
+        costs = (Text(f"{told}."), profile_table(scan, profile))
+        sections.append(Section("What the stages took", costs, is_folded=True))
     return page_of(
         provenance,
         "Scan in Base",
@@ -232,6 +241,43 @@ def scan_page(
         warnings=warnings,
         is_simulated=is_simulated,
     )
+
+
+def profile_quantities(
+    scan: ScanReconstruction, digest: CloudDigest, profile: ChainProfile
+) -> tuple[Quantity, ...]:
+    """Rate and memory of a scan's reconstruction."""
+    n_exposures = len(scan.counts)
+    peak = profile.peak_mb
+    return (
+        Quantity("exposures_per_s", "Exposures a second", n_exposures / profile.wall_s),
+        Quantity("points_per_s", "Points a second", digest.n_points / profile.wall_s),
+        Quantity("wall_s", "Time", profile.wall_s, unit="s"),
+        Quantity("processor_s", "Processor time", profile.processor_s, unit="s"),
+        Quantity(
+            "peak_memory_mb",
+            "Peak memory",
+            float("nan") if peak is None else peak,
+            unit="MB",
+            shown="not told by this system" if peak is None else f"{peak:.0f} MB",
+        ),
+        Quantity("stages_s", "", dict(profile.stages)),
+    )
+
+
+def profile_table(scan: ScanReconstruction, profile: ChainProfile) -> Table:
+    """Processor time by stage; the share of a core is that of the time that all took."""
+    rest = profile.processor_s - sum(seconds for _, seconds in profile.stages)
+    rows = tuple(
+        (
+            name,
+            f"{seconds:.2f}",
+            f"{1e3 * seconds / max(len(scan.counts), 1):.2f}",
+            f"{seconds / profile.wall_s:.2f}",
+        )
+        for name, seconds in (*profile.stages, ("other", rest))
+    )
+    return Table(("stage", "processor s", "ms an exposure", "cores"), rows)
 
 
 def status_totals(scan: ScanReconstruction) -> Table:

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan reconstruct``: from images to points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from armscan.cli.options import (
+    ArmFile,
+    AsJson,
+    BitsAlign,
+    BitsUsed,
+    Cache,
+    EulerAngles,
+    Force,
+    LaserColourOption,
+    Method,
+    MethodOption,
+    StripeMethodOption,
+    given,
+    refuse_given,
+    refuse_vain,
+    run,
+)
+
+OF_IMAGES = (
+    "background right right_background sheet depth_margin arm "
+    "method stripe_method laser_colour bits_used bits_align cache profile"
+)
+RECONSTRUCT_EXAMPLE = (
+    "\b\nExamples:\n"
+    "  armscan reconstruct scan --scanner scanner.json -o cloud.ply\n"
+    "  armscan reconstruct scan/laser.png --background scan/dark.png --sensor sensor.json \\\n"
+    "      --sheet A -o cloud.ply\n"
+    "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
+    "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
+)
+
+DepthMargin = Annotated[
+    float | None,
+    typer.Option(
+        help="Widen the calibrated depth range by this part of its width at either end; "
+        "points beyond are left out. Without it 0; with two cameras 0.5; points between are "
+        "extrapolated.",
+        show_default=False,
+    ),
+]
+ProfilePoses = Annotated[
+    Path | None,
+    typer.Option(
+        help="Table of the robot's poses, one a profile: the files are profiles of a sensor "
+        "that delivers points.",
+        show_default=False,
+    ),
+]
+
+
+Images = Annotated[
+    list[str],
+    typer.Argument(
+        help="A recording's folder; or images with the laser on: files, folders, patterns.",
+        show_default=False,
+    ),
+]
+Calibration = Annotated[
+    Path,
+    typer.Option(
+        "--sensor",
+        "--scanner",
+        help="Calibration: a recording with scanner.json is placed in Base, all else is in the "
+        "Sensor frame.",
+        show_default=False,
+    ),
+]
+ProfileOption = Annotated[
+    bool, typer.Option("--profile", help="Say what each stage of a scan took.")
+]
+Volume = Annotated[
+    str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
+]
+
+
+def reconstruct(
+    context: typer.Context,
+    *,
+    images: Images,
+    sensor: Calibration,
+    background: Annotated[
+        list[str] | None, typer.Option(help="The same views without laser; repeatable.")
+    ] = None,
+    right: Annotated[
+        list[str] | None,
+        typer.Option(help="Right camera's images of the same instants; of a stereo head."),
+    ] = None,
+    right_background: Annotated[
+        list[str] | None, typer.Option(help="The right camera's without laser; repeatable.")
+    ] = None,
+    sheet: Annotated[str, typer.Option(help="Sheet that drew the stripes; empty finds it.")] = "",
+    depth_margin: DepthMargin = None,
+    volume: Volume = "",
+    arm: ArmFile = None,
+    poses: ProfilePoses = None,
+    euler: EulerAngles = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
+    ] = Path("cloud.ply"),
+    method: MethodOption = None,
+    stripe_method: StripeMethodOption = None,
+    laser_colour: LaserColourOption = None,
+    bits_used: BitsUsed = None,
+    bits_align: BitsAlign = None,
+    cache: Cache = True,
+    profile: ProfileOption = False,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure points from a recording of a scan, or from images of laser lines on objects."""
+    from armscan.jobs.reconstruct import PoseTable, StillPaths
+    from armscan.jobs.reconstruct import reconstruct as reconstruct_points
+    from armscan.pipeline.measure import MeasureOptions
+    from armscan.reconstruction.triangulate import DepthRange
+    from armscan.storage.images import ImageOptions
+    from armscan.vision.stripe.image import StripeOptions
+
+    names = (images, background, right, right_background)
+    _check_poses(context, poses, euler)
+    options = MeasureOptions(
+        stripes=given(StripeOptions, method=stripe_method, laser_colour=laser_colour),
+        depths=None if depth_margin is None else DepthRange(depth_margin),
+        sheet=sheet,
+        is_by_thesis=method is Method.THESIS,
+    )
+    run(
+        lambda job: reconstruct_points(
+            job,
+            sensor,
+            StillPaths(*(tuple(one or ()) for one in names)),
+            volume=volume,
+            arm=arm,
+            poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
+            options=options,
+            image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
+            is_profiled=profile,
+        ),
+        as_json=as_json,
+        output=output,
+        force=force,
+        cache=cache,
+    )
+
+
+def _check_poses(context: typer.Context, poses: Path | None, euler: str | None) -> None:
+    """Refuse options without effect on profiles, and angles of no table."""
+    if poses is None:
+        refuse_vain({"--euler": euler}, "there is no table of poses", "give --poses, or leave out")
+    else:
+        refuse_given(
+            context, OF_IMAGES, "profiles with --poses are points already: no image is read"
+        )

@@ -5,10 +5,11 @@ Command: ``OMP_NUM_THREADS=1 python benchmarks/scan_length.py [exposures ...]`` 
 8000; seed 0). ``--reference PATH`` runs the sources in PATH as well and compares the clouds.
 
 A recording of a plate: 16 drawn images of one line (320 x 240 px, 320 points), repeated under
-names of their own, 80 a second; the arm carries the line to and fro over lanes that run 30 mm aside
-each, 0.5 mm an exposure, so that new surface comes all the time. Simulated: drawn without the renderer. Each
-length is one run of the command in a process of its own, without cache. Told are exposures and
-points a second by the wall clock, processor time an exposure, and the process's peak memory.
+names of their own, 80 a second; the arm carries the line to and fro over lanes that run 30 mm
+aside each, 0.5 mm an exposure, so that new surface comes all the time. Simulated: drawn without
+the renderer. Each length is one run of the command in a process of its own, without cache. Told
+are exposures and points a second by the wall clock, processor time an exposure, the process's peak
+memory, and the beginning of the hash of the cloud's points.
 """
 
 from __future__ import annotations
@@ -117,8 +118,8 @@ def main() -> None:
     parser.add_argument("--reference", type=Path)
     given = parser.parse_args()
     own = Path(__file__).parents[1] / "src"
-    print("| exposures | points | exposures/s | points/s | ms a core an exposure | peak MB |")
-    print("|--:|--:|--:|--:|--:|--:|")
+    print("| exposures | points | exposures/s | points/s | ms an exposure | peak MB | hash |")
+    print("|--:|--:|--:|--:|--:|--:|---|")
     for n in given.exposures:
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary) / "scan"

@@ -15,7 +15,7 @@ from armscan.cli import reconstruct as reconstruct_command
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
     *("inspect", "verify"),
     *("convert", "info", "doctor"),
 )
@@ -78,6 +78,7 @@ app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
 app.command("reconstruct", epilog=reconstruct_command.RECONSTRUCT_EXAMPLE)(
     reconstruct_command.reconstruct
 )
+app.command("fuse", epilog=reconstruct_command.FUSE_EXAMPLE)(reconstruct_command.fuse)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)

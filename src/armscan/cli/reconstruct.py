@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan reconstruct``: from images to points."""
+"""``armscan reconstruct`` and ``fuse``: from images to points, and to one point a voxel."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ RECONSTRUCT_EXAMPLE = (
     "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
     "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
+FUSE_EXAMPLE = "\b\nExample:\n  armscan fuse monday.ply tuesday.ply --voxel 0.2 -o fused.ply"
 
 DepthMargin = Annotated[
     float | None,
@@ -149,6 +150,31 @@ def reconstruct(
         output=output,
         force=force,
         cache=cache,
+    )
+
+
+def fuse(
+    clouds: Annotated[
+        list[Path], typer.Argument(help="Clouds in one frame, .ply or text.", show_default=False)
+    ],
+    *,
+    voxel: Annotated[
+        float, typer.Option("--voxel", help="Edge of a voxel, mm.", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cloud to write, .ply or .xyz.")
+    ] = Path("fused.ply"),
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Thin clouds to one point a voxel: averaged by weight, with what is left of their sigma."""
+    from armscan.jobs.fuse import fuse as fuse_clouds
+
+    run(
+        lambda job: fuse_clouds(job, clouds, voxel),
+        as_json=as_json,
+        output=output,
+        force=force,
     )
 
 

@@ -107,7 +107,9 @@ class CellSums:
                 self._spill()
 
     def merged(self) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Numbers (M,), rising, and sums (M, K) of all cells, piece by piece; ends the adding."""
+        """Numbers (M,), rising, and sums (M, K) of all cells, piece by piece, as often
+        as asked; ends the adding.
+        """
         if not self._runs:
             keys, sums = self._sorted()
             step = max(FEWEST_ROWS, MOST_BYTES // (32 * (self.n_values + 1)))

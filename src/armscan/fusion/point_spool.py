@@ -137,7 +137,7 @@ class PointSpool:
         Parameters
         ----------
         cloud
-            Of one exposure, in this frame, with these sheets and without normals.
+            Of one exposure, in this frame, with these sheets; normals are left out.
         pixel_px
             (N, 2) where they were seen; None where nobody asks.
         instant

@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.fusion.digest import CloudDigest
 from armscan.fusion.point_spool import PointSpool
-from armscan.geometry.arrays import Box, FloatArray
+from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.job import Job
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
@@ -44,7 +44,7 @@ from armscan.report.cloud import (
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.clouds import XYZ_LOSES, ply_parts, xyz_parts
+from armscan.storage.clouds import XYZ_LOSES, CloudPiece, ply_parts, xyz_parts
 from armscan.storage.documents import (
     is_scanner_document,
     read_scanner_calibration,
@@ -235,7 +235,7 @@ def _stills(
         places,
         marks=measured,
         n_points=len(measured),
-        pieces=[(measured, measured.sigma_mm)],
+        pieces=[CloudPiece(measured, measured.sigma_mm)],
         page=lambda: page,
     )
     return Summary(
@@ -279,16 +279,13 @@ def _sensor(path: Path) -> SensorCalibration:
     return sensor
 
 
-Pieces: TypeAlias = Iterable[tuple[PointCloud, FloatArray]]
-
-
 def _write(
     job: Job,
     places: Sequence[Path],
     *,
     marks: PointCloud,
     n_points: int,
-    pieces: Pieces,
+    pieces: Iterable[CloudPiece],
     page: Callable[[], Page],
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """The files written, the page last, and what they do not hold."""
@@ -399,9 +396,9 @@ def _told(
             is_simulated=is_simulated,
         )
 
-    def pieces() -> Pieces:
+    def pieces() -> Iterator[CloudPiece]:
         with timer.stage("writing", is_alone=True):
-            yield from ((piece.cloud, piece.sigma_mm) for piece in points.pieces())
+            yield from (CloudPiece(one.cloud, one.sigma_mm) for one in points.pieces())
 
     written, losses = _write(
         job,

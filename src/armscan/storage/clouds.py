@@ -17,13 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import read_calibration, read_camera_calibration
-from armscan.storage.files import check_outputs, path_text, read_bytes, told_of, write_files
+from armscan.storage.files import (
+    check_outputs,
+    is_file,
+    path_text,
+    read_bytes,
+    told_of,
+    write_files,
+)
 from armscan.storage.foreign import camera_info_yaml
 from armscan.storage.tables import refuse_beyond_reach
 
@@ -167,6 +174,8 @@ COVARIANCE = {
 }
 INDICES = ("sheet", "exposure", "segment")
 NOISE_LENGTH = "noise_length_points"
+N_POINTS = "n_points"
+"""Measured points that one of a fused cloud stands for."""
 SIMULATED = "simulated"
 """Comment in the header of a cloud that was measured on rendered images."""
 FORCED = "forced"
@@ -190,11 +199,30 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     of points measured on rendered images also ``comment simulated``, of those of a calibration
     that was refused and forced ``comment forced 0 "why"``.
     """
-    return b"".join(ply_parts(cloud, len(cloud), [(cloud, cloud.sigma_mm)]))
+    return b"".join(ply_parts(cloud, len(cloud), [CloudPiece(cloud, cloud.sigma_mm)]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudPiece:
+    """Points of a cloud that is written piece by piece.
+
+    Parameters
+    ----------
+    cloud
+        The points.
+    sigma_mm
+        (N,) as `PointCloud.sigma_mm`.
+    n_points
+        (N,) measured points that each stands for; None if each is one.
+    """
+
+    cloud: PointCloud
+    sigma_mm: FloatArray
+    n_points: IntArray | None = None
 
 
 def ply_parts(
-    marks: PointCloud, n_points: int, pieces: Iterable[tuple[PointCloud, FloatArray]]
+    marks: PointCloud, n_points: int, pieces: Iterable[CloudPiece], *, is_fused: bool = False
 ) -> Iterator[bytes]:
     """As `ply_bytes`, of a cloud that comes in pieces.
 
@@ -205,7 +233,9 @@ def ply_parts(
     n_points
         Of all pieces.
     pieces
-        Points and their ``sigma_mm`` (N,), in order.
+        In order.
+    is_fused
+        The pieces say how many measured points each point stands for.
     """
     comments = ["written by armscan", "unit mm", f"frame {marks.frame}"]
     if marks.is_simulated:
@@ -216,24 +246,29 @@ def ply_parts(
         (FORCED, marks.forced),
     ):
         comments += [f"{word} {k} {json.dumps(name)}" for k, name in enumerate(names)]
-    yield ply_header(_ply_table(marks.select(slice(0)), np.zeros(0)).dtype, n_points, comments)
-    for cloud, sigma_mm in pieces:
-        yield _ply_table(cloud, sigma_mm).tobytes()
+    none = CloudPiece(marks.select(slice(0)), np.zeros(0), np.zeros(0, int) if is_fused else None)
+    yield ply_header(_ply_table(none).dtype, n_points, comments)
+    for piece in pieces:
+        yield _ply_table(piece).tobytes()
 
 
-def _ply_table(cloud: PointCloud, sigma_mm: FloatArray) -> NDArray[Any]:
+def _ply_table(piece: CloudPiece) -> NDArray[Any]:
+    cloud = piece.cloud
     columns: dict[str, NDArray[Any]] = {}
     columns |= {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
     if cloud.normals is not None:
         columns |= {name: cloud.normals[:, k] for k, name in enumerate(NORMAL)}
-    columns["sigma_mm"] = sigma_mm
+    columns["sigma_mm"] = piece.sigma_mm
     columns["sigma_noise_mm"] = cloud.sigma_noise_mm
     if cloud.noise_length is not None:
         columns[NOISE_LENGTH] = cloud.noise_length
     columns |= {name: cloud.covariance_mm2[:, i, j] for name, (i, j) in COVARIANCE.items()}
     columns["intensity"] = cloud.intensity
     columns |= {name: getattr(cloud, name) for name in INDICES}
-    kinds = [(name, "<i4" if name in INDICES else "<f8") for name in columns]
+    if piece.n_points is not None:
+        columns[N_POINTS] = piece.n_points
+    whole = (*INDICES, N_POINTS)
+    kinds = [(name, "<i4" if name in whole else "<f8") for name in columns]
     table = np.zeros(len(cloud), dtype=kinds)
     for name, values in columns.items():
         table[name] = values
@@ -242,19 +277,17 @@ def _ply_table(cloud: PointCloud, sigma_mm: FloatArray) -> NDArray[Any]:
 
 def xyz_bytes(cloud: PointCloud) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
-    return b"".join(xyz_parts(cloud, [(cloud, np.zeros(0))]))
+    return b"".join(xyz_parts(cloud, [CloudPiece(cloud, np.zeros(0))]))
 
 
-def xyz_parts(
-    marks: PointCloud, pieces: Iterable[tuple[PointCloud, FloatArray]]
-) -> Iterator[bytes]:
+def xyz_parts(marks: PointCloud, pieces: Iterable[CloudPiece]) -> Iterator[bytes]:
     """As `xyz_bytes`, of a cloud that comes in pieces; parameters as of `ply_parts`."""
     frame = f"{marks.frame}; {SIMULATED}" if marks.is_simulated else marks.frame
     header = f"x_mm y_mm z_mm in frame {frame}; not in this file: {'; '.join(XYZ_LOSES)}"
     header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in marks.forced)))
-    for k, (cloud, _) in enumerate(pieces):
+    for k, piece in enumerate(pieces):
         buffer = io.StringIO()
-        np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header if k == 0 else "")
+        np.savetxt(buffer, piece.cloud.points_mm, fmt="%.7f", header=header if k == 0 else "")
         yield buffer.getvalue().encode()
 
 
@@ -344,19 +377,7 @@ def read_cloud(path: Path) -> PointCloud:
     """
     data, where = read_bytes(path), path_text(path)
     if data.startswith(b"ply"):
-        vertices = parse_ply(data, where)
-        table = vertices.table
-        names = set(table.dtype.names or ())
-        if names.issuperset(COVARIANCE):
-            return _own_cloud(vertices, where)
-        if missing := sorted(set(POINT) - names):
-            raise FileFormatError(
-                f"the PLY file's points have no {missing[0]}",
-                where=str(path),
-                remedy="give a cloud with x, y and z in mm",
-            )
-        points = np.stack([table[name].astype(np.float64) for name in POINT], axis=1)
-        return _bare_cloud(points, FOREIGN_FRAME, path)
+        return _cloud_of(parse_ply(data, where), path)
     if path.suffix.lower() not in (".xyz", ".txt", ".csv", ".asc"):
         raise FileFormatError(
             "this is no point cloud that armscan knows",
@@ -364,6 +385,65 @@ def read_cloud(path: Path) -> PointCloud:
             remedy="give a .ply file, or a text file .xyz, .txt, .asc or .csv with x y z in mm",
         )
     return _text_cloud(data, path)
+
+
+def _cloud_of(vertices: PlyVertices, path: Path) -> PointCloud:
+    table = vertices.table
+    names = set(table.dtype.names or ())
+    if names.issuperset(COVARIANCE):
+        return _own_cloud(vertices, path_text(path))
+    if missing := sorted(set(POINT) - names):
+        raise FileFormatError(
+            f"the PLY file's points have no {missing[0]}",
+            where=str(path),
+            remedy="give a cloud with x, y and z in mm",
+        )
+    points = np.stack([table[name].astype(np.float64) for name in POINT], axis=1)
+    return _bare_cloud(points, FOREIGN_FRAME, path)
+
+
+PIECE_POINTS = 200_000
+"""Points of a file that are read at a time: 60 MB with all that is made of them."""
+
+
+def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
+    """As `read_cloud`, piece by piece; text files in one piece.
+
+    Raises
+    ------
+    FileFormatError
+        As `read_cloud`.
+    """
+    where = path_text(path)
+    if not is_file(path):
+        read_bytes(path)
+    with path.open("rb") as file:
+        start = b""
+        while (line := file.readline()) and len(start) < MOST_HEADER_BYTES:
+            start += line
+            if not start.startswith(b"ply") or END_HEADER.fullmatch(line):
+                break
+        is_binary = start.startswith(b"ply") and b"\nformat binary" in start[:100]
+        if not (is_binary and END_HEADER.fullmatch(line)):
+            yield read_cloud(path)
+            return
+        # what is wrong with a header is said by the reader of whole files
+        try:
+            _, count, kind, comments = _header(start.decode("latin-1"))
+        except (ValueError, KeyError, IndexError):
+            yield read_cloud(path)
+            return
+        for first in range(0, count, PIECE_POINTS):
+            asked = min(PIECE_POINTS, count - first)
+            table = np.frombuffer(file.read(asked * kind.itemsize)[: asked * kind.itemsize], "u1")
+            n = len(table) // kind.itemsize
+            if n < asked:
+                raise FileFormatError(
+                    f"the PLY file holds {first + n} of {count} points",
+                    where=where,
+                    remedy="copy the file again",
+                )
+            yield _cloud_of(PlyVertices(table.view(kind), comments), path)
 
 
 def _text_cloud(data: bytes, path: Path) -> PointCloud:

@@ -13,7 +13,7 @@ from armscan.fusion import digest as digest_module
 from armscan.fusion import point_spool
 from armscan.fusion.digest import CloudDigest, percentiles
 from armscan.reconstruction.place import merge_clouds
-from armscan.storage.clouds import ply_bytes, ply_parts, xyz_bytes, xyz_parts
+from armscan.storage.clouds import CloudPiece, ply_bytes, ply_parts, xyz_bytes, xyz_parts
 from rigs.long_scan import POINTS, pixels_of, spool_of, stripes
 
 KEPT = [0, 1, 2, 3, 6, 7, 9]
@@ -32,7 +32,7 @@ def test_every_value_comes_back_to_the_last_bit(
         found = spool.cloud()
         pieces = list(spool.pieces())
         starts = [piece.start for piece in pieces]
-        parts = [(piece.cloud, piece.sigma_mm) for piece in pieces]
+        parts = [CloudPiece(piece.cloud, piece.sigma_mm) for piece in pieces]
         marks = spool.without_points()
         assert len(spool) == len(whole)
         np.testing.assert_array_equal(spool.corners_mm[1], whole.points_mm.max(axis=0))
@@ -41,7 +41,7 @@ def test_every_value_comes_back_to_the_last_bit(
     assert b"".join(ply_parts(marks, len(whole), parts)) == ply_bytes(whole)
     assert b"".join(xyz_parts(marks, parts)) == xyz_bytes(whole)
     np.testing.assert_array_equal(pixels, np.concatenate([pixels_of(clouds[k], k) for k in KEPT]))
-    assert starts == np.cumsum([0, *(len(cloud) for cloud, _ in parts[:-1])]).tolist()
+    assert starts == np.cumsum([0, *(len(part.cloud) for part in parts[:-1])]).tolist()
     assert len(pieces) > 1 or piece_points == 10**6
     assert not any(tmp_path.iterdir()), "the files go with the spool"
 

@@ -51,8 +51,8 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     assert main(["-h"]) == 0
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
-    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"]
-    assert names == [*chain, "inspect", "verify", "convert", "info", "doctor"]
+    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
+    assert names == [*chain, "register", "inspect", "verify", "convert", "info", "doctor"]
 
 
 @pytest.mark.parametrize("path", [(), ("calibrate",), ("inspect",)], ids=" ".join)

@@ -240,7 +240,7 @@ def _in_order(
         yield from ((images, extract(images)) for images in instants)
         return
     pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    n_threads = min(_count_cores(), MOST_THREADS)
+    n_threads = min(count_cores(), MOST_THREADS)
     with ThreadPoolExecutor(n_threads) as pool:
         try:
             for images in instants:
@@ -255,7 +255,7 @@ def _in_order(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _count_cores() -> int:
+def count_cores() -> int:
     """Cores that this process may use, where the system tells."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

@@ -2,7 +2,9 @@
 """Memory and rate of `armscan reconstruct` against the length of a scan.
 
 Command: ``OMP_NUM_THREADS=1 python benchmarks/scan_length.py [exposures ...]`` (default 500 2000
-8000; seed 0). ``--reference PATH`` runs the sources in PATH as well and compares the clouds.
+8000; seed 0). ``--reference PATH`` runs the sources in PATH as well and compares the clouds;
+``--stripes-once`` extracts the stripes of images that repeat once: what is left is the rest of the
+chain.
 
 A recording of a plate: 16 drawn images of one line (320 x 240 px, 320 points), repeated under
 names of their own, 80 a second; the arm carries the line to and fro over lanes that run 30 mm
@@ -35,6 +37,19 @@ from rigs.scan_fake import line_image, looking_down, scanner
 IMAGES, PERIOD_NS = 16, 12_500_000
 STEP_MM, LANE_MM, LANE_APART_MM = 0.5, 150.0, 30.0
 RUN = "import sys; from armscan.cli import main; sys.exit(main())"
+STRIPES_KEPT = f"""
+from dataclasses import replace
+from pathlib import Path
+from armscan.pipeline import targets
+real, kept = targets.extract_stripes, {{}}
+def again(exposure, *others):
+    number = int(Path(exposure.source).stem) % {IMAGES}
+    if number not in kept:
+        kept[number] = real(exposure, *others)
+    return replace(kept[number], source=exposure.source)
+targets.extract_stripes = again
+"""
+"""Images are decoded, but stripes extracted once of each of those that repeat."""
 MB = 1024.0
 """Kilobytes, in which Linux tells peak memory."""
 
@@ -84,14 +99,14 @@ class Run:
     digest: str
 
 
-def run(folder: Path, sources: Path) -> Run:
+def run(folder: Path, sources: Path, before: str = "") -> Run:
     """Reconstruct the recording with the package in ``sources``."""
     cloud = folder.parent / "cloud.ply"
     environment = {**os.environ, "PYTHONPATH": str(sources)}
     words = ["reconstruct", str(folder), "--scanner", str(folder.parent / "scanner.json")]
     start = time.perf_counter()
     child = subprocess.Popen(
-        [sys.executable, "-c", RUN, *words, "-o", str(cloud), "--no-cache", "--force"],
+        [sys.executable, "-c", before + RUN, *words, "-o", str(cloud), "--no-cache", "--force"],
         env=environment,
         stdout=subprocess.DEVNULL,
     )
@@ -116,6 +131,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("exposures", nargs="*", type=int, default=[500, 2000, 8000])
     parser.add_argument("--reference", type=Path)
+    parser.add_argument("--stripes-once", action="store_true")
     given = parser.parse_args()
     own = Path(__file__).parents[1] / "src"
     print("| exposures | points | exposures/s | points/s | ms an exposure | peak MB | hash |")
@@ -125,7 +141,7 @@ def main() -> None:
             folder = Path(temporary) / "scan"
             write_scan(folder, n)
             for sources in [own, *([given.reference] if given.reference else [])]:
-                found = run(folder, sources)
+                found = run(folder, sources, STRIPES_KEPT if given.stripes_once else "")
                 print(
                     f"| {n:,} | {found.n_points:,} | {n / found.wall_s:.0f} | "
                     f"{found.n_points / found.wall_s:,.0f} | {1e3 * found.processor_s / n:.1f} | "

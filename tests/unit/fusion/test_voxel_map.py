@@ -92,7 +92,8 @@ def test_sigma_is_that_of_the_error(correlation: float) -> None:
     """400 scans of four voxels with an error of the calibration in common, noise along one axis.
 
     Noise of neighbours correlates as an autoregression, whose sums have (1 + r) / (1 - r) times the
-    variance of independent ones. 1200 components of chi2: their mean must lie in interval; were the shared error taken to average out too, it would be far beyond.
+    variance of independent ones. 1200 components of chi2: their mean must lie in its 99.9 %
+    interval; were the shared error taken to average out too, it would be far beyond.
     """
     rng = np.random.default_rng(5)
     axis = np.array([0.6, 0.0, 0.8])

@@ -7,16 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from armscan.fusion.point_spool import PointSpool
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
-from armscan.reconstruction.labels import LabelledProfile
 from armscan.reconstruction.sync import ExposurePoses
 from armscan.reconstruction.triangulate import intersect_sheets
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
-from armscan.records.profile import Profile
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from rigs.scan_fake import CAMERA, TOOL_FROM_SENSOR, scanner
 
@@ -135,27 +134,20 @@ def doubt(
     head = head or scanner()
     assert head.sensor is not None
     poses = read_as(scan.truth) if read is None else read
-    images, rows, parts = [], [], []
+    points = PointSpool("Base", ("A",))
+    rows = []
     for row, true_pose in enumerate(scan.truth):
         pixels = section_px(true_pose, rng)
         if mirrored:
             pixels[:, 0] = CAMERA.width_px - 1 - pixels[:, 0]
         for camera in range(n_cameras):
             own = pixels[camera::n_cameras]
-            points, is_met = intersect_sheets(own, np.zeros(len(own), dtype=np.int64), head.sensor)
-            images.append(_image(scan.rows[row].source, own[is_met]))
+            found, is_met = intersect_sheets(own, np.zeros(len(own), dtype=np.int64), head.sensor)
             rows.append(row)
             pose = poses.pose(row) @ head.hand_eye.tool_from_sensor
-            parts.append(points[is_met] @ pose.rotation.T + pose.translation_mm)
-    exposure = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return doubt_scan(
-        scan,
-        head,
-        poses,
-        cloud=_cloud(np.concatenate(parts), exposure, len(parts)),
-        images=tuple(images),
-        pose_rows=tuple(rows),
-    )
+            placed = found[is_met] @ pose.rotation.T + pose.translation_mm
+            points.add(_cloud(placed, scan.rows[row].source), own[is_met], instant=row)
+    return doubt_scan(scan, head, poses, points=points, pose_rows=rows)
 
 
 def read_as(poses: tuple[Pose[Base, Tool], ...]) -> ExposurePoses:
@@ -179,28 +171,10 @@ def poses_of(rotations: FloatArray, translations_mm: FloatArray) -> ExposurePose
     )
 
 
-def _image(source: str, pixels: FloatArray) -> LabelledProfile:
-    n = len(pixels)
-    zeros: IntArray = np.zeros(n, dtype=np.int64)
-    normals = np.tile([0.0, 1.0], (n, 1))
-    profile = Profile(
-        source=source,
-        points_px=pixels,
-        normals_px=normals,
-        sigma_px=np.full(n, NOISE_PX),
-        width_px=np.full(n, 3.0),
-        intensity=np.full(n, 150.0),
-        flags=zeros,
-        segment=zeros,
-    )
-    return LabelledProfile(profile=profile, sheet=zeros, status=zeros, reason="the only one")
-
-
-def _cloud(points_mm: FloatArray, exposure: IntArray, n_exposures: int) -> PointCloud:
+def _cloud(points_mm: FloatArray, source: str) -> PointCloud:
     n = len(points_mm)
     zeros: IntArray = np.zeros(n, dtype=np.int64)
     covariance = np.broadcast_to(NOISE_MM**2 * np.eye(3), (n, 3, 3))
-    sources = tuple(f"{k}.png" for k in range(n_exposures))
     return PointCloud(
         frame="Base",
         points_mm=points_mm,
@@ -208,8 +182,8 @@ def _cloud(points_mm: FloatArray, exposure: IntArray, n_exposures: int) -> Point
         sigma_noise_mm=np.full(n, NOISE_MM),
         sheet=zeros,
         sheet_names=("A",),
-        exposure=exposure,
-        exposure_sources=sources,
+        exposure=zeros,
+        exposure_sources=(source,),
         segment=zeros,
         intensity=np.full(n, 150.0),
     )

@@ -51,8 +51,9 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     assert main(["-h"]) == 0
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
-    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"]
-    assert names == [*chain, "clean", "inspect", "verify", "convert", "info", "doctor"]
+    chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
+    looks = ["clean", "inspect", "verify", "mesh", "convert", "info", "doctor"]
+    assert names == [*chain, "register", *looks]
 
 
 @pytest.mark.parametrize("path", [(), ("calibrate",), ("inspect",)], ids=" ".join)

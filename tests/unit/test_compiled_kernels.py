@@ -6,6 +6,8 @@ from __future__ import annotations
 import importlib.util
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,3 +92,30 @@ def test_a_damaged_cache_is_compiled_anew(
         path.write_bytes({"cut": content[:100], "junk": b"junk" * 40, "empty": b""}[how])
     assert total() == 3.0
     assert total() == 3.0, "the cache is whole again"
+
+
+def test_two_processes_do_not_compile_the_same_kernel(tmp_path: Path) -> None:
+    """Both start with an empty cache; what one compiles, the other waits for and takes."""
+    program = (
+        "from armscan.kernels import cells, voxels\n"
+        "from armscan.kernels.arrays import COMPILED\n"
+        "print(*COMPILED)"
+    )
+    environment = {**os.environ, VARIABLE: str(tmp_path)}
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    first, second = (one.communicate()[0].split() for one in both)
+    assert [one.returncode for one in both] == [0, 0]
+    assert not set(first) & set(second)
+    assert {"armscan.kernels.cells.add_to_cells", "armscan.kernels.voxels.voxel_values"} <= {
+        *first,
+        *second,
+    }
+    again = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True
+    )
+    assert again.stdout.split() == []

@@ -17,16 +17,16 @@ from armscan.cli import (
     inspect,
     inspect_cad,
     inspect_features,
-    measure,
     points,
     surface,
     twin,
 )
+from armscan.cli import reconstruct as reconstruct_command
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
-    *("demo", "simulate", "probe", "calibrate", "reconstruct", "markers", "register"),
+    *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
     *("clean", "inspect", "verify", "mesh"),
     *("convert", "info", "doctor"),
 )
@@ -96,7 +96,10 @@ app.add_typer(inspect_group, name="inspect")
 app.command("demo", epilog=twin.DEMO_EXAMPLE)(twin.demo)
 app.command("simulate", epilog=twin.SIMULATE_EXAMPLE)(twin.simulate)
 app.command("probe", epilog=points.PROBE_EXAMPLE)(points.probe)
-app.command("reconstruct", epilog=measure.RECONSTRUCT_EXAMPLE)(measure.reconstruct)
+app.command("reconstruct", epilog=reconstruct_command.RECONSTRUCT_EXAMPLE)(
+    reconstruct_command.reconstruct
+)
+app.command("fuse", epilog=reconstruct_command.FUSE_EXAMPLE)(reconstruct_command.fuse)
 app.command("markers", epilog=points.MARKERS_EXAMPLE)(points.markers)
 app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)

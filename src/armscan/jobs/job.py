@@ -22,7 +22,7 @@ from armscan.report.page import Page, render_page
 from armscan.report.quantity import sentences
 from armscan.storage.detection_cache import DetectionCache
 from armscan.storage.documents import new_provenance
-from armscan.storage.files import check_outputs, write_files
+from armscan.storage.files import Content, check_outputs, write_files
 
 T = TypeVar("T")
 
@@ -115,7 +115,7 @@ class Job:
             forced=forced,
         )
 
-    def write(self, contents: Mapping[Path, bytes | Page]) -> tuple[Path, ...]:
+    def write(self, contents: Mapping[Path, Content | Page]) -> tuple[Path, ...]:
         """Write all files or none, and remove the page of an earlier refusal."""
         files = {
             path: render_page(content) if isinstance(content, Page) else content

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,22 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InputError, OptionError
+from armscan.fusion.digest import CloudDigest
+from armscan.fusion.point_spool import PointSpool
 from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.job import Job
-from armscan.models.calibration import ScannerCalibration, SensorCalibration
+from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
 from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
 from armscan.pipeline.measure import reconstruct as reconstruct_images
+from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
     ScanOptions,
     ScanReconstruction,
-    measure_scan,
+    measure_long_scan,
     place_profiles,
+    scan_spool,
 )
 from armscan.reconstruction.labels import PointStatus
 from armscan.records.cloud import PointCloud
@@ -30,21 +34,23 @@ from armscan.records.exposure import Exposure
 from armscan.report.cloud import (
     cloud_page,
     cloud_quantities,
+    profile_quantities,
+    profile_table,
     scan_page,
     scan_quantities,
     status_table,
     status_totals,
 )
-from armscan.report.page import Page
-from armscan.report.photographs import evenly_chosen
+from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_bytes, cloud_losses
+from armscan.storage.clouds import CLOUD_SUFFIXES, CloudPiece, cloud_losses, cloud_parts
 from armscan.storage.documents import (
     is_scanner_document,
     read_scanner_calibration,
     read_sensor_calibration,
 )
+from armscan.storage.files import scratch_folder
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import profile_files, read_profiles, read_robot_poses
@@ -52,7 +58,6 @@ from armscan.storage.recording import FolderRecording, is_recording, read_record
 from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
 
 LISTED = 4
-MAX_SHOWN = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +140,7 @@ def reconstruct(
     poses: PoseTable | None = None,
     options: MeasureOptions | None = None,
     image_options: ImageOptions | None = None,
+    is_profiled: bool = False,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
 
@@ -157,6 +163,8 @@ def reconstruct(
         Of profiles; None for images.
     options, image_options
         Of stripes, depths and sheet, and how pixels are read.
+    is_profiled
+        Say what each stage of a scan took.
 
     Raises
     ------
@@ -180,8 +188,9 @@ def reconstruct(
                 remedy="name one recording at a time",
             )
         _check_own_images(paths)
-        return _scan(job, calibration, recordings[0], arm, ScanOptions(measure=options, volume=box))
-    for option, value in (("--volume", volume), ("--arm", arm)):
+        chosen = ScanOptions(measure=options, volume=box)
+        return _scan(job, calibration, recordings[0], arm, chosen, is_profiled=is_profiled)
+    for option, value in (("--volume", volume), ("--arm", arm), ("--profile", is_profiled)):
         if value:
             raise OptionError(
                 "there is no recording of an arm with a scanner's document",
@@ -222,7 +231,14 @@ def _stills(
     by_source = {exposure.source: exposure for exposure in read.exposures}
     page = cloud_page(result, sensor, by_source, provenance, is_simulated=is_simulated)
     measured = replace(result.cloud, is_simulated=is_simulated, forced=provenance.forced)
-    written, losses = _write(job, places, measured, page)
+    written, losses = _write(
+        job,
+        places,
+        marks=measured,
+        n_points=len(measured),
+        pieces=[CloudPiece(measured, measured.sigma_mm)],
+        page=lambda: page,
+    )
     return Summary(
         title="Points measured" + (" on simulated images." if is_simulated else "."),
         quantities=cloud_quantities(result),
@@ -265,41 +281,62 @@ def _sensor(path: Path) -> SensorCalibration:
 
 
 def _write(
-    job: Job, places: Sequence[Path], cloud: PointCloud, page: Page
+    job: Job,
+    places: Sequence[Path],
+    *,
+    marks: PointCloud,
+    n_points: int,
+    pieces: Iterable[CloudPiece],
+    page: Callable[[], Page],
 ) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """The files written, and what they do not hold."""
-    written = job.write({places[0]: cloud_bytes(cloud, places[0]), places[1]: page})
-    losses = cloud_losses(cloud, places[0])
+    """The files written, the page last, and what they do not hold."""
+    content = cloud_parts(places[0], marks, n_points, pieces)
+    written = job.write({places[0]: content, places[1]: (render_page(make()) for make in (page,))})
+    losses = cloud_losses(marks, places[0])
     kind = places[0].suffix.lstrip(".").upper()
     return written, (f"the {kind} file does not hold {', '.join(losses)}",) if losses else ()
 
 
 def _scan(
-    job: Job, calibration: Path, folder: Path, arm: Path | None, options: ScanOptions
+    job: Job,
+    calibration: Path,
+    folder: Path,
+    arm: Path | None,
+    options: ScanOptions,
+    *,
+    is_profiled: bool,
 ) -> Summary:
+    clock = StageClock()
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
-    scan = measure_scan(recording, scanner, options, progress=job.progress, cache=job.cache)
-    warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
-    tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
-    inputs = [path for path in (*tables, calibration, arm) if path is not None and path.exists()]
-    provenance = job.provenance(
-        inputs, (options,), parents=(scanner.provenance,), warnings=warnings
-    )
-    shown = [recording.exposure(row) for row in evenly_chosen(scan.image_rows, MAX_SHOWN)]
-    by_source = {exposure.source: exposure for exposure in shown}
-    is_simulated = recording.is_simulated
-    page = scan_page(scan, by_source, provenance, warnings, is_simulated=is_simulated)
-    return _told(
-        job,
-        places,
-        scan,
-        page,
-        warnings=warnings,
-        scanner=scanner,
-        is_simulated=is_simulated,
-    )
+    with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
+        scan = measure_long_scan(
+            recording, scanner, points, options,
+            progress=job.progress, cache=job.cache, clock=clock,
+        )  # fmt: skip
+        warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
+        tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
+        inputs = [path for path in (*tables, calibration, arm) if path is not None]
+        provenance = job.provenance(
+            [path for path in inputs if path.exists()],
+            (options,),
+            parents=(scanner.provenance,),
+            warnings=warnings,
+        )
+        shown = [recording.exposure(row) for row in scan.image_rows]
+        return _told(
+            job,
+            places,
+            scan,
+            points,
+            exposures={exposure.source: exposure for exposure in shown},
+            provenance=provenance,
+            warnings=warnings,
+            scanner=scanner,
+            is_simulated=recording.is_simulated,
+            clock=clock if is_profiled else None,
+        )
 
 
 def _delivered(
@@ -309,7 +346,9 @@ def _delivered(
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     profiles = read_profiles(names)
-    scan = place_profiles(profiles, read_robot_poses(table.path, table.euler), scanner, volume)
+    points = scan_spool(scanner)
+    poses = read_robot_poses(table.path, table.euler)
+    scan = place_profiles(profiles, poses, scanner, volume, points=points)
     files = [path for name in names for path in profile_files(Path(name))]
     provenance = job.provenance(
         (*files, table.path, calibration),
@@ -317,26 +356,66 @@ def _delivered(
         parents=(scanner.provenance,),
         warnings=scan.warnings,
     )
-    page = scan_page(scan, {}, provenance, scan.warnings)
-    return _told(job, places, scan, page, warnings=scan.warnings, scanner=scanner)
+    return _told(
+        job,
+        places,
+        scan,
+        points,
+        exposures={},
+        provenance=provenance,
+        warnings=scan.warnings,
+        scanner=scanner,
+    )
 
 
 def _told(
     job: Job,
     places: Sequence[Path],
     scan: ScanReconstruction,
-    page: Page,
+    points: PointSpool,
     *,
+    exposures: Mapping[str, Exposure],
+    provenance: Provenance,
     warnings: Sequence[str],
     scanner: ScannerCalibration,
     is_simulated: bool = False,
+    clock: StageClock | None = None,
 ) -> Summary:
     """Write a cloud in Base and say what came out."""
-    written, losses = _write(job, places, scan.cloud, page)
+    timer = clock or StageClock()
+    with timer.stage("page", is_alone=True):
+        digest = CloudDigest.of_spool(points, scan.cloud)
+
+    def page() -> Page:
+        return scan_page(
+            scan,
+            exposures,
+            provenance,
+            warnings,
+            digest=digest,
+            profile=None if clock is None else clock.profile(),
+            is_simulated=is_simulated,
+        )
+
+    def pieces() -> Iterator[CloudPiece]:
+        with timer.stage("writing", is_alone=True):
+            yield from (CloudPiece(one.cloud, one.sigma_mm) for one in points.pieces())
+
+    written, losses = _write(
+        job,
+        places,
+        marks=scan.cloud,
+        n_points=len(points),
+        pieces=pieces(),
+        page=page,
+    )
+    profile = None if clock is None else clock.profile()
+    costs = () if profile is None else profile_quantities(scan, digest, profile)
+    tables = (status_totals(scan),) if scan.counts else ()
     return Summary(
         title="Scan placed in Base" + (" (simulated images)." if is_simulated else "."),
-        quantities=scan_quantities(scan),
-        tables=(status_totals(scan),) if scan.images else (),
+        quantities=(*scan_quantities(scan, digest), *costs),
+        tables=tables if profile is None else (*tables, profile_table(scan, profile)),
         warnings=sentences((*warnings, *losses)),
         written=written,
         next_step=f"open {written[-1]}, then `armscan inspect plane {written[0]}` or sphere, step",

@@ -3,12 +3,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Literal, TypeAlias, TypeVar
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numba import njit, types
 from numpy.typing import NDArray
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover - Windows has none
+    fcntl = None  # type: ignore[assignment]
+
+COMPILED: dict[str, float] = {}
+"""Seconds that this process compiled each kernel for which the cache had nothing."""
 
 Image: TypeAlias = NDArray[np.float32]
 Mask: TypeAlias = NDArray[np.uint8]
@@ -74,10 +86,19 @@ def compiled(
         signature = _TYPES[named.pop("return")](*(_TYPES[name] for name in named.values()))
 
         def built(*, cache: bool) -> F:
-            found: F = njit(
-                signature, cache=cache, nogil=True, fastmath=fastmath, error_model=error_model
-            )(kernel)
-            return found
+            found: Any = njit(cache=cache, nogil=True, fastmath=fastmath, error_model=error_model)(
+                kernel
+            )
+            if found is kernel:
+                # compilation is switched off, as for a debugger
+                return kernel
+            start = time.perf_counter()
+            with _alone(found):
+                found.compile(signature)
+            if found.stats.cache_misses or not cache:
+                COMPILED[f"{kernel.__module__}.{kernel.__name__}"] = time.perf_counter() - start
+            found.disable_compile()
+            return cast(F, found)
 
         try:
             return built(cache=True)
@@ -88,6 +109,27 @@ def compiled(
     return compile_kernel
 
 
+@contextmanager
+def _alone(kernel: Any) -> Iterator[None]:
+    """Wait while another process compiles the same kernel, to take it from the cache then.
+
+    Where nothing can be locked, both compile.
+    """
+    handle = None
+    if fcntl is not None:
+        with suppress(OSError):
+            folder = Path(kernel._cache.cache_path)
+            folder.mkdir(parents=True, exist_ok=True)
+            name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+            handle = os.open(folder / f".{name}.lock", os.O_RDWR | os.O_CREAT, 0o600)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
+
+
 def _forgotten(kernel: Any) -> bool:
     """Empty the cache of one kernel; False if its folder may not be written."""
     try:
@@ -95,3 +137,16 @@ def _forgotten(kernel: Any) -> bool:
     except OSError:
         return False
     return True
+
+
+def kernel_folder() -> str:
+    """Where compiled kernels are kept, in words."""
+
+    def nothing() -> None:
+        """Is never compiled."""
+
+    try:
+        found: Any = njit(cache=True)(nothing)
+    except RuntimeError:
+        return "in no folder: none can be written"
+    return "not compiled" if found is nothing else str(found._cache.cache_path)

@@ -15,7 +15,7 @@ from armscan.errors import ArmscanError, InputError
 from armscan.geometry.arrays import BoolArray, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.camera import CameraModel
-from armscan.pipeline.progress import Progress, ProgressEvent
+from armscan.pipeline.progress import Progress, ProgressEvent, StageClock
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ExposureRow
 
@@ -421,6 +421,8 @@ class ScanInstants:
         stage: str,
         progress: Progress,
         base_from_sensor: Callable[[Instant], Pose[Base, Sensor] | None] = lambda _: None,
+        *,
+        clock: StageClock | None = None,
     ) -> Iterator[InstantImages]:
         """Read instants one by one; what cannot be read is left out and kept in `unreadable`.
 
@@ -432,12 +434,15 @@ class ScanInstants:
             Told of every instant.
         base_from_sensor
             Where the sensor was.
+        clock
+            Counts what decoding takes.
         """
-        n = len(instants)
+        clock, n = clock or StageClock(), len(instants)
         for done, one in enumerate(instants):
             progress(ProgressEvent(stage, done, n, self._source.rows[one.rows[0]].source))
             try:
-                pairs = tuple(self.pair(row) for row in one.rows)
+                with clock.stage("decoding"):
+                    pairs = tuple(self.pair(row) for row in one.rows)
             except ArmscanError as error:
                 self.unreadable.update(dict.fromkeys(one.rows, str(error)))
                 continue

@@ -26,7 +26,7 @@ from armscan.pipeline.instants import (
     check_sizes,
     pair_exposures,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
 from armscan.pipeline.targets import cached_profile
 from armscan.reconstruction.label_cross import CrossLabeller
 from armscan.reconstruction.label_stereo import StereoLabeller
@@ -34,6 +34,7 @@ from armscan.reconstruction.labels import (
     LabelledProfile,
     PointStatus,
     SingleLabeller,
+    StripeCounts,
     StripeLabeller,
 )
 from armscan.reconstruction.place import merge_clouds
@@ -53,6 +54,8 @@ from armscan.thesis.row_rule import RowLabeller
 from armscan.vision.stripe.image import StripeOptions
 
 STAGE = "reconstruct"
+EXTRACTION, NAMING, PLACING = "extraction", "naming", "placing"
+"""Stages whose processor time is told."""
 TRIMMED_AFTER = 100
 """Instants after which the cache is kept small."""
 LEAST_APART_RAD = 0.5
@@ -166,6 +169,7 @@ def measure_instants(
     is_pass: bool,
     reads_ahead: bool = True,
     cache: DetectionCache | None = None,
+    clock: StageClock | None = None,
 ) -> Iterator[MeasuredInstant]:
     """Extract the stripes of each instant, label them, and turn them into points.
 
@@ -186,6 +190,8 @@ def measure_instants(
         of the one before.
     cache
         Keeps the stripes of every image for another run; None to keep none.
+    clock
+        Counts what extraction and naming take.
 
     Raises
     ------
@@ -194,12 +200,14 @@ def measure_instants(
     EstimationError
         If the sheet of a stripe is ambiguous.
     """
+    clock = clock or StageClock()
     depths = options.accepted_depths(sensor)
     cameras, stripes = cameras_of(sensor), stripes_for(sensor, options.stripes)
 
     def extract(images: InstantImages) -> list[Profile]:
         pairs = zip(images.pairs, cameras, strict=True)
-        return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
+        with clock.stage(EXTRACTION):
+            return [extract_profile(pair, camera, stripes, cache) for pair, camera in pairs]
 
     try:
         for n, (images, profiles) in enumerate(
@@ -209,8 +217,13 @@ def measure_instants(
                 labeller.reset()
             if cache is not None and n % TRIMMED_AFTER == 0:
                 cache.trim()
-            labelled = labeller.label(profiles, images.lasers, images.base_from_sensor, images.t_ns)
-            yield MeasuredInstant(images, measure_points(labelled, sensor, depths))
+            with clock.stage(NAMING):
+                labelled = labeller.label(
+                    profiles, images.lasers, images.base_from_sensor, images.t_ns
+                )
+            with clock.stage(PLACING):
+                measured = MeasuredInstant(images, measure_points(labelled, sensor, depths))
+            yield measured
     finally:
         if cache is not None:
             cache.trim()
@@ -227,7 +240,7 @@ def _in_order(
         yield from ((images, extract(images)) for images in instants)
         return
     pending: deque[tuple[InstantImages, Future[list[Profile]]]] = deque()
-    n_threads = min(_count_cores(), MOST_THREADS)
+    n_threads = min(count_cores(), MOST_THREADS)
     with ThreadPoolExecutor(n_threads) as pool:
         try:
             for images in instants:
@@ -242,7 +255,7 @@ def _in_order(
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _count_cores() -> int:
+def count_cores() -> int:
     """Cores that this process may use, where the system tells."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
@@ -375,9 +388,13 @@ def reconstruct(
     progress(ProgressEvent(STAGE, len(left), len(left)))
     cloud = merge_clouds(clouds)
     if len(cloud) == 0:
-        raise nothing_measured(images, is_by_thesis=options.is_by_thesis)
-    depths = [cloud.points_mm[cloud.sheet == k, 2] for k in range(len(sensor.sheets))]
-    warnings = (*measurement_warnings(images, depths, sensor), *summarised(weak))
+        counts = [image.counts for image in images]
+        raise nothing_measured(counts, is_by_thesis=options.is_by_thesis)
+    depths = SheetDepths.of(sensor)
+    for k, counted in enumerate(depths):
+        counted.add(cloud.points_mm[cloud.sheet == k, 2])
+    counts = [image.counts for image in images]
+    warnings = (*measurement_warnings(counts, depths, sensor), *summarised(weak))
     return Reconstruction(cloud, tuple(images), warnings)
 
 
@@ -405,10 +422,10 @@ def _check_cameras(sensor: SensorCalibration, n_left: int, n_right: int) -> None
 
 
 def nothing_measured(
-    images: Sequence[LabelledProfile], *, is_by_thesis: bool = False
+    images: Sequence[StripeCounts], *, is_by_thesis: bool = False
 ) -> EstimationError:
     """Why these images gave no point at all, to be raised."""
-    n_points = sum(len(image.profile) for image in images)
+    n_points = sum(map(len, images))
     if n_points == 0:
         return EstimationError(
             f"no stripe was found in {len(images)} images", remedy=NOTHING_MEASURED_REMEDY
@@ -440,9 +457,42 @@ def summarised(warnings: Sequence[str]) -> tuple[str, ...]:
     return (f"{len(warnings)} exposures: {warnings[0]}",) if warnings else ()
 
 
+@dataclass(slots=True)
+class SheetDepths:
+    """Depths of the points measured with one sheet, counted as they come.
+
+    Parameters
+    ----------
+    range_mm
+        In which the sheet was calibrated.
+    n, n_beyond
+        Points, and those outside the range.
+    most_beyond_mm
+        How far the furthest of them lies outside.
+    """
+
+    range_mm: tuple[float, float]
+    n: int = 0
+    n_beyond: int = 0
+    most_beyond_mm: float = 0.0
+
+    @staticmethod
+    def of(sensor: SensorCalibration) -> tuple[SheetDepths, ...]:
+        """One a sheet of the sensor, without points."""
+        return tuple(SheetDepths(sheet.depth_range_mm) for sheet in sensor.sheets)
+
+    def add(self, depths_mm: FloatArray) -> None:
+        """Count points by their Z in Sensor (N,)."""
+        low, high = self.range_mm
+        beyond = np.maximum(low - depths_mm, depths_mm - high)
+        self.n += len(depths_mm)
+        self.n_beyond += int((beyond > 0.0).sum())
+        self.most_beyond_mm = max(self.most_beyond_mm, float(beyond.max(initial=0.0)))
+
+
 def measurement_warnings(
-    images: Sequence[LabelledProfile],
-    depths_mm: Sequence[FloatArray],
+    images: Sequence[StripeCounts],
+    depths: Sequence[SheetDepths],
     sensor: SensorCalibration,
 ) -> tuple[str, ...]:
     """Say what a person should know of these images; the same for still images and for scans.
@@ -451,28 +501,24 @@ def measurement_warnings(
     ----------
     images
         What each gave.
-    depths_mm
-        One array a sheet: the Z in Sensor of the points measured with it.
+    depths
+        One a sheet: of the points measured with it.
     sensor
         Camera and sheets.
     """
     warnings = []
     n_measured = [one.count(PointStatus.MEASURED) + one.count(PointStatus.SHARED) for one in images]
-    both = list(zip((one.profile for one in images), n_measured, strict=True))
-    empty = [profile.source for profile, n in both if n == 0]
+    both = list(zip(images, n_measured, strict=True))
+    empty = [image.source for image, n in both if n == 0]
     if empty:
         warnings.append(f"{len(empty)} images gave no point: {', '.join(empty[:LISTED])}")
-    doubtful = [profile.source for profile, n in both if 0 < n < CLEAN_SHARE * len(profile)]
+    doubtful = [image.source for image, n in both if 0 < n < CLEAN_SHARE * len(image)]
     if doubtful:
         warnings.append(
             f"less than half of what looked like a stripe could be measured in "
             f"{', '.join(doubtful[:LISTED])}: see in the pictures whether it is a laser line"
         )
-    assumed = [
-        profile.source
-        for profile, n in both
-        if n and (profile.flags & int(StripeFlag.NOISE_ASSUMED)).any()
-    ]
+    assumed = [image.source for image, n in both if n and image.flags & StripeFlag.NOISE_ASSUMED]
     if assumed:
         warnings.append(
             f"in {len(assumed)} images the stripe is too short to show its noise: the sigmas of "
@@ -485,16 +531,15 @@ def measurement_warnings(
         warnings.append(
             "the camera came without covariance: the points' sigmas leave its errors out"
         )
-    for sheet, depth in zip(sensor.sheets, depths_mm, strict=True):
-        low, high = sheet.depth_range_mm
-        beyond = np.maximum(low - depth, depth - high)
-        if (beyond > 0.0).any():
+    for sheet, depth in zip(sensor.sheets, depths, strict=True):
+        low, high = depth.range_mm
+        if depth.n_beyond:
             warnings.append(
-                f"sheet {sheet.name}: {int((beyond > 0.0).sum())} of {len(depth)} points lie up to "
-                f"{float(beyond.max()):.1f} mm outside its calibrated depth range, {low:.1f} to "
+                f"sheet {sheet.name}: {depth.n_beyond} of {depth.n} points lie up to "
+                f"{depth.most_beyond_mm:.1f} mm outside its calibrated depth range, {low:.1f} to "
                 f"{high:.1f} mm: their sigma supposes that the sheet goes on as it was calibrated"
             )
-        if len(depth) and not sheet.is_redundant:
+        if depth.n and not sheet.is_redundant:
             warnings.append(
                 f"sheet {sheet.name} rests on two boards only: nothing but the coplanarity of two "
                 "stripes checks it"

@@ -4,20 +4,25 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from pathlib import Path
 
 import numpy as np
 
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError, InputError
+from armscan.fusion.point_spool import PointSpool
+from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
 from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
 from armscan.pipeline.measure import (
+    PLACING,
     MeasureOptions,
+    SheetDepths,
     cameras_of,
     labeller_for,
     measure_instants,
@@ -25,16 +30,14 @@ from armscan.pipeline.measure import (
     nothing_measured,
     summarised,
 )
-from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.progress import Progress, ProgressEvent, StageClock, silent
 from armscan.pipeline.scan_doubts import ScanDoubt, doubt_scan
-from armscan.reconstruction.labels import LabelledProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.reconstruction.place import (
     DELIVERED,
     BaseTransform,
-    choose_radius_mm,
     cut_cloud,
     delivered_points,
-    estimate_normals,
     merge_clouds,
     propagate_to_base,
 )
@@ -54,6 +57,8 @@ STAGE = "scan"
 MANY_WITHOUT_NORMAL = 0.1
 """A larger share of points without normal is warned of."""
 LISTED = 4
+SHOWN_IMAGES = 12
+"""Stripes that a page shows on their photographs."""
 
 
 class ExposureStatus(Enum):
@@ -105,8 +110,8 @@ class ScanReconstruction:
         Points in Base. ``normals`` are (0, 0, 0) where there is no tangent plane, None if not
         asked for.
     images
-        Stripe points of the exposures that were placed, in order of time; ``cloud.exposure``
-        points into it.
+        Stripe points of the exposures that were placed, in order of time, or of some of them; if
+        of all, ``cloud.exposure`` points into it.
     image_rows
         Row of the recording that each of ``images`` is.
     exposures
@@ -117,6 +122,8 @@ class ScanReconstruction:
         What is weak, in words.
     doubt
         How far the passes of the scan agree.
+    counts
+        How many stripe points of each exposure that was placed became what.
     """
 
     cloud: PointCloud
@@ -126,6 +133,7 @@ class ScanReconstruction:
     poses: ExposurePoses
     warnings: tuple[str, ...] = ()
     doubt: ScanDoubt = field(default_factory=lambda: ScanDoubt(None))
+    counts: tuple[StripeCounts, ...] = ()
 
     @property
     def contradictions(self) -> tuple[str, ...]:
@@ -176,14 +184,20 @@ class ScanOptions:
     has_normals: bool = True
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Placed:
-    """What one exposure gave: its stripe, its points in Base, their depths, those cut away."""
+@dataclass(slots=True, eq=False)
+class _Measured:
+    """What the exposures of a scan gave besides points, which are in a spool.
 
-    labelled: LabelledProfile
-    cloud: PointCloud
-    depths_mm: tuple[FloatArray, ...]
-    n_outside_volume: int
+    ``rows`` are those of the recording, as they were measured; ``images`` the stripes of some of
+    them, by row.
+    """
+
+    depths: tuple[SheetDepths, ...]
+    rows: list[int] = field(default_factory=list)
+    counts: list[StripeCounts] = field(default_factory=list)
+    n_outside_volume: list[int] = field(default_factory=list)
+    images: dict[int, LabelledProfile] = field(default_factory=dict)
+    weak: list[str] = field(default_factory=list)
 
 
 def measure_scan(
@@ -195,6 +209,9 @@ def measure_scan(
     cache: DetectionCache | None = None,
 ) -> ScanReconstruction:
     """Measure the stripes of every exposure that has a pose and place them in Base.
+
+    All points and the stripes of all exposures are in memory at the end; `measure_long_scan`
+    leaves them on disk.
 
     Instants are read one after another and dropped once measured; an image that cannot be read
     is counted and named, and so is its partner of the same instant, or an image of one camera of
@@ -222,7 +239,60 @@ def measure_scan(
     EstimationError
         If no exposure has a pose, the sheet of a stripe is ambiguous, or nothing was measured.
     """
-    options = options or ScanOptions()
+    with scan_spool(scanner) as points:
+        scan = measure_long_scan(
+            source, scanner, points, options, progress=progress, cache=cache, most_images=None
+        )
+        cloud = points.cloud()
+    marks = scan.cloud
+    cloud = replace(cloud, is_simulated=marks.is_simulated, forced=marks.forced)
+    return replace(scan, cloud=cloud)
+
+
+def scan_spool(scanner: ScannerCalibration, folder: Path | None = None) -> PointSpool:
+    """An empty place for the points of a scan in Base; None for the folder keeps it in memory."""
+    sensor = scanner.sensor
+    names = (DELIVERED,) if sensor is None else tuple(one.name for one in sensor.sheets)
+    return PointSpool("Base", names, folder)
+
+
+def measure_long_scan(
+    source: ScanSource,
+    scanner: ScannerCalibration,
+    points: PointSpool,
+    options: ScanOptions | None = None,
+    *,
+    progress: Progress = silent,
+    cache: DetectionCache | None = None,
+    most_images: int | None = SHOWN_IMAGES,
+    clock: StageClock | None = None,
+) -> ScanReconstruction:
+    """As `measure_scan`, with memory that does not grow with the scan's length.
+
+    Parameters
+    ----------
+    source, scanner, options, progress, cache
+        As for `measure_scan`.
+    points
+        From `scan_spool`; holds the points with their normals afterwards.
+    most_images
+        Exposures whose stripes are kept, evenly chosen; None for all.
+    clock
+        Counts what the stages take.
+
+    Returns
+    -------
+    ScanReconstruction
+        Its ``cloud`` has names and marks but no points.
+
+    Raises
+    ------
+    ArmscanError
+        As `measure_scan`.
+    OutputError
+        If the disk is full.
+    """
+    options, clock = options or ScanOptions(), clock or StageClock()
     sensor = scanner.sensor
     if sensor is None:
         raise InputError(
@@ -233,50 +303,66 @@ def measure_scan(
     wanted = [one for one in scan.lit if poses.has_pose[list(one.rows)].all()]
     transform = BaseTransform.of(scanner)
     labeller = labeller_for(sensor, options.measure, is_scan=True)
-    placed: dict[int, _Placed] = {}
-    weak: list[str] = []
-    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner))
+    found = _Measured(SheetDepths.of(sensor))
+    shown = _shown_rows(wanted, most_images)
+    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner), clock=clock)
     for one in measure_instants(
-        instants, labeller, sensor, options.measure, is_pass=True, cache=cache
+        instants, labeller, sensor, options.measure, is_pass=True, cache=cache, clock=clock
     ):
         rows = one.images.instant.rows
         for row, measured in zip(rows, one.profiles, strict=True):
-            placed[row] = _place(measured, poses.pose(rows[0]), transform, options.volume)
-            weak += measured.warnings
-    hung = _hung(placed, wanted, poses)
-    kept = {row: one for row, one in placed.items() if row not in hung}
-    exposures = _exposures(source, scan, poses, kept, hung)
-    cloud, extra = _joined(kept, exposures, poses, transform, options, progress=progress)
-    images = tuple(one.labelled for one in kept.values())
+            found.rows.append(row)
+            with clock.stage(PLACING):
+                base_from_tool = poses.pose(rows[0])
+                placed = _place(measured, base_from_tool, transform, options.volume, found)
+                points.add(*placed, instant=rows[0])
+            if row in shown:
+                found.images[row] = measured.labelled
+    hung = _hung(found.rows, wanted, poses, points)
+    kept = [k for k, row in enumerate(found.rows) if row not in hung]
+    points.keep(kept)
+    exposures = _exposures(source, scan, poses, found, hung)
     first_row = {row: instant.rows[0] for instant in wanted for row in instant.rows}
-    doubt = doubt_scan(
-        source,
-        scanner,
-        poses,
-        cloud=cloud,
-        images=images,
-        pose_rows=tuple(first_row[row] for row in kept),
-    )
-    depths = [
-        np.concatenate([one.depths_mm[k] for one in kept.values()])
-        for k in range(len(sensor.sheets))
-    ]
+    pose_rows = [first_row[found.rows[k]] for k in kept]
+    if not len(points):
+        raise _nothing_placed(found, exposures, options)
+    extra: tuple[str, ...] = ()
+    if options.has_normals:
+        with clock.stage("normals", is_alone=True):
+            extra = _add_normals(points, pose_rows, poses, transform, progress)
+    with clock.stage("passes", is_alone=True):
+        doubt = doubt_scan(source, scanner, poses, points=points, pose_rows=pose_rows)
+    counts = tuple(found.counts[k] for k in kept)
+    image_rows = tuple(row for row in found.images if row not in hung)
     return ScanReconstruction(
-        cloud=replace(cloud, is_simulated=source.is_simulated, forced=scanner.provenance.forced),
-        images=images,
-        image_rows=tuple(kept),
+        cloud=replace(
+            points.without_points(),
+            is_simulated=source.is_simulated,
+            forced=scanner.provenance.forced,
+        ),
+        images=tuple(found.images[row] for row in image_rows),
+        image_rows=image_rows,
         exposures=exposures,
         poses=poses,
         warnings=(
             *_scan_warnings(exposures, poses),
-            *measurement_warnings(images, depths, sensor),
+            *measurement_warnings(counts, found.depths, sensor),
             *extra,
             *doubt.warnings,
             *_unknown_lasers(source, sensor, options.measure),
-            *summarised(weak),
+            *summarised(found.weak),
         ),
         doubt=doubt,
+        counts=counts,
     )
+
+
+def _shown_rows(instants: Sequence[Instant], most: int | None) -> set[int]:
+    """Rows whose stripes are kept."""
+    rows = [row for one in instants for row in one.rows]
+    if most is None or len(rows) <= most:
+        return set(rows)
+    return {rows[k] for k in np.linspace(0, len(rows) - 1, most).astype(int)}
 
 
 def sensor_poses(
@@ -298,28 +384,51 @@ def _place(
     base_from_tool: Pose[Base, Tool],
     transform: BaseTransform,
     volume: Box | None,
-) -> _Placed:
-    """Place the measured points of one exposure in Base and cut those outside a volume."""
-    points, labelled = measured.points, measured.labelled
-    cloud = propagate_to_base(points, labelled.profile, base_from_tool, transform)
-    n_sheets = len(transform.factors)
-    depths = tuple(points.points_mm[points.sheet == k, 2] for k in range(n_sheets))
-    inside = cloud if volume is None else cut_cloud(cloud, volume)
-    return _Placed(labelled, inside, depths, len(cloud) - len(inside))
+    found: _Measured,
+) -> tuple[PointCloud, FloatArray]:
+    """Points of one exposure in Base, without those outside a volume, and their pixels (N, 2)."""
+    stripe, labelled = measured.points, measured.labelled
+    cloud = propagate_to_base(stripe, labelled.profile, base_from_tool, transform)
+    pixel_px = labelled.profile.points_px[stripe.row]
+    for k, depths in enumerate(found.depths):
+        depths.add(stripe.points_mm[stripe.sheet == k, 2])
+    n_all = len(cloud)
+    if volume is not None:
+        inside = volume.holds(cloud.points_mm)
+        cloud, pixel_px = cut_cloud(cloud, volume), pixel_px[inside]
+    found.counts.append(labelled.counts)
+    found.n_outside_volume.append(n_all - len(cloud))
+    found.weak += measured.warnings
+    return cloud, pixel_px
+
+
+class _InstantClouds(Mapping[int, PointCloud]):
+    """Points of all cameras of an instant by the row of its pose, read when they are asked for."""
+
+    def __init__(self, points: PointSpool, members: Mapping[int, list[int]]) -> None:
+        self._points, self._members = points, members
+
+    def __getitem__(self, row: int) -> PointCloud:
+        return merge_clouds([self._points.of_exposure(k) for k in self._members[row]])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._members)
+
+    def __len__(self) -> int:
+        return len(self._members)
 
 
 def _hung(
-    placed: dict[int, _Placed], instants: Sequence[Instant], poses: ExposurePoses
+    rows: Sequence[int], instants: Sequence[Instant], poses: ExposurePoses, points: PointSpool
 ) -> dict[int, float]:
     """Rows whose pose stood still, and how far in mm their stripes lie from an earlier one's.
 
     The cameras of one instant share its pose and see parts of one stripe: they count as one.
     """
-    measured = {one.rows[0]: one.rows for one in instants if one.rows[0] in placed}
-    clouds = {
-        first: merge_clouds([placed[row].cloud for row in rows]) for first, rows in measured.items()
-    }
-    apart = stripes_at_equal_poses(clouds, poses)
+    number = {row: k for k, row in enumerate(rows)}
+    measured = {one.rows[0]: one.rows for one in instants if one.rows[0] in number}
+    members = {first: [number[row] for row in group] for first, group in measured.items()}
+    apart = stripes_at_equal_poses(_InstantClouds(points, members), poses)
     return {row: apart[first] for first in apart for row in measured[first]}
 
 
@@ -343,21 +452,22 @@ def _exposures(
     source: ScanSource,
     scan: ScanInstants,
     poses: ExposurePoses,
-    placed: dict[int, _Placed],
+    found: _Measured,
     hung: dict[int, float],
 ) -> tuple[ScanExposure, ...]:
     """What became of every row."""
     records = []
+    placed = {row: k for k, row in enumerate(found.rows) if row not in hung}
     for k, row in enumerate(source.rows):
         if k in placed:
-            one = placed[k]
+            counts = found.counts[placed[k]]
             records.append(
                 ScanExposure(
                     row,
                     ExposureStatus.PLACED,
-                    n_stripe_points=len(one.labelled.profile),
-                    n_measured=one.labelled.count(PointStatus.MEASURED),
-                    n_outside_volume=one.n_outside_volume,
+                    n_stripe_points=len(counts),
+                    n_measured=counts.count(PointStatus.MEASURED),
+                    n_outside_volume=found.n_outside_volume[placed[k]],
                 )
             )
             continue
@@ -377,60 +487,55 @@ def _exposures(
     return tuple(records)
 
 
-def _joined(
-    placed: dict[int, _Placed],
-    exposures: Sequence[ScanExposure],
-    poses: ExposurePoses,
-    transform: BaseTransform,
-    options: ScanOptions,
-    *,
-    progress: Progress,
-) -> tuple[PointCloud, tuple[str, ...]]:
-    """All points in one cloud with normals towards the sensor, and what is weak about these."""
+def _nothing_placed(
+    found: _Measured, exposures: Sequence[ScanExposure], options: ScanOptions
+) -> EstimationError:
+    """Why a scan has no point in Base, to be raised."""
+    placed = [one for one in exposures if one.status is ExposureStatus.PLACED]
     if not placed:
         unreadable = [e.reason for e in exposures if e.status is ExposureStatus.UNREADABLE]
         why = "; ".join(unreadable) or "no laser"
-        raise EstimationError(f"no exposure with a pose could be measured: {why}")
-    cloud = merge_clouds([one.cloud for one in placed.values()])
-    if len(cloud) == 0:
-        n_outside = sum(one.n_outside_volume for one in placed.values())
-        if n_outside:
-            raise EstimationError(
-                f"all {n_outside} measured points lie outside the volume {options.volume}",
-                remedy="give limits in mm in the arm's base frame, or none",
-            )
-        images = [one.labelled for one in placed.values()]
-        raise nothing_measured(images, is_by_thesis=options.measure.is_by_thesis)
-    if not options.has_normals:
-        return cloud, ()
-    return _with_normals(cloud, list(placed), poses, transform, progress)
+        return EstimationError(f"no exposure with a pose could be measured: {why}")
+    n_outside = sum(one.n_outside_volume for one in placed)
+    if n_outside:
+        return EstimationError(
+            f"all {n_outside} measured points lie outside the volume {options.volume}",
+            remedy="give limits in mm in the arm's base frame, or none",
+        )
+    return nothing_measured(found.counts, is_by_thesis=options.measure.is_by_thesis)
 
 
-def _with_normals(
-    cloud: PointCloud,
-    rows: list[int],
+def _add_normals(
+    points: PointSpool,
+    pose_rows: Sequence[int],
     poses: ExposurePoses,
     transform: BaseTransform,
     progress: Progress,
-) -> tuple[PointCloud, tuple[str, ...]]:
-    """The cloud with normals towards the sensor of each exposure, and what is weak about these."""
+) -> tuple[str, ...]:
+    """Give the points normals towards the sensor of each exposure; what is weak about these."""
     eye = transform.scanner.hand_eye.tool_from_sensor.translation_mm
+    rows = list(pose_rows)
     cameras = poses.rotations[rows] @ eye + poses.translations_mm[rows]
-    radius_mm = choose_radius_mm(cloud.points_mm, cloud.exposure)
-    normals = estimate_normals(
-        cloud.points_mm,
-        cameras[cloud.exposure],
-        radius_mm,
-        told=lambda n_done: progress(ProgressEvent("normals", n_done, len(cloud))),
+    points.look_from(cameras)
+    radius_mm = choose_scan_radius_mm(points)
+    n_done = n_without = 0
+    with ScanNormals(points, radius_mm) as surface:
+        for places, exposure in points.places():
+            normals = surface.at(places, cameras[exposure])
+            points.add_normals(normals)
+            n_done += len(places)
+            n_without += int((~normals.any(axis=1)).sum())
+            progress(ProgressEvent("normals", n_done, len(points)))
+    return _normals_warning(n_without / n_done, radius_mm)
+
+
+def _normals_warning(share: float, radius_mm: float) -> tuple[str, ...]:
+    if share <= MANY_WITHOUT_NORMAL:
+        return ()
+    return (
+        f"{100.0 * share:.0f} % of the points have no normal: within {radius_mm:.1f} mm "
+        "they lie on single lines, or on no plane",
     )
-    share = float((~normals.any(axis=1)).mean())
-    warnings: tuple[str, ...] = ()
-    if share > MANY_WITHOUT_NORMAL:
-        warnings = (
-            f"{100.0 * share:.0f} % of the points have no normal: within {radius_mm:.1f} mm "
-            "they lie on single lines, or on no plane",
-        )
-    return replace(cloud, normals=normals, seen_from_mm=cameras), warnings
 
 
 def check_poses(profiles: Sequence[PointProfile], poses: Sequence[Pose[Base, Tool]]) -> None:
@@ -447,6 +552,8 @@ def place_profiles(
     poses: Sequence[Pose[Base, Tool]],
     scanner: ScannerCalibration,
     volume: Box | None = None,
+    *,
+    points: PointSpool | None = None,
 ) -> ScanReconstruction:
     """Place what a sensor that delivers profiles saw in Base, with covariance and normals.
 
@@ -460,6 +567,8 @@ def place_profiles(
         Its hand-eye; without a camera.
     volume
         Part of Base that is kept; None for all of it.
+    points
+        From `scan_spool`, to hold the points as well; None for one that is dropped.
 
     Raises
     ------
@@ -482,10 +591,12 @@ def place_profiles(
         for profile, pose in zip(profiles, poses, strict=True)
     ]
     hung = stripes_at_equal_poses(dict(enumerate(clouds)), found)
+    points = scan_spool(scanner) if points is None else points
     exposures = []
     for k, (profile, cloud) in enumerate(zip(profiles, clouds, strict=True)):
         row = ExposureRow(index=k, t_ns=k, camera=0, source=profile.source, lasers=(DELIVERED,))
-        clouds[k] = inside = cloud if volume is None else cut_cloud(cloud, volume)
+        inside = cloud if volume is None else cut_cloud(cloud, volume)
+        points.add(inside)
         record = ScanExposure(
             row,
             ExposureStatus.PLACED,
@@ -498,15 +609,15 @@ def place_profiles(
             record = ScanExposure(row, ExposureStatus.EQUAL_POSE, reason)
         exposures.append(record)
     kept = [k for k in range(len(clouds)) if k not in hung]
-    merged = merge_clouds([clouds[k] for k in kept])
-    if len(merged) == 0:
+    points.keep(kept)
+    if len(points) == 0:
         raise EstimationError(
             f"no point lies in the volume {volume}",
             remedy="give limits in mm in the arm's base frame, or none",
         )
-    merged, extra = _with_normals(merged, kept, found, transform, silent)
+    extra = _add_normals(points, kept, found, transform, silent)
     return ScanReconstruction(
-        cloud=replace(merged, forced=scanner.provenance.forced),
+        cloud=replace(points.cloud(), forced=scanner.provenance.forced),
         images=(),
         image_rows=tuple(kept),
         exposures=tuple(exposures),

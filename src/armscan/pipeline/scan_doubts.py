@@ -9,7 +9,7 @@ images, a head that is not where its document says, a jump between two passes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
 
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from armscan.devices.sources import ScanSource
 from armscan.errors import ArmscanError
+from armscan.fusion.point_spool import PointSpool
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.geometry.rotations import (
@@ -27,7 +28,6 @@ from armscan.geometry.rotations import (
     rotations_from_euler,
 )
 from armscan.models.calibration import ScannerCalibration
-from armscan.reconstruction.labels import LabelledProfile, PointStatus
 from armscan.reconstruction.pass_agreement import (
     PassAgreement,
     Stripes,
@@ -38,7 +38,6 @@ from armscan.reconstruction.pass_agreement import (
 )
 from armscan.reconstruction.sync import ExposurePoses, poses_by_time
 from armscan.reconstruction.triangulate import intersect_sheets
-from armscan.records.cloud import PointCloud
 
 WARNED_RATIO, WARNED_PAIR = 2.0, 3.0
 """Passes of a sound scan lie 0.3 times what is expected from each other, 0.7 at most (see
@@ -58,6 +57,9 @@ SEARCHED_POINTS = 2500
 SPLIT_RATIO, SPLIT_SHARE = 1.5, 0.7
 """Pairs of passes this far apart, in units of what is expected, are told from the others, and a
 break of the scan is named if so large a part of pairs on either side of it and across it fit."""
+MOST_THINNED, ESTIMATED_BY = 250_000, 50
+"""Thinned points that are compared (30 MB), and exposures by which their count is estimated; of
+longer scans some passes are left out whole."""
 DENSE_NS = 50_000_000
 HAND_EYE_ROUNDS = 6
 SHEET_STEP_MM, LARGEST_SHIFT_MM = 0.01, 5.0
@@ -117,23 +119,22 @@ def doubt_scan(
     scanner: ScannerCalibration,
     poses: ExposurePoses,
     *,
-    cloud: PointCloud,
-    images: tuple[LabelledProfile, ...],
-    pose_rows: tuple[int, ...],
+    points: PointSpool,
+    pose_rows: Sequence[int],
 ) -> ScanDoubt:
     """Compare the passes of a scan with each other, and look for the mistake if they disagree.
 
     Parameters
     ----------
     source, scanner, poses
-        What the cloud was made from.
-    cloud
-        All measured points; ``exposure`` counts ``images``.
-    images, pose_rows
-        Stripe points of each image, and the row of the recording whose pose they were placed with:
-        that of the first camera, for all images of one instant.
+        What the points were made from.
+    points
+        All measured points, with the pixels where they were seen.
+    pose_rows
+        Row of the recording with whose pose each exposure kept was placed: that of the first
+        camera, for all images of one instant.
     """
-    scan = _thinned(source, scanner, poses, cloud=cloud, images=images, pose_rows=pose_rows)
+    scan = _thinned(source, scanner, poses, points=points, pose_rows=np.array(pose_rows))
     if scan is None:
         return ScanDoubt(None)
     found = pass_agreement(scan.stripes)
@@ -164,34 +165,68 @@ def _thinned(
     scanner: ScannerCalibration,
     poses: ExposurePoses,
     *,
-    cloud: PointCloud,
-    images: tuple[LabelledProfile, ...],
-    pose_rows: tuple[int, ...],
+    points: PointSpool,
+    pose_rows: IntArray,
 ) -> _Scan | None:
-    if len(cloud) == 0 or scanner.sensor is None:
+    if len(points) == 0 or scanner.sensor is None:
         return None
-    row_of = np.array(pose_rows)[cloud.exposure]
-    kept = thinned_rows(cloud.points_mm, row_of)
-    rows, exposure = np.unique(row_of[kept], return_inverse=True)
-    measured = [image.status == PointStatus.MEASURED for image in images]
-    pixels = np.concatenate([i.profile.points_px[m] for i, m in zip(images, measured, strict=True)])
-    if len(pixels) != len(cloud):
-        # points outside the volume asked for are cut away: their pixels are not told apart
-        pixels = np.zeros((len(cloud), 2))
+    wanted = _compared_rows(points, pose_rows, source)
+    low_mm = points.corners_mm[0]
+    parts = []
+    for piece in points.pieces():
+        cloud, row_of = piece.cloud, pose_rows[piece.cloud.exposure]
+        kept = thinned_rows(cloud.points_mm, row_of, low_mm=low_mm)
+        kept = kept[np.isin(row_of[kept], wanted)]
+        parts.append(
+            (
+                cloud.points_mm[kept],
+                cloud.covariance_mm2[kept],
+                piece.pixel_px[kept],
+                row_of[kept],
+                cloud.sheet[kept],
+            )
+        )
+    places_mm, covariance, pixels, row_of, sheet = map(np.concatenate, zip(*parts, strict=True))
+    rows, exposure = np.unique(row_of, return_inverse=True)
     hand_eye = scanner.hand_eye.tool_from_sensor
     rotations = poses.rotations[rows] @ hand_eye.rotation
     places = poses.rotations[rows] @ hand_eye.translation_mm + poses.translations_mm[rows]
-    local = cloud.points_mm[kept] - places[exposure]
+    local = places_mm - places[exposure]
     times = np.array([source.rows[row].t_ns for row in rows], dtype=np.int64)
     stripes = Stripes(
         np.einsum("mji,mj->mi", rotations[exposure], local),
-        cloud.covariance_mm2[kept],
+        covariance,
         exposure,
         passes_of(times),
         rotations,
         places,
     )
-    return _Scan(source, scanner, rows, poses, stripes, pixels[kept], cloud.sheet[kept])
+    return _Scan(source, scanner, rows, poses, stripes, pixels, sheet)
+
+
+def _compared_rows(points: PointSpool, pose_rows: IntArray, source: ScanSource) -> IntArray:
+    """Rows of the recording whose points are compared: all, or those of evenly chosen passes.
+
+    A scan of minutes has more passes than fit into memory with their covariances.
+    """
+    rows = np.unique(pose_rows)
+    if len(points) <= MOST_THINNED:
+        return rows
+    n_thinned = n_seen = 0
+    for k in points.kept[:: max(1, len(points.kept) // ESTIMATED_BY)]:
+        cloud = points.of_exposure(int(k))
+        n_seen += len(cloud)
+        if len(cloud):
+            n_thinned += len(thinned_rows(cloud.points_mm, cloud.exposure))
+    n_expected = len(points) * n_thinned / max(n_seen, 1)
+    if n_expected <= MOST_THINNED:
+        return rows
+    times = np.array([source.rows[row].t_ns for row in rows], dtype=np.int64)
+    passes = passes_of(times)
+    n_passes = int(passes[-1]) + 1
+    n_taken = max(2, int(n_passes * MOST_THINNED / n_expected))
+    taken = np.linspace(0, n_passes - 1, n_taken).astype(np.int64)
+    return np.asarray(rows[np.isin(passes, taken)])
 
 
 def _cause(scan: _Scan, full: PassAgreement | None) -> tuple[str, str]:

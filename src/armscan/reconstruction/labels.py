@@ -84,6 +84,47 @@ class LabelledProfile(ArrayRecord):
         """Count of points of this status."""
         return int((self.status == status).sum())
 
+    @property
+    def counts(self) -> StripeCounts:
+        """What tables tell of it."""
+        flags = self.profile.flags
+        return StripeCounts(
+            source=self.profile.source,
+            by_status=tuple(np.bincount(self.status, minlength=len(PointStatus)).tolist()),
+            flags=int(np.bitwise_or.reduce(flags, initial=0)),
+            rejecting_flags=int(
+                np.bitwise_or.reduce(flags[self.status == PointStatus.FLAGGED], initial=0)
+            ),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class StripeCounts:
+    """How many stripe points of one exposure became what, of a scan that does not keep them.
+
+    Parameters
+    ----------
+    source
+        The exposure's source name.
+    by_status
+        Count of points of each `PointStatus`, by its value.
+    flags, rejecting_flags
+        All `armscan.records.profile.StripeFlag` of its points, and those of flagged points.
+    """
+
+    source: str
+    by_status: tuple[int, ...]
+    flags: int
+    rejecting_flags: int
+
+    def __len__(self) -> int:
+        """Count of stripe points."""
+        return sum(self.by_status)
+
+    def count(self, status: PointStatus) -> int:
+        """Count of points of this status."""
+        return self.by_status[status]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LabelledInstant:

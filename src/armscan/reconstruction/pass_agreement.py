@@ -181,9 +181,20 @@ def passes_of(t_ns: IntArray) -> IntArray:
     return numbers
 
 
-def thinned_rows(points_mm: FloatArray, exposure: IntArray, size_mm: float = CELL_MM) -> IntArray:
-    """Rows of one point for each cell of each exposure."""
-    cell = np.floor((points_mm - points_mm.min(axis=0)) / size_mm).astype(np.int64)
+def thinned_rows(
+    points_mm: FloatArray,
+    exposure: IntArray,
+    size_mm: float = CELL_MM,
+    *,
+    low_mm: FloatArray | None = None,
+) -> IntArray:
+    """Rows of one point for each cell of each exposure.
+
+    ``low_mm`` (3,) is the lowest corner of the cloud of which the points are a part; None if they
+    are all of it.
+    """
+    low = points_mm.min(axis=0) if low_mm is None else low_mm
+    cell = np.floor((points_mm - low) / size_mm).astype(np.int64)
     spans = cell.max(axis=0) + 1
     key = (cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2]
     order = np.lexsort((key, exposure))

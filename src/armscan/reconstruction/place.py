@@ -255,7 +255,7 @@ def cut_cloud(cloud: PointCloud, box: Box) -> PointCloud:
     return cloud.select(box.holds(cloud.points_mm))
 
 
-AT_ONCE = 20_000
+AT_ONCE = 8_192
 """Points whose neighbourhoods are held at the same time: 2 KB each."""
 NEIGHBOURS = 32
 """Cells looked at around a point, at most: a full disc of four cells' radius holds 50."""
@@ -296,13 +296,17 @@ def choose_radius_mm(points_mm: FloatArray, exposure: IntArray) -> float:
         return SMALLEST_RADIUS_MM
     # one mean of the points of each cell and exposure
     n_exposures = int(exposure.max()) + 1
-    keys = _cell_keys(points_mm, SMALLEST_RADIUS_MM / 4.0) * n_exposures + exposure
-    cells, owner = _cell_means(points_mm, keys), np.unique(keys) % n_exposures
+    keys = cell_keys(points_mm, SMALLEST_RADIUS_MM / 4.0) * n_exposures + exposure
+    cells, owner = cell_means(points_mm, keys), np.unique(keys) % n_exposures
     sample = np.arange(0, len(cells), max(1, len(cells) // SAMPLED))
     count = min(LOOKED_AT, len(cells))
     distance, neighbour = cKDTree(cells).query(cells[sample], k=np.arange(1, count + 1))
     is_other = owner[neighbour] != owner[sample, None]
-    spacing = np.where(is_other, distance, np.inf).min(axis=1)
+    return radius_of_spacings(np.where(is_other, distance, np.inf).min(axis=1))
+
+
+def radius_of_spacings(spacing: FloatArray) -> float:
+    """Radius that fits distances (S,) in mm to the next exposure's stripe; infinite where none."""
     wanted = SPACINGS * float(np.percentile(np.minimum(spacing, LARGEST_RADIUS_MM), 75))
     return float(np.clip(wanted, SMALLEST_RADIUS_MM, LARGEST_RADIUS_MM))
 
@@ -348,8 +352,24 @@ def estimate_normals(
     normals = np.zeros_like(points)
     if len(points) == 0:
         return normals
-    cells = _cell_means(points, _cell_keys(points, radius_mm / 4.0))
+    cells = cell_means(points, cell_keys(points, radius_mm / 4.0))
     tree = cKDTree(cells)
+    for first in range(0, len(points), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        normals[part] = tangent_normals_near(points[part], towards[part], cells, tree, radius_mm)
+        told(min(first + AT_ONCE, len(points)))
+    return normals
+
+
+def tangent_normals_near(
+    points: FloatArray, towards: FloatArray, cells: FloatArray, tree: cKDTree, radius_mm: float
+) -> FloatArray:
+    """(N, 3) unit normals, towards (N, 3), of the planes of the cells (M, 3) near points (N, 3).
+
+    ``tree`` holds the cells; it may lack those that are further than the radius from all points.
+    A normal is zero where there is none. Of many points, `AT_ONCE` are looked at together.
+    """
+    normals = np.zeros_like(points)
     for first in range(0, len(points), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         distance, neighbour = tree.query(
@@ -360,18 +380,24 @@ def estimate_normals(
         found = _tangent_normals(points[part], near, is_near, radius_mm)
         side = np.einsum("ni,ni->n", found, towards[part] - points[part])
         normals[part] = np.where(side[:, None] < 0.0, -found, found)
-        told(min(first + AT_ONCE, len(points)))
     return normals
 
 
-def _cell_keys(points: FloatArray, size_mm: float) -> IntArray:
-    """(N,) number of the cubic cell that each point lies in."""
-    cell = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    spans = cell.max(axis=0) + 1
+def cell_keys(
+    points: FloatArray, size_mm: float, corners_mm: tuple[FloatArray, FloatArray] | None = None
+) -> IntArray:
+    """(N,) number of the cubic cell that each point lies in.
+
+    ``corners_mm`` are the lowest and highest coordinates of the cloud of which the points are a
+    part; None if they are all of it.
+    """
+    low, high = corners_mm or (points.min(axis=0), points.max(axis=0))
+    cell = np.floor((points - low) / size_mm).astype(np.int64)
+    spans = np.floor((high - low) / size_mm).astype(np.int64) + 1
     return np.asarray((cell[:, 0] * spans[1] + cell[:, 1]) * spans[2] + cell[:, 2])
 
 
-def _cell_means(points: FloatArray, keys: IntArray) -> FloatArray:
+def cell_means(points: FloatArray, keys: IntArray) -> FloatArray:
     """(M, 3) mean of the points of equal key, by rising key."""
     _, member = np.unique(keys, return_inverse=True)
     sums = [np.bincount(member, weights=points[:, k]) for k in range(3)]

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.camera import CameraModel
 from armscan.report.drawing import ACCENT, INK, chart_markup, new_figure, styled
 from armscan.report.page import Picture
@@ -26,13 +26,17 @@ ARROW_SHARE = 0.06
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bars:
-    """Values to count in a histogram: filled bars, or an outline; unnamed without a label."""
+    """Values to count in a histogram: filled bars, or an outline; unnamed without a label.
+
+    Where ``counts`` are given, each value counts so often.
+    """
 
     values: FloatArray
     colour: str
     label: str | None = None
     is_outline: bool = False
     alpha: float = 1.0
+    counts: IntArray | None = None
 
 
 def histogram_chart(
@@ -70,10 +74,13 @@ def histogram_chart(
             if item.is_outline:
                 axes.hist(
                     item.values, bins, histtype="step", color=item.colour, linewidth=1.4,
-                    label=item.label,
+                    label=item.label, weights=item.counts,
                 )  # fmt: skip
             else:
-                axes.hist(item.values, bins, color=item.colour, alpha=item.alpha, label=item.label)
+                axes.hist(
+                    item.values, bins, color=item.colour, alpha=item.alpha, label=item.label,
+                    weights=item.counts,
+                )  # fmt: skip
         if curve is not None:
             axes.plot(curve[0], curve[1], color=INK, linewidth=1.2, label=curve[2])
         axes.xaxis.set_major_locator(MaxNLocator(5))

@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from armscan.fusion.digest import CloudDigest
 from armscan.models.calibration import Provenance, SensorCalibration
 from armscan.pipeline.measure import Reconstruction
+from armscan.pipeline.progress import ChainProfile
 from armscan.pipeline.scan import ExposureStatus, ScanReconstruction
-from armscan.reconstruction.labels import LabelledProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.report.charts import Bars, histogram_chart
@@ -29,7 +31,8 @@ from armscan.report.page import Gallery, Page, Picture, Section, Text, page_of
 from armscan.report.photographs import evenly_chosen, stripe_gallery
 from armscan.report.quantity import Quantity, Table, fact, only, plural, significant
 
-MAX_SHOWN = 20_000
+MAX_LISTED = 2000
+"""Exposures of the folded table: a scan of minutes has tens of thousands."""
 MAX_PROFILES = 6
 PROFILE_TEXT = "Measured profiles, seen square on to the light sheet; the camera is above."
 STATUS_TEXT = (
@@ -40,27 +43,27 @@ STATUS_TEXT = (
 
 def cloud_quantities(result: Reconstruction) -> tuple[Quantity, ...]:
     """What is told of measured points."""
-    cloud = result.cloud
+    cloud, digest = result.cloud, CloudDigest.of(result.cloud)
+    n_stripe = sum(len(image.profile) for image in result.images)
     names = [name for k, name in enumerate(cloud.sheet_names) if (cloud.sheet == k).any()]
     sheets = f"sheet{'s' if len(names) > 1 else ''} {', '.join(names)}"
     return (
-        *_point_quantities(cloud, result.images),
+        *_point_quantities(digest, n_stripe),
         fact("Images", str(len(result.images)), sheets),
     )
 
 
-def _point_quantities(cloud: PointCloud, images: Sequence[LabelledProfile]) -> tuple[Quantity, ...]:
-    n_stripe = sum(len(image.profile) for image in images) or len(cloud)
-    median, high = (float(value) for value in np.percentile(cloud.sigma_mm, [50, 95]))
-    low, top = cloud.points_mm.min(axis=0).tolist(), cloud.points_mm.max(axis=0).tolist()
+def _point_quantities(digest: CloudDigest, n_stripe: int) -> tuple[Quantity, ...]:
+    median, high = (float(value) for value in digest.sigma_mm[:2])
+    low, top, frame = digest.low_mm.tolist(), digest.high_mm.tolist(), digest.shown.frame
     return (
         Quantity(
             "n_points",
             "Points",
-            len(cloud),
-            meaning=f"in the {cloud.frame} frame, of {n_stripe:,} stripe points",
+            digest.n_points,
+            meaning=f"in the {frame} frame, of {n_stripe:,} stripe points",
         ),
-        Quantity("frame", "", cloud.frame),
+        Quantity("frame", "", frame),
         Quantity(
             "sigma_median_mm",
             "Sigma of a point",
@@ -75,8 +78,8 @@ def _point_quantities(cloud: PointCloud, images: Sequence[LabelledProfile]) -> t
     )
 
 
-def scan_quantities(scan: ScanReconstruction) -> tuple[Quantity, ...]:
-    """What is told of a scan."""
+def scan_quantities(scan: ScanReconstruction, digest: CloudDigest) -> tuple[Quantity, ...]:
+    """What is told of a scan and its points."""
     counts = {status: scan.count(status) for status in ExposureStatus}
     found = scan.doubt.agreement
     passes = None
@@ -91,7 +94,7 @@ def scan_quantities(scan: ScanReconstruction) -> tuple[Quantity, ...]:
             "cause": scan.doubt.cause,
         }
     return (
-        *_point_quantities(scan.cloud, scan.images),
+        *_point_quantities(digest, sum(map(len, scan.counts)) or digest.n_points),
         Quantity(
             "exposures",
             "Exposures",
@@ -131,7 +134,7 @@ def cloud_page(
     is_simulated: bool = False,
 ) -> Page:
     """Lay out the report; arguments as `armscan.report.sheets.laser_page`."""
-    cloud = result.cloud
+    cloud, digest = result.cloud, CloudDigest.of(result.cloud)
     told = cloud_quantities(result)
     depth = cloud.points_mm[:, 2]
     span = f"{depth.min():.1f} to {depth.max():.1f} mm"
@@ -144,10 +147,10 @@ def cloud_page(
         f"{len(cloud):,} points in the {cloud.frame} frame from "
         f"{plural(len(result.images), 'image')}",
         (
-            Section("The points", (Gallery((cloud_view(cloud),), 560),)),
+            Section("The points", (Gallery((digest_view(digest),), 560),)),
             Section("Profiles", (Text(PROFILE_TEXT), Gallery(tuple(profiles)))),
             Section("The stripes", stripes),
-            Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)),
+            Section("How far to trust them", (Gallery((sigma_histogram(digest),)),)),
         ),
         cards=(
             *only(told, "n_points", "sigma_median_mm"),
@@ -170,7 +173,7 @@ def status_table(result: Reconstruction) -> Table:
     return Table(columns, rows, "", (len(columns) - 1,))
 
 
-def _statuses(images: Sequence[LabelledProfile]) -> list[PointStatus]:
+def _statuses(images: Sequence[LabelledProfile] | Sequence[StripeCounts]) -> list[PointStatus]:
     return [status for status in PointStatus if any(image.count(status) for image in images)]
 
 
@@ -180,6 +183,8 @@ def scan_page(
     provenance: Provenance,
     warnings: Sequence[str] = (),
     *,
+    digest: CloudDigest,
+    profile: ChainProfile | None = None,
     is_simulated: bool = False,
 ) -> Page:
     """Lay out the report.
@@ -188,40 +193,48 @@ def scan_page(
     ----------
     scan
         The scan.
+    digest
+        Of its points.
     exposures
         Images by source name; those that are missing are not shown.
     provenance
         How the cloud came to be.
     warnings
         What is odd about the recording and the scan.
+    profile
+        What the stages took; None to say nothing of it.
     is_simulated
         True if the images were rendered.
     """
-    cloud = scan.cloud
-    size = " × ".join(f"{value:.0f}" for value in np.ptp(cloud.points_mm, axis=0))
+    size = " × ".join(f"{value:.0f}" for value in digest.high_mm - digest.low_mm)
     without = f"{len(scan.without_pose)} had no pose of the arm" if scan.without_pose else ""
     n_placed = scan.count(ExposureStatus.PLACED)
-    sections = [Section("The cloud", (Gallery((cloud_view(cloud),), 560),))]
-    if scan.images:
+    sections = [Section("The cloud", (Gallery((digest_view(digest),), 560),))]
+    if scan.counts:
         totals = (Text(STATUS_TEXT), status_totals(scan))
         sections.append(Section("What became of the points", totals))
-    sections.append(Section("How far to trust them", (Gallery((sigma_histogram(cloud),)),)))
+    sections.append(Section("How far to trust them", (Gallery((sigma_histogram(digest),)),)))
     if scan.without_pose:
         table = Table(("exposure", "why"), tuple(scan.without_pose), "", (1,))
         sections.append(Section("Exposures without a pose", (table,)))
-    if scan.images:
-        stripes = stripe_gallery(scan.images, cloud.sheet_names, exposures)
+    if scan.counts:
+        stripes = stripe_gallery(scan.images, scan.cloud.sheet_names, exposures, scan.counts)
         sections += [
             Section("The stripes", stripes),
-            Section("Exposure by exposure", (_exposure_table(scan),), is_folded=True),
+            Section("Exposure by exposure", _exposure_table(scan), is_folded=True),
         ]
+    if profile is not None:
+        rates = profile_quantities(scan, digest, profile)
+        told = "; ".join(f"{one.label.lower()} {one.text}" for one in rates if one.label)
+        costs = (Text(f"{told}."), profile_table(scan, profile))
+        sections.append(Section("What the stages took", costs, is_folded=True))
     return page_of(
         provenance,
         "Scan in Base",
-        f"{len(cloud):,} points from {n_placed} exposures of a moving arm",
+        f"{digest.n_points:,} points from {n_placed} exposures of a moving arm",
         sections,
         cards=(
-            *only(scan_quantities(scan), "n_points", "sigma_median_mm"),
+            *only(scan_quantities(scan, digest), "n_points", "sigma_median_mm"),
             fact("Exposures placed", str(n_placed), without or "each with a pose of the arm"),
             fact("Extent", f"{size} mm", "along X, Y, Z of Base"),
         ),
@@ -230,9 +243,46 @@ def scan_page(
     )
 
 
+def profile_quantities(
+    scan: ScanReconstruction, digest: CloudDigest, profile: ChainProfile
+) -> tuple[Quantity, ...]:
+    """Rate and memory of a scan's reconstruction."""
+    n_exposures = len(scan.counts)
+    peak = profile.peak_mb
+    return (
+        Quantity("exposures_per_s", "Exposures a second", n_exposures / profile.wall_s),
+        Quantity("points_per_s", "Points a second", digest.n_points / profile.wall_s),
+        Quantity("wall_s", "Time", profile.wall_s, unit="s"),
+        Quantity("processor_s", "Processor time", profile.processor_s, unit="s"),
+        Quantity(
+            "peak_memory_mb",
+            "Peak memory",
+            float("nan") if peak is None else peak,
+            unit="MB",
+            shown="not told by this system" if peak is None else f"{peak:.0f} MB",
+        ),
+        Quantity("stages_s", "", dict(profile.stages)),
+    )
+
+
+def profile_table(scan: ScanReconstruction, profile: ChainProfile) -> Table:
+    """Processor time by stage; the share of a core is that of the time that all took."""
+    rest = profile.processor_s - sum(seconds for _, seconds in profile.stages)
+    rows = tuple(
+        (
+            name,
+            f"{seconds:.2f}",
+            f"{1e3 * seconds / max(len(scan.counts), 1):.2f}",
+            f"{seconds / profile.wall_s:.2f}",
+        )
+        for name, seconds in (*profile.stages, ("other", rest))
+    )
+    return Table(("stage", "processor s", "ms an exposure", "cores"), rows)
+
+
 def status_totals(scan: ScanReconstruction) -> Table:
     """All stripe points by what became of them."""
-    counts = {status: sum(image.count(status) for image in scan.images) for status in PointStatus}
+    counts = {status: sum(image.count(status) for image in scan.counts) for status in PointStatus}
     n_all = max(sum(counts.values()), 1)
     rows = tuple(
         (status.label, f"{count:,}", f"{100.0 * count / n_all:.2f} %")
@@ -242,22 +292,30 @@ def status_totals(scan: ScanReconstruction) -> Table:
     return Table(("stripe points", "count", "share"), rows)
 
 
-def _exposure_table(scan: ScanReconstruction) -> Table:
-    """Every exposure with what became of its points."""
-    statuses = _statuses(scan.images)
+def _exposure_table(scan: ScanReconstruction) -> tuple[Text | Table, ...]:
+    """Every exposure with what became of its points; of a long scan some, evenly chosen."""
+    statuses = _statuses(scan.counts)
+    listed = evenly_chosen(scan.counts, MAX_LISTED)
     rows = tuple(
-        (image.profile.source, *(str(image.count(status)) for status in statuses))
-        for image in scan.images
+        (image.source, *(str(image.count(status)) for status in statuses)) for image in listed
     )
-    return Table(("exposure", *(status.label for status in statuses)), rows)
+    table = Table(("exposure", *(status.label for status in statuses)), rows)
+    if len(listed) == len(scan.counts):
+        return (table,)
+    return Text(f"{len(listed)} of {len(scan.counts)} exposures, evenly chosen."), table
 
 
 def cloud_view(cloud: PointCloud) -> Picture:
     """The points in space, coloured by their standard deviation."""
-    step = max(1, len(cloud) // MAX_SHOWN)
-    sigma_um = 1000.0 * cloud.sigma_mm[::step]
+    return digest_view(CloudDigest.of(cloud))
+
+
+def digest_view(digest: CloudDigest) -> Picture:
+    """As `cloud_view`, of a cloud of which some points are at hand."""
+    cloud, step = digest.shown, digest.step
+    sigma_um = 1000.0 * digest.shown_sigma_mm
     low, high = (float(value) for value in np.percentile(sigma_um, [2, 98]))
-    dots = SceneDots(cloud.points_mm[::step], ramp_colours(sigma_um, low, high))
+    dots = SceneDots(cloud.points_mm, ramp_colours(sigma_um, low, high))
     is_z_up = cloud.frame != "Sensor"
     scene = scene_markup([dots], [], [], "Measured points in space", is_z_up=is_z_up)
     shown = f" One point in {step} is shown." if step > 1 else ""
@@ -300,15 +358,17 @@ def profile_view(cloud: PointCloud, sensor: SensorCalibration, exposure: int) ->
     )
 
 
-def sigma_histogram(cloud: PointCloud) -> Picture:
+def sigma_histogram(digest: CloudDigest) -> Picture:
     """How uncertain the points are, and how much of it is stripe noise."""
-    sigma_um = 1000.0 * cloud.sigma_mm
+    edges = 1000.0 * digest.edges_mm
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    noise = digest.noise_counts
     return histogram_chart(
         [
-            Bars(sigma_um, ACCENT, "all"),
-            Bars(1000.0 * cloud.sigma_noise_mm, PALETTE[1], "stripe noise", is_outline=True),
+            Bars(middles, ACCENT, "all", counts=digest.sigma_counts),
+            Bars(middles, PALETTE[1], "stripe noise", is_outline=True, counts=noise),
         ],
-        np.linspace(0.0, 1.15 * float(np.percentile(sigma_um, 99)), 61),
+        edges,
         "standard deviation of a point, µm",
         title="How far to trust a point",
         caption="Stripe noise differs from point to point and averages out; the rest, from the "

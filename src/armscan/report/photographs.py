@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import or_
 from typing import TypeVar
 
 import cv2
@@ -12,7 +14,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.models.calibration import Provenance
-from armscan.reconstruction.labels import LabelledProfile, PointStatus
+from armscan.reconstruction.labels import LabelledProfile, PointStatus, StripeCounts
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile, StripeFlag
 from armscan.report.drawing import Marks, photo_markup
@@ -190,21 +192,25 @@ def stripe_gallery(
     images: Sequence[LabelledProfile],
     sheet_names: Sequence[str],
     exposures: Mapping[str, Exposure],
+    counts: Sequence[StripeCounts] = (),
 ) -> tuple[Block, ...]:
     """Text, legend and pictures of every stripe point, coloured by what became of it.
 
     Parameters
     ----------
     images
-        Stripe points of all exposures.
+        Stripe points of all exposures, or of some.
     sheet_names
         Names of the sheets, in the order of their numbers.
     exposures
         Images by source name; those that are missing are not shown.
+    counts
+        Of all exposures; empty if ``images`` are all.
     """
-    seen = {status for status in STATUS_COLOURS if any(image.count(status) for image in images)}
+    counts = counts or [image.counts for image in images]
+    seen = {status for status in STATUS_COLOURS if any(one.count(status) for one in counts)}
     statuses = [(STATUS_COLOURS[status], status.label) for status in PointStatus if status in seen]
-    flags = flags_of((image.profile, image.status) for image in images)
+    flags = reduce(or_, (one.rejecting_flags for one in counts), 0)
     shown = evenly_chosen([image for image in images if image.profile.source in exposures])
     pictures = tuple(
         stripe_picture(
@@ -218,8 +224,8 @@ def stripe_gallery(
         for image in shown
     )
     text = "Every stripe point, measured or not. Dark photographs are brightened here."
-    if len(shown) < len(images):
-        text += f" {len(shown)} of {len(images)} images are shown, evenly chosen."
+    if len(shown) < len(counts):
+        text += f" {len(shown)} of {len(counts)} images are shown, evenly chosen."
     return Text(text), stripe_legend(sheet_names, statuses, flags), Gallery(pictures, 420)
 
 

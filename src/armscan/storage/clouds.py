@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
@@ -13,23 +13,39 @@ from armscan.models.camera import CameraModel
 from armscan.records.cloud import PointCloud
 from armscan.storage.codec import parse_json
 from armscan.storage.documents import read_calibration, read_camera_calibration
-from armscan.storage.files import check_outputs, read_bytes, write_files
+from armscan.storage.files import check_outputs, is_file, read_bytes, write_files
 from armscan.storage.foreign import camera_info_yaml
 from armscan.storage.formats import e57, las, meshes, pcd, text
-from armscan.storage.formats.columns import FOREIGN_FRAME, CloudColumns, cloud_of_columns
-from armscan.storage.formats.ply import parse_ply, ply_bytes, ply_columns, read_ply
+from armscan.storage.formats.columns import (
+    FOREIGN_FRAME,
+    CloudColumns,
+    CloudPiece,
+    cloud_of_columns,
+)
+from armscan.storage.formats.ply import (
+    parse_ply,
+    ply_bytes,
+    ply_columns,
+    ply_parts,
+    ply_pieces,
+    read_ply,
+)
 from armscan.storage.formats.text import XYZ_LOSES, xyz_bytes
 
 __all__ = (
     "CLOUD_SUFFIXES",
     "FOREIGN_FRAME",
     "XYZ_LOSES",
+    "CloudPiece",
     "cloud_bytes",
     "cloud_losses",
+    "cloud_parts",
     "convert_file",
     "parse_ply",
     "ply_bytes",
+    "ply_parts",
     "read_cloud",
+    "read_cloud_pieces",
     "read_ply",
     "write_cloud",
     "xyz_bytes",
@@ -135,6 +151,57 @@ def cloud_bytes(cloud: PointCloud, path: Path) -> bytes:
             fact = f"{known.name} files hold triangles, and a cloud has none"
         raise OptionError(fact, where=str(path), remedy=f"end it in {', '.join(CLOUD_SUFFIXES)}")
     return known.write(cloud)
+
+
+def cloud_parts(
+    path: Path,
+    marks: PointCloud,
+    n_points: int,
+    pieces: Iterable[CloudPiece],
+    *,
+    is_fused: bool = False,
+) -> Iterator[bytes]:
+    """As `cloud_bytes`, of a cloud that comes in pieces.
+
+    PLY and XYZ files are made piece by piece, others in memory.
+
+    Parameters
+    ----------
+    path
+        Where it goes.
+    marks, n_points, pieces, is_fused
+        As of `ply_parts`; how many points each stands for is in PLY files alone.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        yield from ply_parts(marks, n_points, pieces, is_fused=is_fused)
+    elif suffix in (".xyz", ".asc", ".txt"):
+        yield from text.xyz_parts(marks, pieces)
+    else:
+        whole = PointCloud.concat([piece.cloud for piece in pieces])
+        yield cloud_bytes(
+            replace(whole, is_simulated=marks.is_simulated, forced=marks.forced), path
+        )
+
+
+PIECE_POINTS = 200_000
+"""Points of a file that are read at a time: 60 MB with all that is made of them."""
+
+
+def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
+    """As `read_cloud`, a binary PLY file piece by piece.
+
+    Raises
+    ------
+    ArmscanError
+        As `read_cloud`.
+    """
+    pieces = ply_pieces(path, PIECE_POINTS) if is_file(path) else None
+    if pieces is None:
+        yield read_cloud(path)
+        return
+    for found in pieces:
+        yield cloud_of_columns(found, path)
 
 
 def cloud_losses(cloud: PointCloud, path: Path) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import TypeAlias
 from uuid import uuid4
 
 from armscan.errors import FileFormatError, InputError, OutputError
@@ -139,7 +140,11 @@ def check_outputs(paths: Iterable[Path], *, is_overwriting: bool = False) -> Non
             )
 
 
-def write_files(contents: Mapping[Path, bytes], *, is_overwriting: bool = False) -> None:
+Content: TypeAlias = bytes | Iterable[bytes]
+"""Of a file: all of it, or pieces that follow each other."""
+
+
+def write_files(contents: Mapping[Path, Content], *, is_overwriting: bool = False) -> None:
     """Write files that belong together, each of them complete.
 
     Each is written under another name in its folder, and all get their names at the end, so that a
@@ -343,10 +348,39 @@ def _part_name(path: Path) -> Path:
     return path.with_name(f"{_part_stem(path)}{uuid4().hex[:12]}.part")
 
 
-def _write_part(part: Path, content: bytes, locks: ExitStack) -> None:
+@contextmanager
+def scratch_folder(document: Path) -> Iterator[Path]:
+    """Give a folder beside a document for what grows while it is made; it goes with the block.
+
+    What a killed run left of it is removed by the next one that makes this document.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be made.
+    """
+    _remove_rests(document)
+    folder = _part_name(document)
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise OutputError(
+            f"nothing can be written there ({error.strerror})",
+            where=path_text(folder.parent),
+            remedy="free some space or choose another folder",
+        ) from error
+    try:
+        with _locked(folder):
+            yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _write_part(part: Path, content: Content, locks: ExitStack) -> None:
     with part.open("xb") as file:
         locks.enter_context(_locked(part))
-        file.write(content)
+        for piece in (content,) if isinstance(content, bytes) else content:
+            file.write(piece)
         file.flush()
         os.fsync(file.fileno())
 

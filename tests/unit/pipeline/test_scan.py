@@ -11,15 +11,23 @@ import numpy as np
 import pytest
 
 from armscan.errors import EstimationError, InputError
+from armscan.fusion import point_spool
 from armscan.geometry.arrays import Box
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline import measure, targets
 from armscan.pipeline import scan as scan_module
 from armscan.pipeline.measure import MeasureOptions
-from armscan.pipeline.progress import ProgressEvent
-from armscan.pipeline.scan import ExposureStatus, ScanOptions, measure_scan
+from armscan.pipeline.progress import ProgressEvent, StageClock
+from armscan.pipeline.scan import (
+    ExposureStatus,
+    ScanOptions,
+    measure_long_scan,
+    measure_scan,
+    scan_spool,
+)
 from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
+from armscan.storage.clouds import ply_bytes
 from armscan.storage.detection_cache import DetectionCache
 from armscan.vision.stripe.extract import extract_stripes
 from rigs.scan_fake import (
@@ -70,7 +78,7 @@ def test_reading_ahead_and_volume_change_nothing_but_speed_and_extent(
     monkeypatch.setattr(measure, "MOST_THREADS", 1)
     one = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     monkeypatch.setattr(measure, "MOST_THREADS", 3)
-    monkeypatch.setattr(measure, "_count_cores", lambda: 3)
+    monkeypatch.setattr(measure, "count_cores", lambda: 3)
     two = measure_scan(as_source(fake_scan()), device, ScanOptions(has_normals=False))
     np.testing.assert_array_equal(one.cloud.points_mm, two.cloud.points_mm)
     assert one.cloud.normals is None
@@ -218,10 +226,35 @@ def test_an_interrupted_scan_looks_at_each_image_once(
     np.testing.assert_array_equal(again.cloud.sigma_mm, whole.cloud.sigma_mm)
 
 
+def test_a_long_scan_is_the_same_scan_with_its_points_elsewhere(
+    device: ScannerCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = measure_scan(as_source(fake_scan(8)), device)
+    monkeypatch.setattr(point_spool, "PIECE_POINTS", 700)
+    clock = StageClock()
+    with scan_spool(device, tmp_path) as points:
+        found = measure_long_scan(
+            as_source(fake_scan(8)), device, points, most_images=3, clock=clock
+        )
+        assert ply_bytes(points.cloud()) == ply_bytes(whole.cloud)
+    assert len(found.cloud) == 0
+    assert found.image_rows == (0, 3, 7)
+    assert [image.profile.source for image in found.images] == [
+        whole.images[k].profile.source for k in found.image_rows
+    ]
+    assert found.counts == tuple(image.counts for image in whole.images)
+    assert found.warnings == whole.warnings
+    profile = clock.profile()
+    names = [name for name, _ in profile.stages]
+    assert names == ["decoding", "extraction", "naming", "placing", "normals", "passes"]
+    assert 0.0 < sum(seconds for _, seconds in profile.stages) < 1.05 * profile.processor_s
+    assert profile.peak_mb is None or profile.peak_mb > 50.0
+
+
 def test_a_few_points_without_normal_are_normal(
     device: ScannerCalibration, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scan_module, "choose_radius_mm", lambda *_: 0.6)
+    monkeypatch.setattr(scan_module, "choose_scan_radius_mm", lambda *_: 0.6)
     result = measure_scan(as_source(fake_scan(3)), device)
     assert any("have no normal: within 0.6 mm" in warning for warning in result.warnings)
 

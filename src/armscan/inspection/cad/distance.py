@@ -24,6 +24,9 @@ from armscan.kernels.triangle_tree import (
 
 NEIGHBOUR_BITS = 10
 """Cells an axis, as a power of two, by which points are sorted so that neighbours come together."""
+OPPOSITE = -0.5
+"""Cosine below which a surface looks away from a point's normal: the other side of a wall is at -1,
+and normals that were estimated beside an edge may be 90 degrees off."""
 LEAST_CHUNK = 2000
 """Points a thread takes at least."""
 
@@ -113,7 +116,7 @@ class PartSurface:
             rows = found[0].copy()
             rows[rows >= 0] = self._order[rows[rows >= 0]]
             looks_away = (rows >= 0) & (
-                np.einsum("ij,ij->i", self.part.normals[rows], towards) < 0.0
+                np.einsum("ij,ij->i", self.part.normals[rows], towards) < OPPOSITE
             )
             again = order[looks_away[order]]
             second = self._closest(points, again, np.ascontiguousarray(towards), reach_mm)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError, InputError, OptionError
-from armscan.geometry.arrays import FloatArray
+from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.records.cloud import CloudFrame, PointCloud
 from armscan.storage.files import path_text, told_of
 from armscan.storage.tables import refuse_beyond_reach
@@ -35,6 +35,10 @@ COVARIANCE = {
 }
 INDICES = ("sheet", "exposure", "segment")
 NOISE_LENGTH = "noise_length_points"
+N_POINTS = "n_points"
+"""Measured points that one of a fused cloud stands for."""
+WHOLE = (*INDICES, N_POINTS)
+"""Columns of whole numbers."""
 SIMULATED = "simulated"
 """Note of a cloud that was measured on rendered images."""
 FORCED = "forced"
@@ -74,21 +78,49 @@ class CloudColumns:
         return set(COVARIANCE) <= set(self.columns)
 
 
-def cloud_columns(cloud: PointCloud) -> CloudColumns:
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudPiece:
+    """Points of a cloud that is written piece by piece.
+
+    Parameters
+    ----------
+    cloud
+        The points.
+    sigma_mm
+        (N,) as `PointCloud.sigma_mm`, where it is known already.
+    n_points
+        (N,) measured points that each stands for; None if each is one.
+    """
+
+    cloud: PointCloud
+    sigma_mm: FloatArray | None = None
+    n_points: IntArray | None = None
+
+
+def cloud_columns(piece: PointCloud | CloudPiece) -> CloudColumns:
     """All that a cloud carries.
 
     ``sigma_mm`` is there for other programs; it follows from the covariance.
     """
+    piece = piece if isinstance(piece, CloudPiece) else CloudPiece(piece)
+    cloud = piece.cloud
     columns: dict[str, Column] = {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
     if cloud.normals is not None:
         columns |= {name: cloud.normals[:, k] for k, name in enumerate(NORMAL)}
-    columns["sigma_mm"] = cloud.sigma_mm
+    columns["sigma_mm"] = cloud.sigma_mm if piece.sigma_mm is None else piece.sigma_mm
     columns["sigma_noise_mm"] = cloud.sigma_noise_mm
     if cloud.noise_length is not None:
         columns[NOISE_LENGTH] = cloud.noise_length
     columns |= {name: cloud.covariance_mm2[:, i, j] for name, (i, j) in COVARIANCE.items()}
     columns["intensity"] = cloud.intensity
     columns |= {name: getattr(cloud, name) for name in INDICES}
+    if piece.n_points is not None:
+        columns[N_POINTS] = piece.n_points
+    return CloudColumns(columns, cloud_notes(cloud))
+
+
+def cloud_notes(cloud: PointCloud) -> tuple[str, ...]:
+    """Frame, names and marks of a cloud, one a line."""
     notes = ["written by armscan", "unit mm", f"frame {cloud.frame}"]
     if cloud.is_simulated:
         notes.append(SIMULATED)
@@ -101,13 +133,13 @@ def cloud_columns(cloud: PointCloud) -> CloudColumns:
     if cloud.seen_from_mm is not None:
         places = cloud.seen_from_mm.tolist()
         notes += [f"{SEEN_FROM} {k} {json.dumps(place)}" for k, place in enumerate(places)]
-    return CloudColumns(columns, tuple(notes))
+    return tuple(notes)
 
 
 def structured(found: CloudColumns, names: Sequence[str] = ()) -> NDArray[Any]:
     """(N,) structured array of columns, float64 and int32; all of them if none is named."""
     chosen = names or tuple(found.columns)
-    kinds = [(name, "<i4" if name in INDICES else "<f8") for name in chosen]
+    kinds = [(name, "<i4" if name in WHOLE else "<f8") for name in chosen]
     table = np.zeros(len(found.columns["x"]), dtype=kinds)
     for name in chosen:
         table[name] = found.columns[name]

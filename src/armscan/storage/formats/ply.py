@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,9 @@ from armscan.storage.files import path_text, read_bytes
 from armscan.storage.formats.columns import (
     DAMAGED,
     CloudColumns,
+    CloudPiece,
     cloud_columns,
+    cloud_notes,
     columns_of,
     own_cloud,
     structured,
@@ -164,9 +166,31 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     ``comment simulated``, of those of a calibration that was refused and forced
     ``comment forced 0 "why"``.
     """
-    found = cloud_columns(cloud)
-    table = structured(found)
-    return b"".join((ply_header(table.dtype, len(table), found.notes), table.data))
+    return b"".join(ply_parts(cloud, len(cloud), [CloudPiece(cloud)]))
+
+
+def ply_parts(
+    marks: PointCloud, n_points: int, pieces: Iterable[CloudPiece], *, is_fused: bool = False
+) -> Iterator[bytes]:
+    """As `ply_bytes`, of a cloud that comes in pieces.
+
+    Parameters
+    ----------
+    marks
+        Names and marks of the cloud, with or without points.
+    n_points
+        Of all pieces.
+    pieces
+        In order.
+    is_fused
+        The pieces say how many measured points each point stands for.
+    """
+    none = CloudPiece(
+        marks.select(slice(0)), np.zeros(0), np.zeros(0, np.int64) if is_fused else None
+    )
+    yield ply_header(structured(cloud_columns(none)).dtype, n_points, cloud_notes(marks))
+    for piece in pieces:
+        yield structured(cloud_columns(piece)).tobytes()
 
 
 def ply_columns(data: bytes, path: Path) -> CloudColumns:
@@ -174,6 +198,51 @@ def ply_columns(data: bytes, path: Path) -> CloudColumns:
     vertices = parse_ply(data, path_text(path))
     remarks = (vertices_remark(vertices.n_faces),) if vertices.n_faces else ()
     return CloudColumns(columns_of(vertices.table), vertices.comments, remarks=remarks)
+
+
+def ply_pieces(path: Path, most_points: int) -> Iterator[CloudColumns] | None:
+    """Vertices of a binary PLY file, so many at a time; None for any other file.
+
+    Raises
+    ------
+    FileFormatError
+        While it is read, if it is cut short.
+    """
+    with path.open("rb") as file:
+        start = b""
+        while (line := file.readline()) and len(start) < MOST_HEADER_BYTES:
+            start += line
+            if not start.startswith(b"ply") or END_HEADER.fullmatch(line):
+                break
+    is_binary = start.startswith(b"ply") and b"\nformat binary" in start[:100]
+    if not (is_binary and END_HEADER.fullmatch(line)):
+        return None
+    try:
+        _, count, kind, comments, *_ = _header(start.decode("latin-1"))
+    except (ValueError, KeyError, IndexError):
+        # what is wrong with a header is said by the reader of whole files
+        return None
+    empty = PlyVertices(np.zeros(0, kind), comments)
+    return _pieces(path, len(start), count, empty, most_points)
+
+
+def _pieces(
+    path: Path, start: int, count: int, empty: PlyVertices, most_points: int
+) -> Iterator[CloudColumns]:
+    kind = empty.table.dtype
+    with path.open("rb") as file:
+        file.seek(start)
+        for first in range(0, count, most_points):
+            asked = min(most_points, count - first)
+            data = file.read(asked * kind.itemsize)
+            n = len(data) // kind.itemsize
+            if n < asked:
+                raise FileFormatError(
+                    f"the PLY file holds {first + n} of {count} points",
+                    where=path_text(path),
+                    remedy="copy the file again",
+                )
+            yield CloudColumns(columns_of(np.frombuffer(data, kind, asked)), empty.comments)
 
 
 def vertices_remark(n_triangles: int) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from armscan.storage.formats.columns import (
     POINT,
     SIMULATED,
     CloudColumns,
+    CloudPiece,
     cloud_columns,
     structured,
 )
@@ -53,12 +55,18 @@ OWN_HEADER = "x_mm y_mm z_mm in frame "
 
 def xyz_bytes(cloud: PointCloud) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
-    buffer = io.StringIO()
-    frame = f"{cloud.frame}; {SIMULATED}" if cloud.is_simulated else cloud.frame
+    return b"".join(xyz_parts(cloud, [CloudPiece(cloud)]))
+
+
+def xyz_parts(marks: PointCloud, pieces: Iterable[CloudPiece]) -> Iterator[bytes]:
+    """As `xyz_bytes`, of a cloud that comes in pieces; ``marks`` are its names and marks."""
+    frame = f"{marks.frame}; {SIMULATED}" if marks.is_simulated else marks.frame
     header = f"{OWN_HEADER}{frame}; not in this file: {'; '.join(XYZ_LOSES)}"
-    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in cloud.forced)))
-    np.savetxt(buffer, cloud.points_mm, fmt="%.7f", header=header)
-    return buffer.getvalue().encode()
+    header = "\n".join((header, *(f"{FORCED}: {reason}" for reason in marks.forced)))
+    for k, piece in enumerate(pieces):
+        buffer = io.StringIO()
+        np.savetxt(buffer, piece.cloud.points_mm, fmt="%.7f", header=header if k == 0 else "")
+        yield buffer.getvalue().encode()
 
 
 def csv_bytes(cloud: PointCloud) -> bytes:

@@ -14,9 +14,9 @@ from armscan.errors import FileFormatError, OptionError
 from armscan.inspection.cad.comparison import DECISIONS, DEFINITIONS, CadComparison
 from armscan.inspection.cad.part import PartModel
 from armscan.records.cloud import PointCloud
-from armscan.storage.clouds import ply_header
 from armscan.storage.codec import parse_toml
 from armscan.storage.files import path_text, read_bytes
+from armscan.storage.formats.ply import ply_header
 from armscan.storage.tables import csv_bytes, number_text, parse_csv
 
 EVERY_FACE = "*"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan reconstruct``."""
+"""``armscan reconstruct`` and ``fuse``: from images to points, and to one point a voxel."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from armscan.cli.options import (
 
 OF_IMAGES = (
     "background right right_background sheet depth_margin arm "
-    "method stripe_method laser_colour bits_used bits_align cache"
+    "method stripe_method laser_colour bits_used bits_align cache profile"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -38,7 +38,7 @@ RECONSTRUCT_EXAMPLE = (
     "  armscan reconstruct left.png --right right.png --sensor sensor.json -o cloud.ply\n"
     "  armscan reconstruct 'p*.yml' --poses RobPoses.rob --scanner scanner.json -o cloud.ply"
 )
-
+FUSE_EXAMPLE = "\b\nExample:\n  armscan fuse monday.ply tuesday.ply --voxel 0.2 -o fused.ply"
 
 DepthMargin = Annotated[
     float | None,
@@ -59,6 +59,26 @@ ProfilePoses = Annotated[
 ]
 
 
+Images = Annotated[
+    list[str],
+    typer.Argument(
+        help="A recording's folder; or images with the laser on: files, folders, patterns.",
+        show_default=False,
+    ),
+]
+Calibration = Annotated[
+    Path,
+    typer.Option(
+        "--sensor",
+        "--scanner",
+        help="Calibration: a recording with scanner.json is placed in Base, all else is in the "
+        "Sensor frame.",
+        show_default=False,
+    ),
+]
+ProfileOption = Annotated[
+    bool, typer.Option("--profile", help="Say what each stage of a scan took.")
+]
 Volume = Annotated[
     str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
 ]
@@ -67,23 +87,8 @@ Volume = Annotated[
 def reconstruct(
     context: typer.Context,
     *,
-    images: Annotated[
-        list[str],
-        typer.Argument(
-            help="A recording's folder; or images with the laser on: files, folders, patterns.",
-            show_default=False,
-        ),
-    ],
-    sensor: Annotated[
-        Path,
-        typer.Option(
-            "--sensor",
-            "--scanner",
-            help="Calibration: a recording with scanner.json is placed in Base, all else is in "
-            "the Sensor frame.",
-            show_default=False,
-        ),
-    ],
+    images: Images,
+    sensor: Calibration,
     background: Annotated[
         list[str] | None, typer.Option(help="The same views without laser; repeatable.")
     ] = None,
@@ -109,6 +114,7 @@ def reconstruct(
     bits_used: BitsUsed = None,
     bits_align: BitsAlign = None,
     cache: Cache = True,
+    profile: ProfileOption = False,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
@@ -138,11 +144,37 @@ def reconstruct(
             poses=None if poses is None else given(PoseTable, path=poses, euler=euler),
             options=options,
             image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
+            is_profiled=profile,
         ),
         as_json=as_json,
         output=output,
         force=force,
         cache=cache,
+    )
+
+
+def fuse(
+    clouds: Annotated[
+        list[Path], typer.Argument(help="Clouds in one frame, .ply or text.", show_default=False)
+    ],
+    *,
+    voxel: Annotated[
+        float, typer.Option("--voxel", help="Edge of a voxel, mm.", show_default=False)
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Cloud to write: .ply, or as `convert`.")
+    ] = Path("fused.ply"),
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Thin clouds to one point a voxel: averaged by weight, with what is left of their sigma."""
+    from armscan.jobs.fuse import fuse as fuse_clouds
+
+    run(
+        lambda job: fuse_clouds(job, clouds, voxel),
+        as_json=as_json,
+        output=output,
+        force=force,
     )
 
 

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Normals of a scan that lies on disk: cells are summed in one pass, tangent planes fitted in a
+second, in the order of the points.
+
+Both passes do what `armscan.reconstruction.place` does with a cloud in memory, to the last bit
+while its cells fit into memory and to the rounding of their sums beyond.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import BinaryIO
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.errors import OutputError
+from armscan.fusion.cell_sums import IN_BLOCK_BITS, PART_BITS, CellSums, cell_numbers
+from armscan.fusion.point_spool import PointSpool
+from armscan.geometry.arrays import FloatArray, IntArray
+from armscan.reconstruction.place import (
+    LARGEST_RADIUS_MM,
+    LOOKED_AT,
+    SAMPLED,
+    SMALLEST_RADIUS_MM,
+    cell_keys,
+    cell_means,
+    radius_of_spacings,
+    tangent_normals_near,
+)
+
+MOST_KEYS = 2**20
+"""Cells of exposures among which the sampled ones are chosen, held in memory; of more, those whose
+numbers' hash ends in zeros, so that the choice does not depend on their order."""
+MIXER = np.uint64(0x9E3779B97F4A7C15)
+"""Odd multiplier of Fibonacci hashing (Knuth, The Art of Computer Programming 3, 6.4)."""
+CELLS_HELD = 400_000
+"""Cells of the tree that is kept for the next points; 24 bytes and a node each."""
+
+
+def choose_scan_radius_mm(spool: PointSpool) -> float:
+    """Radius for normals, as `armscan.reconstruction.place.choose_radius_mm`.
+
+    Of scans of more than `MOST_KEYS` cells of exposures, the stripes' spacing is sampled among a
+    part of them.
+    """
+    if len(spool) == 0:
+        return SMALLEST_RADIUS_MM
+    with ExitStack() as files:
+        means = files.enter_context(_MeansFile(spool))
+        sample = _sampled(spool, means)
+        return radius_of_spacings(_spacings(means, sample))
+
+
+@dataclass(slots=True, eq=False)
+class _MeansFile:
+    """One mean a cell and exposure, on disk, with its exposure; parts of whole exposures."""
+
+    spool: PointSpool
+    file: BinaryIO = field(init=False)
+    parts: list[int] = field(default_factory=list)
+
+    def __enter__(self) -> _MeansFile:
+        folder = self.spool.folder
+        self.file = io.BytesIO() if folder is None else (folder / "means").open("w+b")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.file.close()
+        if self.spool.folder is not None:
+            (self.spool.folder / "means").unlink(missing_ok=True)
+
+    def add(self, means: FloatArray, exposure: IntArray) -> None:
+        try:
+            self.file.write(np.column_stack([means, exposure]).tobytes())
+        except OSError as error:
+            raise OutputError(
+                f"means of the cloud cannot be kept ({error.strerror})",
+                where=str(self.spool.folder),
+                remedy="free some space",
+            ) from error
+        self.parts.append(len(means))
+
+    def read(self) -> Iterator[tuple[FloatArray, IntArray]]:
+        self.file.seek(0)
+        for n in self.parts:
+            rows = np.frombuffer(self.file.read(32 * n)).reshape(n, 4)
+            yield rows[:, :3], rows[:, 3].astype(np.int64)
+
+
+def _sampled(spool: PointSpool, means: _MeansFile) -> IntArray:
+    """Write the means of cells and exposures, and choose rows of them by rising number."""
+    low, high = spool.corners_mm
+    size_mm, n_exposures = SMALLEST_RADIUS_MM / 4.0, len(spool.kept)
+    keys, rows = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    written, mask = 0, np.uint64(0)
+    for points, exposure in spool.places():
+        if not len(points):
+            continue
+        number = cell_keys(points, size_mm, (low, high)) * n_exposures + exposure
+        found = np.unique(number)
+        # of each exposure together, so that a stripe is read at once
+        order = np.argsort(found % n_exposures, kind="stable")
+        means.add(cell_means(points, number)[order], found[order] % n_exposures)
+        keys = np.concatenate([keys, found[order]])
+        rows = np.concatenate([rows, np.arange(written, written + len(found))])
+        written += len(found)
+        while True:
+            is_in = (keys.view(np.uint64) * MIXER >> np.uint64(40)) & mask == 0
+            keys, rows = keys[is_in], rows[is_in]
+            if len(keys) <= MOST_KEYS:
+                break
+            mask = np.uint64(2 * int(mask) + 1)
+    order = np.argsort(keys)
+    return np.asarray(rows[order][:: max(1, len(keys) // SAMPLED)])
+
+
+def _spacings(means: _MeansFile, sample: IntArray) -> FloatArray:
+    """Distance of sampled means to the next one of another exposure, infinite if it is not among
+    the `LOOKED_AT` nearest.
+    """
+    place, owner = _rows_of(means, sample)
+    spacing = np.full(len(sample), np.inf)
+    own_reach = np.full(len(sample), np.inf)
+    for cells, exposure in means.read():
+        tree = cKDTree(cells)
+        is_here = (owner >= exposure.min()) & (owner <= exposure.max())
+        away = np.flatnonzero(~is_here)
+        if len(away):
+            distance, _ = tree.query(place[away], distance_upper_bound=LARGEST_RADIUS_MM)
+            spacing[away] = np.minimum(spacing[away], distance)
+        here = np.flatnonzero(is_here)
+        if not len(here):
+            continue
+        count = min(LOOKED_AT, len(cells))
+        distance, neighbour = tree.query(place[here], k=np.arange(1, count + 1))
+        is_other = exposure[neighbour] != owner[here, None]
+        nearest = np.where(is_other, distance, np.inf).min(axis=1)
+        spacing[here] = np.minimum(spacing[here], nearest)
+        for k in here:
+            own = cells[exposure == owner[k]]
+            if len(own) >= LOOKED_AT:
+                own_reach[k] = np.sort(np.linalg.norm(own - place[k], axis=1))[LOOKED_AT - 1]
+    return np.where(spacing < own_reach, spacing, np.inf)
+
+
+def _rows_of(means: _MeansFile, rows: IntArray) -> tuple[FloatArray, IntArray]:
+    """Places and exposures of rows of the file."""
+    place, owner = np.zeros((len(rows), 3)), np.zeros(len(rows), dtype=np.int64)
+    first = 0
+    for cells, exposure in means.read():
+        inside = np.flatnonzero((rows >= first) & (rows < first + len(cells)))
+        place[inside], owner[inside] = cells[rows[inside] - first], exposure[rows[inside] - first]
+        first += len(cells)
+    return place, owner
+
+
+@dataclass(slots=True, eq=False)
+class ScanNormals:
+    """Tangent planes of a spool's points, as `armscan.reconstruction.place.estimate_normals`.
+
+    Parameters
+    ----------
+    spool
+        The points.
+    radius_mm
+        Points within this distance make a point's tangent plane.
+    """
+
+    spool: PointSpool
+    radius_mm: float
+    _low_mm: FloatArray = field(init=False)
+    _blocks: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    _starts: IntArray = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    _file: BinaryIO = field(init=False)
+    _tree: cKDTree | None = None
+    _cells: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    _held: frozenset[int] = frozenset()
+
+    def __enter__(self) -> ScanNormals:
+        folder = self.spool.folder
+        self._low_mm = self.spool.corners_mm[0]
+        self._file = io.BytesIO() if folder is None else (folder / "cells").open("w+b")
+        sums = CellSums(4, folder)
+        try:
+            for points, _ in self.spool.places():
+                values = np.column_stack([points, np.ones(len(points))])
+                sums.add(cell_numbers(self._cell(points)), values)
+            self._write(sums)
+        finally:
+            sums.close()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+        if self.spool.folder is not None:
+            (self.spool.folder / "cells").unlink(missing_ok=True)
+
+    def at(self, points: FloatArray, towards_mm: FloatArray) -> FloatArray:
+        """(N, 3) unit normals of points that follow each other, towards (N, 3); 0 where none."""
+        needed = self._blocks_near(points)
+        if self._tree is None or not needed <= self._held:
+            held = needed | self._held if len(self._cells) < CELLS_HELD else needed
+            self._held = held
+            self._cells = self._read(np.array(sorted(held), dtype=np.int64))
+            self._tree = cKDTree(self._cells)
+        return tangent_normals_near(points, towards_mm, self._cells, self._tree, self.radius_mm)
+
+    def _cell(self, points: FloatArray) -> IntArray:
+        return np.floor((points - self._low_mm) / (self.radius_mm / 4.0)).astype(np.int64)
+
+    def _write(self, sums: CellSums) -> None:
+        """Means of the cells, block by block, and where each block begins."""
+        blocks: list[IntArray] = []
+        starts: list[IntArray] = []
+        written = 0
+        for keys, found in sums.merged():
+            self._file.write((found[:, :3] / found[:, 3:]).tobytes())
+            number = keys >> IN_BLOCK_BITS
+            first = np.flatnonzero(np.concatenate([[True], number[1:] != number[:-1]]))
+            if blocks and len(blocks[-1]) and number[0] == blocks[-1][-1]:
+                first = first[1:]
+            blocks.append(number[first])
+            starts.append(first + written)
+            written += len(keys)
+        self._blocks = np.concatenate(blocks)
+        self._starts = np.concatenate([*starts, [written]])
+
+    def _blocks_near(self, points: FloatArray) -> frozenset[int]:
+        """Places among the blocks of those that hold cells within the radius of a point.
+
+        A neighbour lies four cells away at most, a mean anywhere in its cell.
+        """
+        found = set()
+        cell = self._cell(points)
+        for corner in np.ndindex(3, 3, 3):
+            block = np.maximum(cell + 5 * (np.array(corner) - 1), 0) >> PART_BITS
+            number = np.unique(cell_numbers(block << PART_BITS) >> IN_BLOCK_BITS)
+            place = np.searchsorted(self._blocks, number)
+            is_there = place < len(self._blocks)
+            is_there[is_there] = self._blocks[place[is_there]] == number[is_there]
+            found.update(place[is_there].tolist())
+        return frozenset(found)
+
+    def _read(self, places: IntArray) -> FloatArray:
+        """(M, 3) means of the cells of blocks; consecutive blocks in one go."""
+        parts = []
+        for run in np.split(places, np.flatnonzero(np.diff(places) != 1) + 1):
+            begin, end = int(self._starts[run[0]]), int(self._starts[run[-1] + 1])
+            self._file.seek(24 * begin)
+            parts.append(self._file.read(24 * (end - begin)))
+        return np.frombuffer(b"".join(parts)).reshape(-1, 3)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From clouds to one with a point a voxel, and its page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.fusion.digest import CloudDigest, percentiles
+from armscan.fusion.point_spool import PointSpool
+from armscan.fusion.voxel_map import FUSED, VoxelMap
+from armscan.jobs.job import Job
+from armscan.pipeline.progress import ProgressEvent
+from armscan.records.cloud import PointCloud
+from armscan.report.fuse import FusedCloud, fused_page, fused_quantities
+from armscan.report.quantity import Summary, sentences
+from armscan.storage.clouds import (
+    CLOUD_SUFFIXES,
+    CloudPiece,
+    cloud_losses,
+    cloud_parts,
+    read_cloud_pieces,
+)
+from armscan.storage.files import scratch_folder, told_of
+
+STAGE = "fuse"
+NOT_KNOWN = (
+    "the points' covariances are not known: all count alike, and the fused points have none either"
+)
+
+
+def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
+    """Put clouds of one frame together, one point a voxel.
+
+    Parameters
+    ----------
+    job
+        Where to write the cloud ``NAME.ply`` or ``NAME.xyz``; ``NAME.html`` is written beside it.
+    paths
+        Clouds, as `armscan.storage.clouds.read_cloud` reads them.
+    size_mm
+        Edge of a voxel.
+
+    Raises
+    ------
+    ArmscanError
+        If a file cannot be read, clouds do not fuse, or there is no point; nothing is written then.
+    """
+    places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
+    with scratch_folder(places[0]) as scratch:
+        voxels = VoxelMap(size_mm, scratch)
+        try:
+            for k, path in enumerate(paths):
+                job.progress(ProgressEvent(STAGE, k, len(paths), path.name))
+                for cloud in read_cloud_pieces(path):
+                    with told_of(str(path)):
+                        voxels.add(cloud)
+            job.progress(ProgressEvent(STAGE, len(paths), len(paths)))
+            if voxels.n_points == 0:
+                raise InputError("the clouds hold no point", where=", ".join(map(str, paths)))
+            return _written(job, paths, places, voxels, scratch)
+        finally:
+            voxels.close()
+
+
+def _written(
+    job: Job, paths: Sequence[Path], places: Sequence[Path], voxels: VoxelMap, scratch: Path
+) -> Summary:
+    assert voxels.frame is not None  # noqa: S101 - there are points
+    with PointSpool(voxels.frame, (FUSED,), scratch) as points:
+        for piece in voxels.fused():
+            points.add(piece.cloud)
+        marks = replace(
+            PointCloud.empty(frame=voxels.frame, sheet_names=(FUSED,), exposure_sources=(FUSED,)),
+            normals=np.zeros((0, 3)) if voxels.has_normals else None,
+            noise_length=np.zeros(0) if voxels.has_noise_length else None,
+            is_simulated=voxels.is_simulated,
+            forced=voxels.forced,
+        )
+        digest = CloudDigest.of_spool(points, marks)
+        n_points = len(points)
+        private = percentiles(lambda: (part[:, 1] for part in points.sigmas()), (50.0,), n_points)
+    result = FusedCloud(voxels.size_mm, voxels.n_points, digest, float(private[0]))
+    warnings = () if voxels.has_covariance else (NOT_KNOWN,)
+    provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
+    pieces = (
+        CloudPiece(piece.cloud, piece.cloud.sigma_mm, piece.n_points) for piece in voxels.fused()
+    )
+    content = cloud_parts(places[0], marks, n_points, pieces, is_fused=True)
+    written = job.write({places[0]: content, places[1]: fused_page(result, provenance, warnings)})
+    losses = cloud_losses(marks, places[0])
+    kind = places[0].suffix.lstrip(".").upper()
+    lost = (f"the {kind} file does not hold {', '.join(losses)}",) if losses else ()
+    return Summary(
+        title="Clouds fused" + (" (simulated images)." if voxels.is_simulated else "."),
+        quantities=fused_quantities(result),
+        warnings=sentences((*warnings, *lost)),
+        written=written,
+        next_step=f"open {written[-1]}",
+        forced=voxels.forced,
+        extra={"kind": "fused", "simulated": voxels.is_simulated},
+    )

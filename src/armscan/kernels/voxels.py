@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measured points to what a voxel adds up: weighted places, covariances, normals and counts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from armscan.kernels.arrays import IntsOut, Table, TableOut, compiled
+
+N_VALUES = 28
+"""Weight; weighted offset from the voxel's centre (3), covariance (6), covariance of the noise
+alone (6), the same times weight and correlation length (6), normal (3); weight of points with a
+normal; count; weighted intensity. Covariances as xx, xy, xz, yy, yz, zz."""
+BLOCK_BITS, PART_BITS = 16, 5
+MIDDLE = 2 ** (BLOCK_BITS + PART_BITS - 1)
+"""Number along an axis of the voxel whose lower corner is the origin."""
+NOTHING = 1e-15
+"""Off-diagonals below this part of the diagonal are rounding."""
+JACOBI_SWEEPS = 6
+"""Sweeps of a symmetric 3 x 3 matrix; three leave nothing but rounding (Golub and Van Loan 8.5)."""
+
+
+@compiled()
+def principal_axes(matrix: TableOut, axes: TableOut) -> None:
+    """Diagonalise a symmetric (3, 3) matrix in place by Jacobi rotations.
+
+    Parameters
+    ----------
+    matrix
+        Its diagonal holds the eigenvalues afterwards, in no order.
+    axes
+        (3, 3) unit eigenvectors in its columns.
+    """
+    for i in range(3):
+        for j in range(3):
+            axes[i, j] = 1.0 if i == j else 0.0
+    for _ in range(JACOBI_SWEEPS):
+        off = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
+        if off <= NOTHING * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
+            return
+        for p in range(2):
+            for q in range(p + 1, 3):
+                off = matrix[p, q]
+                if off == 0.0:
+                    continue
+                half = 0.5 * (matrix[q, q] - matrix[p, p])
+                tangent = off / (abs(half) + math.hypot(half, off))
+                if half < 0.0:
+                    tangent = -tangent
+                cosine = 1.0 / math.sqrt(1.0 + tangent * tangent)
+                sine = tangent * cosine
+                for k in range(3):
+                    first, second = matrix[k, p], matrix[k, q]
+                    matrix[k, p] = cosine * first - sine * second
+                    matrix[k, q] = sine * first + cosine * second
+                for k in range(3):
+                    first, second = matrix[p, k], matrix[q, k]
+                    matrix[p, k] = cosine * first - sine * second
+                    matrix[q, k] = sine * first + cosine * second
+                matrix[p, q] = matrix[q, p] = 0.0
+                for k in range(3):
+                    first, second = axes[k, p], axes[k, q]
+                    axes[k, p] = cosine * first - sine * second
+                    axes[k, q] = sine * first + cosine * second
+
+
+@compiled()
+def voxel_values(
+    points_mm: Table,
+    covariance_mm2: Table,
+    noise: Table,
+    normals: Table,
+    size_mm: float,
+    keys: IntsOut,
+    values: TableOut,
+) -> int:
+    """Number of each point's voxel, and the row that the point adds to it.
+
+    The noise is taken to act along the longest axes of the total covariance, where a stripe's noise
+    acts: along the first as far as its variance goes, what is left along the next.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3).
+    covariance_mm2
+        (N, 9) total covariance of each.
+    noise
+        (N, 3): its standard deviation in mm, correlation length in points, peak grey level.
+    normals
+        (N, 3); zero where there is none.
+    size_mm
+        Edge of a voxel.
+    keys
+        (N,) numbers, as `armscan.fusion.cell_sums.cell_numbers` of cells counted from -2^20.
+    values
+        (N, `N_VALUES`).
+
+    Returns
+    -------
+    int
+        First point that lies beyond all voxels that can be numbered; N if there is none.
+    """
+    matrix, axes, own = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    part = (1 << PART_BITS) - 1
+    for n in range(len(points_mm)):
+        block, within = 0, 0
+        for k in range(3):
+            place = points_mm[n, k] / size_mm
+            whole = math.floor(place)
+            if not -MIDDLE <= whole < MIDDLE:
+                return n
+            cell = int(whole) + MIDDLE
+            block = block << BLOCK_BITS | cell >> PART_BITS
+            within = within << PART_BITS | cell & part
+            values[n, 1 + k] = (place - whole - 0.5) * size_mm
+        keys[n] = block << (3 * PART_BITS) | within
+        trace = covariance_mm2[n, 0] + covariance_mm2[n, 4] + covariance_mm2[n, 8]
+        weight = 1.0 / trace if trace > 0.0 else 1.0
+        for i in range(3):
+            for j in range(3):
+                matrix[i, j] = 0.5 * (covariance_mm2[n, 3 * i + j] + covariance_mm2[n, 3 * j + i])
+                own[i, j] = 0.0
+        left = min(noise[n, 0] * noise[n, 0], trace)
+        if left > 0.0:
+            principal_axes(matrix, axes)
+            for _ in range(3):
+                longest = 0
+                for k in range(1, 3):
+                    if matrix[k, k] > matrix[longest, longest]:
+                        longest = k
+                taken = min(left, max(matrix[longest, longest], 0.0))
+                for i in range(3):
+                    for j in range(3):
+                        own[i, j] += taken * axes[i, longest] * axes[j, longest]
+                left -= taken
+                matrix[longest, longest] = -1.0
+        values[n, 0] = weight
+        column = 4
+        for i in range(3):
+            values[n, 1 + i] *= weight
+            for j in range(i, 3):
+                values[n, column] = weight * covariance_mm2[n, 3 * i + j]
+                values[n, column + 6] = weight * own[i, j]
+                values[n, column + 12] = weight * weight * noise[n, 1] * own[i, j]
+                column += 1
+        is_faced = False
+        for k in range(3):
+            values[n, 22 + k] = weight * normals[n, k]
+            is_faced = is_faced or normals[n, k] != 0.0
+        values[n, 25] = weight if is_faced else 0.0
+        values[n, 26] = 1.0
+        values[n, 27] = weight * noise[n, 2]
+    return len(points_mm)

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``armscan fuse``: one point a voxel, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.cli import main
+from armscan.fusion.voxel_map import VoxelMap
+from armscan.reconstruction.place import merge_clouds
+from armscan.storage import clouds as clouds_module
+from armscan.storage.clouds import ply_bytes, read_ply
+from rigs.long_scan import stripes
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    found = [
+        replace(cloud, normals=np.tile([0.0, 0.0, 1.0], (len(cloud), 1))) for cloud in stripes(12)
+    ]
+    (tmp_path / "a.ply").write_bytes(ply_bytes(merge_clouds(found[:6])))
+    (tmp_path / "b.ply").write_bytes(ply_bytes(replace(merge_clouds(found[6:]), forced=("why",))))
+    return tmp_path
+
+
+def test_two_clouds_become_one(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clouds_module, "PIECE_POINTS", 130)
+    names = [str(folder / name) for name in ("a.ply", "b.ply")]
+    output = folder / "fused.ply"
+    assert main(["fuse", *names, "--voxel", "1.5", "-o", str(output), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    parts = [read_ply(Path(name)) for name in names]
+    voxels = VoxelMap(1.5)
+    voxels.add(parts[0])
+    voxels.add(parts[1])
+    (wanted,) = voxels.fused()
+    found = read_ply(output)
+    assert told["n_points"] == len(found) == len(wanted.cloud)
+    assert told["n_measured"] == sum(map(len, parts))
+    np.testing.assert_allclose(found.points_mm, wanted.cloud.points_mm, atol=1e-12)
+    np.testing.assert_allclose(found.sigma_noise_mm, wanted.cloud.sigma_noise_mm, rtol=1e-12)
+    assert found.forced == ("why",)
+    assert found.normals is not None
+    table = clouds_module.parse_ply(output.read_bytes(), "fused").table
+    assert int(table["n_points"].sum()) == told["n_measured"]
+    assert "why" in output.with_suffix(".html").read_text()
+
+
+@pytest.mark.parametrize(
+    "case", ["missing", "empty", "cut", "nan", "frame", "size", "suffix", "exists"]
+)
+def test_bad_input_is_refused_and_nothing_is_left(
+    folder: Path, case: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, size, output = folder / "a.ply", "1", folder / "fused.ply"
+    data = first.read_bytes()
+    if case == "missing":
+        first.unlink()
+    elif case == "empty":
+        first.write_bytes(b"")
+    elif case == "cut":
+        first.write_bytes(data[:-100])
+    elif case == "nan":
+        first.write_bytes(data[:-100] + b"\xff" * 100)
+    elif case == "frame":
+        first.write_bytes(data.replace(b"comment frame Base\n", b"comment frame Part\n"))
+    elif case == "size":
+        size = "-1"
+    elif case == "suffix":
+        output = folder / "fused.stl"
+    else:
+        output = folder / "b.ply"
+    before = sorted(path.name for path in folder.iterdir())
+    words = [str(first), str(folder / "b.ply"), "--voxel", size, "-o", str(output)]
+    assert main(["fuse", *words]) == 2
+    assert capsys.readouterr().err.startswith("error: ")
+    assert sorted(path.name for path in folder.iterdir()) == before

@@ -145,5 +145,7 @@ def test_what_a_cloud_does_not_carry_is_said() -> None:
     for options in (CleaningOptions(edge_mm=1.0), CleaningOptions(overlap_mm=1.0)):
         with pytest.raises(InputError, match="of one stripe"):
             clean_cloud(bare, options)
+    (told,) = clean_cloud(plate(), CleaningOptions(edge_mm=10.0)).warnings
+    assert "took 67 %" in told
     with pytest.raises(InputError, match="no point is left"):
         clean_cloud(plate(), CleaningOptions(isolated_mm=0.01))

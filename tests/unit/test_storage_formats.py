@@ -145,6 +145,9 @@ def test_an_ascii_stl(tmp_path: Path) -> None:
     mesh = trimesh.Trimesh(POINTS, [[0, 1, 2]])
     path.write_text(trimesh.exchange.stl.export_stl_ascii(mesh))
     assert sorted(read_cloud(path).points_mm.tolist()) == sorted(POINTS.tolist())
+    path.write_text(path.read_text()[:-30])
+    with pytest.raises(FileFormatError, match="cut short"):
+        read_cloud(path)
 
 
 def test_las_files_of_another_program(tmp_path: Path) -> None:
@@ -276,6 +279,11 @@ def test_columns_of_a_table_are_found_by_their_names(tmp_path: Path) -> None:
     assert found.points_mm.tolist() == POINTS[:2].tolist()
     assert found.normals is not None
     assert found.normals.tolist() == [[0, 0, 1], [0, 1, 0]]
+    path.write_text("id,grade,x,y,z\n1,,1.5,-2,3.25\n,,4,5,-6.5\n")
+    assert read_cloud(path).points_mm.tolist() == POINTS[:2].tolist()
+    path.write_text("x,y,z\n1.5,-2,3.25\n4,,-6.5\n")
+    with pytest.raises(FileFormatError, match="not finite"):
+        read_cloud(path)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".e57", ".laz", ".las", ".pcd", ".stl"])

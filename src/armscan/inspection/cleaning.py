@@ -20,6 +20,8 @@ LINE_REACH = 5
 """Points on either side of one to which the line is drawn that it should lie on."""
 LEAST_LINE = 4
 """Fewest of them that make a line."""
+MUCH, THINNING = 0.5, ("region", "lines too near", "overlap", "density")
+"""A filter that takes more than half of the points is told of, but for those that thin."""
 PASS_GAP = 6
 """Exposures in one place whose numbers are further apart are of different passes."""
 LINE_SAMPLE = 60
@@ -121,6 +123,20 @@ class Cleaning(ArrayRecord):
     cloud: PointCloud
     taken_by: IntArray = ints("N")
     steps: tuple[CleaningStep, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Filters that took more than a cleaning should, in words."""
+        left, found = len(self.taken_by), []
+        for step in self.steps:
+            if step.n_taken > MUCH * left and step.name not in THINNING:
+                found.append(
+                    f"the filter '{step.name}' took {100.0 * step.n_taken / left:.0f} % of the "
+                    "points before it: check its number, and that points stand in the file in "
+                    "their order along each stripe"
+                )
+            left -= step.n_taken
+        return tuple(found)
 
 
 Filter = Callable[[PointCloud, float, CleaningOptions], BoolArray]

@@ -148,7 +148,7 @@ def inspect_feature(
     """
     selection = select(cloud, wanted.region, options)
     sample = sample_of(selection)
-    start = find_shape(selection, wanted, sample)
+    start = find_shape(sample, wanted)
     if isinstance(start, FitFailure):
         return start
     shape, chosen = start, np.zeros(len(selection.rows), dtype=np.bool_)

@@ -193,7 +193,7 @@ def sample_of(selection: Selection) -> Sample:
     )
 
 
-def find_shape(selection: Selection, wanted: WantedFeature, sample: Sample) -> Shape | FitFailure:
+def find_shape(sample: Sample, wanted: WantedFeature) -> Shape | FitFailure:
     """The shape of a kind that most points lie on, as far as it fits what is known of it."""
     scored = [
         (_score(sample, shape), -k, shape)

@@ -271,7 +271,7 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
     if is_cloud:
         cloud, remarks = _read(source)
         content = cloud_bytes(cloud, output)
-        what = f"cloud to {BY_SUFFIX[suffix].name}, {len(cloud):,} points"
+        what = f"cloud to {BY_SUFFIX[suffix].name}"
         conversion = Conversion(what, cloud_losses(cloud, output), remarks, cloud.forced)
     else:
         camera, forced = _camera(source)

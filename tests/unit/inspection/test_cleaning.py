@@ -10,9 +10,11 @@ import pytest
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, IntArray
+from armscan.geometry.poses import Pose
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
+from armscan.pipeline.register import carry_cloud
 from armscan.records.cloud import PointCloud
-from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of
+from rigs.inspection_clouds import RADIUS_MM, ball_stripes, cloud_of, random_motion
 
 SPACING_MM, N_STRIPES, N_POINTS = 0.1, 20, 300
 
@@ -145,5 +147,19 @@ def test_what_a_cloud_does_not_carry_is_said() -> None:
     for options in (CleaningOptions(edge_mm=1.0), CleaningOptions(overlap_mm=1.0)):
         with pytest.raises(InputError, match="of one stripe"):
             clean_cloud(bare, options)
+    (told,) = clean_cloud(plate(), CleaningOptions(edge_mm=10.0)).warnings
+    assert "took 67 %" in told
     with pytest.raises(InputError, match="no point is left"):
         clean_cloud(plate(), CleaningOptions(isolated_mm=0.01))
+
+
+def test_angles_of_incidence_stay_when_a_cloud_is_carried_to_another_frame() -> None:
+    outward = ball_stripes(16, 40)
+    cloud = cloud_of(RADIUS_MM * outward, np.repeat(np.arange(16), 40), normals=outward)
+    cloud = replace(cloud, seen_from_mm=np.tile([30.0, 0.0, 200.0], (16, 1)))
+    rotation, shift = random_motion(3)
+    moved = carry_cloud(cloud, Pose(rotation, shift), np.zeros((6, 6)), "Part")
+    options = CleaningOptions(max_incidence_deg=50.0)
+    before, after = (clean_cloud(one, options).taken_by for one in (cloud, moved))
+    assert np.array_equal(before, after)
+    assert 0 < int((before >= 0).sum()) < len(before)

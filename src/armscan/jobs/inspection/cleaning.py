@@ -9,7 +9,7 @@ from armscan.errors import OptionError
 from armscan.inspection.cleaning import CleaningOptions, clean_cloud
 from armscan.jobs.job import Job
 from armscan.report.inspection.cleaning import cleaning_page, cleaning_quantities, cleaning_table
-from armscan.report.quantity import Summary
+from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_bytes, cloud_losses, read_cloud
 
 
@@ -36,7 +36,8 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     cloud = read_cloud(path)
     found = clean_cloud(cloud, options)
     losses = cloud_losses(found.cloud, job.output)
-    warnings = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
+    lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
+    warnings = (*found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)
     page = cleaning_page(found, cloud.points_mm, provenance, is_simulated=cloud.is_simulated)
     written = job.write({places[0]: cloud_bytes(found.cloud, job.output), places[1]: page})
@@ -44,7 +45,7 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
         title="Cloud cleaned" + (" (simulated data)." if cloud.is_simulated else "."),
         quantities=cleaning_quantities(found),
         tables=(cleaning_table(found),),
-        warnings=warnings,
+        warnings=sentences(warnings),
         written=written,
         next_step=f"open {places[1]}",
         forced=cloud.forced,

@@ -73,6 +73,7 @@ def cleaning_page(
                 for step in found.steps
             ),
         ),
+        warnings=found.warnings,
         is_simulated=is_simulated,
     )
 

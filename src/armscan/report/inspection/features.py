@@ -10,7 +10,7 @@ import numpy as np
 
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.features import FeatureInspection, MeasuredAngle, Relation
-from armscan.inspection.results import MeasuredLength
+from armscan.inspection.results import MeasuredLength, PointCounts
 from armscan.records.cloud import PointCloud
 from armscan.report.inspection.shapes import (
     InspectionReport,
@@ -197,6 +197,18 @@ SHOWN = (
 """What a relation tells people of each of its features; programs are told all."""
 
 
+def _counts(first: PointCounts, second: PointCounts) -> PointCounts:
+    """Of both features together; a point may be of both."""
+    return PointCounts(
+        n_given=first.n_given,
+        n_region=max(first.n_region, second.n_region),
+        n_feature=first.n_feature + second.n_feature,
+        n_fitted=first.n_fitted + second.n_fitted,
+        feature_rule=f"first: {first.feature_rule}; second: {second.feature_rule}",
+        fit_rule=first.fit_rule,
+    )
+
+
 def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
     """Report of how two features stand to each other."""
     names = f"{found.first.wanted} and {found.second.wanted}"
@@ -244,6 +256,6 @@ def relation_report(found: Relation, cloud: PointCloud) -> InspectionReport:
                 reference="each one's own fit",
             ),
         ),
-        counts=found.first.counts,
+        counts=_counts(found.first.counts, found.second.counts),
         warnings=tuple(sorted(warnings)),
     )

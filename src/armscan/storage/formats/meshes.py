@@ -42,9 +42,8 @@ def stl_columns(data: bytes, path: Path) -> CloudColumns:
     FileFormatError
         If it is cut short, or no STL file.
     """
-    corners = _ascii_corners(data) if _is_ascii(data) else None
-    if corners is None:
-        corners = _binary_corners(data, path_text(path))
+    where = path_text(path)
+    corners = _ascii_corners(data, where) if _is_ascii(data) else _binary_corners(data, where)
     points = np.unique(corners, axis=0)
     return CloudColumns(
         {name: points[:, k] for k, name in enumerate(POINT)},
@@ -57,14 +56,19 @@ def _is_ascii(data: bytes) -> bool:
     return data[:5].lower() == b"solid" and b"vertex" in data[:2000]
 
 
-def _ascii_corners(data: bytes) -> FloatArray | None:
+def _ascii_corners(data: bytes, where: str) -> FloatArray:
+    """(3 M, 3) corners of the triangles."""
     words = [line.split() for line in data.splitlines()]
     try:
         found = [[float(word) for word in row[1:4]] for row in words if row[:1] == [b"vertex"]]
-        corners = np.array(found, dtype=np.float64)
-    except ValueError:
-        return None
-    return corners if corners.ndim == 2 and corners.shape[1] == 3 else None
+        corners = np.array(found, dtype=np.float64).reshape(len(found), 3)
+    except ValueError as error:
+        raise FileFormatError(
+            "the corners of the STL file are not understood", where=where, remedy=DAMAGED
+        ) from error
+    if len(corners) % 3 or b"endsolid" not in data[-1000:].lower():
+        raise FileFormatError("the STL file is cut short", where=where, remedy=DAMAGED)
+    return corners
 
 
 def _binary_corners(data: bytes, where: str) -> FloatArray:

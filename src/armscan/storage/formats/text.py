@@ -50,6 +50,8 @@ KNOWN = {
 """Columns that are read, by their names in a heading."""
 LOOKED_AT = 1000
 """Lines in which decimal commas are sought: a table that has them has them everywhere."""
+EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
+"""Nothing between two separators: a value that is missing, which must not move the next ones."""
 OWN_HEADER = "x_mm y_mm z_mm in frame "
 
 
@@ -124,6 +126,8 @@ def _named(heading: list[str]) -> dict[str, int]:
 
 def _values(body: str, columns: tuple[int, ...], path: Path) -> FloatArray:
     """(N, C) numbers of some columns."""
+    if EMPTY_FIELD.search(body):
+        body = EMPTY_FIELD.sub(r"\1nan", body)
     text = io.StringIO(body.replace(",", " ").replace(";", " "))
     try:
         return np.loadtxt(text, usecols=columns, ndmin=2)

@@ -14,6 +14,8 @@ from armscan.kernels.arrays import (
     FloatsOut,
     Image,
     ImageOut,
+    IntsOut,
+    Row,
     RowOut,
     Table,
     TableOut,
@@ -217,6 +219,24 @@ def gaussian_taps(sigma_px: float) -> Image:
 
 
 @compiled(fastmath=True)
+def combine_columns(down0: Row, down1: Row, down2: Row, taps: Image, result: FloatsOut) -> None:
+    """Derivatives (5,) of columns that were smoothed and differentiated once and twice, (m,)."""
+    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
+    gx = gy = gxx = gxy = gyy = np.float32(0.0)
+    for i in range(taps0.shape[0]):
+        gx += taps1[i] * down0[i]
+        gxx += taps2[i] * down0[i]
+        gxy += taps1[i] * down1[i]
+        gy += taps0[i] * down1[i]
+        gyy += taps0[i] * down2[i]
+    result[0] = gx
+    result[1] = gy
+    result[2] = gxx
+    result[3] = gxy
+    result[4] = gyy
+
+
+@compiled(fastmath=True)
 def derivatives_at(
     image: Image,
     x: int,
@@ -260,18 +280,74 @@ def derivatives_at(
                 down0[i] += smooth * value
                 down1[i] += slope * value
                 down2[i] += bend * value
-    gx = gy = gxx = gxy = gyy = np.float32(0.0)
-    for i in range(m):
-        gx += taps1[i] * down0[i]
-        gxx += taps2[i] * down0[i]
-        gxy += taps1[i] * down1[i]
-        gy += taps0[i] * down1[i]
-        gyy += taps0[i] * down2[i]
-    result[0] = gx
-    result[1] = gy
-    result[2] = gxx
-    result[3] = gxy
-    result[4] = gyy
+    combine_columns(down0, down1, down2, taps, result)
+
+
+BLOCK_PX = 32
+"""Columns that are smoothed together where a line runs along a row."""
+MARGIN_PX = 2 * BLOCK_PX
+"""Columns kept beyond either border; taps reach no farther."""
+
+
+@compiled(fastmath=True)
+def smooth_block(
+    image: Image, block: int, y: int, taps: Image, radius: int, kept: ImageOut
+) -> None:
+    """Smooth and differentiate `BLOCK_PX` columns down around row ``y`` into ``kept``.
+
+    The others: As for `shared_derivatives_at`.
+    """
+    height, width = image.shape
+    left = block * BLOCK_PX - MARGIN_PX
+    is_inside = left >= 0 and left + BLOCK_PX <= width
+    own = slice(block * BLOCK_PX, (block + 1) * BLOCK_PX)
+    down0, down1, down2 = kept[0, own], kept[1, own], kept[2, own]
+    down0[:] = np.float32(0.0)
+    down1[:] = np.float32(0.0)
+    down2[:] = np.float32(0.0)
+    for j in range(2 * radius + 1):
+        row = min(max(y + j - radius, 0), height - 1)
+        smooth = taps[0, j]
+        slope = taps[1, j]
+        bend = taps[2, j]
+        if is_inside:
+            pixels = image[row, left : left + BLOCK_PX]
+            for i in range(BLOCK_PX):
+                value = pixels[i]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+        else:
+            for i in range(BLOCK_PX):
+                value = image[row, min(max(left + i, 0), width - 1)]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+
+
+@compiled()
+def shared_derivatives_at(
+    image: Image,
+    x: int,
+    y: int,
+    taps: Image,
+    radius: int,
+    kept: ImageOut,
+    row_of_block: IntsOut,
+    result: FloatsOut,
+) -> None:
+    """As `derivatives_at`, with columns that neighbours in the same row share.
+
+    ``kept``: (3, W + 2 `MARGIN_PX` and up to a block more) columns, and ``row_of_block`` (blocks,)
+    the row around which each block of them was smoothed; -1 for none.
+    """
+    first = x - radius + MARGIN_PX
+    stop = first + taps.shape[1]
+    for block in range(first // BLOCK_PX, (stop - 1) // BLOCK_PX + 1):
+        if row_of_block[block] != y:
+            row_of_block[block] = y
+            smooth_block(image, block, y, taps, radius, kept)
+    combine_columns(kept[0, first:stop], kept[1, first:stop], kept[2, first:stop], taps, result)
 
 
 @compiled()
@@ -282,6 +358,9 @@ def step_to_ridge(
     taps: Image,
     radius: int,
     scratch: ImageOut,
+    kept: ImageOut,
+    row_of_block: IntsOut,
+    is_shared: bool,
     derivatives: FloatsOut,
     result: FloatsOut,
 ) -> bool:
@@ -292,7 +371,8 @@ def step_to_ridge(
     the step leaves its pixel.
 
     ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``x_px``,
-    ``y_px``: Start. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
+    ``y_px``: Start. ``kept``, ``row_of_block``: As for `shared_derivatives_at`, which is taken if
+    ``is_shared``. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
     y, negative second derivative along the normal.
     """
     height, width = image.shape
@@ -301,7 +381,10 @@ def step_to_ridge(
     for _ in range(ROUNDS):
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
-        derivatives_at(image, x, y, taps, radius, scratch, derivatives)
+        if is_shared:
+            shared_derivatives_at(image, x, y, taps, radius, kept, row_of_block, derivatives)
+        else:
+            derivatives_at(image, x, y, taps, radius, scratch, derivatives)
         half = 0.5 * (derivatives[2] - derivatives[4])
         gxy = derivatives[3]
         root = math.sqrt(half * half + gxy * gxy)
@@ -361,11 +444,31 @@ def refine_candidates(
     derivatives = np.zeros(5)
     ridge = np.zeros(5)
     latest = np.full((2, max(height, width)), -1e9)
+    n_blocks = (width + 2 * MARGIN_PX) // BLOCK_PX + 1
+    kept = np.zeros((3, n_blocks * BLOCK_PX), np.float32)
+    row_of_block = np.full(n_blocks, -1, np.int64)
+    row_before = column_before = -1
+    is_narrow = padded.shape[1] <= MARGIN_PX
     count = 0
     for r in range(n_runs):
         is_row = runs[r, 2] == ROW
+        row = math.floor(runs[r, 1] + 0.5)
+        column = math.floor(runs[r, 0] + 0.5)
+        is_shared = row == row_before and abs(column - column_before) < BLOCK_PX // 2
+        row_before = row
+        column_before = column
         if not step_to_ridge(
-            image, runs[r, 0], runs[r, 1], padded, radius, scratch, derivatives, ridge
+            image,
+            runs[r, 0],
+            runs[r, 1],
+            padded,
+            radius,
+            scratch,
+            kept,
+            row_of_block,
+            is_shared and is_narrow,
+            derivatives,
+            ridge,
         ):
             continue
         if ridge[4] < least_bend:

@@ -149,6 +149,9 @@ RIDGE_POWER = 1.5
 """Of the scale, by which second derivatives of ridges are compared (Lindeberg 1998): lines of sigma
 above 5 px are sought at the wider scale."""
 SAMPLE = 3000
+LOOKED_AT = 8
+NEARLY = 0.8
+"""Of the narrow scale's strength: less at the wide one leaves no doubt."""
 MEASURED = 300
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
@@ -189,14 +192,23 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     it would be taken for the line.
     """
     sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
-    best, best_strength = np.zeros((0, 6)), 0.0
-    for scale in SCALES_PX:
-        points = np.zeros((len(sample), 6))
-        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), 0.0, points)
-        strength = scale**RIDGE_POWER * strong_median(points[:n, 4])
-        if strength > best_strength:
-            best, best_strength = points[:n], strength
-    return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
+    narrow, wide = SCALES_PX
+    points, strength = _at_scale(image, sample, narrow)
+    # wide filters take long, and few lines need them: some candidates tell
+    few = np.ascontiguousarray(sample[::LOOKED_AT])
+    if _at_scale(image, few, wide)[1] > NEARLY * strength:
+        points_wide, strength_wide = _at_scale(image, sample, wide)
+        points = points_wide if strength_wide > strength else points
+    return points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
+
+
+def _at_scale(
+    image: FloatImage, sample: FloatArray, scale_px: float
+) -> tuple[FloatArray, float]:
+    """(N, 6) ridge points of candidates at a scale, and how strong they are."""
+    points = np.zeros((len(sample), 6))
+    n = refine_candidates(image, sample, len(sample), gaussian_taps(scale_px), 0.0, points)
+    return points[:n], scale_px**RIDGE_POWER * strong_median(points[:n, 4])
 
 
 def _across(image: FloatImage, points: FloatArray) -> FloatArray:

@@ -285,6 +285,8 @@ def derivatives_at(
 
 BLOCK_PX = 32
 """Columns that are smoothed together where a line runs along a row."""
+KEPT_ROWS = 8
+"""Rows whose columns are kept: a walk to the ridge leaves the row of its candidate."""
 MARGIN_PX = 2 * BLOCK_PX
 """Columns kept beyond either border; taps reach no farther."""
 
@@ -338,16 +340,20 @@ def shared_derivatives_at(
 ) -> None:
     """As `derivatives_at`, with columns that neighbours in the same row share.
 
-    ``kept``: (3, W + 2 `MARGIN_PX` and up to a block more) columns, and ``row_of_block`` (blocks,)
-    the row around which each block of them was smoothed; -1 for none.
+    ``kept``: (3 `KEPT_ROWS`, W + 2 `MARGIN_PX` and up to a block more) columns, and
+    ``row_of_block`` (`KEPT_ROWS` blocks,) the row around which each block was smoothed; -1 for
+    none. Rows with the same remainder share a place.
     """
     first = x - radius + MARGIN_PX
     stop = first + taps.shape[1]
+    n_blocks = row_of_block.shape[0] // KEPT_ROWS
+    at = y % KEPT_ROWS
+    own = kept[3 * at : 3 * at + 3]
     for block in range(first // BLOCK_PX, (stop - 1) // BLOCK_PX + 1):
-        if row_of_block[block] != y:
-            row_of_block[block] = y
-            smooth_block(image, block, y, taps, radius, kept)
-    combine_columns(kept[0, first:stop], kept[1, first:stop], kept[2, first:stop], taps, result)
+        if row_of_block[at * n_blocks + block] != y:
+            row_of_block[at * n_blocks + block] = y
+            smooth_block(image, block, y, taps, radius, own)
+    combine_columns(own[0, first:stop], own[1, first:stop], own[2, first:stop], taps, result)
 
 
 @compiled()
@@ -413,6 +419,80 @@ def step_to_ridge(
     return False
 
 
+SHARED_FROM = 3
+"""Candidates in one row and block from which on smoothing the whole block is worth its time."""
+
+
+@compiled()
+def sort_candidates(runs: Table, n_runs: int, cell: IntsOut, order: IntsOut) -> int:
+    """Sort candidates by row, and by block of columns within it.
+
+    ``runs``, ``n_runs``: As for `refine_candidates`. ``cell``: (n_runs,) output: number of the row
+    and block of each. ``order``: (n_runs,) output: candidates by rising cell. Returns count of
+    cells.
+    """
+    blocks = rows = 0
+    for r in range(n_runs):
+        blocks = max(blocks, math.floor(runs[r, 0] + 0.5) // BLOCK_PX + 1)
+        rows = max(rows, math.floor(runs[r, 1] + 0.5) + 1)
+    place = np.zeros(rows * blocks + 1, np.int64)
+    for r in range(n_runs):
+        own = math.floor(runs[r, 1] + 0.5) * blocks + math.floor(runs[r, 0] + 0.5) // BLOCK_PX
+        cell[r] = own
+        place[own + 1] += 1
+    for k in range(rows * blocks):
+        place[k + 1] += place[k]
+    for r in range(n_runs):
+        order[place[cell[r]]] = r
+        place[cell[r]] += 1
+    return rows * blocks
+
+
+@compiled()
+def find_ridges(image: Image, runs: Table, n_runs: int, taps: Image, ridges: TableOut) -> None:
+    """Walk from each candidate to its ridge; ``ridges``: (n_runs, 5) output, 0 where there is none.
+
+    The others, and the columns: As for `refine_candidates` and `step_to_ridge`.
+    """
+    width = image.shape[1]
+    radius = taps.shape[1] // 2
+    # whole registers: what is left over of a row would take as long as the rest
+    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
+    padded[:, : taps.shape[1]] = taps
+    scratch = np.zeros(padded.shape, np.float32)
+    derivatives = np.zeros(5)
+    n_blocks = (width + 2 * MARGIN_PX) // BLOCK_PX + 1
+    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
+    row_of_block = np.full(KEPT_ROWS * n_blocks, -1, np.int64)
+    is_narrow = padded.shape[1] <= MARGIN_PX
+    cell = np.zeros(n_runs, np.int64)
+    order = np.zeros(n_runs, np.int64)
+    sort_candidates(runs, n_runs, cell, order)
+    first = 0
+    while first < n_runs:
+        stop = first + 1
+        while stop < n_runs and cell[order[stop]] == cell[order[first]]:
+            stop += 1
+        is_shared = is_narrow and stop - first >= SHARED_FROM
+        for k in range(first, stop):
+            r = order[k]
+            if not step_to_ridge(
+                image,
+                runs[r, 0],
+                runs[r, 1],
+                padded,
+                radius,
+                scratch,
+                kept,
+                row_of_block,
+                is_shared,
+                derivatives,
+                ridges[r],
+            ):
+                ridges[r, 4] = 0.0
+        first = stop
+
+
 @compiled()
 def refine_candidates(
     image: Image,
@@ -436,40 +516,15 @@ def refine_candidates(
     Returns count of points.
     """
     height, width = image.shape
-    radius = taps.shape[1] // 2
-    # whole registers: what is left over of a row would take as long as the rest
-    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
-    padded[:, : taps.shape[1]] = taps
-    scratch = np.zeros(padded.shape, np.float32)
-    derivatives = np.zeros(5)
-    ridge = np.zeros(5)
     latest = np.full((2, max(height, width)), -1e9)
-    n_blocks = (width + 2 * MARGIN_PX) // BLOCK_PX + 1
-    kept = np.zeros((3, n_blocks * BLOCK_PX), np.float32)
-    row_of_block = np.full(n_blocks, -1, np.int64)
-    row_before = column_before = -1
-    is_narrow = padded.shape[1] <= MARGIN_PX
+    ridges = np.zeros((n_runs, 5))
+    find_ridges(image, runs, n_runs, taps, ridges)
     count = 0
     for r in range(n_runs):
         is_row = runs[r, 2] == ROW
-        row = math.floor(runs[r, 1] + 0.5)
-        column = math.floor(runs[r, 0] + 0.5)
-        is_shared = row == row_before and abs(column - column_before) < BLOCK_PX // 2
-        row_before = row
-        column_before = column
-        if not step_to_ridge(
-            image,
-            runs[r, 0],
-            runs[r, 1],
-            padded,
-            radius,
-            scratch,
-            kept,
-            row_of_block,
-            is_shared and is_narrow,
-            derivatives,
-            ridge,
-        ):
+        side = ROW if is_row else COLUMN
+        ridge = ridges[r]
+        if ridge[4] <= 0.0:
             continue
         if ridge[4] < least_bend:
             continue
@@ -483,7 +538,6 @@ def refine_candidates(
         else:
             line = int(runs[r, 0])
             centre = ridge[1] - (line - ridge[0]) * ridge[2] / ridge[3]
-        side = ROW if is_row else COLUMN
         if abs(centre - latest[side, line]) < REPEAT_PX:
             continue
         if centre < 0.0 or centre > (width if is_row else height) - 1:

@@ -20,6 +20,7 @@ Ints: TypeAlias = NDArray[np.int64]
 ImageOut: TypeAlias = NDArray[np.float32]
 Row: TypeAlias = NDArray[np.float32]
 RowOut: TypeAlias = NDArray[np.float32]
+BytesOut: TypeAlias = NDArray[np.uint8]
 MapOut: TypeAlias = NDArray[np.int32]
 TableOut: TypeAlias = NDArray[np.float64]
 FloatsOut: TypeAlias = NDArray[np.float64]
@@ -36,6 +37,7 @@ _TYPES: dict[str, Any] = {
     "ImageOut": types.Array(types.float32, 2, "C"),
     "Row": types.Array(types.float32, 1, "C", readonly=True),
     "RowOut": types.Array(types.float32, 1, "C"),
+    "BytesOut": types.Array(types.uint8, 1, "C"),
     "MapOut": types.Array(types.int32, 2, "C"),
     "TableOut": types.Array(types.float64, 2, "C"),
     "FloatsOut": types.Array(types.float64, 1, "C"),

@@ -254,3 +254,25 @@ def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
     for i in range(n - 1, -1, -1):
         state[i] = last
         last = before[i, last]
+
+
+@compiled()
+def sum_windows(values: Table, chain: Ints, half: int, sums: TableOut) -> None:
+    """Sums over the neighbours within ``half`` places on the same chain.
+
+    ``values``: (M, N). ``chain``: (N,) numbers; a chain's points are consecutive. ``sums``: (M, N)
+    output.
+    """
+    m, n = values.shape
+    running = np.zeros(n + 1)
+    for row in range(m):
+        first = 0
+        while first < n:
+            stop = first
+            running[first] = 0.0
+            while stop < n and chain[stop] == chain[first]:
+                running[stop + 1] = running[stop] + values[row, stop]
+                stop += 1
+            for i in range(first, stop):
+                sums[row, i] = running[min(i + half + 1, stop)] - running[max(i - half, first)]
+            first = stop

@@ -10,6 +10,7 @@ import numpy as np
 from armscan.kernels.arrays import (
     COLUMN,
     ROW,
+    BytesOut,
     Floats,
     FloatsOut,
     Image,
@@ -38,26 +39,12 @@ def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
 
 
 @compiled()
-def level_at(image: Image, axis: int, line: int, k: int) -> float:
-    """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
-    return float(image[k, line] if axis == COLUMN else image[line, k])
-
-
-@compiled()
-def hump_centre(
-    image: Image,
-    axis: int,
-    line: int,
-    first: int,
-    last: int,
-    background: float,
-    peak: float,
-) -> float:
+def hump_centre(levels: Floats, first: int, last: int, background: float, peak: float) -> float:
     """Centroid of what rises above half of the peak, so that a bright ground does not pull it."""
     floor = background + 0.5 * peak
     weight = moment = 0.0
     for k in range(first, last + 1):
-        above = max(level_at(image, axis, line, k) - floor, 0.0)
+        above = max(levels[k] - floor, 0.0)
         weight += above
         moment += above * k
     return moment / weight if weight > 0.0 else 0.5 * (first + last)
@@ -72,6 +59,7 @@ def split_run(
     last: int,
     background: float,
     rise: float,
+    levels: FloatsOut,
     runs: TableOut,
     count: int,
 ) -> int:
@@ -82,24 +70,27 @@ def split_run(
 
     ``image``: (H, W) grey levels. ``axis``, ``line``, ``first``, ``last``: The run: pixels
     ``first..last`` of column (axis 0) or row (axis 1) ``line``. ``background``, ``rise``: Local
-    background, and the height above it at which the run was cut. ``runs``: (capacity, 3) output
-    rows ``x, y, axis``; rows beyond the capacity are counted only. ``count``: Rows used so far.
+    background, and the height above it at which the run was cut. ``levels``: Scratch, of the run's
+    length and two more. ``runs``: (capacity, 3) output rows ``x, y, axis``; rows beyond the
+    capacity are counted only. ``count``: Rows used so far.
     """
+    n = last - first + 1
+    for k in range(n):
+        levels[k + 1] = image[first + k, line] if axis == COLUMN else image[line, first + k]
+    levels[0] = levels[1]
+    levels[n + 1] = levels[n]
     peak = 0.0
     low = np.inf
-    low_at = start = first
-    for k in range(first, last + 2):
-        is_end = k > last
+    low_at = start = 1
+    for k in range(1, n + 2):
+        is_end = k > n
         smooth = 0.0
         if not is_end:
-            smooth = level_at(image, axis, line, k)
-            smooth += level_at(image, axis, line, max(k - 1, first))
-            smooth += level_at(image, axis, line, min(k + 1, last))
-            smooth = smooth / 3.0 - background
+            smooth = (levels[k] + levels[k - 1] + levels[k + 1]) / 3.0 - background
         if is_end or (low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise):
             if count < runs.shape[0]:
-                stop = last if is_end else low_at
-                centre = hump_centre(image, axis, line, start, stop, background, peak)
+                stop = n if is_end else low_at
+                centre = first - 1 + hump_centre(levels, start, stop, background, peak)
                 runs[count, 0] = line if axis == COLUMN else centre
                 runs[count, 1] = centre if axis == COLUMN else line
                 runs[count, 2] = axis
@@ -113,6 +104,33 @@ def split_run(
             low = smooth
             low_at = k
     return count
+
+
+ROUNDING = 1e-3
+"""Of the threshold, in grey levels."""
+
+
+@compiled()
+def is_any_above(pixels: Row, level: float) -> bool:
+    """True if one of some pixels is brighter."""
+    limit = np.float32(level)
+    count = np.int32(0)
+    for k in range(pixels.shape[0]):
+        count += np.int32(pixels[k] > limit)
+    return count > 0
+
+
+@compiled()
+def mark_lit(
+    pixels: Row, upper: Row, lower: Row, fraction: float, lift: float, is_lit: BytesOut
+) -> None:
+    """Mark pixels above the background, which lies between that of two rows of cells, by more than
+    ``lift``.
+    """
+    share = np.float32(fraction)
+    rise = np.float32(lift)
+    for k in range(pixels.shape[0]):
+        is_lit[k] = pixels[k] > upper[k] + share * (lower[k] - upper[k]) + rise
 
 
 @compiled()
@@ -135,7 +153,9 @@ def find_runs(
     Returns count of candidates; more than the capacity if the output was too short.
     """
     height, width = image.shape
-    floor = np.zeros(width, np.float32)
+    n_cells = -(-width // cell_px)
+    quiet = np.zeros(n_cells)
+    levels = np.zeros(longest_px + 2)
     upper = np.zeros(width, np.float32)
     lower = np.zeros(width, np.float32)
     n_words = -(-width // 8)
@@ -146,6 +166,7 @@ def find_runs(
     start = np.full(width, -1, np.int64)
     count = 0
     lift = np.float32(rise)
+    fraction = np.float32(0.0)
     for y in range(height + 1):
         row_start = -1
         is_lit[:] = 0
@@ -157,13 +178,20 @@ def find_runs(
                 following = min(cell + 1, background.shape[0] - 1)
                 interpolate_columns(background, cell_px, following, lower)
                 above = cell
+                for k in range(n_cells):
+                    own = slice(k * cell_px, min((k + 1) * cell_px, width))
+                    quiet[k] = min(upper[own].min(), lower[own].min()) + rise - ROUNDING
             fraction = np.float32(v - cell)
             row = image[y]
-            for x in range(width):
-                floor[x] = upper[x] + fraction * (lower[x] - upper[x]) + lift
-                is_lit[x] = row[x] > floor[x]
+            for k in range(n_cells):
+                # most of the image is dark, and is passed over by a cell's width at once
+                low = k * cell_px
+                high = min(low + cell_px, width)
+                if is_any_above(row[low:high], quiet[k]):
+                    mark_lit(
+                        row[low:high], upper[low:high], lower[low:high], fraction, lift, is_lit[low:]
+                    )
         for word in range(n_words):
-            # most of the image is dark, and is passed over by eight pixels at once
             if words[word] == 0 and n_open[word] == 0 and row_start < 0:
                 continue
             for x in range(8 * word, min(8 * word + 8, width)):
@@ -179,17 +207,19 @@ def find_runs(
                 else:
                     if start[x] >= 0:
                         if y - start[x] <= longest_px:
-                            base = float(floor[x]) - rise
+                            base = float(upper[x] + fraction * (lower[x] - upper[x]) + lift) - rise
                             count = split_run(
-                                image, COLUMN, x, start[x], y - 1, base, rise, runs, count
+                                image, COLUMN, x, start[x], y - 1, base, rise, levels, runs, count
                             )
                         start[x] = -1
                         n_open[word] -= 1
                     stop = x - 1
                 if row_start >= 0:
                     if stop - row_start < longest_px:
-                        base = float(floor[x]) - rise
-                        count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
+                        base = float(upper[x] + fraction * (lower[x] - upper[x]) + lift) - rise
+                        count = split_run(
+                            image, ROW, y, row_start, stop, base, rise, levels, runs, count
+                        )
                     row_start = -1
     return count
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
-from armscan.kernels.chains import find_neighbours, place_points, walk_chains
+from armscan.kernels.chains import find_neighbours, place_points, sum_windows, walk_chains
 from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates, sample_across
 
 FloatImage: TypeAlias = NDArray[np.float32]
@@ -111,17 +111,15 @@ def chain_bounds(chain: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def sum_along(values: FloatArray, chain: IntArray, half: int) -> FloatArray:
-    """Sum (N, ...) over the neighbours within ``half`` places on the same chain."""
-    first, stop = chain_bounds(chain)
-    place = np.arange(len(chain))
-    low = np.maximum(first, place - half)
-    high = np.minimum(stop, place + half + 1)
-    running = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-    return np.asarray(running[high] - running[low])
+    """Sums (M, N) or (N,) of values over the neighbours within ``half`` places on the same chain."""
+    rows = np.ascontiguousarray(np.atleast_2d(values), dtype=np.float64)
+    sums = np.empty(rows.shape)
+    sum_windows(rows, chain, half, sums)
+    return sums.reshape(np.shape(values))
 
 
 def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: int) -> FloatArray:
-    """Weighted mean (N,) over the neighbours; 0 where the weights sum to 0."""
+    """Weighted means, (M, N) or (N,), over the neighbours; 0 where the weights sum to 0."""
     total = sum_along(weights, chain, half)
     mean = sum_along(weights * values, chain, half)
     return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 0.0))
@@ -273,6 +271,8 @@ class RidgePoints:
 
     def select(self, keep: NDArray[np.bool_]) -> RidgePoints:
         """Return the points where ``keep`` (N,) is True; chains are cut where a gap opens."""
+        if keep.all():
+            return self
         table, chain = self.table[keep], self.chain[keep]
         if len(table) == 0:
             return RidgePoints(table, chain)

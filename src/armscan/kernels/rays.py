@@ -307,3 +307,31 @@ def add_propagated(
                 out[i, 3 * a + b] += total
                 if a != b:
                     out[i, 3 * b + a] += total
+
+
+@compiled(fastmath=True)
+def add_equations(
+    rows: Table, group: Ints, weight: Floats, wanted: Floats, matrix: TableOut, vector: TableOut
+) -> None:
+    """Add rows of equations to the normal equations of their groups.
+
+    ``rows``: (H, Q) derivatives. ``group``: (H,). ``weight``: (H,). ``wanted``: (H,) right-hand
+    side. ``matrix``: (G, Q Q) sums of weighted products. ``vector``: (G, Q) of each with what is
+    wanted.
+    """
+    q = rows.shape[1]
+    for i in range(rows.shape[0]):
+        if weight[i] == 0.0:
+            continue
+        row = rows[i]
+        sums = vector[group[i]]
+        share = weight[i] * wanted[i]
+        for c in range(q):
+            sums[c] += share * row[c]
+        for c in range(q):
+            products = matrix[group[i], c * q : (c + 1) * q]
+            share = weight[i] * row[c]
+            if share == 0.0:
+                continue
+            for d in range(q):
+                products[d] += share * row[d]

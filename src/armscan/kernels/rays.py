@@ -12,6 +12,7 @@ from armscan.kernels.arrays import (
     FloatsOut,
     Ints,
     IntsOut,
+    IntTable,
     Table,
     TableOut,
     compiled,
@@ -335,3 +336,40 @@ def add_equations(
                 continue
             for d in range(q):
                 products[d] += share * row[d]
+
+
+@compiled()
+def join_equations(
+    matrix: Table, vector: Table, columns: IntTable, whole: TableOut, side: FloatsOut
+) -> None:
+    """Add normal equations of groups, (G, Q Q) and (G, Q), to those of all parameters.
+
+    ``columns``: (G, Q) places of a group's parameters. ``whole``: (P, P). ``side``: (P,).
+    """
+    q = columns.shape[1]
+    for g in range(columns.shape[0]):
+        for c in range(q):
+            row = whole[columns[g, c]]
+            side[columns[g, c]] += vector[g, c]
+            for d in range(q):
+                row[columns[g, d]] += matrix[g, c * q + d]
+
+
+@compiled(fastmath=True)
+def combine_rows(
+    rows: Table, group: Ints, columns: IntTable, factor: Table, combined: TableOut
+) -> None:
+    """Multiply rows (H, Q) by what a factor (P, K) has of their groups' parameters; (H, K) zeros.
+
+    ``group``: (H,). ``columns``: (G, Q) places of a group's parameters.
+    """
+    k = factor.shape[1]
+    for i in range(rows.shape[0]):
+        total = combined[i]
+        for c in range(rows.shape[1]):
+            share = rows[i, c]
+            if share == 0.0:
+                continue
+            own = factor[columns[group[i], c]]
+            for j in range(k):
+                total[j] += share * own[j]

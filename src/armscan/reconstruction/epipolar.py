@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
 from armscan.geometry.least_squares import square_root
-from armscan.kernels.rays import add_equations
+from armscan.kernels.rays import add_equations, combine_rows, join_equations
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.triangulate import (
@@ -401,6 +401,24 @@ class Residuals:
         add_equations(rows, group.astype(np.int64), weight, wanted, matrix, vector)
         return matrix.reshape(-1, q, q), vector
 
+    def joined_equations(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Normal equations of all parameters, (P + 3, P + 3) and (P + 3,), to undo the residuals.
+
+        ``weight``: (H,).
+        """
+        n = int(self.columns.max()) + 1
+        matrix, vector = self.equations(weight, -self.px, self.sheet, len(self.columns))
+        whole, side = np.zeros((n, n)), np.zeros(n)
+        join_equations(matrix.reshape(len(matrix), -1), vector, self.columns, whole, side)
+        return whole, side
+
+    def whitened(self, rows: IntArray, factor: FloatArray) -> FloatArray:
+        """(M, K) derivatives of some residuals by the errors of which a factor (P + 3, K) is one."""
+        combined = np.zeros((len(rows), factor.shape[1]))
+        by_errors = np.ascontiguousarray(self.by_errors[rows])
+        combine_rows(by_errors, self.sheet[rows], self.columns, factor, combined)
+        return combined
+
     def weighted_sum(self, weight: FloatArray) -> FloatArray:
         """(P + 3,) derivative of the residuals' sum with weights (H,)."""
         total = np.zeros(int(self.columns.max()) + 1)
@@ -479,14 +497,12 @@ class _Equations:
         sigma = CORRELATION * np.hypot(residuals.sigma_px, FLOOR_PX)
         wanted = -residuals.px
         used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
-        weight, step = used, np.zeros(len(prior.factor))
-        information = np.eye(prior.factor.shape[1])
-        right_side = np.zeros(prior.factor.shape[1])
-        change, missed = weight, wanted
+        weight = used
+        matrix, vector = residuals.joined_equations(weight / sigma**2)
+        information = prior.factor.T @ (matrix @ prior.factor)
+        information += np.eye(len(information))
+        right_side = vector @ prior.factor
         for k in range(ROUNDS):
-            matrix, vector = _joined(residuals, change / sigma**2)
-            information += prior.factor.T @ (matrix @ prior.factor)
-            right_side += vector @ prior.factor
             step = prior.factor @ np.linalg.solve(information, right_side)
             missed = wanted - residuals.explained(step)
             if k == ROUNDS - 1:
@@ -494,9 +510,13 @@ class _Equations:
             score = np.abs(missed) / sigma * CORRELATION
             next_weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
             # few lie beyond the limit: only these change the sums
-            change = next_weight - weight
-            if not change.any():
+            rows = np.flatnonzero(next_weight != weight)
+            if not len(rows):
                 break
+            design = residuals.whitened(rows, prior.factor)
+            change = (next_weight - weight)[rows] / sigma[rows] ** 2
+            information += (design * change[:, None]).T @ design
+            right_side += (change * wanted[rows]) @ design
             weight = next_weight
         return _Equations(sigma, weight, step, missed, information)
 
@@ -504,18 +524,6 @@ class _Equations:
         """(P + 3, K) factor of the covariance of all errors, the residuals being known."""
         lower = np.linalg.cholesky(self.information)
         return np.asarray(solve_triangular(lower, prior.factor.T, lower=True, check_finite=False).T)
-
-
-def _joined(residuals: Residuals, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix (P + 3, P + 3) and right-hand side (P + 3,) of weighted residuals."""
-    columns = residuals.columns
-    n = int(columns.max()) + 1
-    of_sheets = residuals.equations(weight, -residuals.px, residuals.sheet, len(columns))
-    matrix, vector = np.zeros((n, n)), np.zeros(n)
-    for own, own_matrix, own_vector in zip(columns, *of_sheets, strict=True):
-        matrix[np.ix_(own, own)] += own_matrix
-        vector[own] += own_vector
-    return matrix, vector
 
 
 def left_out_scores(

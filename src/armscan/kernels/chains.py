@@ -11,7 +11,6 @@ from armscan.kernels.arrays import (
     COLUMN,
     ROW,
     Floats,
-    FloatsOut,
     Ints,
     IntsOut,
     MapOut,

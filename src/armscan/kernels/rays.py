@@ -23,7 +23,8 @@ RAY_TOLERANCE = 1e-7
 """Of a step; Newton's next one is its square."""
 SHEET_STEPS = 12
 SHEET_TOLERANCE_MM = 1e-6
-SETTLED_MM = 1e-9
+SETTLED_MM = 1e-7
+"""Of a step along the ray; Newton's next one is its square."""
 NEAREST_SOURCE = 0.2
 """As in the models of the camera and the light sheet."""
 

@@ -39,15 +39,21 @@ def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
 
 
 @compiled()
-def hump_centre(levels: Floats, first: int, last: int, background: float, peak: float) -> float:
-    """Centroid of what rises above half of the peak, so that a bright ground does not pull it."""
+def hump_centre(
+    levels: Floats, first: int, last: int, place: int, background: float, peak: float
+) -> float:
+    """Centroid of what rises above half of the peak, so that a bright ground does not pull it.
+
+    ``levels``: Grey levels, of which ``first`` to ``last`` count. ``place``: That of level 0.
+    """
     floor = background + 0.5 * peak
     weight = moment = 0.0
     for k in range(first, last + 1):
         above = max(levels[k] - floor, 0.0)
         weight += above
-        moment += above * k
-    return moment / weight if weight > 0.0 else 0.5 * (first + last)
+        # of whole places, so that the middle between two pixels stays exactly there
+        moment += above * (place + k)
+    return moment / weight if weight > 0.0 else place + 0.5 * (first + last)
 
 
 @compiled()
@@ -90,7 +96,7 @@ def split_run(
         if is_end or (low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise):
             if count < runs.shape[0]:
                 stop = n if is_end else low_at
-                centre = first - 1 + hump_centre(levels, start, stop, background, peak)
+                centre = hump_centre(levels, start, stop, first - 1, background, peak)
                 runs[count, 0] = line if axis == COLUMN else centre
                 runs[count, 1] = centre if axis == COLUMN else line
                 runs[count, 2] = axis
@@ -117,7 +123,7 @@ def is_any_above(pixels: Row, level: float) -> bool:
     count = np.int32(0)
     for k in range(pixels.shape[0]):
         count += np.int32(pixels[k] > limit)
-    return count > 0
+    return bool(count > 0)
 
 
 @compiled()
@@ -188,9 +194,8 @@ def find_runs(
                 low = k * cell_px
                 high = min(low + cell_px, width)
                 if is_any_above(row[low:high], quiet[k]):
-                    mark_lit(
-                        row[low:high], upper[low:high], lower[low:high], fraction, lift, is_lit[low:]
-                    )
+                    own = slice(low, high)
+                    mark_lit(row[own], upper[own], lower[own], v - cell, rise, is_lit[low:])
         for word in range(n_words):
             if words[word] == 0 and n_open[word] == 0 and row_start < 0:
                 continue

@@ -43,8 +43,8 @@ LEAST_DETERMINANT = 1e-9
 def reach_neighbours(course: Table, first: int, other: int, lanes: FloatsOut) -> float:
     """Places of one neighbour of each lane in the lane's tangent frame; the nearest one's reach.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``first``: Place of lane 0. ``other``: Place of its
-    neighbour. ``lanes``: (8 `LANES`,) x, y, normal, chain and largest distance so far of each
+    ``course``: (6, P) as `Neighbourhoods` lays it out. ``first``: Place of lane 0. ``other``: Of
+    its neighbour. ``lanes``: (8 `LANES`,) x, y, normal, chain and largest distance so far of each
     point, which grows to `BEYOND` where the chain ends or turns; output: distance along the tangent
     and along the normal.
     """
@@ -106,8 +106,8 @@ def gather_moments(course: Table, windows_px: Floats, is_asked: Ints, moments: F
     along the tangent and not turned by more than about 50 degrees. The point itself counts in the
     first ring.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``windows_px``: (K,) half widths along the tangent,
-    increasing. ``is_asked``: (P / `LANES`,) 0 for blocks whose moments stay as they are.
+    ``course``: (6, P) as `Neighbourhoods` lays it out. ``windows_px``: (K,) half widths along the
+    tangent, increasing. ``is_asked``: (P / `LANES`,) 0 for blocks whose moments stay as they are.
     ``moments``: (P K 9,) output, by block, ring, moment and lane.
     """
     n_windows = windows_px.shape[0]
@@ -269,7 +269,8 @@ def choose_windows(
     Windows grow while their estimates agree within the noise (intersection of confidence
     intervals): a bend stops the growth before its bias exceeds the noise.
 
-    ``course``: (6, P) as `Neighbourhoods` lays it out. ``moments``: Of `gather_moments`, with the same windows.
+    ``course``: (6, P) as `Neighbourhoods` lays it out. ``moments``: Of `gather_moments`, with the
+    same windows.
     ``scale``: Variance of the points over what their weights say. ``sigma_px``: (N,) standard
     deviation along the normal. ``inflation``: (K,) factor on the variance of each window because
     neighbours' noise is correlated. ``confidence``: Half width of the confidence intervals in

@@ -413,7 +413,7 @@ class Residuals:
         return whole, side
 
     def whitened(self, rows: IntArray, factor: FloatArray) -> FloatArray:
-        """(M, K) derivatives of some residuals by the errors of which a factor (P + 3, K) is one."""
+        """(M, K) derivatives of some residuals by the whitened errors of a factor (P + 3, K)."""
         combined = np.zeros((len(rows), factor.shape[1]))
         by_errors = np.ascontiguousarray(self.by_errors[rows])
         combine_rows(by_errors, self.sheet[rows], self.columns, factor, combined)
@@ -559,7 +559,8 @@ def left_out_scores(
     columns = residuals.columns
     factor = equations.factor(prior)[columns]
     # in units of what was known before, which all are near 1
-    unit = np.linalg.norm(prior.factor, axis=1)[columns]
+    unit = np.linalg.norm(prior.factor, axis=1)
+    unit = np.where(unit > 0.0, unit, 1.0)[columns]
     factor /= unit[:, :, None]
     covariance = (factor @ factor.transpose(0, 2, 1))[sheet]
     weight, unit = equations.weight / equations.sigma**2, unit[sheet]

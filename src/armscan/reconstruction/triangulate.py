@@ -280,7 +280,7 @@ def triangulate_stripe(
     sheets = _checked_sheets(profile, sheet_of_point, sensor)
     asked = np.flatnonzero(sheets >= 0)
     met = intersect_with_jacobian(profile.points_px[asked], sheets[asked], sensor)
-    noise = np.empty((len(asked), 3, 1))
+    noise = np.zeros((len(asked), 3, 1))
     across = (profile.normals_px * profile.sigma_px[:, None])[asked]
     np.einsum("nij,nj->ni", met.dpoint_dpx, across, out=noise[:, :, 0])
     noise.setflags(write=False)
@@ -321,8 +321,10 @@ def moved_by_shape(
     """
     moved = np.zeros((len(points_mm), 3))
     size = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
-    own = (np.ascontiguousarray(one, dtype=np.float64) for one in (points_mm, rays))
-    move_by_shape(*own, np.ascontiguousarray(sheet, np.int64), _numbers(sensor), size, moved)
+    at = np.ascontiguousarray(points_mm, dtype=np.float64)
+    along = np.ascontiguousarray(rays, dtype=np.float64)
+    own = np.ascontiguousarray(sheet, dtype=np.int64)
+    move_by_shape(at, along, own, _numbers(sensor), size, moved)
     return moved
 
 

@@ -59,7 +59,9 @@ def test_scores_are_those_of_solving_without_each_segment() -> None:
     scores = left_out_scores(residuals, prior, segment, is_used)
 
     whitened = np.zeros((len(segment), prior.factor.shape[1]))
-    for row, (sheet, by_errors) in enumerate(zip(residuals.sheet, residuals.by_errors, strict=True)):
+    for row, (sheet, by_errors) in enumerate(
+        zip(residuals.sheet, residuals.by_errors, strict=True)
+    ):
         whitened[row] = by_errors @ prior.factor[residuals.columns[sheet]]
     equations = epipolar._Equations.of(residuals, prior, is_used)
     wanted_all = -residuals.px

@@ -245,7 +245,11 @@ def test_volume() -> None:
 def test_propagation_in_one_pass_is_that_of_the_whole_product() -> None:
     """Some columns are zero for some points, as where one camera of two saw nothing."""
     rng = np.random.default_rng(5)
-    points, own, shape = rng.normal(size=(40, 3)), rng.normal(size=(40, 3, 2)), rng.normal(size=(40, 3))
+    points, own, shape = (
+        rng.normal(size=(40, 3)),
+        rng.normal(size=(40, 3, 2)),
+        rng.normal(size=(40, 3)),
+    )
     by_sensor = rng.normal(size=(40, 3, 11))
     by_sensor[::3, :, 4:9] = 0.0
     by_sensor[1::3, 0] = 0.0

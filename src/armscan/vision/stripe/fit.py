@@ -282,11 +282,9 @@ def fit_ridge(
     fit_profiles(
         plane.image, plane.clipped, ground, table, sigma, sides, noise, section, reach, values
     )
-    good: BoolArray | slice = values[:, VARIANCE] > 0.0
-    if np.all(good):
-        good = slice(None)
+    good = values[:, VARIANCE] > 0.0
     return ProfileFits(
-        ridge.select(values[:, VARIANCE] > 0.0),
+        ridge.select(good),
         values[good],
         sides[good],
         side_sigma[good],

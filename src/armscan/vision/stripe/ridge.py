@@ -111,9 +111,9 @@ def chain_bounds(chain: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def sum_along(values: FloatArray, chain: IntArray, half: int) -> FloatArray:
-    """Sums (M, N) or (N,) of values over the neighbours within ``half`` places on the same chain."""
+    """Sums, (M, N) or (N,), over the neighbours within ``half`` places on the same chain."""
     rows = np.ascontiguousarray(np.atleast_2d(values), dtype=np.float64)
-    sums = np.empty(rows.shape)
+    sums = np.zeros(rows.shape)
     sum_windows(rows, chain, half, sums)
     return sums.reshape(np.shape(values))
 
@@ -200,9 +200,7 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     return points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
 
 
-def _at_scale(
-    image: FloatImage, sample: FloatArray, scale_px: float
-) -> tuple[FloatArray, float]:
+def _at_scale(image: FloatImage, sample: FloatArray, scale_px: float) -> tuple[FloatArray, float]:
     """(N, 6) ridge points of candidates at a scale, and how strong they are."""
     points = np.zeros((len(sample), 6))
     n = refine_candidates(image, sample, len(sample), gaussian_taps(scale_px), 0.0, points)

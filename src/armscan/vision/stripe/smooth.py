@@ -97,7 +97,7 @@ class Neighbourhoods:
         self._laid[NORMAL_X : NORMAL_Y + 1, self._own] = course.normals.T
         self._laid[CHAIN, self._own] = course.chain
         self._laid[WEIGHT, self._own] = course.weight
-        self._moments = np.empty(n_blocks * LANES * len(windows_px) * MOMENTS)
+        self._moments = np.zeros(n_blocks * LANES * len(windows_px) * MOMENTS)
         gather_moments(self._laid, windows_px, np.ones(n_blocks, np.int64), self._moments)
 
     def leave_out(self, rows: IntArray) -> None:
@@ -117,7 +117,7 @@ class Neighbourhoods:
         ``inflation``: (K,). ``sigma``: (N,) of the points. ``scale``: Their variance over that by
         which the neighbours were weighted.
         """
-        result = np.empty((SMOOTH_ROWS, len(sigma)))
+        result = np.zeros((SMOOTH_ROWS, len(sigma)))
         given = (self._laid, self._moments, scale, sigma, self._windows, inflation)
         choose_windows(*given, CONFIDENCE, result)
         return result

@@ -90,24 +90,8 @@ def exponential(x: float) -> float:
     return float(power2048 * power2048)
 
 
-(
-    IN_CENTRE,
-    IN_AMPLITUDE,
-    IN_SIGMA,
-    THIRD,
-    FOURTH,
-    PLACE,
-    STEP,
-    BELL,
-    RATIO,
-    CHANGE,
-    IS_OPEN,
-    IS_DONE,
-    START,
-    START_SIGMA,
-    SPREAD,
-    SUMS,
-) = range(16)
+IN_CENTRE, IN_AMPLITUDE, IN_SIGMA, THIRD, FOURTH, PLACE, STEP, BELL, RATIO = range(9)
+CHANGE, IS_OPEN, IS_DONE, START, START_SIGMA, SUMS = range(9, 15)
 N_SUMS = 13
 """Normal matrix of (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side,
 then the residual against the skew term, the skew term's norm, its product with the centre's
@@ -143,7 +127,7 @@ def accumulate(pixel: Floats, noise: Floats, lanes: FloatsOut) -> None:
     What is seen of it is that times the ground's reflectance.
 
     ``pixel``: (4 `LANES`,) grey level less background, background, 1 where the pixel counts, and
-    reflectance. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``lanes``: (29 `LANES`,).
+    reflectance. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``lanes``: (28 `LANES`,).
     """
     square, linear, constant = noise[0], noise[1], noise[2]
     for k in range(LANES):
@@ -395,7 +379,7 @@ def fit_profiles(
             pixels = np.zeros(capacity * PROFILE_ROWS * LANES)
         lanes[:] = 0.0
         lanes[IN_SIGMA * LANES : THIRD * LANES] = 1.0
-        lanes[START_SIGMA * LANES : SPREAD * LANES] = 1.0
+        lanes[START_SIGMA * LANES : SUMS * LANES] = 1.0
         for k in range(n_lanes):
             i = block + k
             read_profile(

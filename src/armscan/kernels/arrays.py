@@ -30,7 +30,9 @@ Floats: TypeAlias = NDArray[np.float64]
 IntTable: TypeAlias = NDArray[np.int64]
 Ints: TypeAlias = NDArray[np.int64]
 ImageOut: TypeAlias = NDArray[np.float32]
+Row: TypeAlias = NDArray[np.float32]
 RowOut: TypeAlias = NDArray[np.float32]
+BytesOut: TypeAlias = NDArray[np.uint8]
 MapOut: TypeAlias = NDArray[np.int32]
 TableOut: TypeAlias = NDArray[np.float64]
 FloatsOut: TypeAlias = NDArray[np.float64]
@@ -46,7 +48,9 @@ _TYPES: dict[str, Any] = {
     "IntTable": types.Array(types.int64, 2, "C", readonly=True),
     "Ints": types.Array(types.int64, 1, "C", readonly=True),
     "ImageOut": types.Array(types.float32, 2, "C"),
+    "Row": types.Array(types.float32, 1, "C", readonly=True),
     "RowOut": types.Array(types.float32, 1, "C"),
+    "BytesOut": types.Array(types.uint8, 1, "C"),
     "MapOut": types.Array(types.int32, 2, "C"),
     "TableOut": types.Array(types.float64, 2, "C"),
     "FloatsOut": types.Array(types.float64, 1, "C"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chains of ridge points: links, distance to other lines, likeliest sheets, smoothing."""
+"""Chains of ridge points: links, distance to other lines, likeliest sheets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from armscan.kernels.arrays import (
     COLUMN,
     ROW,
     Floats,
-    FloatsOut,
     Ints,
     IntsOut,
     MapOut,
@@ -256,164 +255,23 @@ def best_states(scores: Table, change_cost: Floats, state: IntsOut) -> None:
         last = before[i, last]
 
 
-SHIFT, SLOPE, BEND, BEND_SIGMA, SMOOTH_SIGMA, WINDOW, PREDICTED, PREDICTED_SIGMA = range(8)
-SMOOTH_COLUMNS = 8
-"""Columns of a smoothing result."""
-LEAST_POINTS = 5
-MOST_TURNED_COSINE = 0.6
-COUNT = 8
-"""Place of the count of points among the moments."""
-
-
 @compiled()
-def solve_quadratic(moments: Floats, solved: FloatsOut) -> bool:
-    """Fit a weighted parabola; False if it is not determined.
+def sum_windows(values: Table, chain: Ints, half: int, sums: TableOut) -> None:
+    """Sums over the neighbours within ``half`` places on the same chain.
 
-    ``moments``: (9,) sums of w, w s, w s^2, w s^3, w s^4, w d, w s d, w s^2 d, and the count of
-    points. ``solved``: (5,) output: value, slope and second derivative at 0, then the variances of
-    the value and of the second derivative.
+    ``values``: (M, N). ``chain``: (N,) numbers; a chain's points are consecutive. ``sums``: (M, N)
+    output.
     """
-    s0, s1, s2, s3, s4 = moments[0], moments[1], moments[2], moments[3], moments[4]
-    c00 = s2 * s4 - s3 * s3
-    c01 = s2 * s3 - s1 * s4
-    c02 = s1 * s3 - s2 * s2
-    determinant = s0 * c00 + s1 * c01 + s2 * c02
-    if not determinant > 1e-9 * s0 * s2 * s4:
-        return False
-    c11 = s0 * s4 - s2 * s2
-    c12 = s1 * s2 - s0 * s3
-    share = 1.0 / determinant
-    c22 = s0 * s2 - s1 * s1
-    solved[0] = (c00 * moments[5] + c01 * moments[6] + c02 * moments[7]) * share
-    solved[1] = (c01 * moments[5] + c11 * moments[6] + c12 * moments[7]) * share
-    solved[2] = 2.0 * (c02 * moments[5] + c12 * moments[6] + c22 * moments[7]) * share
-    solved[3] = c00 * share
-    solved[4] = 4.0 * c22 * share
-    return True
-
-
-@compiled()
-def gather(
-    points: Table,
-    normals: Table,
-    weight: Floats,
-    chain: Ints,
-    i: int,
-    j: int,
-    direction: int,
-    reach: float,
-    moments: FloatsOut,
-) -> int:
-    """Add the neighbours of point ``i`` from place ``j`` on to the moments; return where it ended.
-
-    Neighbours are taken in the tangent frame of point ``i`` while they lie on its chain, within
-    ``reach`` along the tangent and not turned by more than about 50 degrees.
-    """
-    nx = normals[i, 0]
-    ny = normals[i, 1]
-    m0 = m1 = m2 = m3 = m4 = d0 = d1 = d2 = count = 0.0
-    while 0 <= j < points.shape[0] and chain[j] == chain[i]:
-        dx = points[j, 0] - points[i, 0]
-        dy = points[j, 1] - points[i, 1]
-        s = dy * nx - dx * ny
-        if abs(s) > reach or abs(normals[j, 0] * nx + normals[j, 1] * ny) < MOST_TURNED_COSINE:
-            break
-        w = weight[j]
-        if w > 0.0:
-            d = dx * nx + dy * ny
-            ws = w * s
-            wss = ws * s
-            m0 += w
-            m1 += ws
-            m2 += wss
-            m3 += wss * s
-            m4 += wss * s * s
-            d0 += w * d
-            d1 += ws * d
-            d2 += wss * d
-            count += 1.0
-        j += direction
-    moments[0] += m0
-    moments[1] += m1
-    moments[2] += m2
-    moments[3] += m3
-    moments[4] += m4
-    moments[5] += d0
-    moments[6] += d1
-    moments[7] += d2
-    moments[COUNT] += count
-    return j
-
-
-@compiled()
-def smooth_chains(
-    points: Table,
-    normals: Table,
-    sigma_px: Floats,
-    weight: Floats,
-    chain: Ints,
-    windows_px: Floats,
-    inflation: Floats,
-    confidence: float,
-    result: TableOut,
-) -> None:
-    """Smooth every point along its chain by a local quadratic in its own tangent frame.
-
-    Windows grow while their estimates agree within the noise (intersection of confidence
-    intervals): a bend stops the growth before its bias exceeds the noise.
-
-    ``points``, ``normals``: (N, 2) centres and unit normals, ordered along the chains.
-    ``sigma_px``: (N,) standard deviation along the normal. ``weight``: (N,) its inverse square, or
-    0 for points that must not pull their neighbours. ``chain``: (N,) chain number of each point; a
-    chain is consecutive. ``windows_px``: (K,) half widths along the tangent, increasing.
-    ``inflation``: (K,) factor on
-    the variance of each window because neighbours' noise is correlated. ``confidence``: Half width
-    of the confidence intervals in sigmas. ``result``: (N, 8) output: shift along the normal, slope
-    of the line against the tangent, its second derivative (curvature) and that one's sigma, sigma
-    of the shift, half window (0: not smoothed), prediction of the point's shift by its neighbours
-    alone, and that prediction's sigma (0: there is none).
-    """
-    n = points.shape[0]
-    moments = np.zeros(9)
-    others = np.zeros(9)
-    solved = np.zeros(5)
-    for i in range(n):
-        moments[:] = 0.0
-        if weight[i] > 0.0:
-            moments[0] = weight[i]
-            moments[COUNT] = 1.0
-        for k in range(result.shape[1]):
-            result[i, k] = 0.0
-        result[i, SMOOTH_SIGMA] = sigma_px[i]
-        lower = -1e9
-        upper = 1e9
-        inflated = 1.0
-        down = i - 1
-        up = i + 1
-        for k in range(windows_px.shape[0]):
-            reach = windows_px[k]
-            down = gather(points, normals, weight, chain, i, down, -1, reach, moments)
-            up = gather(points, normals, weight, chain, i, up, 1, reach, moments)
-            if moments[COUNT] < LEAST_POINTS:
-                continue
-            if not solve_quadratic(moments, solved):
-                continue
-            value = solved[0]
-            sigma = math.sqrt(solved[3] * inflation[k])
-            lower = max(lower, value - confidence * sigma)
-            upper = min(upper, value + confidence * sigma)
-            if lower > upper:
-                break
-            result[i, SHIFT] = value
-            result[i, SLOPE] = solved[1]
-            result[i, BEND] = solved[2]
-            result[i, BEND_SIGMA] = math.sqrt(solved[4] * inflation[k])
-            result[i, SMOOTH_SIGMA] = sigma
-            result[i, WINDOW] = reach
-            inflated = inflation[k]
-            others[:] = moments
-        if result[i, WINDOW] > 0.0:
-            others[0] -= weight[i]
-            if solve_quadratic(others, solved):
-                result[i, PREDICTED] = solved[0]
-                result[i, PREDICTED_SIGMA] = math.sqrt(solved[3] * inflated)
+    m, n = values.shape
+    running = np.zeros(n + 1)
+    for row in range(m):
+        first = 0
+        while first < n:
+            stop = first
+            running[first] = 0.0
+            while stop < n and chain[stop] == chain[first]:
+                running[stop + 1] = running[stop] + values[row, stop]
+                stop += 1
+            for i in range(first, stop):
+                sums[row, i] = running[min(i + half + 1, stop)] - running[max(i - half, first)]
+            first = stop

@@ -64,103 +64,162 @@ def read_sides(image: Image, points: Table, sigma_px: Floats, sides: TableOut) -
             sides[i, 2 * side + 1] = n
 
 
+LANES = 16
+"""Points that are fitted together, so that the loops over them are vectorised."""
+EXPONENT_HALVINGS = 12
+
+
 @compiled()
-def start_amplitude(profile: Table, n: int, offset: float, sigma: float) -> float:
-    """Unweighted height of a Gaussian ``offset`` pixels from the profile's first pixel."""
-    top = norm = 0.0
-    for k in range(n):
-        u = (k - offset) / sigma
-        g = math.exp(-0.5 * u * u) * profile[2, k] * profile[3, k]
-        top += g * profile[0, k]
-        norm += g * g
-    return top / norm if norm > 0.0 else 0.0
+def exponential(x: float) -> float:
+    """``exp(x)`` to 1e-12 of itself for -700 < x < 100: a series, squared, which is vectorised."""
+    y = x / 2**EXPONENT_HALVINGS
+    series = 1.0 + y / 8.0 * (1.0 + y / 9.0 * (1.0 + y / 10.0))
+    series = 1.0 + y / 5.0 * (1.0 + y / 6.0 * (1.0 + y / 7.0 * series))
+    series = 1.0 + y * (1.0 + y / 2.0 * (1.0 + y / 3.0 * (1.0 + y / 4.0 * series)))
+    power2 = series * series
+    power4 = power2 * power2
+    power8 = power4 * power4
+    power16 = power8 * power8
+    power32 = power16 * power16
+    power64 = power32 * power32
+    power128 = power64 * power64
+    power256 = power128 * power128
+    power512 = power256 * power256
+    power1024 = power512 * power512
+    power2048 = power1024 * power1024
+    return float(power2048 * power2048)
 
 
-@compiled(error_model="numpy")
-def accumulate(
-    profile: Table,
-    n: int,
-    state: Floats,
-    section: Floats,
-    noise: Floats,
-    sums: FloatsOut,
-) -> None:
-    """Weighted sums of one Gauss-Newton step.
+IN_CENTRE, IN_AMPLITUDE, IN_SIGMA, THIRD, FOURTH, PLACE, STEP, BELL, RATIO = range(9)
+CHANGE, IS_OPEN, IS_DONE, START, START_SIGMA, SUMS = range(9, 15)
+N_SUMS = 13
+"""Normal matrix of (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side,
+then the residual against the skew term, the skew term's norm, its product with the centre's
+derivative, and the same product for a term ``u^3``."""
+LANE_ROWS = SUMS + N_SUMS
+LEVEL, GROUND_LEVEL, COUNTS, REFLECTANCE = range(4)
+PROFILE_ROWS = 4
+"""Of each pixel: grey level less background, background, 1 where it counts, and reflectance."""
+
+
+@compiled(fastmath=True, error_model="numpy")
+def begin_sums(lanes: FloatsOut) -> None:
+    """Make the lanes ready for the first pixel of another step."""
+    for k in range(LANES):
+        step = 1.0 / lanes[IN_SIGMA * LANES + k]
+        u = (-1.0 - lanes[IN_CENTRE * LANES + k]) * step
+        lanes[STEP * LANES + k] = step
+        lanes[PLACE * LANES + k] = u
+        bell = exponential(-0.5 * u * u)
+        lanes[BELL * LANES + k] = lanes[IN_AMPLITUDE * LANES + k] * bell
+        # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
+        lanes[RATIO * LANES + k] = exponential(-(u + 0.5 * step) * step)
+        lanes[CHANGE * LANES + k] = exponential(-step * step)
+    lanes[SUMS * LANES :] = 0.0
+
+
+@compiled(fastmath=True, error_model="numpy")
+def accumulate(pixel: Floats, noise: Floats, lanes: FloatsOut) -> None:
+    """Add one pixel of each lane to the weighted sums of a Gauss-Newton step.
 
     The line is ``A exp(-u^2 / 2) (1 + c3 (u^3 - 3 u) + c4 (u^4 - 6 u^2 + 3))`` with ``u`` the
     distance from the centre over sigma: a Gram-Charlier series, whose centre of gravity is u = 0.
     What is seen of it is that times the ground's reflectance.
 
-    ``profile``: (4, >= n) grey level less background, background, 1 where the pixel counts, and
-    reflectance.
-    ``n``: Pixels of the profile. ``state``: (3,) centre from the first pixel, amplitude, sigma.
-    ``section``: (2,) ``c3, c4``.
-    ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``sums``: (13,) output: normal matrix of
-    (centre, log amplitude, log sigma) as 00 01 02 11 12 22, its right-hand side, then the residual
-    against the skew term, the skew term's norm, its product with the centre's derivative, and the
-    same product for a term ``u^3``.
+    ``pixel``: (4 `LANES`,) grey level less background, background, 1 where the pixel counts, and
+    reflectance. ``noise``: (3,) ``C^2``, ``1 / gain``, ``read^2``. ``lanes``: (28 `LANES`,).
     """
-    # sums in an array would wait for memory at every pixel
-    a00 = a01 = a02 = a11 = a12 = a22 = b0 = b1 = b2 = 0.0
-    skew = skew_norm = skew_centre = cubic = 0.0
-    # m(k + 1) = m(k) ratio(k) and ratio(k + 1) = ratio(k) change: no exponential per pixel
-    step = 1.0 / state[2]
-    u = (-1.0 - state[0]) * step
-    bell = state[1] * math.exp(-0.5 * u * u)
-    c3, c4 = section[0], section[1]
-    ratio = math.exp(-(u + 0.5 * step) * step)
-    change = math.exp(-step * step)
-    for k in range(n):
-        u += step
-        bell *= ratio
-        ratio *= change
-        third = u * (u * u - 3.0)
-        shape = 1.0 + c3 * third + c4 * (u * u * (u * u - 6.0) + 3.0)
-        seen = bell * profile[3, k]
+    square, linear, constant = noise[0], noise[1], noise[2]
+    for k in range(LANES):
+        step = lanes[STEP * LANES + k]
+        u = lanes[PLACE * LANES + k] + step
+        bell = lanes[BELL * LANES + k] * lanes[RATIO * LANES + k]
+        lanes[PLACE * LANES + k] = u
+        lanes[BELL * LANES + k] = bell
+        lanes[RATIO * LANES + k] *= lanes[CHANGE * LANES + k]
+        c3 = lanes[THIRD * LANES + k]
+        c4 = lanes[FOURTH * LANES + k]
+        uu = u * u
+        third = u * (uu - 3.0)
+        shape = 1.0 + c3 * third + c4 * (uu * (uu - 6.0) + 3.0)
+        seen = bell * pixel[REFLECTANCE * LANES + k]
         m = seen * max(shape, 0.0)
-        falling = seen * (u * shape - 3.0 * c3 * (u * u - 1.0) - 4.0 * c4 * third)
-        variance = noise[0] * m * m + noise[1] * max(m + profile[1, k], 0.0) + noise[2]
-        w = profile[2, k] / variance
-        r = profile[0, k] - m
+        falling = seen * (u * shape - 3.0 * c3 * (uu - 1.0) - 4.0 * c4 * third)
+        light = max(m + pixel[GROUND_LEVEL * LANES + k], 0.0)
+        w = pixel[COUNTS * LANES + k] / (square * m * m + linear * light + constant)
+        r = pixel[LEVEL * LANES + k] - m
         j0 = falling * step
         j2 = falling * u
         q = seen * third
-        a00 += w * j0 * j0
-        a01 += w * j0 * m
-        a02 += w * j0 * j2
-        a11 += w * m * m
-        a12 += w * m * j2
-        a22 += w * j2 * j2
-        b0 += w * r * j0
-        b1 += w * r * m
-        b2 += w * r * j2
-        skew += w * r * q
-        skew_norm += w * q * q
-        skew_centre += w * q * j0
-        cubic += w * j0 * seen * u * u * u
-    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = a00, a01, a02, a11, a12, a22
-    sums[6], sums[7], sums[8] = b0, b1, b2
-    sums[9], sums[10], sums[11], sums[12] = skew, skew_norm, skew_centre, cubic
+        w0 = w * j0
+        w1 = w * m
+        w2 = w * j2
+        wq = w * q
+        lanes[SUMS * LANES + k] += w0 * j0
+        lanes[(SUMS + 1) * LANES + k] += w0 * m
+        lanes[(SUMS + 2) * LANES + k] += w0 * j2
+        lanes[(SUMS + 3) * LANES + k] += w1 * m
+        lanes[(SUMS + 4) * LANES + k] += w1 * j2
+        lanes[(SUMS + 5) * LANES + k] += w2 * j2
+        lanes[(SUMS + 6) * LANES + k] += w0 * r
+        lanes[(SUMS + 7) * LANES + k] += w1 * r
+        lanes[(SUMS + 8) * LANES + k] += w2 * r
+        lanes[(SUMS + 9) * LANES + k] += wq * r
+        lanes[(SUMS + 10) * LANES + k] += wq * q
+        lanes[(SUMS + 11) * LANES + k] += w0 * q
+        lanes[(SUMS + 12) * LANES + k] += w0 * seen * uu * u
 
 
-@compiled()
-def solve_step(sums: Floats, steps: FloatsOut) -> float:
-    """Solve the normal equations into ``steps`` (3,); return the centre's variance, or 0."""
-    h00, h01, h02, h11, h12, h22 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    b0, b1, b2 = sums[6], sums[7], sums[8]
-    c00 = h11 * h22 - h12 * h12
-    c01 = h02 * h12 - h01 * h22
-    c02 = h01 * h12 - h02 * h11
-    determinant = h00 * c00 + h01 * c01 + h02 * c02
-    if not determinant > 0.0:
-        return 0.0
-    c11 = h00 * h22 - h02 * h02
-    c12 = h01 * h02 - h00 * h12
-    c22 = h00 * h11 - h01 * h01
-    steps[0] = (c00 * b0 + c01 * b1 + c02 * b2) / determinant
-    steps[1] = (c01 * b0 + c11 * b1 + c12 * b2) / determinant
-    steps[2] = (c02 * b0 + c12 * b1 + c22 * b2) / determinant
-    return float(c00 / determinant)
+@compiled(fastmath=True, error_model="numpy")
+def take_steps(is_last: bool, lanes: FloatsOut, variance: FloatsOut) -> int:
+    """Solve the normal equations of the open lanes and move those that are not done.
+
+    ``variance``: (`LANES`,) output: the centre's, of lanes that end here; 0 of those that fail or
+    go on. Returns count of lanes that go on.
+    """
+    go_on = 0
+    for k in range(LANES):
+        h00 = lanes[SUMS * LANES + k]
+        h01 = lanes[(SUMS + 1) * LANES + k]
+        h02 = lanes[(SUMS + 2) * LANES + k]
+        h11 = lanes[(SUMS + 3) * LANES + k]
+        h12 = lanes[(SUMS + 4) * LANES + k]
+        h22 = lanes[(SUMS + 5) * LANES + k]
+        b0 = lanes[(SUMS + 6) * LANES + k]
+        b1 = lanes[(SUMS + 7) * LANES + k]
+        b2 = lanes[(SUMS + 8) * LANES + k]
+        c00 = h11 * h22 - h12 * h12
+        c01 = h02 * h12 - h01 * h22
+        c02 = h01 * h12 - h02 * h11
+        determinant = h00 * c00 + h01 * c01 + h02 * c02
+        c11 = h00 * h22 - h02 * h02
+        c12 = h01 * h02 - h00 * h12
+        c22 = h00 * h11 - h01 * h01
+        is_sound = (lanes[IS_OPEN * LANES + k] > 0.0) & (determinant > 0.0) & (c00 > 0.0)
+        share = 1.0 / (determinant if is_sound else 1.0)
+        step0 = (c00 * b0 + c01 * b1 + c02 * b2) * share
+        step1 = (c01 * b0 + c11 * b1 + c12 * b2) * share
+        step2 = (c02 * b0 + c12 * b1 + c22 * b2) * share
+        sigma = lanes[IN_SIGMA * LANES + k]
+        is_end = is_sound & (is_last | (lanes[IS_DONE * LANES + k] > 0.0))
+        variance[k] = c00 * share if is_end else 0.0
+        is_small = (abs(step0) < 2e-3 * sigma) & (abs(step2) < 0.02)
+        lanes[IS_DONE * LANES + k] = 1.0 if is_small else 0.0
+        half = 0.5 * sigma
+        centre = lanes[IN_CENTRE * LANES + k] + min(max(step0, -half), half)
+        own = lanes[START_SIGMA * LANES + k]
+        wider = sigma * exponential(min(max(step2, -0.25), 0.25))
+        is_near = abs(centre - lanes[START * LANES + k]) < 2.0 * own + 1.0
+        is_near &= (wider > 0.4 * own) & (wider < 2.5 * own + 0.5)
+        is_moved = is_sound & is_near & (not is_end)
+        amplitude = lanes[IN_AMPLITUDE * LANES + k]
+        higher = amplitude * exponential(min(max(step1, -0.5), 0.5))
+        lanes[IN_CENTRE * LANES + k] = centre if is_moved else lanes[IN_CENTRE * LANES + k]
+        lanes[IN_AMPLITUDE * LANES + k] = higher if is_moved else amplitude
+        lanes[IN_SIGMA * LANES + k] = wider if is_moved else sigma
+        lanes[IS_OPEN * LANES + k] = 1.0 if is_moved else 0.0
+        go_on += 1 if is_moved else 0
+    return go_on
 
 
 @compiled()
@@ -201,6 +260,62 @@ def read_profile(
 
 
 @compiled(error_model="numpy")
+def take_lane(
+    profile: Table, n: int, start: float, sigma: float, capacity: int, pixels: FloatsOut
+) -> float:
+    """Copy a profile into a lane; unweighted height of a Gaussian at ``start``.
+
+    ``profile``: (4, >= n) of `read_profile`. ``pixels``: (4 `LANES` `capacity`,) from the lane on,
+    output: by pixel and row; those from ``n`` to ``capacity`` do not count.
+    """
+    top = norm = 0.0
+    step = 1.0 / sigma
+    u = (-1.0 - start) * step
+    bell = math.exp(-0.5 * u * u)
+    ratio = math.exp(-(u + 0.5 * step) * step)
+    change = math.exp(-step * step)
+    for k in range(n):
+        at = k * PROFILE_ROWS * LANES
+        for row in range(PROFILE_ROWS):
+            pixels[at + row * LANES] = profile[row, k]
+        bell *= ratio
+        ratio *= change
+        g = bell * profile[COUNTS, k] * profile[REFLECTANCE, k]
+        top += g * profile[LEVEL, k]
+        norm += g * g
+    for k in range(n, capacity):
+        at = k * PROFILE_ROWS * LANES
+        for row in range(PROFILE_ROWS):
+            pixels[at + row * LANES] = 0.0
+    return top / norm if norm > 0.0 else 0.0
+
+
+@compiled()
+def count_clipped(clipped: Mask, point: Floats, first: int, last: int) -> int:
+    """Clipped pixels from ``first`` to ``last`` of a point's column or row."""
+    is_column = int(point[5]) == COLUMN
+    line = int(point[0] if is_column else point[1])
+    count = 0
+    for k in range(first, last + 1):
+        count += int(clipped[k, line] if is_column else clipped[line, k])
+    return count
+
+
+@compiled()
+def keep_lane(lanes: Floats, k: int, first: int, variance: float, result: FloatsOut) -> None:
+    """Write one lane's fit as a row of `fit_profiles`."""
+    sums = lanes[SUMS * LANES + k :: LANES]
+    sigma = lanes[IN_SIGMA * LANES + k]
+    result[CENTRE] = first + lanes[IN_CENTRE * LANES + k]
+    result[AMPLITUDE] = lanes[IN_AMPLITUDE * LANES + k]
+    result[SIGMA] = sigma
+    result[VARIANCE] = variance
+    result[SKEW] = sums[9] - sums[11] / sums[0] * sums[6]
+    result[SKEW_NORM] = max(sums[10] - sums[11] * sums[11] / sums[0], 0.0)
+    result[BEND_GAIN] = sums[12] / (sums[0] * sigma)
+
+
+@compiled(error_model="numpy")
 def fit_profiles(
     image: Image,
     clipped: Mask,
@@ -233,67 +348,76 @@ def fit_profiles(
     centre, in sigmas (for the correction on bent lines).
     """
     height, width = image.shape
-    profile = np.zeros((4, max(height, width)))
-    state = np.zeros(3)
-    steps = np.zeros(3)
-    sums = np.zeros(13)
-    shape = np.zeros(2)
     has_clipped = clipped.shape[0] == height and clipped.shape[1] == width
-    for i in range(points.shape[0]):
-        is_column = int(points[i, 5]) == COLUMN
-        shape[0] = section[0] if is_column else section[2]
-        shape[1] = section[1] if is_column else section[3]
-        start = points[i, 1] if is_column else points[i, 0]
-        line = int(points[i, 0] if is_column else points[i, 1])
-        size = height if is_column else width
-        half = max(reach[i] * sigma_px[i], 2.0)
-        first = max(math.ceil(start - half), 0)
-        last = min(math.floor(start + half), size - 1)
-        n_clipped = 0
-        if has_clipped:
-            for k in range(first, last + 1):
-                n_clipped += clipped[k, line] if is_column else clipped[line, k]
-            grow = (n_clipped + 1) // 2
-            first = max(first - grow, 0)
-            last = min(last + grow, size - 1)
-        n = last - first + 1
-        read_profile(
-            image, clipped, reflectance, points[i], sides[i], sigma_px[i], first, n, profile
-        )
-        if result[i, VARIANCE] > 0.0:
-            state[0] = result[i, CENTRE] - first
-            state[1] = result[i, AMPLITUDE]
-            state[2] = result[i, SIGMA]
-        else:
-            state[0] = start - first
-            state[1] = start_amplitude(profile, n, state[0], sigma_px[i])
-            state[2] = sigma_px[i]
-        result[i, VARIANCE] = 0.0
-        result[i, CLIPPED] = n_clipped
-        if state[1] <= 0.0 or n - n_clipped < LEAST_PIXELS:
-            continue
-        is_done = False
+    profile = np.zeros((PROFILE_ROWS, max(height, width)))
+    pixels = np.zeros(0)
+    lanes = np.zeros(LANE_ROWS * LANES)
+    variance = np.zeros(LANES)
+    first = np.zeros(LANES, np.int64)
+    count = np.zeros(LANES, np.int64)
+    for block in range(0, points.shape[0], LANES):
+        n_lanes = min(LANES, points.shape[0] - block)
+        capacity = 0
+        for k in range(n_lanes):
+            i = block + k
+            is_column = int(points[i, 5]) == COLUMN
+            start = points[i, 1] if is_column else points[i, 0]
+            last = (height if is_column else width) - 1
+            half = max(reach[i] * sigma_px[i], 2.0)
+            first[k] = max(math.ceil(start - half), 0)
+            stop = min(math.floor(start + half), last)
+            result[i, CLIPPED] = 0.0
+            if has_clipped:
+                n_clipped = count_clipped(clipped, points[i], first[k], stop)
+                grow = (n_clipped + 1) // 2
+                first[k] = max(first[k] - grow, 0)
+                stop = min(stop + grow, last)
+                result[i, CLIPPED] = n_clipped
+            count[k] = stop - first[k] + 1
+            capacity = max(capacity, count[k])
+        if pixels.shape[0] < capacity * PROFILE_ROWS * LANES:
+            pixels = np.zeros(capacity * PROFILE_ROWS * LANES)
+        lanes[:] = 0.0
+        lanes[IN_SIGMA * LANES : THIRD * LANES] = 1.0
+        lanes[START_SIGMA * LANES : SUMS * LANES] = 1.0
+        for k in range(n_lanes):
+            i = block + k
+            read_profile(
+                image,
+                clipped,
+                reflectance,
+                points[i],
+                sides[i],
+                sigma_px[i],
+                first[k],
+                count[k],
+                profile,
+            )
+            is_column = int(points[i, 5]) == COLUMN
+            start = (points[i, 1] if is_column else points[i, 0]) - first[k]
+            amplitude = take_lane(profile, count[k], start, sigma_px[i], capacity, pixels[k:])
+            is_begun = result[i, VARIANCE] > 0.0
+            lanes[IN_CENTRE * LANES + k] = result[i, CENTRE] - first[k] if is_begun else start
+            lanes[IN_AMPLITUDE * LANES + k] = result[i, AMPLITUDE] if is_begun else amplitude
+            lanes[IN_SIGMA * LANES + k] = result[i, SIGMA] if is_begun else sigma_px[i]
+            lanes[THIRD * LANES + k] = section[0] if is_column else section[2]
+            lanes[FOURTH * LANES + k] = section[1] if is_column else section[3]
+            lanes[START * LANES + k] = start
+            lanes[START_SIGMA * LANES + k] = sigma_px[i]
+            is_open = lanes[IN_AMPLITUDE * LANES + k] > 0.0
+            is_open &= count[k] - result[i, CLIPPED] >= LEAST_PIXELS
+            lanes[IS_OPEN * LANES + k] = 1.0 if is_open else 0.0
+            result[i, VARIANCE] = 0.0
         for round_ in range(ITERATIONS):
-            accumulate(profile, n, state, shape, noise, sums)
-            variance = solve_step(sums, steps)
-            if variance <= 0.0:
-                break
-            if is_done or round_ == ITERATIONS - 1:
-                result[i, CENTRE] = first + state[0]
-                result[i, AMPLITUDE] = state[1]
-                result[i, SIGMA] = state[2]
-                result[i, VARIANCE] = variance
-                result[i, SKEW] = sums[9] - sums[11] / sums[0] * sums[6]
-                result[i, SKEW_NORM] = max(sums[10] - sums[11] * sums[11] / sums[0], 0.0)
-                result[i, BEND_GAIN] = sums[12] / (sums[0] * state[2])
-                break
-            is_done = abs(steps[0]) < 2e-3 * state[2] and abs(steps[2]) < 0.02
-            state[0] += min(max(steps[0], -0.5 * state[2]), 0.5 * state[2])
-            state[1] *= math.exp(min(max(steps[1], -0.5), 0.5))
-            state[2] *= math.exp(min(max(steps[2], -0.25), 0.25))
-            drift = abs(first + state[0] - start)
-            is_near = drift < 2.0 * sigma_px[i] + 1.0
-            if not is_near or not 0.4 < state[2] / sigma_px[i] < 2.5 + 0.5 / sigma_px[i]:
+            begin_sums(lanes)
+            for at in range(capacity):
+                own = at * PROFILE_ROWS * LANES
+                accumulate(pixels[own : own + PROFILE_ROWS * LANES], noise, lanes)
+            go_on = take_steps(round_ == ITERATIONS - 1, lanes, variance)
+            for k in range(n_lanes):
+                if variance[k] > 0.0:
+                    keep_lane(lanes, k, first[k], variance[k], result[block + k])
+            if go_on == 0:
                 break
 
 

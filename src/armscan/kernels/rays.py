@@ -12,16 +12,19 @@ from armscan.kernels.arrays import (
     FloatsOut,
     Ints,
     IntsOut,
+    IntTable,
     Table,
     TableOut,
     compiled,
 )
 
 RAY_STEPS = 20
-RAY_TOLERANCE = 1e-9
+RAY_TOLERANCE = 1e-7
+"""Of a step; Newton's next one is its square."""
 SHEET_STEPS = 12
 SHEET_TOLERANCE_MM = 1e-6
-SETTLED_MM = 1e-9
+SETTLED_MM = 1e-7
+"""Of a step along the ray; Newton's next one is its square."""
 NEAREST_SOURCE = 0.2
 """As in the models of the camera and the light sheet."""
 
@@ -42,10 +45,15 @@ def _distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
 
 
 @compiled(error_model="numpy")
-def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
-    """Newton's inverse of `_distort`: x and y into ``out`` (7,) behind its five numbers."""
-    x = u
-    y = v
+def _undistort(
+    u: float, v: float, from_u: float, from_v: float, camera: Floats, out: FloatsOut
+) -> bool:
+    """Newton's inverse of `_distort`: x and y into ``out`` (7,) behind its five numbers.
+
+    It begins ``from_u``, ``from_v`` beside the distorted place.
+    """
+    x = u + from_u
+    y = v + from_v
     if not (math.isfinite(u) and math.isfinite(v)):
         return False
     for _ in range(RAY_STEPS):
@@ -158,6 +166,7 @@ def meet_sheets(
     by_camera = np.zeros((2, 9))
     has_ray = False
     is_differentiated = False
+    shift_u = shift_v = 0.0
     number = 0
     of_sheet = sheets[number]
     fx = camera[0]
@@ -168,7 +177,12 @@ def meet_sheets(
         if not is_same:
             u = (pixels[i, 0] - camera[2]) / fx
             v = (pixels[i, 1] - camera[3]) / fy
-            has_ray = _undistort(u, v, camera, lens)
+            # of its neighbour, which is nearly the pixel's own
+            has_ray = _undistort(u, v, shift_u, shift_v, camera, lens)
+            if not has_ray and (shift_u != 0.0 or shift_v != 0.0):
+                has_ray = _undistort(u, v, 0.0, 0.0, camera, lens)
+            shift_u = lens[5] - u if has_ray else 0.0
+            shift_v = lens[6] - v if has_ray else 0.0
             is_differentiated = False
         if not has_ray or sheet[i] < 0:
             continue
@@ -255,55 +269,205 @@ def sum_off_planes(
             sigma[b, key[i]] += math.sqrt(variance) * square
 
 
-@compiled(fastmath=True)
-def add_propagated(
-    by_sensor: Table, by_hand_eye: Table, factor: Table, turn: Table, rows: Ints, out: TableOut
+@compiled(error_model="numpy")
+def move_by_shape(
+    points: Table, rays: Table, sheet: Ints, sheets: Table, size_mm: Floats, moved: TableOut
 ) -> None:
-    """Add J F F' J' of the points of one sheet, J the derivatives by the sensor and the hand-eye.
+    """Move of points (N, 3) along their rays (N, 3) by a size (S,) across their sheets (N,).
 
-    ``by_sensor``: (N, 3 Q) in Sensor. ``by_hand_eye``: (N, 18) in Base. ``factor``: (Q + 6, K) F.
-    ``turn``: (3, 3) Base from Sensor. ``rows``: (M,) of the points. ``out``: (N, 9) covariances.
+    ``sheets``: As for `meet_sheets`. ``moved``: (N, 3) output.
     """
-    q = by_sensor.shape[1] // 3
+    surface = np.zeros(12)
+    for i in range(points.shape[0]):
+        _height(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
+        along = surface[1] * rays[i, 0] + surface[2] * rays[i, 1] + surface[3] * rays[i, 2]
+        share = size_mm[sheet[i]] / along if abs(along) > 0.0 else 0.0
+        for a in range(3):
+            moved[i, a] = rays[i, a] * share
+
+
+@compiled(fastmath=True)
+def spread_by_factor(point: Floats, by_sensor: Floats, factor: Table, moved: TableOut) -> None:
+    """Errors (3, K) of one point in Sensor by those of sensor and hand-eye.
+
+    ``point``: (3,). ``by_sensor``: (3 Q,) derivatives. ``factor``: (Q + 6, K): of the sensor, then
+    of the hand-eye's turn and shift in Sensor.
+    """
+    q = by_sensor.shape[0] // 3
     width = factor.shape[1]
-    moved = np.zeros((3, width))
-    turned = np.zeros((3, width))
+    first, second, third = moved[0], moved[1], moved[2]
+    x, y, z = point[0], point[1], point[2]
+    about_x, about_y, about_z = factor[q], factor[q + 1], factor[q + 2]
+    shift_x, shift_y, shift_z = factor[q + 3], factor[q + 4], factor[q + 5]
+    for k in range(width):
+        first[k] = about_y[k] * z - about_z[k] * y + shift_x[k]
+        second[k] = about_z[k] * x - about_x[k] * z + shift_y[k]
+        third[k] = about_x[k] * y - about_y[k] * x + shift_z[k]
+    for c in range(q):
+        x, y, z = by_sensor[c], by_sensor[q + c], by_sensor[2 * q + c]
+        # what one camera alone saw does not depend on the other
+        if x == 0.0 and y == 0.0 and z == 0.0:
+            continue
+        row = factor[c]
+        for k in range(width):
+            first[k] += x * row[k]
+            second[k] += y * row[k]
+            third[k] += z * row[k]
+
+
+@compiled(fastmath=True)
+def sum_products(moved: Table, products: FloatsOut) -> None:
+    """Add the products of rows (3, K) with each other: 00 01 02 11 12 22."""
+    first, second, third = moved[0], moved[1], moved[2]
+    xx = xy = xz = yy = yz = zz = 0.0
+    for k in range(first.shape[0]):
+        xx += first[k] * first[k]
+        xy += first[k] * second[k]
+        xz += first[k] * third[k]
+        yy += second[k] * second[k]
+        yz += second[k] * third[k]
+        zz += third[k] * third[k]
+    products[0] += xx
+    products[1] += xy
+    products[2] += xz
+    products[3] += yy
+    products[4] += yz
+    products[5] += zz
+
+
+@compiled()
+def propagate_points(
+    points: Table,
+    own: Table,
+    shape: Table,
+    by_sensor: Table,
+    factor: Table,
+    base_from_sensor: Table,
+    arm: Table,
+    rows: Ints,
+    placed: TableOut,
+    covariance: TableOut,
+) -> None:
+    """Points of one sheet in Base, with all of their covariance, in one pass.
+
+    The errors of sensor and hand-eye are carried as factors in Sensor, own noise is added, and the
+    sum is turned to Base, where the arm's is added.
+
+    ``points``, ``shape``: (N, 3) in Sensor, and their move by one sigma of the sheet's own shape.
+    ``own``: (N, 3 J) of each independent noise, by coordinate. ``by_sensor``: (N, 3 Q).
+    ``factor``: As for `spread_by_factor`. ``base_from_sensor``: (3, 4) turn and shift. ``arm``:
+    (3, 3) variances of its shift and turns, and the two points in Base about which it turns.
+    ``rows``: (M,) of the points. ``placed``: (N, 3), ``covariance``: (N, 9) output.
+    """
+    moved = np.zeros((3, factor.shape[1]))
+    sums = np.zeros(6)
+    inner = np.zeros((3, 3))
+    half = np.zeros((3, 3))
+    n_own = own.shape[1] // 3
+    turn = base_from_sensor
     for i in rows:
+        spread_by_factor(points[i], by_sensor[i], factor, moved)
+        for k in range(6):
+            sums[k] = 0.0
+        sum_products(moved, sums)
+        x, y, z = shape[i, 0], shape[i, 1], shape[i, 2]
+        for k in range(n_own + 1):
+            if k < n_own:
+                x, y, z = own[i, k], own[i, n_own + k], own[i, 2 * n_own + k]
+            else:
+                x, y, z = shape[i, 0], shape[i, 1], shape[i, 2]
+            sums[0] += x * x
+            sums[1] += x * y
+            sums[2] += x * z
+            sums[3] += y * y
+            sums[4] += y * z
+            sums[5] += z * z
+        inner[0, 0], inner[1, 1], inner[2, 2] = sums[0], sums[3], sums[5]
+        inner[0, 1] = inner[1, 0] = sums[1]
+        inner[0, 2] = inner[2, 0] = sums[2]
+        inner[1, 2] = inner[2, 1] = sums[4]
         for a in range(3):
-            for k in range(width):
-                moved[a, k] = 0.0
-        for c in range(q):
-            x = by_sensor[i, c]
-            y = by_sensor[i, q + c]
-            z = by_sensor[i, 2 * q + c]
-            # what one camera alone saw does not depend on the other
-            if x == 0.0 and y == 0.0 and z == 0.0:
-                continue
-            for k in range(width):
-                f = factor[c, k]
-                moved[0, k] += x * f
-                moved[1, k] += y * f
-                moved[2, k] += z * f
-        for a in range(3):
-            t0 = turn[a, 0]
-            t1 = turn[a, 1]
-            t2 = turn[a, 2]
-            for k in range(width):
-                turned[a, k] = t0 * moved[0, k] + t1 * moved[1, k] + t2 * moved[2, k]
-        for c in range(6):
-            x = by_hand_eye[i, c]
-            y = by_hand_eye[i, 6 + c]
-            z = by_hand_eye[i, 12 + c]
-            for k in range(width):
-                f = factor[q + c, k]
-                turned[0, k] += x * f
-                turned[1, k] += y * f
-                turned[2, k] += z * f
+            total = turn[a, 0] * points[i, 0] + turn[a, 1] * points[i, 1]
+            placed[i, a] = total + turn[a, 2] * points[i, 2] + turn[a, 3]
+            for b in range(3):
+                total = turn[a, 0] * inner[0, b] + turn[a, 1] * inner[1, b]
+                half[a, b] = total + turn[a, 2] * inner[2, b]
         for a in range(3):
             for b in range(a + 1):
-                total = 0.0
-                for k in range(width):
-                    total += turned[a, k] * turned[b, k]
-                out[i, 3 * a + b] += total
-                if a != b:
-                    out[i, 3 * b + a] += total
+                total = half[a, 0] * turn[b, 0] + half[a, 1] * turn[b, 1] + half[a, 2] * turn[b, 2]
+                if a == b:
+                    total += arm[0, 0]
+                for about in range(1, 3):
+                    lever_a = placed[i, a] - arm[about, a]
+                    lever_b = placed[i, b] - arm[about, b]
+                    total -= arm[0, about] * lever_a * lever_b
+                    if a == b:
+                        for c in range(3):
+                            total += arm[0, about] * (placed[i, c] - arm[about, c]) ** 2
+                covariance[i, 3 * a + b] = total
+                covariance[i, 3 * b + a] = total
+
+
+@compiled(fastmath=True)
+def add_equations(
+    rows: Table, group: Ints, weight: Floats, wanted: Floats, matrix: TableOut, vector: TableOut
+) -> None:
+    """Add rows of equations to the normal equations of their groups.
+
+    ``rows``: (H, Q) derivatives. ``group``: (H,). ``weight``: (H,). ``wanted``: (H,) right-hand
+    side. ``matrix``: (G, Q Q) sums of weighted products. ``vector``: (G, Q) of each with what is
+    wanted.
+    """
+    q = rows.shape[1]
+    for i in range(rows.shape[0]):
+        if weight[i] == 0.0:
+            continue
+        row = rows[i]
+        sums = vector[group[i]]
+        share = weight[i] * wanted[i]
+        for c in range(q):
+            sums[c] += share * row[c]
+        for c in range(q):
+            products = matrix[group[i], c * q : (c + 1) * q]
+            share = weight[i] * row[c]
+            if share == 0.0:
+                continue
+            for d in range(q):
+                products[d] += share * row[d]
+
+
+@compiled()
+def join_equations(
+    matrix: Table, vector: Table, columns: IntTable, whole: TableOut, side: FloatsOut
+) -> None:
+    """Add normal equations of groups, (G, Q Q) and (G, Q), to those of all parameters.
+
+    ``columns``: (G, Q) places of a group's parameters. ``whole``: (P, P). ``side``: (P,).
+    """
+    q = columns.shape[1]
+    for g in range(columns.shape[0]):
+        for c in range(q):
+            row = whole[columns[g, c]]
+            side[columns[g, c]] += vector[g, c]
+            for d in range(q):
+                row[columns[g, d]] += matrix[g, c * q + d]
+
+
+@compiled(fastmath=True)
+def combine_rows(
+    rows: Table, group: Ints, columns: IntTable, factor: Table, combined: TableOut
+) -> None:
+    """Multiply rows (H, Q) by what a factor (P, K) has of their groups' parameters; (H, K) zeros.
+
+    ``group``: (H,). ``columns``: (G, Q) places of a group's parameters.
+    """
+    k = factor.shape[1]
+    for i in range(rows.shape[0]):
+        total = combined[i]
+        for c in range(rows.shape[1]):
+            share = rows[i, c]
+            if share == 0.0:
+                continue
+            own = factor[columns[group[i], c]]
+            for j in range(k):
+                total[j] += share * own[j]

@@ -10,10 +10,13 @@ import numpy as np
 from armscan.kernels.arrays import (
     COLUMN,
     ROW,
+    BytesOut,
     Floats,
     FloatsOut,
     Image,
     ImageOut,
+    IntsOut,
+    Row,
     RowOut,
     Table,
     TableOut,
@@ -36,29 +39,21 @@ def interpolate_columns(grid: Image, cell_px: int, i: int, row: RowOut) -> None:
 
 
 @compiled()
-def level_at(image: Image, axis: int, line: int, k: int) -> float:
-    """Grey level at place ``k`` of a column (axis 0) or row (axis 1)."""
-    return float(image[k, line] if axis == COLUMN else image[line, k])
-
-
-@compiled()
 def hump_centre(
-    image: Image,
-    axis: int,
-    line: int,
-    first: int,
-    last: int,
-    background: float,
-    peak: float,
+    levels: Floats, first: int, last: int, place: int, background: float, peak: float
 ) -> float:
-    """Centroid of what rises above half of the peak, so that a bright ground does not pull it."""
+    """Centroid of what rises above half of the peak, so that a bright ground does not pull it.
+
+    ``levels``: Grey levels, of which ``first`` to ``last`` count. ``place``: That of level 0.
+    """
     floor = background + 0.5 * peak
     weight = moment = 0.0
     for k in range(first, last + 1):
-        above = max(level_at(image, axis, line, k) - floor, 0.0)
+        above = max(levels[k] - floor, 0.0)
         weight += above
-        moment += above * k
-    return moment / weight if weight > 0.0 else 0.5 * (first + last)
+        # of whole places, so that the middle between two pixels stays exactly there
+        moment += above * (place + k)
+    return moment / weight if weight > 0.0 else place + 0.5 * (first + last)
 
 
 @compiled()
@@ -70,6 +65,7 @@ def split_run(
     last: int,
     background: float,
     rise: float,
+    levels: FloatsOut,
     runs: TableOut,
     count: int,
 ) -> int:
@@ -80,24 +76,27 @@ def split_run(
 
     ``image``: (H, W) grey levels. ``axis``, ``line``, ``first``, ``last``: The run: pixels
     ``first..last`` of column (axis 0) or row (axis 1) ``line``. ``background``, ``rise``: Local
-    background, and the height above it at which the run was cut. ``runs``: (capacity, 3) output
-    rows ``x, y, axis``; rows beyond the capacity are counted only. ``count``: Rows used so far.
+    background, and the height above it at which the run was cut. ``levels``: Scratch, of the run's
+    length and two more. ``runs``: (capacity, 3) output rows ``x, y, axis``; rows beyond the
+    capacity are counted only. ``count``: Rows used so far.
     """
+    n = last - first + 1
+    for k in range(n):
+        levels[k + 1] = image[first + k, line] if axis == COLUMN else image[line, first + k]
+    levels[0] = levels[1]
+    levels[n + 1] = levels[n]
     peak = 0.0
     low = np.inf
-    low_at = start = first
-    for k in range(first, last + 2):
-        is_end = k > last
+    low_at = start = 1
+    for k in range(1, n + 2):
+        is_end = k > n
         smooth = 0.0
         if not is_end:
-            smooth = level_at(image, axis, line, k)
-            smooth += level_at(image, axis, line, max(k - 1, first))
-            smooth += level_at(image, axis, line, min(k + 1, last))
-            smooth = smooth / 3.0 - background
+            smooth = (levels[k] + levels[k - 1] + levels[k + 1]) / 3.0 - background
         if is_end or (low < VALLEY_RATIO * peak and smooth > 2.0 * low + rise):
             if count < runs.shape[0]:
-                stop = last if is_end else low_at
-                centre = hump_centre(image, axis, line, start, stop, background, peak)
+                stop = n if is_end else low_at
+                centre = hump_centre(levels, start, stop, first - 1, background, peak)
                 runs[count, 0] = line if axis == COLUMN else centre
                 runs[count, 1] = centre if axis == COLUMN else line
                 runs[count, 2] = axis
@@ -111,6 +110,33 @@ def split_run(
             low = smooth
             low_at = k
     return count
+
+
+ROUNDING = 1e-3
+"""Of the threshold, in grey levels."""
+
+
+@compiled()
+def is_any_above(pixels: Row, level: float) -> bool:
+    """True if one of some pixels is brighter."""
+    limit = np.float32(level)
+    count = np.int32(0)
+    for k in range(pixels.shape[0]):
+        count += np.int32(pixels[k] > limit)
+    return bool(count > 0)
+
+
+@compiled()
+def mark_lit(
+    pixels: Row, upper: Row, lower: Row, fraction: float, lift: float, is_lit: BytesOut
+) -> None:
+    """Mark pixels above the background, which lies between that of two rows of cells, by more than
+    ``lift``.
+    """
+    share = np.float32(fraction)
+    rise = np.float32(lift)
+    for k in range(pixels.shape[0]):
+        is_lit[k] = pixels[k] > upper[k] + share * (lower[k] - upper[k]) + rise
 
 
 @compiled()
@@ -133,7 +159,9 @@ def find_runs(
     Returns count of candidates; more than the capacity if the output was too short.
     """
     height, width = image.shape
-    floor = np.zeros(width, np.float32)
+    n_cells = -(-width // cell_px)
+    quiet = np.zeros(n_cells)
+    levels = np.zeros(longest_px + 2)
     upper = np.zeros(width, np.float32)
     lower = np.zeros(width, np.float32)
     n_words = -(-width // 8)
@@ -144,6 +172,7 @@ def find_runs(
     start = np.full(width, -1, np.int64)
     count = 0
     lift = np.float32(rise)
+    fraction = np.float32(0.0)
     for y in range(height + 1):
         row_start = -1
         is_lit[:] = 0
@@ -155,13 +184,19 @@ def find_runs(
                 following = min(cell + 1, background.shape[0] - 1)
                 interpolate_columns(background, cell_px, following, lower)
                 above = cell
+                for k in range(n_cells):
+                    own = slice(k * cell_px, min((k + 1) * cell_px, width))
+                    quiet[k] = min(upper[own].min(), lower[own].min()) + rise - ROUNDING
             fraction = np.float32(v - cell)
             row = image[y]
-            for x in range(width):
-                floor[x] = upper[x] + fraction * (lower[x] - upper[x]) + lift
-                is_lit[x] = row[x] > floor[x]
+            for k in range(n_cells):
+                # most of the image is dark, and is passed over by a cell's width at once
+                low = k * cell_px
+                high = min(low + cell_px, width)
+                if is_any_above(row[low:high], quiet[k]):
+                    own = slice(low, high)
+                    mark_lit(row[own], upper[own], lower[own], v - cell, rise, is_lit[low:])
         for word in range(n_words):
-            # most of the image is dark, and is passed over by eight pixels at once
             if words[word] == 0 and n_open[word] == 0 and row_start < 0:
                 continue
             for x in range(8 * word, min(8 * word + 8, width)):
@@ -177,17 +212,19 @@ def find_runs(
                 else:
                     if start[x] >= 0:
                         if y - start[x] <= longest_px:
-                            base = float(floor[x]) - rise
+                            base = float(upper[x] + fraction * (lower[x] - upper[x]) + lift) - rise
                             count = split_run(
-                                image, COLUMN, x, start[x], y - 1, base, rise, runs, count
+                                image, COLUMN, x, start[x], y - 1, base, rise, levels, runs, count
                             )
                         start[x] = -1
                         n_open[word] -= 1
                     stop = x - 1
                 if row_start >= 0:
                     if stop - row_start < longest_px:
-                        base = float(floor[x]) - rise
-                        count = split_run(image, ROW, y, row_start, stop, base, rise, runs, count)
+                        base = float(upper[x] + fraction * (lower[x] - upper[x]) + lift) - rise
+                        count = split_run(
+                            image, ROW, y, row_start, stop, base, rise, levels, runs, count
+                        )
                     row_start = -1
     return count
 
@@ -214,6 +251,24 @@ def gaussian_taps(sigma_px: float) -> Image:
     bend = (k * k - (k * k * smooth).sum()) * smooth
     bend /= 0.5 * (k * k * bend).sum()
     return np.stack([smooth, slope, bend]).astype(np.float32)
+
+
+@compiled(fastmath=True)
+def combine_columns(down0: Row, down1: Row, down2: Row, taps: Image, result: FloatsOut) -> None:
+    """Derivatives (5,) of columns that were smoothed and differentiated once and twice, (m,)."""
+    taps0, taps1, taps2 = taps[0], taps[1], taps[2]
+    gx = gy = gxx = gxy = gyy = np.float32(0.0)
+    for i in range(taps0.shape[0]):
+        gx += taps1[i] * down0[i]
+        gxx += taps2[i] * down0[i]
+        gxy += taps1[i] * down1[i]
+        gy += taps0[i] * down1[i]
+        gyy += taps0[i] * down2[i]
+    result[0] = gx
+    result[1] = gy
+    result[2] = gxx
+    result[3] = gxy
+    result[4] = gyy
 
 
 @compiled(fastmath=True)
@@ -260,18 +315,80 @@ def derivatives_at(
                 down0[i] += smooth * value
                 down1[i] += slope * value
                 down2[i] += bend * value
-    gx = gy = gxx = gxy = gyy = np.float32(0.0)
-    for i in range(m):
-        gx += taps1[i] * down0[i]
-        gxx += taps2[i] * down0[i]
-        gxy += taps1[i] * down1[i]
-        gy += taps0[i] * down1[i]
-        gyy += taps0[i] * down2[i]
-    result[0] = gx
-    result[1] = gy
-    result[2] = gxx
-    result[3] = gxy
-    result[4] = gyy
+    combine_columns(down0, down1, down2, taps, result)
+
+
+BLOCK_PX = 32
+"""Columns that are smoothed together where a line runs along a row."""
+KEPT_ROWS = 8
+"""Rows whose columns are kept: a walk to the ridge leaves the row of its candidate."""
+MARGIN_PX = 2 * BLOCK_PX
+"""Columns kept beyond either border; taps reach no farther."""
+
+
+@compiled(fastmath=True)
+def smooth_block(
+    image: Image, block: int, y: int, taps: Image, radius: int, kept: ImageOut
+) -> None:
+    """Smooth and differentiate `BLOCK_PX` columns down around row ``y`` into ``kept``.
+
+    The others: As for `shared_derivatives_at`.
+    """
+    height, width = image.shape
+    left = block * BLOCK_PX - MARGIN_PX
+    is_inside = left >= 0 and left + BLOCK_PX <= width
+    own = slice(block * BLOCK_PX, (block + 1) * BLOCK_PX)
+    down0, down1, down2 = kept[0, own], kept[1, own], kept[2, own]
+    down0[:] = np.float32(0.0)
+    down1[:] = np.float32(0.0)
+    down2[:] = np.float32(0.0)
+    for j in range(2 * radius + 1):
+        row = min(max(y + j - radius, 0), height - 1)
+        smooth = taps[0, j]
+        slope = taps[1, j]
+        bend = taps[2, j]
+        if is_inside:
+            pixels = image[row, left : left + BLOCK_PX]
+            for i in range(BLOCK_PX):
+                value = pixels[i]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+        else:
+            for i in range(BLOCK_PX):
+                value = image[row, min(max(left + i, 0), width - 1)]
+                down0[i] += smooth * value
+                down1[i] += slope * value
+                down2[i] += bend * value
+
+
+@compiled()
+def shared_derivatives_at(
+    image: Image,
+    x: int,
+    y: int,
+    taps: Image,
+    radius: int,
+    kept: ImageOut,
+    row_of_block: IntsOut,
+    result: FloatsOut,
+) -> None:
+    """As `derivatives_at`, with columns that neighbours in the same row share.
+
+    ``kept``: (3 `KEPT_ROWS`, W + 2 `MARGIN_PX` and up to a block more) columns, and
+    ``row_of_block`` (`KEPT_ROWS` blocks,) the row around which each block was smoothed; -1 for
+    none. Rows with the same remainder share a place.
+    """
+    first = x - radius + MARGIN_PX
+    stop = first + taps.shape[1]
+    n_blocks = row_of_block.shape[0] // KEPT_ROWS
+    at = y % KEPT_ROWS
+    own = kept[3 * at : 3 * at + 3]
+    for block in range(first // BLOCK_PX, (stop - 1) // BLOCK_PX + 1):
+        if row_of_block[at * n_blocks + block] != y:
+            row_of_block[at * n_blocks + block] = y
+            smooth_block(image, block, y, taps, radius, own)
+    combine_columns(own[0, first:stop], own[1, first:stop], own[2, first:stop], taps, result)
 
 
 @compiled()
@@ -282,6 +399,9 @@ def step_to_ridge(
     taps: Image,
     radius: int,
     scratch: ImageOut,
+    kept: ImageOut,
+    row_of_block: IntsOut,
+    is_shared: bool,
     derivatives: FloatsOut,
     result: FloatsOut,
 ) -> bool:
@@ -292,7 +412,8 @@ def step_to_ridge(
     the step leaves its pixel.
 
     ``image``, ``taps``, ``radius``, ``scratch``: As for `derivatives_at`. ``x_px``,
-    ``y_px``: Start. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
+    ``y_px``: Start. ``kept``, ``row_of_block``: As for `shared_derivatives_at`, which is taken if
+    ``is_shared``. ``derivatives``: (5,) scratch. ``result``: (5,) output: x, y, normal x, normal
     y, negative second derivative along the normal.
     """
     height, width = image.shape
@@ -301,7 +422,10 @@ def step_to_ridge(
     for _ in range(ROUNDS):
         if x < 0 or y < 0 or x >= width or y >= height:
             return False
-        derivatives_at(image, x, y, taps, radius, scratch, derivatives)
+        if is_shared:
+            shared_derivatives_at(image, x, y, taps, radius, kept, row_of_block, derivatives)
+        else:
+            derivatives_at(image, x, y, taps, radius, scratch, derivatives)
         half = 0.5 * (derivatives[2] - derivatives[4])
         gxy = derivatives[3]
         root = math.sqrt(half * half + gxy * gxy)
@@ -330,6 +454,80 @@ def step_to_ridge(
     return False
 
 
+SHARED_FROM = 3
+"""Candidates in one row and block from which on smoothing the whole block is worth its time."""
+
+
+@compiled()
+def sort_candidates(runs: Table, n_runs: int, cell: IntsOut, order: IntsOut) -> int:
+    """Sort candidates by row, and by block of columns within it.
+
+    ``runs``, ``n_runs``: As for `refine_candidates`. ``cell``: (n_runs,) output: number of the row
+    and block of each. ``order``: (n_runs,) output: candidates by rising cell. Returns count of
+    cells.
+    """
+    blocks = rows = 0
+    for r in range(n_runs):
+        blocks = max(blocks, math.floor(runs[r, 0] + 0.5) // BLOCK_PX + 1)
+        rows = max(rows, math.floor(runs[r, 1] + 0.5) + 1)
+    place = np.zeros(rows * blocks + 1, np.int64)
+    for r in range(n_runs):
+        own = math.floor(runs[r, 1] + 0.5) * blocks + math.floor(runs[r, 0] + 0.5) // BLOCK_PX
+        cell[r] = own
+        place[own + 1] += 1
+    for k in range(rows * blocks):
+        place[k + 1] += place[k]
+    for r in range(n_runs):
+        order[place[cell[r]]] = r
+        place[cell[r]] += 1
+    return rows * blocks
+
+
+@compiled()
+def find_ridges(image: Image, runs: Table, n_runs: int, taps: Image, ridges: TableOut) -> None:
+    """Walk from each candidate to its ridge; ``ridges``: (n_runs, 5) output, 0 where there is none.
+
+    The others, and the columns: As for `refine_candidates` and `step_to_ridge`.
+    """
+    width = image.shape[1]
+    radius = taps.shape[1] // 2
+    # whole registers: what is left over of a row would take as long as the rest
+    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
+    padded[:, : taps.shape[1]] = taps
+    scratch = np.zeros(padded.shape, np.float32)
+    derivatives = np.zeros(5)
+    n_blocks = (width + 2 * MARGIN_PX) // BLOCK_PX + 1
+    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
+    row_of_block = np.full(KEPT_ROWS * n_blocks, -1, np.int64)
+    is_narrow = padded.shape[1] <= MARGIN_PX
+    cell = np.zeros(n_runs, np.int64)
+    order = np.zeros(n_runs, np.int64)
+    sort_candidates(runs, n_runs, cell, order)
+    first = 0
+    while first < n_runs:
+        stop = first + 1
+        while stop < n_runs and cell[order[stop]] == cell[order[first]]:
+            stop += 1
+        is_shared = is_narrow and stop - first >= SHARED_FROM
+        for k in range(first, stop):
+            r = order[k]
+            if not step_to_ridge(
+                image,
+                runs[r, 0],
+                runs[r, 1],
+                padded,
+                radius,
+                scratch,
+                kept,
+                row_of_block,
+                is_shared,
+                derivatives,
+                ridges[r],
+            ):
+                ridges[r, 4] = 0.0
+        first = stop
+
+
 @compiled()
 def refine_candidates(
     image: Image,
@@ -353,20 +551,15 @@ def refine_candidates(
     Returns count of points.
     """
     height, width = image.shape
-    radius = taps.shape[1] // 2
-    # whole registers: what is left over of a row would take as long as the rest
-    padded = np.zeros((3, -(-taps.shape[1] // LANES) * LANES), np.float32)
-    padded[:, : taps.shape[1]] = taps
-    scratch = np.zeros(padded.shape, np.float32)
-    derivatives = np.zeros(5)
-    ridge = np.zeros(5)
     latest = np.full((2, max(height, width)), -1e9)
+    ridges = np.zeros((n_runs, 5))
+    find_ridges(image, runs, n_runs, taps, ridges)
     count = 0
     for r in range(n_runs):
         is_row = runs[r, 2] == ROW
-        if not step_to_ridge(
-            image, runs[r, 0], runs[r, 1], padded, radius, scratch, derivatives, ridge
-        ):
+        side = ROW if is_row else COLUMN
+        ridge = ridges[r]
+        if ridge[4] <= 0.0:
             continue
         if ridge[4] < least_bend:
             continue
@@ -380,7 +573,6 @@ def refine_candidates(
         else:
             line = int(runs[r, 0])
             centre = ridge[1] - (line - ridge[0]) * ridge[2] / ridge[3]
-        side = ROW if is_row else COLUMN
         if abs(centre - latest[side, line]) < REPEAT_PX:
             continue
         if centre < 0.0 or centre > (width if is_row else height) - 1:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, homogeneous
 from armscan.geometry.least_squares import square_root
+from armscan.kernels.rays import add_equations, combine_rows, join_equations
 from armscan.models.calibration import SensorCalibration
 from armscan.models.two_views import TwoViews
 from armscan.reconstruction.triangulate import (
@@ -383,12 +384,40 @@ class Residuals:
             if len(rows):
                 yield rows, columns
 
-    def moved(self, steps: FloatArray) -> FloatArray:
-        """(H, K) what steps (P + 3, K) of all parameters and the drift add to the residuals."""
-        moved = np.zeros((len(self.px), steps.shape[1]))
-        for rows, columns in self.by_sheet():
-            moved[rows] = self.by_errors[rows] @ steps[columns]
-        return moved
+    def explained(self, step: FloatArray) -> FloatArray:
+        """(H,) what a step (P + 3,) of all parameters and the drift adds to the residuals."""
+        return np.asarray(np.einsum("hq,hq->h", self.by_errors, step[self.columns][self.sheet]))
+
+    def equations(
+        self, weight: FloatArray, wanted: FloatArray, group: IntArray, n_groups: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Normal equations (G, Q + 3, Q + 3) and (G, Q + 3) of groups (H,) of one sheet each.
+
+        ``weight``, ``wanted``: (H,).
+        """
+        q = self.by_errors.shape[1]
+        matrix, vector = np.zeros((n_groups, q * q)), np.zeros((n_groups, q))
+        rows = np.ascontiguousarray(self.by_errors)
+        add_equations(rows, group.astype(np.int64), weight, wanted, matrix, vector)
+        return matrix.reshape(-1, q, q), vector
+
+    def joined_equations(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Normal equations of all parameters, (P + 3, P + 3) and (P + 3,), to undo the residuals.
+
+        ``weight``: (H,).
+        """
+        n = int(self.columns.max()) + 1
+        matrix, vector = self.equations(weight, -self.px, self.sheet, len(self.columns))
+        whole, side = np.zeros((n, n)), np.zeros(n)
+        join_equations(matrix.reshape(len(matrix), -1), vector, self.columns, whole, side)
+        return whole, side
+
+    def whitened(self, rows: IntArray, factor: FloatArray) -> FloatArray:
+        """(M, K) derivatives of some residuals by the whitened errors of a factor (P + 3, K)."""
+        combined = np.zeros((len(rows), factor.shape[1]))
+        by_errors = np.ascontiguousarray(self.by_errors[rows])
+        combine_rows(by_errors, self.sheet[rows], self.columns, factor, combined)
+        return combined
 
     def weighted_sum(self, weight: FloatArray) -> FloatArray:
         """(P + 3,) derivative of the residuals' sum with weights (H,)."""
@@ -416,7 +445,7 @@ def no_offset(sensor: SensorCalibration) -> EpipolarOffset:
 
 
 def estimate_offset(
-    residuals: Residuals, design: FloatArray, sensor: SensorCalibration, prior: EpipolarOffset
+    residuals: Residuals, sensor: SensorCalibration, prior: EpipolarOffset
 ) -> EpipolarOffset:
     """Most likely errors of the calibration and drift, given the residuals of labelled samples.
 
@@ -426,8 +455,6 @@ def estimate_offset(
     ----------
     residuals
         (H,) of samples whose sheet is certain.
-    design
-        (H, K) their derivatives by the whitened errors: `Residuals.moved` by the prior's factor.
     sensor
         Cameras and sheets.
     prior
@@ -435,15 +462,13 @@ def estimate_offset(
     """
     if not len(residuals.px):
         return prior
-    equations = _Equations.of(residuals, design)
-    step = prior.factor @ equations.state
-    n = len(sensor.covariance)
+    equations = _Equations.of(residuals, prior)
+    step, n = equations.step, len(sensor.covariance)
     offset_px, sigma_px, allowed_px = _mean_offset(equations, residuals, sensor)
-    lower = np.linalg.cholesky(equations.information)
     return EpipolarOffset(
         parameter_step=step[:n],
         drift=step[n:],
-        factor=solve_triangular(lower, prior.factor.T, lower=True, check_finite=False).T,
+        factor=equations.factor(prior),
         offset_px=offset_px,
         sigma_px=sigma_px,
         allowed_px=allowed_px,
@@ -454,58 +479,69 @@ def estimate_offset(
 class _Equations:
     """Weighted linear equations of the residuals in whitened errors, and their solution.
 
-    ``design`` (H, K) is the derivative by the whitened errors, ``wanted`` (H,) what undoes the
-    residuals, ``information`` (K, K) that of all equations with the prior's unit matrix.
+    ``sigma``, ``weight``: (H,) of the residuals. ``step``: (P + 3,) of the errors themselves.
+    ``missed``: (H,) what it leaves. ``information``: (K, K) that of all equations with the prior's
+    unit matrix. Points of a sheet depend on few parameters: the sums are taken over these.
     """
 
-    design: FloatArray
-    wanted: FloatArray
     sigma: FloatArray
     weight: FloatArray
-    state: FloatArray
+    step: FloatArray
+    missed: FloatArray
     information: FloatArray
 
     @staticmethod
     def of(
-        residuals: Residuals, design: FloatArray, is_used: BoolArray | None = None
+        residuals: Residuals, prior: EpipolarOffset, is_used: BoolArray | None = None
     ) -> _Equations:
         sigma = CORRELATION * np.hypot(residuals.sigma_px, FLOOR_PX)
         wanted = -residuals.px
         used = np.ones(len(wanted)) if is_used is None else is_used.astype(np.float64)
-        weight, state = used, np.zeros(design.shape[1])
-        scaled = design * (np.sqrt(weight) / sigma)[:, None]
-        information = scaled.T @ scaled + np.eye(design.shape[1])
+        weight = used
+        matrix, vector = residuals.joined_equations(weight / sigma**2)
+        information = prior.factor.T @ (matrix @ prior.factor)
+        information += np.eye(len(information))
+        right_side = vector @ prior.factor
         for k in range(ROUNDS):
-            right_side = (wanted * weight / sigma**2) @ design
-            state = np.asarray(np.linalg.solve(information, right_side))
+            step = prior.factor @ np.linalg.solve(information, right_side)
+            missed = wanted - residuals.explained(step)
             if k == ROUNDS - 1:
                 break
-            score = np.abs(wanted - design @ state) / sigma * CORRELATION
+            score = np.abs(missed) / sigma * CORRELATION
             next_weight = used * np.minimum(1.0, HUBER_SIGMAS / np.maximum(score, 1e-9))
-            # few lie beyond the limit: only these change the sum
-            changed = np.flatnonzero(next_weight != weight)
-            if not len(changed):
+            # few lie beyond the limit: only these change the sums
+            rows = np.flatnonzero(next_weight != weight)
+            if not len(rows):
                 break
-            step = (next_weight - weight)[changed] / sigma[changed] ** 2
-            information += (design[changed] * step[:, None]).T @ design[changed]
+            design = residuals.whitened(rows, prior.factor)
+            change = (next_weight - weight)[rows] / sigma[rows] ** 2
+            information += (design * change[:, None]).T @ design
+            right_side += (change * wanted[rows]) @ design
             weight = next_weight
-        return _Equations(design, wanted, sigma, weight, state, information)
+        return _Equations(sigma, weight, step, missed, information)
+
+    def factor(self, prior: EpipolarOffset) -> FloatArray:
+        """(P + 3, K) factor of the covariance of all errors, the residuals being known."""
+        lower = np.linalg.cholesky(self.information)
+        return np.asarray(solve_triangular(lower, prior.factor.T, lower=True, check_finite=False).T)
 
 
 def left_out_scores(
-    residuals: Residuals, design: FloatArray, segment: IntArray, is_used: BoolArray
+    residuals: Residuals, prior: EpipolarOffset, segment: IntArray, is_used: BoolArray
 ) -> FloatArray:
     """How badly each segment's residuals fit what all the others say of the offset.
 
     A stripe that lies on another sheet's right stripe by chance does so with an offset of its own,
-    which the calibration's freedom would explain away were it asked about itself.
+    which the calibration's freedom would explain away were it asked about itself. With C the
+    covariance of what a segment depends on, and A and b what it said itself, the others leave the
+    covariance ``(I - C A)^-1 C``, and the step less that covariance times b.
 
     Parameters
     ----------
-    residuals, design
-        (H,), (H, K) as for `estimate_offset`.
+    residuals, prior
+        (H,), and what is known without them, as for `estimate_offset`.
     segment
-        (H,) number of the segment of stripe, counted from 0.
+        (H,) number of the segment of stripe, counted from 0; each lies on one sheet.
     is_used
         (H,) False for segments that are asked but have no say.
 
@@ -514,29 +550,45 @@ def left_out_scores(
     FloatArray
         (B,) chi-square of mean, slope and bend of the segment's residuals, over their count.
     """
-    equations = _Equations.of(residuals, design, is_used)
-    lower = np.linalg.cholesky(equations.information)
-    seen = solve_triangular(lower, equations.design.T, lower=True, check_finite=False)
-    weight = equations.weight / equations.sigma**2
-    missed = equations.wanted - equations.design @ equations.state
+    equations = _Equations.of(residuals, prior, is_used)
+    n = int(segment.max(initial=-1)) + 1
     order = np.argsort(segment, kind="stable")
-    bounds = np.searchsorted(segment[order], np.arange(segment.max(initial=-1) + 2))
-    scores = np.zeros(len(bounds) - 1)
+    bounds = np.searchsorted(segment[order], np.arange(n + 1))
+    sheet = np.zeros(n, dtype=np.int64)
+    sheet[segment] = residuals.sheet
+    columns = residuals.columns
+    factor = equations.factor(prior)[columns]
+    # in units of what was known before, which all are near 1
+    unit = np.linalg.norm(prior.factor, axis=1)
+    unit = np.where(unit > 0.0, unit, 1.0)[columns]
+    factor /= unit[:, :, None]
+    covariance = (factor @ factor.transpose(0, 2, 1))[sheet]
+    weight, unit = equations.weight / equations.sigma**2, unit[sheet]
+    said, missed = residuals.equations(weight, equations.missed, segment, n)
+    shapes, asked = np.zeros((n, 3)), np.zeros((n, columns.shape[1], 4))
+    noise = np.zeros((n, 3, 3))
     for b, (first, last) in enumerate(pairwise(bounds)):
-        rows = order[first:last]
-        if not len(rows):
-            continue
-        of_rows = seen[:, rows]
-        known = of_rows.T @ of_rows
-        moments = _moments(len(rows))
-        # (I - G W)^-1 takes what these rows said themselves out of state and covariance
-        own = np.eye(len(rows)) - known * weight[rows]
-        left_out = np.linalg.solve(own.T, moments.T).T
-        shape = left_out @ missed[rows]
-        covariance = left_out @ known @ moments.T
-        covariance += (moments * equations.sigma[rows] ** 2) @ moments.T
-        covariance[0, 0] += FLOOR_PX**2
-        scores[b] = float(shape @ np.linalg.solve(covariance, shape)) / len(shape)
+        rows, moments = order[first:last], _moments(last - first)
+        k = len(moments)
+        shapes[b, :k] = moments @ equations.missed[rows]
+        asked[b, :, :k] = (moments @ residuals.by_errors[rows]).T
+        noise[b, :k, :k] = (moments * equations.sigma[rows] ** 2) @ moments.T
+    asked[:, :, 3] = missed
+    asked *= unit[:, :, None]
+    said *= unit[:, :, None] * unit[:, None, :]
+    alone = np.eye(said.shape[1]) - covariance @ said
+    left_out = np.linalg.solve(alone, covariance @ asked)
+    by_moments = asked[:, :, :3].transpose(0, 2, 1) @ left_out
+    noise += by_moments[:, :, :3]
+    noise[:, 0, 0] += FLOOR_PX**2
+    shapes += by_moments[:, :, 3]
+    scores = np.zeros(n)
+    count = np.minimum(np.diff(bounds), 3)
+    for k in (1, 2, 3):
+        rows = np.flatnonzero(count == k)
+        own = shapes[rows, :k]
+        solved = np.linalg.solve(noise[rows, :k, :k], own[:, :, None])[:, :, 0]
+        scores[rows] = np.sum(own * solved, axis=1) / k
     return scores
 
 

@@ -11,7 +11,7 @@ millimetres off the plane on which the neighbours lie, and the stripe's true she
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -385,6 +385,10 @@ class StereoLabeller:
 
     sensor: SensorCalibration
     depths: DepthRange = LABEL_DEPTHS
+    _prior: EpipolarOffset = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_prior", no_offset(self.sensor))
 
     def label(
         self,
@@ -401,7 +405,7 @@ class StereoLabeller:
             If the sensor has one camera.
         """
         sides = _Side.of(profiles[0]), _Side.of(profiles[1])
-        prior = offset = no_offset(self.sensor)
+        prior = offset = self._prior
         found = _Hypotheses.of(sides, self.sensor, self.depths, prior)
         at, projected = found.sample, found.projected
         doubt = ever = np.zeros(len(at), dtype=np.bool_)
@@ -412,7 +416,7 @@ class StereoLabeller:
             asked = used | doubt | _is_tied(pairs, left)
             doubt = found.doubtful(used, asked, left.segment[at])
             ever = ever | doubt
-            offset = estimate_offset(*found.residuals_of(used & ~doubt), self.sensor, prior)
+            offset = estimate_offset(found.residuals_of(used & ~doubt), self.sensor, prior)
         withdrawn = used & doubt
         labelled = (
             side.labelled(assigned, sample[withdrawn], sample[ever])
@@ -435,8 +439,9 @@ class _Hypotheses:
     """Left samples (H,) on sheets, in the right image, with the stripes beside them.
 
     ``beside`` (H,) is the right sample of the stripe beside each, -1 for none, ``is_covered`` (H,)
-    True where the right camera sees stripes around. ``residuals`` and ``design`` are those of the F
-    pairs found, which each round takes anew; ``place`` (H,) is the row of each pair in them.
+    True where the right camera sees stripes around. ``residuals`` are those of the F pairs found,
+    which each round takes anew, ``prior`` what is known without them; ``place`` (H,) is the row of
+    each pair in them.
     """
 
     sides: tuple[_Side, _Side]
@@ -448,7 +453,7 @@ class _Hypotheses:
     beside: IntArray
     is_covered: BoolArray
     residuals: Residuals
-    design: FloatArray
+    prior: EpipolarOffset
     place: IntArray
 
     @staticmethod
@@ -484,14 +489,13 @@ class _Hypotheses:
             beside=beside,
             is_covered=stripes.covers(projected.q_px),
             residuals=residuals,
-            design=residuals.moved(prior.factor),
+            prior=prior,
             place=place,
         )
 
-    def residuals_of(self, chosen: BoolArray | IntArray) -> tuple[Residuals, FloatArray]:
-        """Residuals and their derivatives by the whitened errors, of pairs that were found."""
-        rows = self.place[chosen]
-        return self.residuals.select(rows), self.design[rows]
+    def residuals_of(self, chosen: BoolArray | IntArray) -> Residuals:
+        """Residuals of pairs that were found."""
+        return self.residuals.select(self.place[chosen])
 
     def pairs(self, doubted: BoolArray, offset: EpipolarOffset) -> _Pairs:
         """Log-likelihood ratio of each left sample on each sheet, given the offset so far."""
@@ -517,7 +521,7 @@ class _Hypotheses:
             return doubt
         projected, n_sheets = self.projected, len(self.sensor.sheets)
         keys, key_of = np.unique(segment[at] * n_sheets + projected.sheet[at], return_inverse=True)
-        scores = left_out_scores(*self.residuals_of(at), key_of, used[at])
+        scores = left_out_scores(self.residuals_of(at), self.prior, key_of, used[at])
         is_bad = scores > OFFSET_CHI_SQUARE
         known = at[used[at] & ~is_bad[key_of]]
         left = self.sides[0]

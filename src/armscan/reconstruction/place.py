@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,7 +16,7 @@ from armscan.geometry.estimate import FitFailure
 from armscan.geometry.least_squares import robust_sigma, square_root
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.geometry.shapes import fit_plane
-from armscan.kernels.rays import add_propagated
+from armscan.kernels.rays import propagate_points
 from armscan.models.calibration import ArmNoise, ScannerCalibration
 from armscan.reconstruction.triangulate import StripePoints, sensor_columns, stripe_cloud
 from armscan.records.cloud import PointCloud
@@ -59,7 +60,7 @@ def place_with_jacobian(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class BaseTransform:
     """What carries points to Base with their covariance, computed once for all exposures.
 
@@ -97,6 +98,16 @@ class BaseTransform:
         factors = tuple(square_root(joint[np.ix_(own, own)], name) for own in places)
         middle = np.mean([one.sheet.origin_mm for one in sensor.sheets], axis=0)
         return BaseTransform(scanner, factors, np.asarray(middle))
+
+    @cached_property
+    def factors_in_sensor(self) -> tuple[FloatArray, ...]:
+        """The factors with the hand-eye's six errors turned to Sensor, for all poses of the arm."""
+        back = self.scanner.hand_eye.tool_from_sensor.rotation.T
+        turned = []
+        for factor in self.factors:
+            own = factor[-6:].reshape(2, 3, -1)
+            turned.append(np.concatenate([factor[:-6], *(back @ own)]))
+        return tuple(turned)
 
     @property
     def sheet_names(self) -> tuple[str, ...]:
@@ -142,35 +153,30 @@ def propagate_to_base(
     if isinstance(profile, Profile) == (transform.scanner.sensor is None):
         fact = "no camera" if transform.scanner.sensor is None else "a camera"
         raise InputError(f"this scanner has {fact}", remedy="give the scanner of these points")
-    placed = place_with_jacobian(stripe.points_mm, base_from_tool, hand_eye.tool_from_sensor)
-    n, turn = len(stripe), placed.by_sensor_point
+    n, base_from_sensor = len(stripe), base_from_tool @ hand_eye.tool_from_sensor
     if transform.scan_point_mm is None:
-        middle = placed.points_base_mm.mean(axis=0) if len(stripe) else np.zeros(3)
+        middle = base_from_sensor.apply(stripe.points_mm).mean(axis=0) if n else np.zeros(3)
     else:
-        middle = base_from_tool.apply(hand_eye.tool_from_sensor.apply(transform.scan_point_mm))
-    covariance = arm_covariance(
-        placed.points_base_mm, middle, base_from_tool.translation_mm, hand_eye.arm_noise
-    )
-    own = np.concatenate([stripe.noise_mm, stripe.shape_mm[:, :, None]], axis=2)
-    turned = turn @ own
-    covariance += turned @ turned.transpose(0, 2, 1)
-    by_sensor = stripe.by_sensor.reshape(n, 3 * stripe.by_sensor.shape[2])
-    for k, factor in enumerate(transform.factors):
-        add_propagated(
-            by_sensor,
-            np.ascontiguousarray(placed.by_hand_eye).reshape(n, 18),
-            np.ascontiguousarray(factor),
-            turn,
+        middle = base_from_sensor.apply(transform.scan_point_mm)
+    placed, covariance = np.zeros((n, 3)), np.zeros((n, 3, 3))
+    carried = (base_from_sensor.rotation, base_from_sensor.translation_mm[:, None])
+    for k, factor in enumerate(transform.factors_in_sensor):
+        propagate_points(
+            stripe.points_mm,
+            stripe.noise_mm.reshape(n, 3 * stripe.noise_mm.shape[2]),
+            stripe.shape_mm,
+            stripe.by_sensor.reshape(n, 3 * stripe.by_sensor.shape[2]),
+            factor,
+            np.concatenate(carried, axis=1),
+            np.stack([hand_eye.arm_noise.variances, middle, base_from_tool.translation_mm]),
             np.flatnonzero(stripe.sheet == k),
+            placed,
             covariance.reshape(n, 9),
         )
+    for array in (placed, covariance):
+        array.setflags(write=False)
     return stripe_cloud(
-        "Base",
-        stripe,
-        profile,
-        placed.points_base_mm,
-        covariance,
-        sheet_names=transform.sheet_names,
+        "Base", stripe, profile, placed, covariance, sheet_names=transform.sheet_names
     )
 
 

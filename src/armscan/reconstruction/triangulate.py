@@ -9,7 +9,7 @@ import numpy as np
 
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
-from armscan.kernels.rays import meet_sheets
+from armscan.kernels.rays import meet_sheets, move_by_shape
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
@@ -104,7 +104,7 @@ def _meet(
         np.ascontiguousarray(points_px, dtype=np.float64),
         np.ascontiguousarray(sheet_of_point, dtype=np.int64),
         np.append(camera.parameters, fold_radius(camera.distortion)),
-        np.stack([one.sheet.numbers for one in sensor.sheets]),
+        _numbers(sensor),
         written[0],
         is_met,
         written[1],
@@ -141,11 +141,14 @@ def intersect_with_jacobian(
     """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
     n = len(points_px)
     points = np.tile([0.0, 0.0, 1.0], (n, 1))
-    by_px, by_sensor = np.zeros((n, 3 * 2)), np.zeros((n, 3 * (N_CAMERA + N_SHEET)))
-    is_met = _meet(points_px, sheet_of_point, sensor, points, by_px, by_sensor)
-    return SheetPoints(
-        points, is_met, by_px.reshape(n, 3, 2), by_sensor.reshape(n, 3, N_CAMERA + N_SHEET)
-    )
+    n_parameters = N_CAMERA + N_SHEET
+    by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, n_parameters))
+    flat = by_px.reshape(n, 6), by_sensor.reshape(n, 3 * n_parameters)
+    is_met = _meet(points_px, sheet_of_point, sensor, points, *flat)
+    # read-only and their own, so that records take them as they are
+    for array in (points, by_px, by_sensor):
+        array.setflags(write=False)
+    return SheetPoints(points, is_met, by_px, by_sensor)
 
 
 class StripePoints(RowRecord):
@@ -216,6 +219,7 @@ def cloud_in_sensor(
         covariance[of_sheet] += (
             jacobian @ sensor_covariance(sensor, k) @ jacobian.transpose(0, 2, 1)
         )
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     names = tuple(one.name for one in sensor.sheets)
     return stripe_cloud("Sensor", stripe, profile, stripe.points_mm, covariance, sheet_names=names)
 
@@ -229,7 +233,7 @@ def stripe_cloud(
     *,
     sheet_names: tuple[str, ...],
 ) -> PointCloud:
-    """The points of one exposure, given in a frame, as a cloud; the covariance is symmetrised."""
+    """The points of one exposure, given in a frame with symmetric covariances, as a cloud."""
     if isinstance(profile, Profile):
         segment, intensity = profile.segment[stripe.row], profile.intensity[stripe.row]
     else:
@@ -237,7 +241,7 @@ def stripe_cloud(
     return PointCloud(
         frame=frame,
         points_mm=points_mm,
-        covariance_mm2=0.5 * (covariance_mm2 + covariance_mm2.transpose(0, 2, 1)),
+        covariance_mm2=covariance_mm2,
         sigma_noise_mm=noise_size_mm(stripe.noise_mm),
         sheet=stripe.sheet,
         sheet_names=sheet_names,
@@ -276,8 +280,10 @@ def triangulate_stripe(
     sheets = _checked_sheets(profile, sheet_of_point, sensor)
     asked = np.flatnonzero(sheets >= 0)
     met = intersect_with_jacobian(profile.points_px[asked], sheets[asked], sensor)
-    across = np.einsum("nij,nj->ni", met.dpoint_dpx, profile.normals_px[asked])
-    noise = across * profile.sigma_px[asked, None]
+    noise = np.zeros((len(asked), 3, 1))
+    across = (profile.normals_px * profile.sigma_px[:, None])[asked]
+    np.einsum("nij,nj->ni", met.dpoint_dpx, across, out=noise[:, :, 0])
+    noise.setflags(write=False)
     length = profile.noise_length
     by_sensor, n_rest = met.dpoint_dsensor, len(sensor_columns(sensor, 0)) - N_CAMERA - N_SHEET
     if n_rest:
@@ -286,7 +292,7 @@ def triangulate_stripe(
     found = StripePoints(
         row=asked,
         points_mm=met.points_mm,
-        noise_mm=noise[:, :, None],
+        noise_mm=noise,
         shape_mm=moved_by_shape(met.points_mm, met.points_mm, sheets[asked], sensor),
         by_sensor=by_sensor,
         sheet=sheets[asked],
@@ -314,19 +320,22 @@ def moved_by_shape(
     All in the Sensor frame; ``sheet`` (M,) is the index of each point's sheet.
     """
     moved = np.zeros((len(points_mm), 3))
-    for k in np.unique(sheet):
-        of_sheet = np.flatnonzero(sheet == k)
-        _, gradient, _ = sensor.sheets[int(k)].sheet.height_with_jacobian(points_mm[of_sheet])
-        along = np.sum(gradient * rays[of_sheet], axis=1)
-        is_met = np.abs(along) > 0.0
-        size = shape_mm(sensor, int(k)) / np.where(is_met, along, np.inf)
-        moved[of_sheet] = rays[of_sheet] * size[:, None]
+    size = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
+    at = np.ascontiguousarray(points_mm, dtype=np.float64)
+    along = np.ascontiguousarray(rays, dtype=np.float64)
+    own = np.ascontiguousarray(sheet, dtype=np.int64)
+    move_by_shape(at, along, own, _numbers(sensor), size, moved)
     return moved
+
+
+def _numbers(sensor: SensorCalibration) -> FloatArray:
+    """(S, 20) the sheets, as the kernels read them."""
+    return np.stack([one.sheet.numbers for one in sensor.sheets])
 
 
 def noise_size_mm(noise_mm: FloatArray) -> FloatArray:
     """(M,) root sum square of the independent noises (M, 3, J) of each point."""
-    return np.asarray(np.sqrt((noise_mm**2).sum(axis=(1, 2))))
+    return np.asarray(np.sqrt(np.einsum("nij,nij->n", noise_mm, noise_mm)))
 
 
 def _checked_sheets(

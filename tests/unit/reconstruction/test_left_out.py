@@ -55,18 +55,24 @@ def test_scores_are_those_of_solving_without_each_segment() -> None:
     crossings = replace(crossings, residual_px=crossings.residual_px + SHIFTED_PX * off)
     is_used = segment % 4 != 2
     residuals = Residuals.of(projected, crossings, sensor)
-    whitened = residuals.moved(no_offset(sensor).factor)
-    scores = left_out_scores(residuals, whitened, segment, is_used)
+    prior = no_offset(sensor)
+    scores = left_out_scores(residuals, prior, segment, is_used)
 
-    equations = epipolar._Equations.of(residuals, whitened, is_used)
+    whitened = np.zeros((len(segment), prior.factor.shape[1]))
+    for row, (sheet, by_errors) in enumerate(
+        zip(residuals.sheet, residuals.by_errors, strict=True)
+    ):
+        whitened[row] = by_errors @ prior.factor[residuals.columns[sheet]]
+    equations = epipolar._Equations.of(residuals, prior, is_used)
+    wanted_all = -residuals.px
     all_weight = equations.weight / equations.sigma**2
     whole = np.eye(whitened.shape[1]) + (whitened.T * all_weight) @ whitened
     np.testing.assert_allclose(equations.information, whole, rtol=1e-9, atol=1e-6)
-    right_side = whitened.T @ (all_weight * equations.wanted)
+    right_side = whitened.T @ (all_weight * wanted_all)
     naive, own = np.zeros(len(scores)), np.zeros(len(scores))
     for b in np.unique(segment):
         at = segment == b
-        design, wanted = equations.design[at], equations.wanted[at]
+        design, wanted = whitened[at], wanted_all[at]
         sigma, weight = equations.sigma[at], equations.weight[at] / equations.sigma[at] ** 2
         others = whole - (design.T * weight) @ design
         state = np.linalg.solve(others, right_side - design.T @ (weight * wanted))

@@ -11,8 +11,8 @@ import pytest
 from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Points, Pose
-from armscan.geometry.rotations import rotation_from_vector
-from armscan.kernels.rays import add_propagated
+from armscan.geometry.rotations import rotation_from_vector, skew
+from armscan.kernels.rays import propagate_points
 from armscan.models.calibration import ArmNoise
 from armscan.models.camera import CameraModel
 from armscan.reconstruction.place import (
@@ -245,20 +245,39 @@ def test_volume() -> None:
 def test_propagation_in_one_pass_is_that_of_the_whole_product() -> None:
     """Some columns are zero for some points, as where one camera of two saw nothing."""
     rng = np.random.default_rng(5)
-    by_sensor, by_hand_eye = rng.normal(size=(40, 3, 11)), rng.normal(size=(40, 3, 6))
+    points, own, shape = (
+        rng.normal(size=(40, 3)),
+        rng.normal(size=(40, 3, 2)),
+        rng.normal(size=(40, 3)),
+    )
+    by_sensor = rng.normal(size=(40, 3, 11))
     by_sensor[::3, :, 4:9] = 0.0
     by_sensor[1::3, 0] = 0.0
     factor, turn = rng.normal(size=(17, 13)), rotation_from_vector(np.array([0.3, -0.8, 0.5]))
-    rows, covariance = np.arange(1, 40, 2), np.zeros((40, 3, 3))
-    add_propagated(
+    shift, arm = np.array([10.0, -20.0, 5.0]), rng.uniform(0.0, 1.0, (3, 3))
+    rows = np.arange(1, 40, 2)
+    placed, covariance = np.zeros((40, 3)), np.zeros((40, 3, 3))
+    propagate_points(
+        points,
+        own.reshape(40, 6),
+        shape,
         by_sensor.reshape(40, 33),
-        by_hand_eye.reshape(40, 18),
         factor,
-        turn,
+        np.column_stack([turn, shift]),
+        arm,
         rows,
+        placed,
         covariance.reshape(40, 9),
     )
-    moved = np.concatenate([turn @ by_sensor, by_hand_eye], axis=2) @ factor
-    expected = moved @ moved.transpose(0, 2, 1)
-    np.testing.assert_allclose(covariance[rows], expected[rows], rtol=1e-10, atol=1e-10)
+    expected_at = points @ turn.T + shift
+    np.testing.assert_allclose(placed[rows], expected_at[rows], rtol=1e-12)
+    for i in rows:
+        by_hand_eye = np.concatenate([-skew(points[i]), np.eye(3)], axis=1)
+        moved = np.concatenate([by_sensor[i], by_hand_eye], axis=1) @ factor
+        whole = moved @ moved.T + own[i] @ own[i].T + np.outer(shape[i], shape[i])
+        expected = turn @ whole @ turn.T + arm[0, 0] * np.eye(3)
+        for variance, about in zip(arm[0, 1:], arm[1:], strict=True):
+            lever = skew(expected_at[i] - about)
+            expected += variance * lever @ lever.T
+        np.testing.assert_allclose(covariance[i], expected, rtol=1e-10)
     assert not covariance[::2].any()

@@ -6,13 +6,7 @@ import pytest
 from scipy.ndimage import correlate, map_coordinates
 from scipy.optimize import curve_fit
 
-from armscan.kernels.chains import (
-    SHIFT,
-    SMOOTH_SIGMA,
-    find_other_lines,
-    smooth_chains,
-    walk_chains,
-)
+from armscan.kernels.chains import find_other_lines, sum_windows, walk_chains
 from armscan.kernels.profile_fit import (
     AMPLITUDE,
     CENTRE,
@@ -25,12 +19,16 @@ from armscan.kernels.profile_fit import (
     weigh_section,
 )
 from armscan.kernels.ridge import (
+    BLOCK_PX,
+    KEPT_ROWS,
+    MARGIN_PX,
     derivatives_at,
     find_runs,
     gaussian_taps,
     interpolate_columns,
     refine_candidates,
     sample_across,
+    shared_derivatives_at,
 )
 
 FLOAT32 = 3e-5
@@ -392,20 +390,30 @@ def test_sides_are_means_beside_the_line() -> None:
     assert sides[0].tolist() == [10.0, 4.0, 30.0, 4.0]
 
 
-def test_smoothing_matches_polyfit() -> None:
-    rng = np.random.default_rng(4)
-    x = np.arange(41.0)
-    y = 0.003 * (x - 20) ** 2 + 0.1 * x + rng.normal(0, 0.1, 41)
-    sigma = rng.uniform(0.08, 0.12, 41)
-    result = np.zeros((41, 8))
-    normals = np.tile([0.0, 1.0], (41, 1))
-    weight, chain = sigma**-2.0, np.zeros(41, np.int64)
-    points = np.stack([x, y], axis=1)
-    smooth_chains(points, normals, sigma, weight, chain, np.array([9.0]), np.ones(1), 3.0, result)
-    near = np.abs(x - 20) <= 9.0
-    fit, covariance = np.polyfit(x[near] - 20, y[near], 2, w=1.0 / sigma[near], cov="unscaled")
-    assert result[20, SHIFT] == pytest.approx(fit[2] - y[20], abs=1e-9)
-    assert result[20, SMOOTH_SIGMA] == pytest.approx(np.sqrt(covariance[2, 2]), rel=1e-9)
+def test_sums_along_chains_are_those_of_each_chain() -> None:
+    rng = np.random.default_rng(5)
+    chain = np.repeat([0, 1, 4], [7, 1, 12])
+    values, sums = rng.normal(size=(2, 20)), np.zeros((2, 20))
+    sum_windows(values, chain, 3, sums)
+    near = np.abs(np.arange(20)[:, None] - np.arange(20)) <= 3
+    expected = values @ (near & (chain[:, None] == chain))
+    assert sums == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("pixel", [(60, 17), (2, 3), (127, 39), (64, 0)])
+def test_shared_columns_give_the_same_derivatives(pixel: tuple[int, int]) -> None:
+    image = np.random.default_rng(1).uniform(0, 255, (40, 128)).astype(np.float32)
+    taps = gaussian_taps(1.7)
+    radius = taps.shape[1] // 2
+    own, shared = np.zeros(5), np.zeros(5)
+    n_blocks = (128 + 2 * MARGIN_PX) // BLOCK_PX + 1
+    kept = np.zeros((3 * KEPT_ROWS, n_blocks * BLOCK_PX), np.float32)
+    rows = np.full(KEPT_ROWS * n_blocks, -1)
+    for shift in (0, 1, 0, KEPT_ROWS, 0):
+        x, y = pixel[0], (pixel[1] + shift) % 40
+        derivatives_at(image, x, y, taps, radius, np.zeros_like(taps), own)
+        shared_derivatives_at(image, x, y, taps, radius, kept, rows, shared)
+        assert shared == pytest.approx(own, abs=255.0 * FLOAT32)
 
 
 def test_chains_walk_ends_first_then_loops() -> None:

@@ -43,6 +43,7 @@ from armscan.vision.stripe.ridge import (
     chain_bounds,
     chain_lengths_px,
     mean_along,
+    sum_along,
 )
 
 START_CONTRAST2 = 0.03
@@ -235,7 +236,7 @@ def fit_ridge(
     table = ridge.table
     sigma = line_sigma_px / np.maximum(axis_component(table), 0.5)
     neighbour = _neighbours(plane, ridge, line_sigma_px)
-    room = neighbour.min(axis=1) / line_sigma_px - FOOT_SIGMAS
+    room = np.minimum(*neighbour.T) / line_sigma_px - FOOT_SIGMAS
     reach = np.clip(room, LEAST_REACH_SIGMAS, REACH_SIGMAS)
     is_clear = neighbour > CLEAR_SIGMAS * line_sigma_px
     sides, side_sigma = _sides(plane, ridge, sigma, is_clear, background_noise)
@@ -358,22 +359,19 @@ def _sides(
     read_sides(plane.image, ridge.table, sigma, raw)
     if plane.reflectance.size > 1:
         read_sides(plane.reflectance, ridge.table, sigma, ground)
-    count = raw[:, 1::2] * is_clear
-    seen = np.where(raw[:, 1::2] > 0.0, ground[:, 0::2], 1.0)
-    level, weight = raw[:, 0::2] / seen, count * seen**2
+    clear = is_clear.T
+    count, seen = raw.T[1::2] * clear, np.where(raw.T[1::2] > 0.0, ground.T[0::2], 1.0)
+    level, weight = raw.T[0::2] / seen, count * seen**2
     stretch = _axis_runs(ridge)
     places = np.minimum(np.subtract(*chain_bounds(stretch)[::-1]), 2 * SIDE_HALF + 1)
-    total = np.stack([mean_along(np.ones(len(ridge)), c, stretch, SIDE_HALF) for c in weight.T], 1)
-    mean = np.stack(
-        [mean_along(v, c, stretch, SIDE_HALF) for v, c in zip(level.T, weight.T, strict=True)], 1
-    )
-    has_own = (total > 0.0) & is_clear
-    lowest = np.where(raw[:, 1::2] > 0.0, level, np.inf).min(axis=1)
-    lowest = np.where(np.isfinite(lowest), lowest, 0.0)[:, None]
-    sides = np.where(has_own, mean, np.where(has_own[:, ::-1], mean[:, ::-1], lowest))
-    pixels = np.where(has_own.all(axis=1), count.min(axis=1), 1.0) * places
-    on_ground = background_noise / seen.min(axis=1)
-    return sides, on_ground * np.sqrt(2.0 / np.maximum(pixels, 1.0))
+    has_own = (sum_along(weight, stretch, SIDE_HALF) > 0.0) & clear
+    mean = mean_along(level, weight, stretch, SIDE_HALF)
+    lowest = np.minimum(*np.where(raw.T[1::2] > 0.0, level, np.inf))
+    lowest = np.where(np.isfinite(lowest), lowest, 0.0)
+    sides = np.where(has_own, mean, np.where(has_own[::-1], mean[::-1], lowest))
+    pixels = np.where(has_own[0] & has_own[1], np.minimum(*count), 1.0) * places
+    on_ground = background_noise / np.minimum(*seen)
+    return np.ascontiguousarray(sides.T), on_ground * np.sqrt(2.0 / np.maximum(pixels, 1.0))
 
 
 def _axis_runs(ridge: RidgePoints) -> IntArray:

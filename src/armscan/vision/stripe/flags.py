@@ -53,10 +53,9 @@ def is_asymmetric(fits: ProfileFits, width_px: FloatArray) -> BoolArray:
 
     ``fits``: Fitted profiles. ``width_px``: (N,) sigma of the line.
     """
-    both = np.stack([fits.values[:, SKEW], fits.values[:, SKEW_NORM]], axis=1)
-    total = sum_along(both, fits.ridge.chain, SKEW_HALF)
-    norm = np.maximum(total[:, 1], 1e-12)
-    size = np.abs(total[:, 0]) / norm
+    lean, norm = sum_along(fits.values[:, [SKEW, SKEW_NORM]].T, fits.ridge.chain, SKEW_HALF)
+    norm = np.maximum(norm, 1e-12)
+    size = np.abs(lean) / norm
     limit = np.maximum(LEAST_SKEW, SKEW_PX / width_px)
     return np.asarray((size * np.sqrt(norm) > SIGNIFICANT) & (size > limit))
 
@@ -80,7 +79,7 @@ def is_near_other_line(distance: FloatArray, chain: IntArray, width_px: FloatArr
     ``distance``: (N, 2) to the nearest other line on both sides. ``chain``: (N,) chain numbers.
     ``width_px``: (N,) sigma of the line.
     """
-    near = np.asarray(distance.min(axis=1) < NEIGHBOUR_SIGMAS * width_px)
+    near = np.asarray(np.minimum(*distance.T) < NEIGHBOUR_SIGMAS * width_px)
     if not near.any():
         return near
     return close_gaps(near, chain, MERGED_SIGMAS * width_px)

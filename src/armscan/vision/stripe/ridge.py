@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.least_squares import robust_sigma
 from armscan.kernels.chains import REACH_PX as CHAINS_REACH_PX
-from armscan.kernels.chains import find_neighbours, place_points, walk_chains
+from armscan.kernels.chains import find_neighbours, place_points, sum_windows, walk_chains
 from armscan.kernels.ridge import find_runs, gaussian_taps, refine_candidates, sample_across
 
 FloatImage: TypeAlias = NDArray[np.float32]
@@ -111,17 +111,15 @@ def chain_bounds(chain: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def sum_along(values: FloatArray, chain: IntArray, half: int) -> FloatArray:
-    """Sum (N, ...) over the neighbours within ``half`` places on the same chain."""
-    first, stop = chain_bounds(chain)
-    place = np.arange(len(chain))
-    low = np.maximum(first, place - half)
-    high = np.minimum(stop, place + half + 1)
-    running = np.concatenate([np.zeros_like(values[:1]), np.cumsum(values, axis=0)])
-    return np.asarray(running[high] - running[low])
+    """Sums, (M, N) or (N,), over the neighbours within ``half`` places on the same chain."""
+    rows = np.ascontiguousarray(np.atleast_2d(values), dtype=np.float64)
+    sums = np.zeros(rows.shape)
+    sum_windows(rows, chain, half, sums)
+    return sums.reshape(np.shape(values))
 
 
 def mean_along(values: FloatArray, weights: FloatArray, chain: IntArray, half: int) -> FloatArray:
-    """Weighted mean (N,) over the neighbours; 0 where the weights sum to 0."""
+    """Weighted means, (M, N) or (N,), over the neighbours; 0 where the weights sum to 0."""
     total = sum_along(weights, chain, half)
     mean = sum_along(weights * values, chain, half)
     return np.asarray(np.where(total > 0.0, mean / np.where(total > 0.0, total, 1.0), 0.0))
@@ -149,6 +147,9 @@ RIDGE_POWER = 1.5
 """Of the scale, by which second derivatives of ridges are compared (Lindeberg 1998): lines of sigma
 above 5 px are sought at the wider scale."""
 SAMPLE = 3000
+LOOKED_AT = 8
+NEARLY = 0.8
+"""Of the narrow scale's strength: less at the wide one leaves no doubt."""
 MEASURED = 300
 STRONG_SHARE = 0.4
 REACH_PX = 30.0
@@ -189,14 +190,21 @@ def _strongest(image: FloatImage, runs: FloatArray) -> FloatArray:
     it would be taken for the line.
     """
     sample = np.ascontiguousarray(runs[:: max(len(runs) // SAMPLE, 1)])
-    best, best_strength = np.zeros((0, 6)), 0.0
-    for scale in SCALES_PX:
-        points = np.zeros((len(sample), 6))
-        n = refine_candidates(image, sample, len(sample), gaussian_taps(scale), 0.0, points)
-        strength = scale**RIDGE_POWER * strong_median(points[:n, 4])
-        if strength > best_strength:
-            best, best_strength = points[:n], strength
-    return best[best[:, 4] >= STRONG_SHARE * strong_median(best[:, 4])]
+    narrow, wide = SCALES_PX
+    points, strength = _at_scale(image, sample, narrow)
+    # wide filters take long, and few lines need them: some candidates tell
+    few = np.ascontiguousarray(sample[::LOOKED_AT])
+    if _at_scale(image, few, wide)[1] > NEARLY * strength:
+        points_wide, strength_wide = _at_scale(image, sample, wide)
+        points = points_wide if strength_wide > strength else points
+    return points[points[:, 4] >= STRONG_SHARE * strong_median(points[:, 4])]
+
+
+def _at_scale(image: FloatImage, sample: FloatArray, scale_px: float) -> tuple[FloatArray, float]:
+    """(N, 6) ridge points of candidates at a scale, and how strong they are."""
+    points = np.zeros((len(sample), 6))
+    n = refine_candidates(image, sample, len(sample), gaussian_taps(scale_px), 0.0, points)
+    return points[:n], scale_px**RIDGE_POWER * strong_median(points[:n, 4])
 
 
 def _across(image: FloatImage, points: FloatArray) -> FloatArray:
@@ -261,6 +269,8 @@ class RidgePoints:
 
     def select(self, keep: NDArray[np.bool_]) -> RidgePoints:
         """Return the points where ``keep`` (N,) is True; chains are cut where a gap opens."""
+        if keep.all():
+            return self
         table, chain = self.table[keep], self.chain[keep]
         if len(table) == 0:
             return RidgePoints(table, chain)

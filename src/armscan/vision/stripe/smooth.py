@@ -10,16 +10,27 @@ from scipy.optimize import nnls
 
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray
 from armscan.geometry.least_squares import MAD_TO_SIGMA
-from armscan.kernels.chains import (
+from armscan.kernels.smoothing import (
     BEND,
     BEND_SIGMA,
+    CHAIN,
+    COURSE_ROWS,
+    LANES,
+    MOMENTS,
+    NORMAL_X,
+    NORMAL_Y,
+    NOWHERE,
     PREDICTED,
     PREDICTED_SIGMA,
     SHIFT,
     SLOPE,
-    SMOOTH_COLUMNS,
+    SMOOTH_ROWS,
     SMOOTH_SIGMA,
-    smooth_chains,
+    WEIGHT,
+    X,
+    Y,
+    choose_windows,
+    gather_moments,
 )
 
 SMALLEST_WINDOW_PX = 3.2
@@ -39,6 +50,8 @@ LEAST_HALF = 8
 OUTLIER_SIGMAS = 6.0
 RESIDUAL_WIDENING = 1.5
 """A wider parabola takes less of the noise with it."""
+NEIGHBOURS_PER_PX = 3.0
+"""More than points of a chain lie within a pixel along it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,20 +73,53 @@ class Polyline:
         """Count of points."""
         return len(self.points)
 
-    def fit_parabolas(self, windows_px: FloatArray, inflation: FloatArray) -> FloatArray:
-        """Result (N, 8) of the smoothing kernel with these half windows."""
-        result = np.zeros((len(self), SMOOTH_COLUMNS))
-        smooth_chains(
-            self.points,
-            self.normals,
-            self.sigma,
-            np.where(self.is_used, self.sigma**-2.0, 0.0),
-            self.chain,
-            windows_px,
-            inflation,
-            CONFIDENCE,
-            result,
-        )
+    @property
+    def weight(self) -> FloatArray:
+        """(N,) by which the points count for their neighbours."""
+        return np.where(self.is_used, self.sigma**-2.0, 0.0)
+
+
+class Neighbourhoods:
+    """Sums over the neighbours of each point of a polyline, in windows along its chain.
+
+    They are gathered once, and again only where points no longer count.
+    """
+
+    def __init__(self, course: Polyline, windows_px: FloatArray) -> None:
+        """Gather the neighbours; ``windows_px``: (K,) half widths, increasing."""
+        n = len(course)
+        self._windows = windows_px
+        self._own = slice(LANES, LANES + n)
+        n_blocks = -(-n // LANES) + 2
+        self._laid = np.zeros((COURSE_ROWS, n_blocks * LANES))
+        self._laid[CHAIN] = NOWHERE
+        self._laid[X : Y + 1, self._own] = course.points.T
+        self._laid[NORMAL_X : NORMAL_Y + 1, self._own] = course.normals.T
+        self._laid[CHAIN, self._own] = course.chain
+        self._laid[WEIGHT, self._own] = course.weight
+        self._moments = np.zeros(n_blocks * LANES * len(windows_px) * MOMENTS)
+        gather_moments(self._laid, windows_px, np.ones(n_blocks, np.int64), self._moments)
+
+    def leave_out(self, rows: IntArray) -> None:
+        """Let points (M,) of the polyline count no longer."""
+        self._laid[WEIGHT, LANES + rows] = 0.0
+        is_asked = np.zeros(self._laid.shape[1] // LANES, np.int64)
+        far = int(np.ceil(NEIGHBOURS_PER_PX * self._windows[-1] / LANES))
+        for shift in range(-far, far + 1):
+            is_asked[np.clip(rows // LANES + 1 + shift, 0, len(is_asked) - 1)] = 1
+        gather_moments(self._laid, self._windows, is_asked, self._moments)
+
+    def fit_parabolas(
+        self, inflation: FloatArray, sigma: FloatArray, scale: float = 1.0
+    ) -> FloatArray:
+        """Result (8, N) of `choose_windows`.
+
+        ``inflation``: (K,). ``sigma``: (N,) of the points. ``scale``: Their variance over that by
+        which the neighbours were weighted.
+        """
+        result = np.zeros((SMOOTH_ROWS, len(sigma)))
+        given = (self._laid, self._moments, scale, sigma, self._windows, inflation)
+        choose_windows(*given, CONFIDENCE, result)
         return result
 
 
@@ -113,10 +159,12 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
     ``course``: The centres. ``largest_px``: Largest half window; 0 only measures the noise.
     """
     half = windows(max(largest_px, 2.0 * SMALLEST_WINDOW_PX))
-    rough = course.fit_parabolas(half, np.ones(len(half)))
-    score = np.abs(rough[:, PREDICTED]) / np.hypot(rough[:, PREDICTED_SIGMA], course.sigma)
+    around = Neighbourhoods(course, half)
+    rough = around.fit_parabolas(np.ones(len(half)), course.sigma)
+    score = np.abs(rough[PREDICTED]) / np.hypot(rough[PREDICTED_SIGMA], course.sigma)
     scale = max(1.0, float(np.median(score)) / 0.6745) if len(score) else 1.0
-    is_outlier = (rough[:, PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
+    is_outlier = (rough[PREDICTED_SIGMA] > 0.0) & (score > OUTLIER_SIGMAS * scale)
+    dropped = np.flatnonzero(is_outlier & course.is_used)
     course = replace(course, is_used=course.is_used & ~is_outlier)
     found = noise_correlation(course, half[-1])
     is_measured = found is not None
@@ -128,16 +176,19 @@ def smooth(course: Polyline, largest_px: float) -> SmoothedCentres:
         return SmoothedCentres(
             course.points, course.normals, course.sigma, sigma_sum, is_outlier, is_measured
         )
-    result = course.fit_parabolas(half, np.array([_inflation(correlation, h) for h in half]))
+    if len(dropped):
+        around.leave_out(dropped)
+    inflation = np.array([_inflation(correlation, h) for h in half])
+    result = around.fit_parabolas(inflation, course.sigma, float(correlation[0]))
     used, normals = course.is_used, course.normals
-    shift = np.where(used, result[:, SHIFT], 0.0)
-    slope = np.where(used, result[:, SLOPE], 0.0)
+    shift = np.where(used, result[SHIFT], 0.0)
+    slope = np.where(used, result[SLOPE], 0.0)
     tangents = np.stack([-normals[:, 1], normals[:, 0]], axis=1)
     turned = normals - slope[:, None] * tangents
     return SmoothedCentres(
         course.points + shift[:, None] * normals,
         turned / np.linalg.norm(turned, axis=1, keepdims=True),
-        np.where(used, result[:, SMOOTH_SIGMA], course.sigma),
+        np.where(used, result[SMOOTH_SIGMA], course.sigma),
         sigma_sum,
         is_outlier,
         is_measured,
@@ -149,10 +200,11 @@ def curvature(course: Polyline) -> FloatArray:
 
     Shrunk towards zero by its own noise, so that straight lines are not disturbed.
     """
-    result = course.fit_parabolas(BEND_WINDOWS_PX, np.ones(len(BEND_WINDOWS_PX)))
-    square = result[:, BEND] ** 2
-    noise = result[:, BEND_SIGMA] ** 2
-    return np.asarray(result[:, BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
+    around = Neighbourhoods(course, BEND_WINDOWS_PX)
+    result = around.fit_parabolas(np.ones(len(BEND_WINDOWS_PX)), course.sigma)
+    square = result[BEND] ** 2
+    noise = result[BEND_SIGMA] ** 2
+    return np.asarray(result[BEND] * np.maximum(1.0 - noise / np.maximum(square, 1e-30), 0.0))
 
 
 def _weights(half: int) -> FloatArray:

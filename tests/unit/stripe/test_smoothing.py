@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Smoothing of many points together, against a fit of each point alone."""
+
+import numpy as np
+import pytest
+
+from armscan.geometry.arrays import FloatArray
+from armscan.kernels.smoothing import (
+    BEND,
+    LEAST_POINTS,
+    MOST_TURNED_COSINE,
+    PREDICTED,
+    PREDICTED_SIGMA,
+    SHIFT,
+    SLOPE,
+    SMOOTH_SIGMA,
+    WINDOW,
+)
+from armscan.vision.stripe.smooth import CONFIDENCE, Neighbourhoods, Polyline
+
+WINDOWS = np.array([3.2, 5.0, 7.7, 12.0])
+INFLATION = np.array([1.0, 1.1, 1.3, 1.6])
+
+
+def wavy(seed: int) -> Polyline:
+    """Three chains: a long wave, a tight circle that closes, and one too short to be smoothed."""
+    rng = np.random.default_rng(seed)
+    x, turn = np.arange(150.0), np.linspace(0.0, 2.0 * np.pi, 60)
+    courses = [
+        np.stack([x, 20.0 + 6.0 * np.sin(x / 9.0)], axis=1),
+        np.stack([80.0 + 9.0 * np.cos(turn), 80.0 + 9.0 * np.sin(turn)], axis=1),
+        np.stack([np.arange(4.0), np.full(4, 50.0)], axis=1),
+    ]
+    tangents = [np.gradient(one, axis=0) for one in courses]
+    along = np.concatenate(tangents)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    normals = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    sigma = rng.uniform(0.05, 0.1, len(along))
+    points = np.concatenate(courses) + (sigma * rng.normal(size=len(along)))[:, None] * normals
+    chain = np.repeat([0, 1, 3], [150, 60, 4])
+    return Polyline(points, normals, sigma, chain, rng.uniform(size=len(along)) > 0.1)
+
+
+def neighbours(course: Polyline, i: int, reach: float) -> list[int]:
+    """Twin: the points from one on to both sides, until one is too far, turned or another's."""
+    nx, ny = course.normals[i]
+    found = [i]
+    for direction in (-1, 1):
+        j = i + direction
+        while 0 <= j < len(course) and course.chain[j] == course.chain[i]:
+            dx, dy = course.points[j] - course.points[i]
+            is_turned = abs(course.normals[j] @ course.normals[i]) < MOST_TURNED_COSINE
+            if abs(dy * nx - dx * ny) > reach or is_turned:
+                break
+            found.append(j)
+            j += direction
+    return [j for j in found if course.is_used[j]]
+
+
+def parabola(course: Polyline, i: int, rows: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (3,) of the weighted fit in the tangent frame of a point, and covariance."""
+    away = course.points[rows] - course.points[i]
+    s = away @ np.array([-course.normals[i, 1], course.normals[i, 0]])
+    fit, covariance = np.polyfit(
+        s, away @ course.normals[i], 2, w=1.0 / course.sigma[rows], cov="unscaled"
+    )
+    return fit[::-1], covariance[::-1, ::-1]
+
+
+def test_each_point_is_that_of_a_fit_of_its_own() -> None:
+    course = wavy(0)
+    scale = 1.7
+    result = Neighbourhoods(course, WINDOWS).fit_parabolas(INFLATION, course.sigma, scale)
+    taken = []
+    for i in range(len(course)):
+        lower, upper, window, rows = -np.inf, np.inf, 0.0, []
+        expected, sigma, inflated = np.zeros(3), course.sigma[i], 1.0
+        for reach, inflation in zip(WINDOWS, INFLATION, strict=True):
+            near = neighbours(course, i, reach)
+            if len(near) < LEAST_POINTS:
+                continue
+            fit, covariance = parabola(course, i, near)
+            spread = np.sqrt(covariance[0, 0] * inflation * scale)
+            lower = max(lower, fit[0] - CONFIDENCE * spread)
+            upper = min(upper, fit[0] + CONFIDENCE * spread)
+            if lower > upper:
+                break
+            expected, sigma, window, rows, inflated = fit, spread, reach, near, inflation
+        taken.append(window)
+        assert result[WINDOW, i] == window
+        assert result[[SHIFT, SLOPE], i] == pytest.approx(expected[:2], rel=1e-7, abs=1e-9)
+        assert result[BEND, i] == pytest.approx(2.0 * expected[2], rel=1e-7, abs=1e-9)
+        assert result[SMOOTH_SIGMA, i] == pytest.approx(sigma, rel=1e-7)
+        others = [j for j in rows if j != i]
+        if len(others) > LEAST_POINTS:
+            fit, covariance = parabola(course, i, others)
+            assert result[PREDICTED, i] == pytest.approx(fit[0], rel=1e-6, abs=1e-9)
+            spread = np.sqrt(covariance[0, 0] * inflated * scale)
+            assert result[PREDICTED_SIGMA, i] == pytest.approx(spread, rel=1e-6)
+    assert set(taken) >= {0.0, 7.7, 12.0}, "windows stop growing at bends"
+
+
+def test_points_that_are_left_out_are_as_if_they_had_never_counted() -> None:
+    course = wavy(1)
+    dropped = np.array([3, 31, 32, 100, 170])
+    around = Neighbourhoods(course, WINDOWS)
+    around.leave_out(dropped)
+    is_used = course.is_used.copy()
+    is_used[dropped] = False
+    fewer = Polyline(course.points, course.normals, course.sigma, course.chain, is_used)
+    anew = Neighbourhoods(fewer, WINDOWS).fit_parabolas(INFLATION, course.sigma)
+    before = Neighbourhoods(course, WINDOWS).fit_parabolas(INFLATION, course.sigma)
+    assert np.array_equal(around.fit_parabolas(INFLATION, course.sigma), anew)
+    assert not np.array_equal(before, anew)

@@ -37,7 +37,6 @@ MapOut: TypeAlias = NDArray[np.int32]
 TableOut: TypeAlias = NDArray[np.float64]
 FloatsOut: TypeAlias = NDArray[np.float64]
 IntsOut: TypeAlias = NDArray[np.int64]
-BytesOut: TypeAlias = NDArray[np.uint8]
 
 _TYPES: dict[str, Any] = {
     "Image": types.Array(types.float32, 2, "C", readonly=True),
@@ -55,7 +54,6 @@ _TYPES: dict[str, Any] = {
     "TableOut": types.Array(types.float64, 2, "C"),
     "FloatsOut": types.Array(types.float64, 1, "C"),
     "IntsOut": types.Array(types.int64, 1, "C"),
-    "BytesOut": types.Array(types.uint8, 1, "C"),
     "float": types.float64,
     "int": types.int64,
     "None": types.void,

@@ -174,7 +174,7 @@ def scale_mismatch(surface: PartSurface, points_mm: FloatArray) -> FitFailure | 
             "scan more of the part",
         )
     low, high = np.percentile(points_mm, [1.0, 99.0], axis=0)
-    ours, theirs = float(np.linalg.norm(high - low)), surface.part.diagonal_mm
+    ours, theirs = float(np.linalg.norm(high - low)), surface.diagonal_mm
     if not ours > TOO_SMALL * theirs or not ours < TOO_LARGE * theirs:
         ratio = ours / theirs
         larger = ratio > 1.0
@@ -294,7 +294,7 @@ def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> Fi
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     d = np.abs(measured(surface, cloud, best.cad_from_part, rows).signed_mm)
     noise = float(np.median(cloud.sigma_mm[rows]))
-    near = max(NEAR * surface.part.diagonal_mm, 5.0 * noise)
+    near = max(NEAR * surface.diagonal_mm, 5.0 * noise)
     share = float((d <= near).mean())
     if share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise):
         return None
@@ -445,7 +445,7 @@ def _free_motions(
     found = measured(surface, cloud, pose, rows)
     placed = pose.apply(points)
     centre, radius = _middle(placed)
-    scale = max(robust_scale(found.signed_mm), 1e-7 * surface.part.diagonal_mm)
+    scale = max(robust_scale(found.signed_mm), 1e-7 * surface.diagonal_mm)
     weights = tukey_weights(found.signed_mm, scale)
     normal = fit_step(placed, found.normals, weights, centre)[1]
     unit = np.repeat([1.0 / radius, 1.0], 3)
@@ -453,7 +453,7 @@ def _free_motions(
     free = []
     for k in np.flatnonzero(values < WEAK * values[-1]).tolist():
         for way in TRIED:
-            twist = vectors[:, k] * unit * way * surface.part.diagonal_mm
+            twist = vectors[:, k] * unit * way * surface.diagonal_mm
             put = screwed(pose, twist, centre)
             again = closer(surface, points, normals, put, 4)
             kept = np.linalg.norm(again.apply(points) - placed, axis=1).mean()
@@ -524,7 +524,7 @@ def _along_free(
     if not best.free:
         return False
     between = other.cad_from_part @ best.cad_from_part.inverse()
-    centre, radius = best.centre_mm, surface.part.diagonal_mm / 2.0
+    centre, radius = best.centre_mm, surface.diagonal_mm / 2.0
     turn = vector_from_rotation(between.rotation)
     shift = between.apply(centre) - centre
     rows = np.concatenate([turn * radius, shift])
@@ -539,7 +539,7 @@ def _along_free(
             # a finite turn carries the centre round the axis: both ways of that circle are allowed
             spanned += [np.concatenate([np.zeros(3), v]) for v in (arm, across) if v.any()]
     q = np.linalg.qr(np.array(spanned).T)[0]
-    return float(np.linalg.norm(rows - q @ (q.T @ rows))) < APART * surface.part.diagonal_mm
+    return float(np.linalg.norm(rows - q @ (q.T @ rows))) < APART * surface.diagonal_mm
 
 
 def _datum_step(

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
@@ -33,6 +34,7 @@ from armscan.report.drawing import (
     SceneValues,
     chart_markup,
     new_figure,
+    raster_markup,
     scene_markup,
     styled,
 )
@@ -462,8 +464,7 @@ def section_chart(found: CadComparison, part: PartModel, axis: int, limit_mm: fl
     with styled():
         figure = new_figure(5.6, 4.2)
         axes = figure.add_subplot()
-        for piece in outline:
-            axes.plot(piece[:, 0], piece[:, 1], color=MUTED, linewidth=0.8)
+        axes.add_collection(LineCollection(list(outline), colors=MUTED, linewidths=0.8))
         across, up = drawn[:, others].T
         axes.scatter(across, up, c=colours / 255.0, s=4, linewidths=0)
         axes.set_xlabel(f"{'XYZ'[others[0]]}, mm")
@@ -471,7 +472,7 @@ def section_chart(found: CadComparison, part: PartModel, axis: int, limit_mm: fl
         axes.set_aspect("equal", adjustable="datalim")
     title = f"{name} = {at:.2f} mm"
     return Picture(
-        chart_markup(figure, f"Section at {title}"),
+        raster_markup(figure, f"Section at {title}"),
         title=title,
         caption=f"{len(near):,} points within {significant(0.01 * part.diagonal_mm, 'mm', 2)}.",
     )

@@ -47,9 +47,15 @@ def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]
     if not text:
         return math.nan, {}
     try:
-        return float(text), {}
+        limit = float(text)
     except ValueError:
         path = Path(text)
+    else:
+        if not math.isfinite(limit):
+            raise OptionError(
+                f"a tolerance of {text} mm", where="--tolerance", remedy="give a length in mm"
+            )
+        return limit, {}
     if path.suffix.lower() not in (".toml", ".csv"):
         raise OptionError(
             f"'{text}' is neither a length in mm nor a .toml or .csv file",

@@ -194,6 +194,8 @@ def test_tolerances_by_face(tmp_path: Path) -> None:
     assert read_tolerances(str(toml), PART) == (0.1, {"face 3": 0.02})
     assert read_tolerances("0.07", PART) == (0.07, {})
     assert np.isnan(read_tolerances("", PART)[0])
+    with pytest.raises(OptionError):
+        read_tolerances("nan", PART)
 
 
 @pytest.mark.parametrize(

@@ -359,19 +359,9 @@ def fit_to_part(
         if np.abs(step[3:]).max() + radius * np.abs(step[:3]).max() < SETTLED_MM:
             break
     used = weights > 0.0
+    held = 6 - len(motions)
     errors = PointErrors.of(cloud, pose, found.normals, rows) if errors_known else None
-    if errors is None:
-        covariance = _scatter_covariance(placed, influence, d, 6 - len(motions))
-        rule = (
-            "from the scatter of the distances between regions of the part: the cloud carries no "
-            "standard deviations"
-        )
-    else:
-        covariance = errors.covariance(influence)
-        rule = (
-            "from the points' covariances: the stripes' noise point by point, the rest common to "
-            "an exposure, or to a block of neighbouring ones (the larger)"
-        )
+    covariance, rule = _stated_covariance(errors, influence, placed, d, held)
     return Alignment(
         method="best",
         cad_from_part=pose,
@@ -415,6 +405,25 @@ def _about_origin(covariance: FloatArray, centre: FloatArray) -> FloatArray:
     change = np.eye(6)
     change[3:, :3] = skew(centre[None])[0]
     return np.asarray(change @ covariance @ change.T)
+
+
+def _stated_covariance(
+    errors: PointErrors | None,
+    influence: FloatArray,
+    placed: FloatArray,
+    d: FloatArray,
+    held: int,
+) -> tuple[FloatArray, str]:
+    """(6, 6) covariance of a step, and where it comes from, in words."""
+    if errors is None:
+        return _scatter_covariance(placed, influence, d, held), (
+            "from the scatter of the distances between regions of the part: the cloud's standard "
+            "deviations are not known, or not used"
+        )
+    return errors.covariance(influence), (
+        "from the points' covariances: the stripes' noise point by point, the rest common to an "
+        "exposure, or to a block of neighbouring ones (the larger)"
+    )
 
 
 def _scatter_covariance(
@@ -584,9 +593,10 @@ def _datum_step(
         influence = influence + ways @ own
         left = left @ vectors[:, ~taken]
         used[at] = weights > 0.0
-    errors = PointErrors.of(cloud, pose, found.normals, rows)
-    covariance = errors.covariance(influence)
     d = np.where(np.isfinite(found.signed_mm), found.signed_mm, 0.0)
+    is_known = bool(cloud.covariance_mm2.any())
+    errors = PointErrors.of(cloud, pose, found.normals, rows) if is_known else None
+    covariance, rule = _stated_covariance(errors, influence, placed, d, 6 - left.shape[1])
     result = Alignment(
         method="321",
         cad_from_part=pose,
@@ -596,7 +606,7 @@ def _datum_step(
         rows=rows[used],
         influence=influence[:, used],
         rms_mm=float(np.sqrt(np.mean(d[used] ** 2))) if used.any() else math.nan,
-        sigma_rule="from the covariances of the points on the datum faces",
+        sigma_rule=rule,
         free=named_motions(left * unit[:, None], centre, radius),
     )
     return -influence @ d, result

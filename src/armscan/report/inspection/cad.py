@@ -204,16 +204,16 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
 def verdict_table(found: CadComparison) -> Table:
     """A row a face: decision, tolerance, mean and worst spot, each with its U."""
     has_limit = found.options.has_tolerance
-    heads = ("face", "points", "mean", "U of mean", "spot", "U of spot")
+    decided = ("decision", "tolerance") if has_limit else ()
+    heads = ("face", *decided, "points", "mean", "U of mean", "spot", "U of spot")
     rows = []
     for one in found.faces:
         pairs = ((one.statistics.mean_mm, one.u_mean_mm), (one.spot_mm, one.u_spot_mm))
         cells = [text for value, u in pairs for text in (_length(value), _length(u, sign=""))]
-        limit = (_length(one.tolerance_mm, sign=""), one.decision) if has_limit else ()
-        rows.append((one.name, f"{one.statistics.n:,}", *cells, *limit))
-    more = ("tolerance", "decision") if has_limit else ()
+        limit = (one.decision, _length(one.tolerance_mm, sign="")) if has_limit else ()
+        rows.append((one.name, *limit, f"{one.statistics.n:,}", *cells))
     title = "Decision by face, mm" if has_limit else "Faces, mm"
-    return Table((*heads, *more), tuple(rows), title, (len(heads) + 1,) if has_limit else ())
+    return Table(heads, tuple(rows), title, (1,) if has_limit else ())
 
 
 def statistics_table(found: CadComparison) -> Table:

@@ -126,7 +126,7 @@ def _listed(names: tuple[str, ...], most: int = 12) -> str:
 def face_table_bytes(found: CadComparison) -> bytes:
     """CSV of the faces: statistics, spot that deviates most, tolerance and decision."""
     columns: dict[str, tuple[str, ...]] = {
-        "face": tuple(one.name.replace(",", " ") for one in found.faces),
+        "face": tuple(one.name for one in found.faces),
         "n": tuple(str(one.statistics.n) for one in found.faces),
     }
     for key in MM_COLUMNS:

@@ -123,7 +123,7 @@ def cad(
         unit=None if unit is None else unit.value,
         datums=datums,
     )
-    chord = given(ChordError, chord_mm=chord_mm)
+    chord = None if chord_mm is None else ChordError(chord_mm=chord_mm)
     summary = run(
         lambda job: inspect_cad(
             job, cloud, part, tolerance=tolerance, region=box, part_options=how,

@@ -174,7 +174,7 @@ def scale_mismatch(surface: PartSurface, points_mm: FloatArray) -> FitFailure | 
             "scan more of the part",
         )
     low, high = np.percentile(points_mm, [1.0, 99.0], axis=0)
-    ours, theirs = float(np.linalg.norm(high - low)), surface.part.diagonal_mm
+    ours, theirs = float(np.linalg.norm(high - low)), surface.diagonal_mm
     if not ours > TOO_SMALL * theirs or not ours < TOO_LARGE * theirs:
         ratio = ours / theirs
         larger = ratio > 1.0
@@ -294,7 +294,7 @@ def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> Fi
     rows = spread_rows(cloud.points_mm, MOST_POINTS)
     d = np.abs(measured(surface, cloud, best.cad_from_part, rows).signed_mm)
     noise = float(np.median(cloud.sigma_mm[rows]))
-    near = max(NEAR * surface.part.diagonal_mm, 5.0 * noise)
+    near = max(NEAR * surface.diagonal_mm, 5.0 * noise)
     share = float((d <= near).mean())
     if share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise):
         return None
@@ -359,19 +359,9 @@ def fit_to_part(
         if np.abs(step[3:]).max() + radius * np.abs(step[:3]).max() < SETTLED_MM:
             break
     used = weights > 0.0
+    held = 6 - len(motions)
     errors = PointErrors.of(cloud, pose, found.normals, rows) if errors_known else None
-    if errors is None:
-        covariance = _scatter_covariance(placed, influence, d, 6 - len(motions))
-        rule = (
-            "from the scatter of the distances between regions of the part: the cloud carries no "
-            "standard deviations"
-        )
-    else:
-        covariance = errors.covariance(influence)
-        rule = (
-            "from the points' covariances: the stripes' noise point by point, the rest common to "
-            "an exposure, or to a block of neighbouring ones (the larger)"
-        )
+    covariance, rule = _stated_covariance(errors, influence, placed, d, held)
     return Alignment(
         method="best",
         cad_from_part=pose,
@@ -417,6 +407,25 @@ def _about_origin(covariance: FloatArray, centre: FloatArray) -> FloatArray:
     return np.asarray(change @ covariance @ change.T)
 
 
+def _stated_covariance(
+    errors: PointErrors | None,
+    influence: FloatArray,
+    placed: FloatArray,
+    d: FloatArray,
+    held: int,
+) -> tuple[FloatArray, str]:
+    """(6, 6) covariance of a step, and where it comes from, in words."""
+    if errors is None:
+        return _scatter_covariance(placed, influence, d, held), (
+            "from the scatter of the distances between regions of the part: the cloud's standard "
+            "deviations are not known, or not used"
+        )
+    return errors.covariance(influence), (
+        "from the points' covariances: the stripes' noise point by point, the rest common to an "
+        "exposure, or to a block of neighbouring ones (the larger)"
+    )
+
+
 def _scatter_covariance(
     placed: FloatArray, influence: FloatArray, d: FloatArray, held: int
 ) -> FloatArray:
@@ -445,7 +454,7 @@ def _free_motions(
     found = measured(surface, cloud, pose, rows)
     placed = pose.apply(points)
     centre, radius = _middle(placed)
-    scale = max(robust_scale(found.signed_mm), 1e-7 * surface.part.diagonal_mm)
+    scale = max(robust_scale(found.signed_mm), 1e-7 * surface.diagonal_mm)
     weights = tukey_weights(found.signed_mm, scale)
     normal = fit_step(placed, found.normals, weights, centre)[1]
     unit = np.repeat([1.0 / radius, 1.0], 3)
@@ -453,7 +462,7 @@ def _free_motions(
     free = []
     for k in np.flatnonzero(values < WEAK * values[-1]).tolist():
         for way in TRIED:
-            twist = vectors[:, k] * unit * way * surface.part.diagonal_mm
+            twist = vectors[:, k] * unit * way * surface.diagonal_mm
             put = screwed(pose, twist, centre)
             again = closer(surface, points, normals, put, 4)
             kept = np.linalg.norm(again.apply(points) - placed, axis=1).mean()
@@ -524,7 +533,7 @@ def _along_free(
     if not best.free:
         return False
     between = other.cad_from_part @ best.cad_from_part.inverse()
-    centre, radius = best.centre_mm, surface.part.diagonal_mm / 2.0
+    centre, radius = best.centre_mm, surface.diagonal_mm / 2.0
     turn = vector_from_rotation(between.rotation)
     shift = between.apply(centre) - centre
     rows = np.concatenate([turn * radius, shift])
@@ -539,7 +548,7 @@ def _along_free(
             # a finite turn carries the centre round the axis: both ways of that circle are allowed
             spanned += [np.concatenate([np.zeros(3), v]) for v in (arm, across) if v.any()]
     q = np.linalg.qr(np.array(spanned).T)[0]
-    return float(np.linalg.norm(rows - q @ (q.T @ rows))) < APART * surface.part.diagonal_mm
+    return float(np.linalg.norm(rows - q @ (q.T @ rows))) < APART * surface.diagonal_mm
 
 
 def _datum_step(
@@ -584,9 +593,10 @@ def _datum_step(
         influence = influence + ways @ own
         left = left @ vectors[:, ~taken]
         used[at] = weights > 0.0
-    errors = PointErrors.of(cloud, pose, found.normals, rows)
-    covariance = errors.covariance(influence)
     d = np.where(np.isfinite(found.signed_mm), found.signed_mm, 0.0)
+    is_known = bool(cloud.covariance_mm2.any())
+    errors = PointErrors.of(cloud, pose, found.normals, rows) if is_known else None
+    covariance, rule = _stated_covariance(errors, influence, placed, d, 6 - left.shape[1])
     result = Alignment(
         method="321",
         cad_from_part=pose,
@@ -596,7 +606,7 @@ def _datum_step(
         rows=rows[used],
         influence=influence[:, used],
         rms_mm=float(np.sqrt(np.mean(d[used] ** 2))) if used.any() else math.nan,
-        sigma_rule="from the covariances of the points on the datum faces",
+        sigma_rule=rule,
         free=named_motions(left * unit[:, None], centre, radius),
     )
     return -influence @ d, result

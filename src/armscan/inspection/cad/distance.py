@@ -66,13 +66,16 @@ class PartSurface:
 
     Attributes
     ----------
+    diagonal_mm
+        Of the box about the part.
     is_closed
         True if each edge joins two triangles, so that inside and outside are parted.
     """
 
     def __init__(self, part: PartModel) -> None:
         self.part = part
-        corners = part.corners_mm
+        self.diagonal_mm = part.diagonal_mm
+        corners, self._normals = part.corners_mm, part.normals
         boxes = np.concatenate([corners.min(axis=1), corners.max(axis=1)], axis=1)
         n = len(corners)
         order = np.arange(n, dtype=np.int64)
@@ -82,7 +85,7 @@ class PartSurface:
         self._order = order
         a, u, v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
         products = [np.einsum("ij,ij->i", p, q) for p, q in ((u, u), (u, v), (v, v))]
-        rows = np.concatenate([a, u, v, part.normals, np.stack(products, axis=1)], axis=1)
+        rows = np.concatenate([a, u, v, self._normals, np.stack(products, axis=1)], axis=1)
         self._triangles = np.ascontiguousarray(rows[order])
         counts = np.bincount(edges_of(part.triangles)[1].ravel())
         self.is_closed = bool((counts == 2).all())
@@ -116,7 +119,7 @@ class PartSurface:
             rows = found[0].copy()
             rows[rows >= 0] = self._order[rows[rows >= 0]]
             looks_away = (rows >= 0) & (
-                np.einsum("ij,ij->i", self.part.normals[rows], towards) < OPPOSITE
+                np.einsum("ij,ij->i", self._normals[rows], towards) < OPPOSITE
             )
             again = order[looks_away[order]]
             second = self._closest(points, again, np.ascontiguousarray(towards), reach_mm)
@@ -157,7 +160,7 @@ class PartSurface:
         offset = points - closest
         length = np.linalg.norm(offset, axis=1)
         sign = np.where(np.einsum("ij,ij->i", offset, pseudo) < 0.0, -1.0, 1.0)
-        is_off = length > 1e-9 * self.part.diagonal_mm
+        is_off = length > 1e-9 * self.diagonal_mm
         direction = offset * (sign / np.where(is_off, length, 1.0))[:, None]
         return SurfaceDistance(
             signed_mm=np.where(triangle >= 0, sign * length, np.nan),
@@ -168,7 +171,7 @@ class PartSurface:
 
     def _normals_at(self, triangle: IntArray, place: IntArray) -> FloatArray:
         """(N, 3) unit normals of the surface where the closest points lie."""
-        normals = self.part.normals[triangle]
+        normals = self._normals[triangle]
         for code, column in ((ON_AB, 0), (ON_BC, 1), (ON_CA, 2)):
             at = np.flatnonzero(place == code)
             normals[at] = self._edge_normals[self._edge_number[triangle[at], column]]

@@ -101,7 +101,7 @@ def search_pose(
     grid = _distance_grid(surface)
     facing = towards if surface.is_closed else None
     poses = _starts(surface)
-    diagonal = surface.part.diagonal_mm
+    diagonal = surface.diagonal_mm
     for count, kept, widths in (
         (FEW, KEPT, diagonal * np.geomspace(0.15, 0.03, 10)),
         (SOME, LAST, diagonal * np.geomspace(0.04, 0.01, 8)),
@@ -184,7 +184,7 @@ def closer(
         towards = None if normals is None else pose.rotate(normals)
         found = surface.distance(placed, towards=towards)
         d = found.signed_mm
-        scale = max(robust_scale(d), 1e-9 * surface.part.diagonal_mm)
+        scale = max(robust_scale(d), 1e-9 * surface.diagonal_mm)
         centre = placed.mean(axis=0)
         weights = tukey_weights(d, scale)
         jacobian, normal = fit_step(placed, found.normals, weights, centre)
@@ -345,7 +345,7 @@ def _rated(
     """
     distances = [_distances(surface, points, normals, pose) for pose in poses]
     scales = [robust_scale(d) for d in distances]
-    unit = max(min(scales), 1e-7 * surface.part.diagonal_mm)
+    unit = max(min(scales), 1e-7 * surface.diagonal_mm)
     squares = [_clipped(d, unit) for d in distances]
     costs = np.array([float(one.mean()) for one in squares])
     order = np.argsort(costs, kind="stable")
@@ -375,6 +375,6 @@ def _is_new(
 ) -> bool:
     """Whether a pose puts the points elsewhere than all poses found."""
     place = pose.apply(points)
-    limit = APART * surface.part.diagonal_mm
+    limit = APART * surface.diagonal_mm
     off = [np.linalg.norm(one.cad_from_part.apply(points) - place, axis=1).max() for one in found]
     return float(min(off)) > limit

@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
@@ -33,6 +34,7 @@ from armscan.report.drawing import (
     SceneValues,
     chart_markup,
     new_figure,
+    raster_markup,
     scene_markup,
     styled,
 )
@@ -202,16 +204,16 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
 def verdict_table(found: CadComparison) -> Table:
     """A row a face: decision, tolerance, mean and worst spot, each with its U."""
     has_limit = found.options.has_tolerance
-    heads = ("face", "points", "mean", "U of mean", "spot", "U of spot")
+    decided = ("decision", "tolerance") if has_limit else ()
+    heads = ("face", *decided, "points", "mean", "U of mean", "spot", "U of spot")
     rows = []
     for one in found.faces:
         pairs = ((one.statistics.mean_mm, one.u_mean_mm), (one.spot_mm, one.u_spot_mm))
         cells = [text for value, u in pairs for text in (_length(value), _length(u, sign=""))]
-        limit = (_length(one.tolerance_mm, sign=""), one.decision) if has_limit else ()
-        rows.append((one.name, f"{one.statistics.n:,}", *cells, *limit))
-    more = ("tolerance", "decision") if has_limit else ()
+        limit = (one.decision, _length(one.tolerance_mm, sign="")) if has_limit else ()
+        rows.append((one.name, *limit, f"{one.statistics.n:,}", *cells))
     title = "Decision by face, mm" if has_limit else "Faces, mm"
-    return Table((*heads, *more), tuple(rows), title, (len(heads) + 1,) if has_limit else ())
+    return Table(heads, tuple(rows), title, (1,) if has_limit else ())
 
 
 def statistics_table(found: CadComparison) -> Table:
@@ -462,8 +464,7 @@ def section_chart(found: CadComparison, part: PartModel, axis: int, limit_mm: fl
     with styled():
         figure = new_figure(5.6, 4.2)
         axes = figure.add_subplot()
-        for piece in outline:
-            axes.plot(piece[:, 0], piece[:, 1], color=MUTED, linewidth=0.8)
+        axes.add_collection(LineCollection(list(outline), colors=MUTED, linewidths=0.8))
         across, up = drawn[:, others].T
         axes.scatter(across, up, c=colours / 255.0, s=4, linewidths=0)
         axes.set_xlabel(f"{'XYZ'[others[0]]}, mm")
@@ -471,7 +472,7 @@ def section_chart(found: CadComparison, part: PartModel, axis: int, limit_mm: fl
         axes.set_aspect("equal", adjustable="datalim")
     title = f"{name} = {at:.2f} mm"
     return Picture(
-        chart_markup(figure, f"Section at {title}"),
+        raster_markup(figure, f"Section at {title}"),
         title=title,
         caption=f"{len(near):,} points within {significant(0.01 * part.diagonal_mm, 'mm', 2)}.",
     )

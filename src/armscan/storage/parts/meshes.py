@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from armscan.errors import FileFormatError
+from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.storage.files import path_text, read_bytes
@@ -40,12 +40,22 @@ def read_part(path: Path, *, unit: str = "mm", chord: ChordError | None = None) 
 
     Raises
     ------
+    OptionError
+        If a unit is given for a STEP file, or a chord error for a mesh.
     FileFormatError
         If the file is none of these, is cut short, or is not understood.
     InputError
         If it holds no surface.
     """
     suffix, where = path.suffix.lower(), path_text(path)
+    if suffix in STEP_SUFFIXES and unit != "mm":
+        raise OptionError(
+            "a STEP file says its own unit", where="--unit", remedy="leave out --unit"
+        )
+    if suffix not in STEP_SUFFIXES and chord is not None:
+        raise OptionError(
+            "a mesh has no faces to make triangles of", where="--chord-mm", remedy="leave it out"
+        )
     if suffix in STEP_SUFFIXES:
         return read_step(path, chord or ChordError())
     if suffix not in MESH_SUFFIXES:
@@ -119,19 +129,18 @@ def _ply(data: bytes, where: str) -> FloatArray:
         raise FileFormatError("the PLY file's vertices have no x, y, z", where=where, remedy=CUT)
     points = np.stack([table[name].astype(np.float64) for name in "xyz"], axis=1)
     start = data.find(b"\n", data.find(b"\nend_header") + 1) + 1
-    header = data[:start].decode("latin-1").split("\n")
-    words = [line.split() for line in header]
-    order = next(line[1] for line in words if line[:1] == ["format"])
-    elements = [line for line in words if line[:1] == ["element"]]
-    count = int(elements[1][2]) if len(elements) > 1 and elements[1][1] == "face" else 0
+    try:
+        order, count, kinds = _ply_faces(data[:start].decode("latin-1"))
+    except (ValueError, KeyError, IndexError, StopIteration) as error:
+        raise FileFormatError(
+            "the PLY header is not understood", where=where, remedy=CUT
+        ) from error
     if count == 0:
         raise FileFormatError(
             "the PLY file holds points but no faces: it is a cloud, not the model of a part",
             where=where,
             remedy="give a mesh",
         )
-    at = next(k for k, line in enumerate(words) if line == elements[1])
-    kinds = [line[1:] for line in words[at + 1 :] if line[:1] == ["property"]]
     if order == "ascii":
         lines = [line for line in data[start:].split(b"\n") if line.strip()]
         rows = [line.split() for line in lines[len(table) : len(table) + count]]
@@ -142,6 +151,24 @@ def _ply(data: bytes, where: str) -> FloatArray:
             data, body, count, kinds=kinds, order=BYTE_ORDERS[order], where=where
         )
     return _triangulated(points, polygons, where)
+
+
+def _ply_faces(header: str) -> tuple[str, int, list[list[str]]]:
+    """Byte order, count of faces, and their properties; `ValueError` and the like for no header."""
+    words = [line.split() for line in header.split("\n")]
+    order = next(line[1] for line in words if line[:1] == ["format"])
+    elements = [k for k, line in enumerate(words) if line[:1] == ["element"]]
+    if len(elements) < 2 or words[elements[1]][1] != "face":
+        return order, 0, []
+    end = elements[2] if len(elements) > 2 else len(words)
+    kinds = [line[1:] for line in words[elements[1] : end] if line[:1] == ["property"]]
+    for kind in kinds:
+        # a type that is not known is a KeyError here, not while faces are read
+        _ = [TYPES[name] for name in (kind[1:3] if kind[0] == "list" else kind[:1])]
+    count = int(words[elements[1]][2])
+    if count < 0:
+        raise ValueError("a count below zero")
+    return order, count, kinds
 
 
 def _text_polygons(rows: list[list[bytes]], count: int, where: str) -> list[IntArray]:

@@ -47,9 +47,15 @@ def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]
     if not text:
         return math.nan, {}
     try:
-        return float(text), {}
+        limit = float(text)
     except ValueError:
         path = Path(text)
+    else:
+        if not math.isfinite(limit):
+            raise OptionError(
+                f"a tolerance of {text} mm", where="--tolerance", remedy="give a length in mm"
+            )
+        return limit, {}
     if path.suffix.lower() not in (".toml", ".csv"):
         raise OptionError(
             f"'{text}' is neither a length in mm nor a .toml or .csv file",
@@ -120,7 +126,7 @@ def _listed(names: tuple[str, ...], most: int = 12) -> str:
 def face_table_bytes(found: CadComparison) -> bytes:
     """CSV of the faces: statistics, spot that deviates most, tolerance and decision."""
     columns: dict[str, tuple[str, ...]] = {
-        "face": tuple(one.name.replace(",", " ") for one in found.faces),
+        "face": tuple(one.name for one in found.faces),
         "n": tuple(str(one.statistics.n) for one in found.faces),
     }
     for key in MM_COLUMNS:

@@ -146,7 +146,8 @@ def test_too_few_points_are_refused() -> None:
 def noisy_trials(n_trials: int) -> tuple[list[float], list[float]]:
     """Normalised squares of the pose's errors, and face means over their U, of many scans.
 
-    Each exposure is shifted as a whole, each point has noise of its own.
+    Each exposure is shifted as a whole, each point has noise of its own. There are so few exposures
+    that none are taken together, which would be careful.
     """
     own, common, n = 0.02, 0.01, 1500
     squares, ratios = [], []
@@ -154,8 +155,8 @@ def noisy_trials(n_trials: int) -> tuple[list[float], list[float]]:
         random = np.random.default_rng(100 + trial)
         points, triangle = WEDGE.part.surface_points(n, trial)
         normals = WEDGE.part.normals[triangle]
-        exposure = np.minimum((points[:, 0] / 80.0 * 16.0).astype(np.int64), 15)
-        shifts = random.normal(0.0, common, (16, 3))
+        exposure = np.minimum((points[:, 0] / 80.0 * 10.0).astype(np.int64), 9)
+        shifts = random.normal(0.0, common, (10, 3))
         noisy = points + normals * random.normal(0.0, own, n)[:, None] + shifts[exposure]
         cloud = cloud_of(noisy, exposure, sigma_mm=common, noise_mm=own, noise_along=normals)
         fit = fit_to_part(WEDGE, cloud, Pose(np.eye(3), np.zeros(3)), True)
@@ -175,9 +176,7 @@ def test_the_stated_covariance_is_that_of_many_scans() -> None:
     trials = 40
     squares, ratios = noisy_trials(trials)
     low, high = chi2.ppf([0.0005, 0.9995], 6 * trials)
-    # the larger of three ways to share errors among exposures counts: never too certain, and not
-    # twice too careful in variance
-    assert low / 2.0 < sum(squares) < high
+    assert low < sum(squares) < high
     inside = np.mean(np.abs(ratios) < 1.0)
     assert 0.93 < inside <= 0.995
 

@@ -131,6 +131,28 @@ def test_a_cloud_is_no_model(tmp_path: Path) -> None:
         read_part(path)
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [(b"element face 12", b"element face 1x"), (b"list uchar int", b"list uchar"),
+     (b"list uchar int", b"list uchar word"), (b"element face 12", b"element face 13"),
+     (b"element face 12", b"element face -3")],
+)  # fmt: skip
+def test_a_damaged_header_is_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+    path = written(tmp_path, "a.ply")
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+    with pytest.raises(ArmscanError):
+        read_part(path)
+
+
+def test_options_without_effect_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(OptionError):
+        read_part(written(tmp_path, "a.stl"), chord=ChordError())
+    with pytest.raises(OptionError):
+        read_part(step_file(tmp_path), unit="inch")
+
+
 def test_faces_are_parted_at_creases_only() -> None:
     """A prism of 36 sides has a bottom, a top, and one round side."""
     angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
@@ -194,6 +216,8 @@ def test_tolerances_by_face(tmp_path: Path) -> None:
     assert read_tolerances(str(toml), PART) == (0.1, {"face 3": 0.02})
     assert read_tolerances("0.07", PART) == (0.07, {})
     assert np.isnan(read_tolerances("", PART)[0])
+    with pytest.raises(OptionError):
+        read_tolerances("nan", PART)
 
 
 @pytest.mark.parametrize(

@@ -204,7 +204,7 @@ class _Measured:
     """What the exposures of a scan gave besides points, which are in a spool.
 
     ``rows`` are those of the recording, as they were measured; ``images`` the stripes of some of
-    them, by row.
+    them, by row. ``depths`` count also what is left out afterwards for its pose.
     """
 
     depths: tuple[SheetDepths, ...]

@@ -218,9 +218,7 @@ def _judged_steps(places: FloatArray, t_ns: IntArray, resolution_mm: float) -> _
             continue
         # rows are judged each by itself: few at a time, of a track of minutes
         for own in np.array_split(np.arange(start, end), 1 + (end - start) // JUDGED_AT_ONCE):
-            around = own[:, None] + np.concatenate(
-                [np.arange(-WINDOW, 0), np.arange(1, WINDOW + 1)]
-            )
+            around = own[:, None] + beside
             inside = (around >= start) & (around < end)
             near = velocity[np.clip(around, start, end - 1)]
             usual = np.nanmedian(np.where(inside[:, :, None], near, np.nan), axis=1)

@@ -275,8 +275,7 @@ def progress_bar() -> Iterator[Progress]:
 
     from armscan.pipeline.progress import silent
 
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not (console := Console(stderr=True)).is_terminal:
         yield silent
         return
     bars = ProgressBars(
@@ -293,8 +292,9 @@ def progress_bar() -> Iterator[Progress]:
     def advance(event: ProgressEvent) -> None:
         if event.stage not in tasks:
             tasks[event.stage] = bars.add_task(event.stage, total=event.total, item="")
-        task = bars.tasks[tasks[event.stage]].id
-        bars.update(task, completed=event.done, total=event.total, item=event.item)
+        task = bars.tasks[tasks[event.stage]]
+        item = f"{task.speed:.0f}/s {event.item}" if task.speed else event.item
+        bars.update(task.id, completed=event.done, total=event.total, item=item)
 
     with bars:
         yield advance

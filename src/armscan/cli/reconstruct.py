@@ -28,7 +28,7 @@ from armscan.cli.options import (
 
 OF_IMAGES = (
     "background right right_background sheet depth_margin arm "
-    "method stripe_method laser_colour bits_used bits_align cache profile"
+    "method stripe_method laser_colour bits_used bits_align cache profile cluster"
 )
 RECONSTRUCT_EXAMPLE = (
     "\b\nExamples:\n"
@@ -79,6 +79,13 @@ Calibration = Annotated[
 ProfileOption = Annotated[
     bool, typer.Option("--profile", help="Say what each stage of a scan took.")
 ]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Dask scheduler, tcp://HOST:PORT, whose workers extract the stripes of a scan.",
+        show_default=False,
+    ),
+]
 Volume = Annotated[
     str, typer.Option(help="Part of Base to measure: xmin,xmax,ymin,ymax,zmin,zmax in mm.")
 ]
@@ -115,12 +122,14 @@ def reconstruct(
     bits_align: BitsAlign = None,
     cache: Cache = True,
     profile: ProfileOption = False,
+    cluster: ClusterOption = None,
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure points from a recording of a scan, or from images of laser lines on objects."""
     from armscan.jobs.reconstruct import PoseTable, StillPaths
     from armscan.jobs.reconstruct import reconstruct as reconstruct_points
+    from armscan.pipeline.cluster.extraction import ClusterAddress
     from armscan.pipeline.measure import MeasureOptions
     from armscan.reconstruction.triangulate import DepthRange
     from armscan.storage.images import ImageOptions
@@ -145,6 +154,7 @@ def reconstruct(
             options=options,
             image_options=given(ImageOptions, bits_used=bits_used, align=bits_align),
             is_profiled=profile,
+            cluster=None if cluster is None else ClusterAddress(cluster),
         ),
         as_json=as_json,
         output=output,

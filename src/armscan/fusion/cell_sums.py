@@ -27,6 +27,8 @@ AXIS_CELLS = 2 ** (BLOCK_BITS + PART_BITS)
 """Cells along an axis that can be numbered."""
 MOST_BYTES = 64 * 2**20
 """Memory that the cells of one grid take before they go to disk."""
+WRITTEN_ROWS = 2**14
+"""Rows of a run that are put together at a time."""
 FEWEST_ROWS = 1024
 """Rows of each run that are held while runs are merged, at least."""
 
@@ -148,13 +150,15 @@ class CellSums:
         return self._keys[:n][order], self._sums[:n][order]
 
     def _spill(self) -> None:
-        keys, sums = self._sorted()
         assert self.folder is not None  # noqa: S101 - only a grid with a folder spills
-        table = np.concatenate([keys.view(np.float64)[:, None], sums], axis=1)
+        order = np.argsort(self._keys[: int(self._count[0])])
         try:
             file = (self.folder / f"cells-{id(self)}-{len(self._runs)}").open("w+b")
             self._runs.append(file)
-            file.write(table.tobytes())
+            for first in range(0, len(order), WRITTEN_ROWS):
+                rows = order[first : first + WRITTEN_ROWS]
+                keys = self._keys[rows].view(np.float64)
+                file.write(np.column_stack([keys, self._sums[rows]]).tobytes())
         except OSError as error:
             raise OutputError(
                 f"cells cannot be kept on disk ({error.strerror})",
@@ -167,7 +171,7 @@ class CellSums:
     def _merge(self) -> Iterator[tuple[IntArray, FloatArray]]:
         """Take from all runs what lies below the least of their windows' ends, over and over."""
         width = 8 * (self.n_values + 1)
-        rows = max(FEWEST_ROWS, self.most_bytes // (2 * width * len(self._runs)))
+        rows = max(FEWEST_ROWS, self.most_bytes // (8 * width * len(self._runs)))
         for run in self._runs:
             run.seek(0, io.SEEK_SET)
 

@@ -17,8 +17,9 @@ from armscan.geometry.arrays import Box
 from armscan.geometry.rotations import EulerConvention, check_convention
 from armscan.jobs.job import Job
 from armscan.models.calibration import Provenance, ScannerCalibration, SensorCalibration
+from armscan.pipeline.cluster.extraction import ClusterAddress, ClusterReader
 from armscan.pipeline.instants import PARTNER_MISSING, ScanInstants
-from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of
+from armscan.pipeline.measure import MeasureOptions, Reconstruction, cameras_of, stripes_for
 from armscan.pipeline.measure import reconstruct as reconstruct_images
 from armscan.pipeline.progress import StageClock
 from armscan.pipeline.scan import (
@@ -141,6 +142,7 @@ def reconstruct(
     options: MeasureOptions | None = None,
     image_options: ImageOptions | None = None,
     is_profiled: bool = False,
+    cluster: ClusterAddress | None = None,
 ) -> Summary:
     """Measure a recording in Base if there is one and a scanner's document, else in Sensor.
 
@@ -165,6 +167,8 @@ def reconstruct(
         Of stripes, depths and sheet, and how pixels are read.
     is_profiled
         Say what each stage of a scan took.
+    cluster
+        Whose workers extract the stripes of a scan; None to do so here.
 
     Raises
     ------
@@ -189,8 +193,11 @@ def reconstruct(
             )
         _check_own_images(paths)
         chosen = ScanOptions(measure=options, volume=box)
-        return _scan(job, calibration, recordings[0], arm, chosen, is_profiled=is_profiled)
-    for option, value in (("--volume", volume), ("--arm", arm), ("--profile", is_profiled)):
+        return _scan(
+            job, calibration, recordings[0], arm, chosen, is_profiled=is_profiled, cluster=cluster
+        )
+    of_scans = {"--volume": volume, "--arm": arm, "--profile": is_profiled, "--cluster": cluster}
+    for option, value in of_scans.items():
         if value:
             raise OptionError(
                 "there is no recording of an arm with a scanner's document",
@@ -305,15 +312,21 @@ def _scan(
     options: ScanOptions,
     *,
     is_profiled: bool,
+    cluster: ClusterAddress | None,
 ) -> Summary:
     clock = StageClock()
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
     scanner = read_scanner_calibration(calibration)
     recording = read_recording(folder, None if arm is None else read_arm_model(arm))
+    reader = None
+    if cluster is not None and scanner.sensor is not None:
+        stripes = stripes_for(scanner.sensor, options.measure.stripes)
+        cameras = cameras_of(scanner.sensor)
+        reader = ClusterReader(cluster, recording, cameras, stripes, job.cache)
     with scratch_folder(places[0]) as scratch, scan_spool(scanner, scratch) as points:
         scan = measure_long_scan(
             recording, scanner, points, options,
-            progress=job.progress, cache=job.cache, clock=clock,
+            progress=job.progress, cache=job.cache, clock=clock, reader=reader,
         )  # fmt: skip
         warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
         tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]

@@ -17,6 +17,7 @@ from armscan.geometry.poses import Base, Pose, Sensor
 from armscan.models.camera import CameraModel
 from armscan.pipeline.progress import Progress, ProgressEvent, StageClock
 from armscan.records.exposure import Exposure
+from armscan.records.profile import Profile
 from armscan.records.recording import ExposureRow
 
 ExposurePair = tuple[Exposure, Exposure | None]
@@ -341,16 +342,21 @@ class InstantImages:
         Where the sensor was; None if unknown.
     instant
         Its rows and time in a scan; of still images there are none.
+    profiles, named_lasers
+        Stripes of each camera and sources that were on, where these were extracted elsewhere and
+        ``pairs`` is empty.
     """
 
     pairs: tuple[ExposurePair, ...]
     base_from_sensor: Pose[Base, Sensor] | None = None
     instant: Instant = Instant((), 0)
+    profiles: tuple[Profile, ...] = ()
+    named_lasers: tuple[str, ...] = ()
 
     @property
     def lasers(self) -> tuple[str, ...]:
         """Sources that were on; empty if unknown."""
-        return self.pairs[0][0].lasers
+        return self.pairs[0][0].lasers if self.pairs else self.named_lasers
 
     @property
     def t_ns(self) -> int:
@@ -449,6 +455,11 @@ class ScanInstants:
             yield InstantImages(pairs, base_from_sensor(one), one)
         progress(ProgressEvent(stage, n, n))
 
+    def background_row(self, row: int) -> int | None:
+        """Row of the exposure without laser of the same view and camera; None if there is none."""
+        view, camera = self._source.rows[row].view, self._source.rows[row].camera
+        return None if view is None else self._dark_row.get((view, camera))
+
     def pair(self, row: int) -> ExposurePair:
         """Read one exposure and its background, if there is one.
 
@@ -457,9 +468,8 @@ class ScanInstants:
         ArmscanError
             If an image cannot be read.
         """
-        exposure = self._source.exposure(row)
-        view, camera = self._source.rows[row].view, self._source.rows[row].camera
-        dark_row = None if view is None else self._dark_row.get((view, camera))
+        exposure, camera = self._source.exposure(row), self._source.rows[row].camera
+        dark_row = self.background_row(row)
         if dark_row is None:
             return exposure, None
         if camera not in self._dark or self._dark[camera][0] != dark_row:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from armscan.fusion.scan_normals import ScanNormals, choose_scan_radius_mm
 from armscan.geometry.arrays import Box, FloatArray
 from armscan.geometry.poses import Base, Pose, Sensor, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.instants import PARTNER_MISSING, Instant, ScanInstants
+from armscan.pipeline.instants import PARTNER_MISSING, Instant, InstantImages, ScanInstants
 from armscan.pipeline.measure import (
     PLACING,
     MeasureOptions,
@@ -184,12 +185,26 @@ class ScanOptions:
     has_normals: bool = True
 
 
+class InstantReader(Protocol):
+    """Gives the instants of a scan in order, with profiles that were extracted elsewhere."""
+
+    def read(
+        self,
+        scan: ScanInstants,
+        instants: Sequence[Instant],
+        stage: str,
+        progress: Progress,
+        base_from_sensor: Callable[[Instant], Pose[Base, Sensor] | None],
+    ) -> Iterator[InstantImages]:
+        """Parameters as of `ScanInstants.read`; what cannot be read goes to its `unreadable`."""
+
+
 @dataclass(slots=True, eq=False)
 class _Measured:
     """What the exposures of a scan gave besides points, which are in a spool.
 
     ``rows`` are those of the recording, as they were measured; ``images`` the stripes of some of
-    them, by row.
+    them, by row. ``depths`` count also what is left out afterwards for its pose.
     """
 
     depths: tuple[SheetDepths, ...]
@@ -266,6 +281,7 @@ def measure_long_scan(
     cache: DetectionCache | None = None,
     most_images: int | None = SHOWN_IMAGES,
     clock: StageClock | None = None,
+    reader: InstantReader | None = None,
 ) -> ScanReconstruction:
     """As `measure_scan`, with memory that does not grow with the scan's length.
 
@@ -279,6 +295,8 @@ def measure_long_scan(
         Exposures whose stripes are kept, evenly chosen; None for all.
     clock
         Counts what the stages take.
+    reader
+        Reads and extracts elsewhere; None to do so here.
 
     Returns
     -------
@@ -305,7 +323,11 @@ def measure_long_scan(
     labeller = labeller_for(sensor, options.measure, is_scan=True)
     found = _Measured(SheetDepths.of(sensor))
     shown = _shown_rows(wanted, most_images)
-    instants = scan.read(wanted, STAGE, progress, sensor_poses(poses, scanner), clock=clock)
+    at = sensor_poses(poses, scanner)
+    if reader is None:
+        instants = scan.read(wanted, STAGE, progress, at, clock=clock)
+    else:
+        instants = reader.read(scan, wanted, STAGE, progress, at)
     for one in measure_instants(
         instants, labeller, sensor, options.measure, is_pass=True, cache=cache, clock=clock
     ):

@@ -21,6 +21,8 @@ LEVER_MM = 200.0
 SHORTEST_GAP_NS, LONGEST_STEP_NS, GAP_PERIODS = 100_000_000, 250_000_000, 3
 """Steps beyond three median periods (but at least 0.1 s), or beyond a quarter of a second, are
 gaps: the tool may have gone anywhere meanwhile."""
+JUDGED_AT_ONCE = 4096
+"""Steps whose neighbours are held at a time: 3 KB each."""
 WINDOW = 4
 """Steps on either side that tell the speed about a step."""
 FEWEST_STEPS = 8
@@ -210,19 +212,21 @@ def _judged_steps(places: FloatArray, t_ns: IntArray, resolution_mm: float) -> _
     samples, leaps, speeds, sides = [], [], [], []
     is_joined = step_ns <= longest
     edges = np.flatnonzero(np.diff(np.concatenate([[0], is_joined.astype(np.int8), [0]])))
+    beside = np.concatenate([np.arange(-WINDOW, 0), np.arange(1, WINDOW + 1)])
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         if end - start < FEWEST_STEPS:
             continue
-        own = np.arange(start, end)
-        around = own[:, None] + np.concatenate([np.arange(-WINDOW, 0), np.arange(1, WINDOW + 1)])
-        inside = (around >= start) & (around < end)
-        near = velocity[np.clip(around, start, end - 1)]
-        usual = np.nanmedian(np.where(inside[:, :, None], near, np.nan), axis=1)
-        speed = _largest(near.reshape(-1, 12)).reshape(inside.shape)
-        samples.append(own)
-        leaps.append(way[own] - usual * seconds[own, None])
-        speeds.append(np.nanmedian(np.where(inside, speed, np.nan), axis=1))
-        sides.append(np.where(inside.sum(axis=1) >= WINDOW + 2, 1.0, 2.0))
+        # rows are judged each by itself: few at a time, of a track of minutes
+        for own in np.array_split(np.arange(start, end), 1 + (end - start) // JUDGED_AT_ONCE):
+            around = own[:, None] + beside
+            inside = (around >= start) & (around < end)
+            near = velocity[np.clip(around, start, end - 1)]
+            usual = np.nanmedian(np.where(inside[:, :, None], near, np.nan), axis=1)
+            speed = _largest(near.reshape(-1, 12)).reshape(inside.shape)
+            samples.append(own)
+            leaps.append(way[own] - usual * seconds[own, None])
+            speeds.append(np.nanmedian(np.where(inside, speed, np.nan), axis=1))
+            sides.append(np.where(inside.sum(axis=1) >= WINDOW + 2, 1.0, 2.0))
     if not samples:
         return empty
     sample, leap, speed = np.concatenate(samples), np.concatenate(leaps), np.concatenate(speeds)

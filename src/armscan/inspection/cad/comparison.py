@@ -11,7 +11,15 @@ from typing import Literal
 import numpy as np
 
 from armscan.errors import OptionError
-from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, ints
+from armscan.geometry.arrays import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    RowRecord,
+    bools,
+    floats,
+    ints,
+)
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cad.alignment import Alignment, measured
 from armscan.inspection.cad.distance import PartSurface
@@ -23,6 +31,7 @@ from armscan.records.cloud import PointCloud
 Decision = Literal["pass", "fail", "undecided"]
 DECISIONS: tuple[Decision, ...] = ("pass", "undecided", "fail")
 """In the order of their numbers in files, 0, 1, 2, and from best to worst."""
+FAIL = DECISIONS.index("fail")
 OF_VALIDITY: Mapping[Validity, Decision] = {
     "still valid": "pass",
     "not valid": "fail",
@@ -31,13 +40,16 @@ OF_VALIDITY: Mapping[Validity, Decision] = {
 RULE = (
     "passed if the deviation's size is at most the tolerance minus U, failed if it is above the "
     "tolerance plus U, else undecided (ISO 14253-1); U is the deviation's expanded uncertainty "
-    "(k = 2)"
+    "(k = 2); what one exposure alone shows is undecided, not failed"
 )
 SPOT_SHARE = 0.02
 """Width of a spot over the part's diagonal: small enough to show a dent, large enough for noise to
 average out. Of thin clouds spots are larger, so that they hold points enough."""
 LEAST_SPOT_POINTS = 10
 """A face none of whose spots has so many is not seen, and not judged."""
+ALONG_FACE = 0.98
+"""Cosine between a deviation and the normal of its face, below which the closest point is on an
+edge: the facets of a round face are up to 10 degrees apart, and the point may be of either face."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +112,11 @@ class DeviationStatistics:
 
 
 DEFINITIONS: Mapping[str, tuple[str, str]] = {
-    "n": ("points", "points whose closest surface is this one and nearer than the reach"),
+    "n": (
+        "points",
+        "points whose closest surface is this one and nearer than the reach; of a face without "
+        "those beyond its edges, which may be of either face",
+    ),
     "mean_mm": ("mean", "arithmetic mean, with sign"),
     "std_mm": ("std", "standard deviation about their mean, divided by n - 1"),
     "rms_mm": ("rms", "deviation rms: root mean square about the model, divided by n"),
@@ -131,6 +147,9 @@ class FaceComparison:
         Of the face; NaN for none.
     decision
         The worse of those on the mean and on every spot; empty without a tolerance.
+    is_seen_once
+        What would fail it was shown by one exposure alone, so it is undecided: a stripe along an
+        edge errs by tenths of a millimetre, and alone.
     """
 
     name: str
@@ -141,6 +160,7 @@ class FaceComparison:
     spot_place_mm: FloatArray
     tolerance_mm: float
     decision: Decision | Literal["", "not seen"]
+    is_seen_once: bool = False
 
 
 class CadComparison(RowRecord):
@@ -162,8 +182,11 @@ class CadComparison(RowRecord):
         (N,) expanded uncertainty (k = 2) of each; NaN where not known.
     face
         (N,) number of the face.
+    is_beside_edge
+        (N,) True beyond the edges of a face: the closest point is on the edge, and the point may
+        be of either face. It counts in ``overall`` alone.
     decision
-        (N,) number in `DECISIONS`; -1 without a tolerance.
+        (N,) number in `DECISIONS`; -1 without a tolerance, or beside an edge.
     overall
         Statistics over all.
     faces
@@ -183,6 +206,7 @@ class CadComparison(RowRecord):
     deviation_mm: FloatArray = floats("N")
     u_mm: FloatArray = floats("N", nan=True)
     face: IntArray = ints("N")
+    is_beside_edge: BoolArray = bools("N")
     decision: IntArray = ints("N")
     overall: DeviationStatistics
     faces: tuple[FaceComparison, ...]
@@ -255,7 +279,9 @@ def compare_with_part(
         )
     placed = alignment.cad_from_part.apply(cloud.points_mm)
     normals, d = found.normals, found.signed_mm
-    face = np.where(near, part.face[found.triangle], -1)
+    along = np.abs(np.einsum("nk,nk->n", surface.part.normals[found.triangle], normals))
+    is_beside = near & (along < ALONG_FACE)
+    face = np.where(near & ~is_beside, part.face[found.triangle], -1)
     by_density = math.sqrt(2 * LEAST_SPOT_POINTS * float(part.areas_mm2.sum()) / len(rows))
     spot_width = max(SPOT_SHARE * part.diagonal_mm, by_density)
     spot, n_spots = _spots(found.closest_mm, face, spot_width)
@@ -269,13 +295,22 @@ def compare_with_part(
         u = options.uncertainty_mm
         u_point, u_face, u_spot = (np.full(n, u) for n in (len(cloud), n_faces, n_spots))
     limits = np.array([options.tolerance_of(name) for name in part.face_names])
-    spots = _spot_results(spot, face, d, found.closest_mm, u_spot)
+    once = _seen_once(spot, n_spots, cloud.exposure)
+    spots = _spot_results(spot, face, d, found.closest_mm, u_spot, is_once=once)
+    once = _seen_once(face, n_faces, cloud.exposure)
     by_face = _rows_by(face, n_faces)
     faces = tuple(
-        _face(name, float(limits[k]), d[by_face[k]], float(u_face[k]), spots.of_face(k))
+        _face(
+            name,
+            float(limits[k]),
+            d[by_face[k]],
+            float(u_face[k]),
+            spots.of_face(k),
+            is_once=bool(once[k]),
+        )
         for k, name in enumerate(part.face_names)
     )
-    limit = limits[face[rows]]
+    limit = np.where(is_beside[rows], np.nan, limits[part.face[found.triangle[rows]]])
     return CadComparison(
         alignment=alignment,
         options=options,
@@ -285,7 +320,8 @@ def compare_with_part(
         normals=normals[rows],
         deviation_mm=d[rows],
         u_mm=u_point[rows],
-        face=face[rows],
+        face=part.face[found.triangle[rows]],
+        is_beside_edge=is_beside[rows],
         decision=_decisions(d[rows], limit, u_point[rows]),
         overall=deviation_statistics(d[rows]),
         faces=faces,
@@ -295,12 +331,13 @@ def compare_with_part(
 
 
 class _Spots(RowRecord):
-    """Spots with enough points: face, median deviation, U, and where they are."""
+    """Spots with enough points: face, median deviation, U, where, and if seen by one exposure."""
 
     face: IntArray = ints("N")
     deviation_mm: FloatArray = floats("N")
     u_mm: FloatArray = floats("N", nan=True)
     place_mm: FloatArray = floats("N", 3)
+    is_once: BoolArray = bools("N")
 
     def of_face(self, k: int) -> _Spots:
         return self.select(self.face == k)
@@ -330,8 +367,24 @@ def _rows_by(label: IntArray, count: int) -> list[IntArray]:
     return [order[ends[k] : ends[k + 1]] for k in range(count)]
 
 
+def _seen_once(label: IntArray, count: int, exposure: IntArray) -> BoolArray:
+    """(count,) labels with points of one exposure alone, in a cloud of several."""
+    if len(exposure) == 0 or exposure.min() == exposure.max():
+        return np.zeros(count, bool)
+    inside = label >= 0
+    n_all = int(exposure.max()) + 1
+    pairs = np.unique(label[inside] * n_all + exposure[inside])
+    return np.asarray(np.bincount(pairs // n_all, minlength=count) == 1)
+
+
 def _spot_results(
-    spot: IntArray, face: IntArray, d: FloatArray, closest_mm: FloatArray, u: FloatArray
+    spot: IntArray,
+    face: IntArray,
+    d: FloatArray,
+    closest_mm: FloatArray,
+    u: FloatArray,
+    *,
+    is_once: BoolArray,
 ) -> _Spots:
     """Spots with enough points; the median, so that a stray point makes no dent."""
     count = np.bincount(spot[spot >= 0], minlength=len(u))
@@ -345,6 +398,7 @@ def _spot_results(
         deviation_mm=(d[low] + d[high]) / 2.0,
         u_mm=u[enough],
         place_mm=closest_mm[low],
+        is_once=is_once[enough],
     )
 
 
@@ -385,16 +439,23 @@ def _decisions(d: FloatArray, limit: FloatArray, u: FloatArray) -> IntArray:
     return np.where(np.isfinite(limit), decided, -1).astype(np.int64)
 
 
-def _face(name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots) -> FaceComparison:
+def _face(
+    name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots, *, is_once: bool
+) -> FaceComparison:
     statistics = deviation_statistics(d)
     worst = int(np.argmax(np.abs(spots.deviation_mm))) if len(spots) else -1
     decision: Decision | Literal["", "not seen"] = ""
+    is_excused = False
     if worst < 0:
         decision = "not seen"
     elif math.isfinite(limit):
-        whole = OF_VALIDITY[judge(statistics.mean_mm, limit, u_mean)]
+        whole = DECISIONS.index(OF_VALIDITY[judge(statistics.mean_mm, limit, u_mean)])
         local = _decisions(spots.deviation_mm, np.full(len(spots), limit), spots.u_mm)
-        decision = DECISIONS[max(DECISIONS.index(whole), int(local.max(initial=0)))]
+        fails = np.array([whole, *local]) == FAIL
+        once = np.array([is_once, *spots.is_once])
+        is_excused = bool(fails.any() and once[fails].all())
+        decided = max(whole, int(local.max(initial=0)))
+        decision = DECISIONS[decided - is_excused]
     return FaceComparison(
         name=name,
         statistics=statistics,
@@ -404,4 +465,5 @@ def _face(name: str, limit: float, d: FloatArray, u_mean: float, spots: _Spots) 
         spot_place_mm=spots.place_mm[worst] if worst >= 0 else np.full(3, math.nan),
         tolerance_mm=limit,
         decision=decision,
+        is_seen_once=is_excused,
     )

@@ -75,6 +75,10 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
             f"{found.options.reach_mm:g} mm from the model and count nowhere",
         ),
         Quantity("points.n_given", "", found.n_given),
+        Quantity(
+            "points.n_beside_edge", "Beside edges", int(found.is_beside_edge.sum()),
+            meaning="points beyond an edge, which may be of either face and count for none",
+        ),
         Quantity("points.n_beyond_reach", "", beyond),
         Quantity("reach_mm", "", found.options.reach_mm),
         Quantity("faces.n_seen", "Faces seen", seen, meaning=f"of {len(found.faces)}"),
@@ -177,6 +181,7 @@ def _face_data(one: FaceComparison) -> dict[str, object]:
         "spot_place_mm": one.spot_place_mm.tolist(),
         "tolerance_mm": one.tolerance_mm,
         "decision": one.decision,
+        "is_seen_once": one.is_seen_once,
     }
 
 
@@ -198,6 +203,12 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
     if unseen:
         named = ", ".join(unseen[:6]) + (" and others" if len(unseen) > 6 else "")
         texts.append(f"not seen by the scan, so not judged: {named}")
+    once = [one.name for one in found.faces if one.is_seen_once]
+    if once:
+        texts.append(
+            f"undecided because one exposure alone shows a deviation: {', '.join(once)}; scan "
+            "there again, or look at that stripe: along an edge it may err by tenths of a mm"
+        )
     return tuple(texts)
 
 

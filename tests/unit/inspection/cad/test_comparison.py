@@ -144,3 +144,54 @@ def test_no_overlap_is_refused() -> None:
 def test_lengths_that_make_no_sense_are_refused(options: dict[str, float]) -> None:
     with pytest.raises(OptionError):
         CadOptions(**options)
+
+
+def scanned(points: np.ndarray, exposure: np.ndarray, **options: float) -> CadComparison:
+    cloud = cloud_of(points, exposure, sigma_mm=0.002)
+    found = compare_with_part(BOX, cloud, align_none(cloud), CadOptions(**options), True)
+    assert isinstance(found, CadComparison)
+    return found
+
+
+def test_what_one_exposure_alone_shows_is_undecided() -> None:
+    """A stripe that errs along an edge is no dent; two stripes that agree are."""
+    points = top_points(20_000)
+    strip = (np.abs(points[:, 0] - 30.0) < 1.5) & (np.abs(points[:, 1] - 20.0) < 2.0)
+    points[strip, 2] -= 0.2
+    exposure = np.arange(20_000) % 7
+    for n_seeing, decision in ((1, "undecided"), (2, "fail")):
+        exposure[:] = 3 + np.arange(20_000) % 4
+        away = np.abs(points - [30.0, 20.0, 20.0])[:, :2].max(axis=1) > 4.0
+        exposure[~away] = np.arange(20_000)[~away] % n_seeing
+        found = scanned(points, exposure, tolerance_mm=0.05)
+        top = next(one for one in found.faces if one.statistics.n)
+        assert (top.decision, top.is_seen_once) == (decision, n_seeing == 1)
+        assert found.verdict == decision
+
+
+def test_points_beyond_an_edge_count_for_no_face() -> None:
+    """The rim of a top that is 0.1 mm too high lies beyond the nominal side's edge."""
+    points = top_points(5000)
+    rim = np.column_stack([np.full(400, 60.03), np.linspace(5.0, 35.0, 400), np.full(400, 20.1)])
+    side = np.column_stack([np.full(400, 60.0), np.linspace(5.0, 35.0, 400), np.full(400, 15.0)])
+    whole = np.concatenate([points, rim, side])
+    found = scanned(whole, np.arange(len(whole)) % 5, tolerance_mm=0.05)
+    assert found.is_beside_edge.sum() == 400
+    assert np.array_equal(np.flatnonzero(found.is_beside_edge), 5000 + np.arange(400))
+    assert sum(one.statistics.n for one in found.faces) == 5400
+    assert found.overall.n == 5800
+    assert set(found.decision[found.is_beside_edge].tolist()) == {-1}
+    assert found.verdict == "pass"
+
+
+def test_a_normal_that_is_askew_beside_an_edge_moves_no_point_to_another_face() -> None:
+    """Normals estimated beside an edge are off by up to 90 degrees; those of a far side by 180."""
+    wall = PartSurface(part_of(box_corners([0, 0, 0.0], [60, 40, 2.0]), source="wall"))
+    side = np.column_stack([np.full(50, 60.0), np.linspace(5.0, 35.0, 50), np.full(50, 1.9)])
+    askew = np.tile(np.array([-0.2, 0.0, 1.0]) / np.hypot(0.2, 1.0), (50, 1))
+    found = wall.distance(side, reach_mm=3.0, towards=askew)
+    np.testing.assert_allclose(found.signed_mm, 0.0, atol=1e-12)
+    assert np.abs(found.closest_mm - side).max() < 1e-12
+    below = np.column_stack([np.full(50, 30.0), np.linspace(5.0, 35.0, 50), np.full(50, 0.8)])
+    up = np.tile([0.0, 0.0, 1.0], (50, 1))
+    np.testing.assert_allclose(wall.distance(below, towards=up).signed_mm, -1.2, atol=1e-12)

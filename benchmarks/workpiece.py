@@ -15,12 +15,34 @@ looked at. Each step that is done is not done again; each seed measured is a lin
 from __future__ import annotations
 
 import argparse
+import json
+import subprocess
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from armscan.cli import main as armscan
+from armscan.devices.sources import load_driver
+from armscan.inspection.cad.alignment import align_best
+from armscan.inspection.cad.comparison import CadOptions, compare_with_part
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.features import inspect_feature
+from armscan.inspection.search import WantedFeature
+from armscan.inspection.selection import InspectionOptions
+from armscan.jobs.job import solved
+from armscan.storage.clouds import read_cloud
+from armscan.storage.parts.meshes import read_part
 
 HEAD, PRESET = "thesis-single", "thesis"
 SCENES = ("camera", "laser", "hand-eye", "probing", "workpiece")
+TARGET = "circle-grid:11x9:3.75"
+PAD, BORE = "plane 3", "cylinder 19"
+MADE_MM = {PAD: 0.08, BORE: -0.025}
+"""Deviation of each face as it was made: outside is positive, and a larger bore lies inside."""
+BORE_MM, ON_BORE_MM = 20.05, (-18.0, 22.0, 10.0)
+TOLERANCE_MM, BORE_TOLERANCE_MM = 0.05, 0.015
 
 
 def run(*words: object) -> None:
@@ -39,6 +61,114 @@ def render(seed: int, folder: Path, processes: int) -> None:
             run(*words, "--processes", processes)
 
 
+def scanned(place: Path) -> Path:
+    """The cloud of a seed, calibrated and reconstructed anew."""
+    names = ("camera.json", "sensor.json", "plate.csv", "scanner.json", "cloud.ply")
+    camera, sensor, plate, scanner, cloud = (place / name for name in names)
+    anew = ("--force",)
+    run("calibrate", "camera", "--scan", place / "camera", "--target", TARGET, "-o", camera, *anew)
+    words = ("calibrate", "laser", "--scan", place / "laser", "--camera", camera)
+    run(*words, "--target", TARGET, "-o", sensor, *anew)
+    run("probe", place / "probing", "-o", plate, *anew)
+    words = ("calibrate", "hand-eye", place / "hand-eye", "--sensor", sensor, "--plate", plate)
+    run(*words, "-o", scanner, *anew)
+    run("reconstruct", place / "workpiece", "--scanner", scanner, "-o", cloud, *anew)
+    return cloud
+
+
+def measured(seed: int, place: Path) -> dict[str, Any]:
+    """What a seed's scan says of the part, and then how far that is from the truth."""
+    cloud = read_cloud(scanned(place))
+    model = Path(str(files("armscan.simulation"))) / "workpiece" / "workpiece.step"
+    part = read_part(model)
+    surface = PartSurface(part)
+    alignment = solved(align_best(surface, cloud, True))
+    options = CadOptions(tolerance_mm=TOLERANCE_MM, face_tolerances_mm={BORE: BORE_TOLERANCE_MM})
+    found = solved(compare_with_part(surface, cloud, alignment, options, True))
+    on_bore = alignment.cad_from_part.inverse().apply(np.array(ON_BORE_MM))
+    wanted = WantedFeature("cylinder", diameter_mm=20.0, seed_mm=tuple(on_bore.tolist()))
+    bore = solved(inspect_feature(cloud, wanted, InspectionOptions()))
+    assert bore.diameter is not None
+    faces = {
+        one.name: {
+            "n": one.statistics.n,
+            "mean_mm": one.statistics.mean_mm,
+            "u_mm": one.u_mean_mm,
+            "decision": one.decision,
+        }
+        for one in found.faces
+    }
+    return {
+        "seed": seed,
+        "faces": faces,
+        "bore_mm": bore.diameter.value_mm,
+        "bore_u_mm": 2.0 * bore.diameter.sigma_mm,
+        **_beside_truth(seed, cloud.points_mm, alignment),
+    }
+
+
+def _beside_truth(seed: int, points_mm: Any, alignment: Any) -> dict[str, float]:
+    truth = load_driver("twin")(head=HEAD, preset=PRESET, seed=seed).truth
+    away = truth.workpiece_distance_mm(points_mm)
+    error = alignment.cad_from_part @ truth.base_from_workpiece
+    middle = np.array([0.0, 0.0, 10.0])
+    cosine = np.clip(0.5 * (np.trace(error.rotation) - 1.0), -1.0, 1.0)
+    sine = 0.5 * np.linalg.norm(error.rotation - error.rotation.T) / np.sqrt(2.0)
+    return {
+        "percent_within_50_um": 100.0 * float(np.mean(away <= 0.05)),
+        "shift_mm": float(np.linalg.norm(error.apply(middle) - middle)),
+        "turn_deg": float(np.degrees(np.arctan2(sine, cosine))),
+    }
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    """Markdown: median, 95th percentile and worst of each figure, and wrong decisions."""
+    rows = ["| figure, simulated | median | 95 % | worst |", "|---|---|---|---|"]
+
+    def row(name: str, values: list[float], digits: int = 4, *, is_most: bool = True) -> None:
+        v = np.array(values)
+        high = np.percentile(v, 95.0 if is_most else 5.0)
+        worst = v.max() if is_most else v.min()
+        rows.append(
+            f"| {name} | {np.median(v):.{digits}f} | {high:.{digits}f} | {worst:.{digits}f} |"
+        )
+
+    row("alignment, shift at the part's middle, mm", [one["shift_mm"] for one in lines])
+    row("alignment, turn, degrees", [one["turn_deg"] for one in lines])
+    within = [one["percent_within_50_um"] for one in lines]
+    row("points within 0.05 mm of the surface as made, %", within, 2, is_most=False)
+    seen = [
+        (name, face)
+        for one in lines
+        for name, face in one["faces"].items()
+        if face["decision"] != "not seen"
+    ]
+    off = [abs(face["mean_mm"] - MADE_MM.get(name, 0.0)) for name, face in seen]
+    row("mean of a face against the face as made, mm", off)
+    row("diameter of the bore, error, mm", [abs(one["bore_mm"] - BORE_MM) for one in lines])
+    row("pad, error of its height, mm", [abs(f["mean_mm"] - 0.08) for n, f in seen if n == PAD])
+    held = sum(abs(f["mean_mm"] - MADE_MM.get(n, 0.0)) <= f["u_mm"] for n, f in seen)
+    called = {
+        name: sum(one["faces"][name]["decision"] == "fail" for one in lines) for name in MADE_MM
+    }
+    wrong = [
+        f"{one['seed']}: {name} {face['decision']}"
+        for one in lines
+        for name, face in one["faces"].items()
+        if name not in MADE_MM and face["decision"] not in ("pass", "not seen")
+    ]
+    held_bore = sum(abs(one["bore_mm"] - BORE_MM) <= one["bore_u_mm"] for one in lines)
+    rows += [
+        "",
+        f"{len(lines)} seeds, commit {', '.join(sorted({one['commit'] for one in lines}))}. "
+        f"{held} of {len(seen)} face means and {held_bore} of {len(lines)} bores hold the truth "
+        f"within their U. Called wrong: pad {called[PAD]}, bore {called[BORE]} of {len(lines)}. "
+        f"Other faces not passed: {len(wrong)} of {len(seen) - 2 * len(lines)}"
+        + (f" ({'; '.join(wrong)})." if wrong else "."),
+    ]
+    return "\n".join(rows)
+
+
 def main() -> None:
     """One of the three steps."""
     parser = argparse.ArgumentParser()
@@ -49,8 +179,23 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
+    kept = given.folder / "measured.jsonl"
+    lines = [json.loads(line) for line in kept.read_text().splitlines()] if kept.exists() else []
+    if given.step == "table":
+        print(table(lines))
+        return
+    words = ("git", "rev-parse", "--short", "HEAD")
+    commit = subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
+    if given.step == "measure" and any(one["commit"] != commit for one in lines):
+        raise SystemExit(f"{kept} holds lines of another commit than {commit}: name a new folder")
+    done = {one["seed"] for one in lines}
     for seed in range(given.first, given.first + given.seeds):
-        render(seed, given.folder, given.processes)
+        if given.step == "render":
+            render(seed, given.folder, given.processes)
+        elif seed not in done:
+            line = {"commit": commit, **measured(seed, given.folder / str(seed))}
+            with kept.open("a") as file:
+                file.write(json.dumps(line) + "\n")
 
 
 if __name__ == "__main__":

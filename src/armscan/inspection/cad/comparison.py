@@ -40,7 +40,7 @@ OF_VALIDITY: Mapping[Validity, Decision] = {
 RULE = (
     "passed if the deviation's size is at most the tolerance minus U, failed if it is above the "
     "tolerance plus U, else undecided (ISO 14253-1); U is the deviation's expanded uncertainty "
-    "(k = 2); what one exposure alone shows is undecided, not failed"
+    "(k = 2); what no two exposures show is undecided, not failed"
 )
 SPOT_SHARE = 0.02
 """Width of a spot over the part's diagonal: small enough to show a dent, large enough for noise to
@@ -148,8 +148,8 @@ class FaceComparison:
     decision
         The worse of those on the mean and on every spot; empty without a tolerance.
     is_seen_once
-        What would fail it was shown by one exposure alone, so it is undecided: a stripe along an
-        edge errs by tenths of a millimetre, and alone.
+        What would fail it was shown by no two exposures, so it is undecided: a stripe along an
+        edge, or half in a shadow, errs by tenths of a millimetre, and alone.
     """
 
     name: str
@@ -295,9 +295,11 @@ def compare_with_part(
         u = options.uncertainty_mm
         u_point, u_face, u_spot = (np.full(n, u) for n in (len(cloud), n_faces, n_spots))
     limits = np.array([options.tolerance_of(name) for name in part.face_names])
-    once = _seen_once(spot, n_spots, cloud.exposure)
+    of_spot = np.zeros(n_spots, np.int64)
+    of_spot[spot[face >= 0]] = face[face >= 0]
+    once = _shown_once(spot, cloud.exposure, d, limits[of_spot] + u_spot)
     spots = _spot_results(spot, face, d, found.closest_mm, u_spot, is_once=once)
-    once = _seen_once(face, n_faces, cloud.exposure)
+    once = _shown_once(face, cloud.exposure, d, limits + u_face)
     by_face = _rows_by(face, n_faces)
     faces = tuple(
         _face(
@@ -367,14 +369,23 @@ def _rows_by(label: IntArray, count: int) -> list[IntArray]:
     return [order[ends[k] : ends[k + 1]] for k in range(count)]
 
 
-def _seen_once(label: IntArray, count: int, exposure: IntArray) -> BoolArray:
-    """(count,) labels with points of one exposure alone, in a cloud of several."""
+def _shown_once(
+    label: IntArray, exposure: IntArray, d: FloatArray, least_mm: FloatArray
+) -> BoolArray:
+    """(L,) labels that no two exposures of a cloud of several show to deviate.
+
+    An exposure shows it if the mean of what it saw there deviates by more than ``least_mm`` (L,).
+    """
+    count = len(least_mm)
     if len(exposure) == 0 or exposure.min() == exposure.max():
         return np.zeros(count, bool)
     inside = label >= 0
     n_all = int(exposure.max()) + 1
-    pairs = np.unique(label[inside] * n_all + exposure[inside])
-    return np.asarray(np.bincount(pairs // n_all, minlength=count) == 1)
+    pairs, index = np.unique(label[inside] * n_all + exposure[inside], return_inverse=True)
+    mean = np.bincount(index, d[inside]) / np.bincount(index)
+    of = pairs // n_all
+    shows = np.abs(mean) > least_mm[of]
+    return np.asarray(np.bincount(of[shows], minlength=count) < 2)
 
 
 def _spot_results(

@@ -206,8 +206,8 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
     once = [one.name for one in found.faces if one.is_seen_once]
     if once:
         texts.append(
-            f"undecided because one exposure alone shows a deviation: {', '.join(once)}; scan "
-            "there again, or look at that stripe: along an edge it may err by tenths of a mm"
+            f"undecided because no two exposures show the deviation: {', '.join(once)}; scan there "
+            "again, or look at that stripe: along an edge or a shadow it may err by tenths of a mm"
         )
     return tuple(texts)
 

@@ -29,6 +29,7 @@ class DemoScene(StrEnum):
     MULTI = "multi"
     ALL = "all"
     PHOTOS = "photos"
+    WORKPIECE = "workpiece"
 
 
 class Scene(StrEnum):
@@ -64,7 +65,8 @@ def demo(
         typer.Argument(
             help="single, cross, multi: a scanner of one, two crossed or eleven lines on a "
             "measuring arm, with plate, ball, blocks and part; all: the three beside each other; "
-            "photos: photographs as a laboratory without an arm has them."
+            "photos: photographs as a laboratory without an arm has them; workpiece: a part with "
+            "two faults against its CAD model (needs the extra cad)."
         ),
     ] = DemoScene.SINGLE,
     output: Annotated[
@@ -79,8 +81,9 @@ def demo(
     """Render images, calibrate from them, measure things, and state the errors."""
     from armscan.devices.sources import Preset
     from armscan.jobs.demo import DemoRequest, run_all_heads, run_head_demo, run_photo_demo
+    from armscan.jobs.inspection.demo import run_workpiece_demo
 
-    is_head = scene not in (DemoScene.ALL, DemoScene.PHOTOS)
+    is_head = scene not in (DemoScene.ALL, DemoScene.PHOTOS, DemoScene.WORKPIECE)
     head = f"thesis-{scene.value}" if is_head else "thesis-single"
     request = DemoRequest(output, head, seed, cast(Preset, preset))
     with progress_bar() as progress:
@@ -88,6 +91,8 @@ def demo(
             summary = run_photo_demo(request, progress)
         elif scene is DemoScene.ALL:
             summary = run_all_heads(request, progress)
+        elif scene is DemoScene.WORKPIECE:
+            summary = run_workpiece_demo(request, progress)
         else:
             summary = run_head_demo(request, progress)
     show(summary, as_json=as_json)

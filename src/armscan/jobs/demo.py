@@ -481,10 +481,11 @@ def _commands(run: _Run, demo: HeadDemo) -> Table:
         f"--normal={normal}",
         scan("part"),
     )
-    return _typed(*lines)
+    return typed_commands(*lines)
 
 
-def _typed(*lines: str) -> Table:
+def typed_commands(*lines: str) -> Table:
+    """The commands that do what a demo did."""
     return Table(("The same, command by command",), tuple((line,) for line in lines), "", (0,))
 
 
@@ -519,7 +520,7 @@ def run_photo_demo(request: DemoRequest, progress: Progress = silent) -> Summary
         )
         stages = {name: run.timed(stage, work) for name, stage, work in works}
         errors = _photo_errors(run, read_sensor_calibration(sensor), read_ply(cloud))
-        commands = _typed(
+        commands = typed_commands(
             f"armscan calibrate camera {told_path(boards)} --target {target} -o camera.json",
             f"armscan calibrate laser --camera camera.json --on {told_path(on)} "
             f"--off {told_path(off)} "

@@ -34,6 +34,8 @@ MOST_BLOCKS = 4000
 """Of cells near points: they take a minute or two."""
 MOST_OF_TREE, MOST_EXPOSURES = 50_000, 100
 """Points and exposures that tell how far the lines of a scan lie apart."""
+LARGEST_CELL = 0.2
+"""Over the extent of the cloud."""
 COVERED = 95.0
 """Percentage of the points that have another line within a cell."""
 NEIGHBOURS = 64
@@ -83,6 +85,8 @@ class ScannedSurface(ArrayRecord):
         (T, 3) rows of ``vertices_mm``, anticlockwise seen from the side of the scanner.
     cell_mm, reach_mm
         What it was drawn with.
+    spacing_mm
+        Distance within which most points have one of another exposure.
     n_points, n_without_normal
         Points that it rests on, and points that were left out because they have no normal.
     """
@@ -91,6 +95,7 @@ class ScannedSurface(ArrayRecord):
     triangles: IntArray = ints("T", 3)
     cell_mm: float
     reach_mm: float
+    spacing_mm: float
     n_points: int
     n_without_normal: int
 
@@ -135,7 +140,14 @@ def draw_surface(cloud: PointCloud, options: SurfaceOptions | None = None) -> Sc
             remedy="reconstruct the scan again; its clouds have normals where passes lie closely",
         )
     points = cloud.points_mm[has_normal]
-    cell = options.cell_mm or _cell_of(points, cloud.exposure[has_normal])
+    spacing = _cell_of(points, cloud.exposure[has_normal])
+    cell = options.cell_mm or spacing
+    extent = float(np.ptp(points, axis=0).max())
+    if cell > LARGEST_CELL * extent:
+        raise EstimationError(
+            f"a cell of {cell:.3g} mm is large beside the {extent:.3g} mm of the cloud",
+            remedy="give a smaller --cell, or leave it out and scan more densely",
+        )
     reach = options.reach_mm or cell
     sigma = np.maximum(np.nan_to_num(cloud.sigma_noise_mm[has_normal]), LEAST_SIGMA_MM)
     grid = _Grid(points / cell, normals[has_normal], np.median(sigma) ** 2 / sigma**2)
@@ -153,13 +165,20 @@ def draw_surface(cloud: PointCloud, options: SurfaceOptions | None = None) -> Sc
         triangles=triangles,
         cell_mm=float(cell),
         reach_mm=float(reach),
+        spacing_mm=spacing,
         n_points=len(points),
         n_without_normal=int((~has_normal).sum()),
     )
 
 
-def thinned_surface(surface: ScannedSurface, n_triangles: int) -> ScannedSurface:
-    """The surface with about so many triangles (quadric errors, Garland and Heckbert 1997)."""
+def thinned_surface(
+    surface: ScannedSurface, n_triangles: int, points_mm: FloatArray
+) -> ScannedSurface:
+    """The surface with about so many triangles (quadric errors, Garland and Heckbert 1997).
+
+    Corners that come to lie farther than the reach from ``points_mm`` (N, 3) go with their
+    triangles.
+    """
     simplify = _package("fast_simplification").simplify
     found = simplify(
         np.array(surface.vertices_mm),
@@ -167,7 +186,8 @@ def thinned_surface(surface: ScannedSurface, n_triangles: int) -> ScannedSurface
         target_count=n_triangles,
     )
     vertices, triangles = found[0].astype(np.float64), found[1].astype(np.int64)
-    vertices, triangles = _kept(vertices, triangles, np.ones(len(vertices), bool))
+    away = np.asarray(cKDTree(points_mm).query(vertices)[0])
+    vertices, triangles = _kept(vertices, triangles, away <= surface.reach_mm)
     return replace(surface, vertices_mm=vertices, triangles=triangles)
 
 
@@ -197,7 +217,8 @@ def _is_among(vertices: FloatArray, points: FloatArray, cell: float, reach: floa
     if len(vertices) == 0:
         return np.zeros(0, bool)
     thinned = points[_one_a_cell(np.floor(2.0 * points / cell).astype(np.int64))[0]]
-    away, index = cKDTree(thinned).query(vertices, k=min(NEIGHBOURS, len(thinned)))
+    nearest_few = np.arange(1, min(NEIGHBOURS, len(thinned)) + 1)
+    away, index = cKDTree(thinned).query(vertices, k=nearest_few)
     sigma = SIGMA_CELLS * cell
     weights = np.where(away < REACH_CELLS * cell, np.exp(-0.5 * (away / sigma) ** 2), 0.0)
     mean = np.einsum("vk,vkx->vx", weights, thinned[index])

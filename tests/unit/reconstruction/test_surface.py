@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from armscan.errors import EstimationError, OptionError
 from armscan.geometry.arrays import FloatArray
@@ -150,6 +151,8 @@ def test_what_cannot_be_drawn_is_refused() -> None:
     for cell_mm in (0.003, 1e-6):
         with pytest.raises(EstimationError, match="cells lie near the points"):
             draw_surface(whole, SurfaceOptions(cell_mm=cell_mm))
+    with pytest.raises(EstimationError, match=r"is large beside the 29\.9 mm"):
+        draw_surface(whole, SurfaceOptions(cell_mm=500.0))
     with pytest.raises(EstimationError, match="no surface"):
         draw_surface(cloud_of(points[:3], normals[:3]))
     for wrong in (0.0, -1.0, np.nan):
@@ -160,8 +163,10 @@ def test_what_cannot_be_drawn_is_refused() -> None:
 def test_a_flat_face_keeps_its_place_when_it_is_thinned() -> None:
     points, normals = flat_with_hole(5.0)
     full = draw_surface(cloud_of(points, normals), SurfaceOptions(cell_mm=0.5))
-    few = thinned_surface(full, 400)
-    assert 200 < len(few.triangles) <= 440 < len(full.triangles)
+    few = thinned_surface(full, 400, points)
+    away = cKDTree(points).query(few.vertices_mm)[0]
+    assert away.max() <= full.reach_mm + 5.0 * SIGMA_MM
+    assert 150 < len(few.triangles) <= 440 < len(full.triangles)
     assert np.abs(few.vertices_mm[:, 2]).max() < 5.0 * SIGMA_MM
     assert np.isclose(few.area_mm2, full.area_mm2, rtol=0.02)
 

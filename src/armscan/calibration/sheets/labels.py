@@ -16,6 +16,8 @@ from armscan.calibration.sheets.result import SheetOptions
 from armscan.calibration.sheets.stripes_on_board import BoardImage, StripeObservation
 from armscan.geometry.estimate import FitFailure
 
+CLEAR_CHI2 = 10_000
+"""Beyond it rounding decides on the digits, and nobody asks."""
 AMBIGUOUS_CHI2 = 9.0
 """An assignment must beat the next one by this much (three sigma) to be told from it by
 coplanarity."""
@@ -201,11 +203,11 @@ def _by_coplanarity(stripes: Stripes, names: tuple[str, ...]) -> SheetAssignment
         labels for labels in ranked[1:] if (found[labels][0] - chi2) / scale < AMBIGUOUS_CHI2
     ]
     if not alternatives:
-        margin = (
-            f"; the next naming is worse by chi2 {found[ranked[1]][0] - chi2:.3g}"
-            if len(ranked) > 1
-            else ""
-        )
+        margin = ""
+        if len(ranked) > 1:
+            worse = found[ranked[1]][0] - chi2
+            text = f"{worse:.3g}" if worse < CLEAR_CHI2 else f"more than {CLEAR_CHI2:,}"
+            margin = f"; the next naming is worse by chi2 {text}"
         how = f"by coplanarity over the boards (chi2 {chi2:.3g}{margin})"
         return SheetAssignment(names, best, how)
     is_by_order = by_order in (best, *alternatives)

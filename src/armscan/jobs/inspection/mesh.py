@@ -5,7 +5,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from armscan.errors import EstimationError, OptionError
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.part import part_of
 from armscan.jobs.job import Job
 from armscan.reconstruction.surface import (
     ScannedSurface,
@@ -20,6 +24,8 @@ from armscan.storage.image_paths import are_simulated
 from armscan.storage.parts.surfaces import SURFACE_SUFFIXES, encoded_surface
 
 LEAST_TRIANGLES = 4
+FINE = 0.6
+"""Cells below this part of the lines' distance are said to be too small."""
 MANY_WITHOUT = 0.2
 """Part of the points without a normal from which it is said."""
 
@@ -57,11 +63,12 @@ def draw_mesh(
         full = draw_surface(cloud, options)
     except EstimationError as error:
         raise EstimationError(error.what, where=path_text(path), remedy=error.remedy) from error
-    surface, quantities = full, _quantities(full)
+    surface: ScannedSurface = full
+    extra: tuple[Quantity, ...] = ()
     if n_triangles is not None and n_triangles < len(full.triangles):
-        surface = thinned_surface(full, n_triangles)
-        kept = Quantity("n_triangles_kept", "Kept", len(surface.triangles), unit="triangles")
-        quantities = (*quantities, kept)
+        surface = thinned_surface(full, n_triangles, cloud.points_mm)
+        extra = (_moved(full, surface),)
+    quantities = (*_quantities(surface), *extra)
     is_simulated = cloud.is_simulated or are_simulated((path,))
     written: tuple[Path, ...] = ()
     if job.output is not None:
@@ -79,6 +86,14 @@ def draw_mesh(
         forced=cloud.forced,
         extra={"kind": "mesh", "simulated": is_simulated, "frame": cloud.frame},
     )
+
+
+def _moved(full: ScannedSurface, thinned: ScannedSurface) -> Quantity:
+    """How far the thinned surface's corners lie from the full one."""
+    surface = PartSurface(part_of(full.vertices_mm[full.triangles], source="the full surface"))
+    off = np.abs(surface.distance(thinned.vertices_mm).signed_mm)
+    text = f"by thinning {len(full.triangles):,} triangles, at most"
+    return Quantity("moved_mm", "Moved", float(off.max()), unit="mm", meaning=text)
 
 
 def _quantities(surface: ScannedSurface) -> tuple[Quantity, ...]:
@@ -109,9 +124,15 @@ def _quantities(surface: ScannedSurface) -> tuple[Quantity, ...]:
 
 def _warnings(surface: ScannedSurface) -> tuple[str, ...]:
     part = surface.n_without_normal / (surface.n_points + surface.n_without_normal)
-    if part < MANY_WITHOUT:
-        return ()
-    return (
-        f"{part:.0%} of the points have no normal and are left out: they lie on single lines, or "
-        "on no plane",
-    )
+    texts = []
+    if part >= MANY_WITHOUT:
+        texts.append(
+            f"{part:.0%} of the points have no normal and are left out: they lie on single lines, "
+            "or on no plane"
+        )
+    if surface.cell_mm < FINE * surface.spacing_mm:
+        texts.append(
+            f"cells of {surface.cell_mm:.3g} mm, but lines up to {surface.spacing_mm:.3g} mm "
+            "apart: the surface falls into strips; leave --cell out, or scan more densely"
+        )
+    return tuple(texts)

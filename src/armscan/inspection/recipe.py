@@ -25,11 +25,12 @@ from armscan.inspection.cad.comparison import (
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
 from armscan.inspection.conformity import COVERAGE, judge
-from armscan.inspection.features import FeatureInspection, inspect_feature
+from armscan.inspection.features import FeatureInspection, inspect_feature, inspect_points
 from armscan.inspection.search import WantedFeature
 from armscan.records.cloud import PointCloud
 
 QuantityKind = Literal["feature", "mean", "spot"]
+PartDecision = Literal["pass", "undecided", "fail", "not seen", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +45,15 @@ class RecipeFeature:
         What is looked for, in the model's frame.
     nominal, tolerance
         Of its diameter in mm, or a cone's half angle in degrees; NaN for none.
+    face
+        Name of the model's face that it is, whose points are its own; empty to look for it.
     """
 
     name: str
     wanted: WantedFeature
     nominal: float = math.nan
     tolerance: float = math.nan
+    face: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +113,7 @@ class PartQuantity:
     u_value: float
     nominal: float
     tolerance: float
-    decision: Decision | Literal["", "not seen"]
+    decision: PartDecision
 
     @property
     def label(self) -> str:
@@ -193,7 +197,7 @@ def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFail
     features: dict[str, FeatureInspection] = {}
     quantities, notes = [], []
     for one in recipe.features:
-        feature = _feature(placed, one)
+        feature = _feature(placed, one, comparison)
         if isinstance(feature, FitFailure):
             notes.append(f"{one.name}: {feature.reason}")
         else:
@@ -225,9 +229,16 @@ def placed_cloud(cloud: PointCloud, pose: Pose[Cad, Part]) -> PointCloud:
     )
 
 
-def _feature(cloud: PointCloud, one: RecipeFeature) -> FeatureInspection | FitFailure:
+def _feature(
+    cloud: PointCloud, one: RecipeFeature, comparison: CadComparison | None
+) -> FeatureInspection | FitFailure:
     try:
-        return inspect_feature(cloud, one.wanted)
+        if not one.face or comparison is None:
+            return inspect_feature(cloud, one.wanted)
+        number = [face.name for face in comparison.faces].index(one.face)
+        own = (comparison.face == number) & ~comparison.is_beside_edge
+        points = cloud.select(comparison.rows[own])
+        return inspect_points(points, one.wanted, f"nearest to the face {one.face} of the model")
     except InputError as error:
         return FitFailure(error.what, error.remedy)
 
@@ -241,7 +252,7 @@ def feature_value(one: RecipeFeature, found: FeatureInspection | None) -> PartQu
         sigma = math.degrees(found.half_angle.sigma_rad)
     elif found is not None and found.diameter is not None:
         value, sigma = found.diameter.value_mm, found.diameter.sigma_mm
-    decision: Decision | Literal["", "not seen"] = ""
+    decision: PartDecision = ""
     if math.isfinite(one.tolerance):
         verdict = judge(value - one.nominal, one.tolerance, COVERAGE * sigma)
         decision = "not seen" if found is None else OF_VALIDITY[verdict]

@@ -18,9 +18,9 @@ from armscan.report.charts import PAGE_WIDTH, named_columns
 from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED, chart_markup, new_figure, styled
 from armscan.report.inspection.features import feature_quantities
 from armscan.report.page import Facts, Gallery, Links, Page, Picture, Section, Text, page_of
-from armscan.report.quantity import Quantity, Table, fact, plural
+from armscan.report.quantity import Quantity, Table, fact, for_people, plural
 
-COLUMNS = 5
+COLUMNS = 4
 """Quantities of one table of the page: more would not fit on paper."""
 OPEN_CHARTS = 12
 """Faces whose trends are shown at once; the others open on a click."""
@@ -32,7 +32,8 @@ MARKS = {"pass": ("o", ACCENT), "undecided": ("D", MUTED), "fail": ("s", ALERT),
 """Shape and colour of a decision: the shape tells it in grey print."""
 COLOURS_TEXT = (
     "Each part's deviation from the nominal value in the order of the parts, with its U (k = 2) as "
-    "a bar; dashed lines are the limits. A disc passed, a diamond is undecided, a square failed. "
+    "a bar; dashed lines are the limits. A disc passed (black: not "
+    "judged), a diamond is undecided, a square failed. "
 )
 
 
@@ -50,7 +51,8 @@ def part_page(run: FollowedRecipe, row: PartRow, page: Page) -> Page:
     values = [one for one in row.quantities if one.kind == "feature"]
     if values:
         each = tuple(
-            Facts(feature_quantities(found), title=name) for name, found in run.features.items()
+            Facts(for_people(feature_quantities(found)), title=name)
+            for name, found in run.features.items()
         )
         sections.insert(0, Section("Features", (feature_table(values),)))
         sections.insert(-1, Section("Features in full", each, is_folded=True))
@@ -87,17 +89,16 @@ def wrong_text(row: PartRow) -> str:
     """What did not pass, in words, or why the part was not inspected."""
     if row.reason:
         return row.reason
+    # of a face the worse of mean and spot
+    worst = {one.name: one for one in reversed(row.wrong)}
+    wrong = [one for one in row.wrong if worst[one.name] is one]
     named = [
         f"{one.label} {one.decision}"
-        + ("" if math.isnan(one.value) else f" ({_shown_deviation(one)} {one.unit})")
-        for one in row.wrong[:NAMED_WRONG]
+        + ("" if math.isnan(one.value) else f" ({one.deviation:+.4f} {one.unit})")
+        for one in wrong[:NAMED_WRONG]
     ]
-    more = len(row.wrong) - len(named)
-    return ", ".join(named) + (f" and {more} more" if more else "")
-
-
-def _shown_deviation(one: PartQuantity) -> str:
-    return f"{one.deviation:+.4f}"
+    more = len(wrong) - len(named)
+    return "; ".join(named) + (f" and {more} more" if more else "")
 
 
 def _number(value: float, unit: str) -> str:
@@ -228,8 +229,10 @@ def _chart_sections(
     limited = [
         name
         for name in features
-        if any(math.isfinite(one.tolerance) for row in rows for one in _of(row, name, ("feature",)))
+        for one in [one for row in rows for one in _of(row, name, ("feature",))]
+        if math.isfinite(one.tolerance) and math.isfinite(one.value)
     ]
+    limited = list(dict.fromkeys(limited))
     seen = [name for name in faces if _nearness(rows, name) >= 0.0]
     found = []
     if limited:
@@ -302,9 +305,10 @@ def _draw_series(
         if one is None or math.isnan(one.value):
             continue
         marker, colour = MARKS.get(one.decision, MARKS[""])
+        inside = "white" if is_hollow else colour
         axes.errorbar(
             k + shift, one.deviation, yerr=_finite(one.u_value) or None, fmt=marker, color=colour,
-            markersize=5, capsize=2, linewidth=1.0, markerfacecolor="white" if is_hollow else colour,
+            markersize=5, capsize=2, linewidth=1.0, markerfacecolor=inside,
         )  # fmt: skip
 
 
@@ -344,5 +348,5 @@ def _cell(row: PartRow, name: str, kind: str) -> str:
     sign = "" if kind == "feature" else "+"
     digits = 4 if one.unit == "mm" else 3
     u = "" if math.isnan(one.u_value) else f" (U {one.u_value:.{digits}f})"
-    mark = "" if one.decision in ("", "pass") else f" {one.decision}"
+    mark = {"": "", "pass": "", "not seen": " not judged"}.get(one.decision, f" {one.decision}")
     return f"{one.value:{sign}.{digits}f}{u}{mark}"

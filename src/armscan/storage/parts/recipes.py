@@ -70,6 +70,7 @@ class _FeatureKeys:
 
     name: str
     kind: ShapeKind
+    face: str | None = None
     diameter_mm: float | None = None
     diameter_range_mm: tuple[float, float] | None = None
     half_angle_deg: float | None = None
@@ -195,6 +196,8 @@ def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
     faults = (
         (bool(vain), f"'{''.join(vain[:1])}' has no effect without 'part'",
          "name the model, or leave it out"),
+        (keys.part is None and any(one.face is not None for one in keys.feature),
+         "'feature.face' has no effect without 'part'", "name the model, or leave it out"),
         (keys.part is None and not names, "it names neither a 'part' nor a 'feature'",
          "say what to inspect"),
         ((keys.align == "321") != bool(keys.datums),
@@ -240,11 +243,16 @@ def _feature(keys: _FeatureKeys, where: str) -> RecipeFeature:
         )
     except OptionError as error:
         raise FileFormatError(error.what, where=place, remedy=error.remedy) from error
+    if keys.face is not None and keys.seed_mm is not None:
+        raise FileFormatError(
+            "'seed_mm' has no effect beside 'face'", where=place, remedy="give one of them"
+        )
     return RecipeFeature(
         name=keys.name,
         wanted=wanted,
         nominal=math.nan if nominal is None else nominal,
         tolerance=math.nan if tolerance is None else tolerance,
+        face=keys.face or "",
     )
 
 
@@ -263,6 +271,9 @@ def _options(keys: _RecipeKeys, part: PartModel, where: str) -> CadOptions:
     faces = keys.faces or {}
     for name in faces:
         require_face(name, part, f"{where}: 'faces'")
+    for one in keys.feature:
+        if one.face is not None:
+            require_face(one.face, part, f"{where}: feature '{one.name}'")
     given = {
         "tolerance_mm": keys.tolerance_mm,
         "uncertainty_mm": keys.uncertainty_mm,

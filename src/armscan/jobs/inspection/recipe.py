@@ -31,6 +31,7 @@ from armscan.storage.parts.recipes import (
     PartResult,
     RecipeFile,
     found_features,
+    is_part_table,
     part_result_bytes,
     part_table_bytes,
     read_part_result,
@@ -137,14 +138,13 @@ class _Run:
             )  # fmt: skip
         return part_page(found, row, replace(page, title=f"{recipe.title}: {row.name}"))
 
-    def write_all(self, paths: Sequence[Path], rows: Sequence[PartRow]) -> tuple[Path, ...]:
-        """Write table and page of the parts that are done."""
-        inputs = [path for path, row in zip(paths, rows, strict=False) if not row.reason]
+    def write_all(self, rows: Sequence[PartRow]) -> tuple[Path, ...]:
+        """Write table and page of the parts that are done; each part's own file names its cloud."""
         forced = tuple(dict.fromkeys(text for row in rows for text in row.forced))
-        provenance = self.job.provenance((*self.file.inputs, *inputs), (), forced=forced)
+        provenance = self.job.provenance(self.file.inputs, (), forced=forced)
         page = recipe_page(self.file.recipe.title, rows, provenance)
-        contents = {self.folder / TABLE: part_table_bytes(rows), self.folder / INDEX: page}
-        return self.job.write(contents)
+        table = part_table_bytes(rows)
+        return self.job.write({self.folder / TABLE: table, self.folder / INDEX: page})
 
 
 def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summary:
@@ -184,7 +184,7 @@ def inspect_recipe(job: Job, recipe_path: Path, places: Sequence[Path]) -> Summa
         job.progress(ProgressEvent("inspect", len(paths), len(paths)))
     finally:
         # also when a person interrupts: what is done is in the table
-        written = run.write_all(list(paths.values()), rows)
+        written = run.write_all(rows)
     forced = tuple(dict.fromkeys(text for row in rows for text in row.forced))
     simulated = any(row.is_simulated for row in rows)
     return Summary(
@@ -252,7 +252,7 @@ def _check_folder(folder: Path, *, is_overwriting: bool) -> None:
         raise OutputError(
             "there is no folder above this one", where=where, remedy="create it first"
         )
-    is_own = (folder / TABLE).is_file() or not folder.exists() or not any(folder.iterdir())
+    is_own = is_part_table(folder / TABLE) or not folder.exists() or not any(folder.iterdir())
     if not is_own and not is_overwriting:
         raise OutputError(
             "this folder holds other files",

@@ -63,7 +63,7 @@ def part_page(run: FollowedRecipe, row: PartRow, page: Page) -> Page:
     of_faces = tuple(
         replace(card, label="Faces") if card.key == "verdict" else card for card in page.cards
     )
-    verdict = fact("Verdict of the part", row.verdict or "measured", wrong_text(row))
+    verdict = fact("Verdict of the part", row.verdict or "measured", wrong_text(row, 1))
     return replace(page, cards=(verdict, *of_faces), sections=tuple(sections))
 
 
@@ -85,8 +85,8 @@ def feature_table(values: Sequence[PartQuantity]) -> Table:
     return Table(heads, rows, "", (1, 6))
 
 
-def wrong_text(row: PartRow) -> str:
-    """What did not pass, in words, or why the part was not inspected."""
+def wrong_text(row: PartRow, most: int = NAMED_WRONG) -> str:
+    """What did not pass, ``most`` of it named, or why the part was not inspected."""
     if row.reason:
         return row.reason
     # of a face the worse of mean and spot
@@ -95,7 +95,7 @@ def wrong_text(row: PartRow) -> str:
     named = [
         f"{one.label} {one.decision}"
         + ("" if math.isnan(one.value) else f" ({one.deviation:+.4f} {one.unit})")
-        for one in wrong[:NAMED_WRONG]
+        for one in wrong[:most]
     ]
     more = len(wrong) - len(named)
     return "; ".join(named) + (f" and {more} more" if more else "")
@@ -327,7 +327,9 @@ def _tables(
         chosen = pairs[first : first + COLUMNS]
         heads = ("part", *(_head(rows, name, kind) for name, kind in chosen))
         cells = tuple(
-            (row.name, *(_cell(row, name, kind) for name, kind in chosen)) for row in rows
+            (row.name, *(_cell(row, name, kind) for name, kind in chosen))
+            for row in rows
+            if not row.reason
         )
         found.append(Table(heads, cells))
     return tuple(found)

@@ -35,6 +35,8 @@ from armscan.storage.tables import csv_bytes, number_text
 
 REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"
 POSITIVE_MM = (1e-6, 1e4)
+CLEAN_KEYS = tuple(item.name for item in fields(CleaningOptions))
+TABLE_NOTE = "parts by a recipe; u: expanded uncertainty, k = 2; decision by ISO 14253-1"
 RESULT_SCHEMA: Mapping[str, str] = {"schema": "armscan/inspected-part"}
 
 
@@ -162,7 +164,12 @@ def read_recipe(path: Path) -> RecipeFile:
             remedy = "write [[feature]] with two brackets, once a feature"
         raise FileFormatError(str(error), where=where, remedy=remedy) from error
     except OptionError as error:
-        raise FileFormatError(f"'clean': {error.what}", where=where, remedy=REMEDY) from error
+        # filters are counted before keys that are no filters are noticed
+        odd = [name for name in content["clean"] if name not in CLEAN_KEYS]
+        what = f"'clean.{odd[0]}' is not known" if odd else f"'clean': {error.what}"
+        raise FileFormatError(
+            what, where=where, remedy=f"give one or more of {', '.join(CLEAN_KEYS)}"
+        ) from error
     _check(keys, content, where)
     features = tuple(_feature(one, where) for one in keys.feature)
     recipe = Recipe(title=keys.title or path.stem, cleaning=keys.clean, features=features)
@@ -355,6 +362,11 @@ def read_part_result(path: Path) -> PartResult:
         raise FileFormatError(str(error), where=where, remedy="inspect the part anew") from error
 
 
+def is_part_table(path: Path) -> bool:
+    """True for a table that `part_table_bytes` made."""
+    return is_file(path) and path.read_bytes().startswith(f"# {TABLE_NOTE}".encode())
+
+
 def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
     """CSV with a row a part and, a quantity, its value, U (k = 2) and decision."""
     columns: dict[str, tuple[str, ...]] = {
@@ -363,7 +375,7 @@ def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
         "verdict": tuple(row.verdict for row in rows),
         "reason": tuple(row.reason for row in rows),
     }
-    comments = ["u: expanded uncertainty, k = 2; decision by ISO 14253-1"]
+    comments = [TABLE_NOTE]
     held = [{one.label: one for one in row.quantities} for row in rows]
     known = {label: one for by_label in held for label, one in by_label.items()}
     for label, one in known.items():
@@ -373,8 +385,8 @@ def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
         columns[f"{name}_{unit}"] = tuple(_cell(one, "value") for one in each)
         columns[f"{name}_u_{unit}"] = tuple(_cell(one, "u_value") for one in each)
         columns[f"{name}_decision"] = tuple("" if one is None else one.decision for one in each)
-        if math.isfinite(one.tolerance):
-            comments.append(f"{name}: {one.nominal:g} +- {one.tolerance:g} {one.unit}")
+        if math.isfinite(one.tolerance) and one.kind != "spot":
+            comments.append(f"{one.name}: {one.nominal:g} +- {one.tolerance:g} {one.unit}")
     return csv_bytes(columns, comments)
 
 

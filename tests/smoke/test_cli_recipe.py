@@ -15,7 +15,7 @@ import trimesh
 from armscan.cli import main
 from armscan.geometry.arrays import FloatArray
 from armscan.inspection.cad.part import part_of
-from armscan.jobs.inspection import recipe as recipe_job
+from armscan.inspection.recipe import follow_recipe
 from armscan.storage.clouds import ply_bytes
 from rigs.inspection_clouds import cloud_of, random_motion
 from rigs.parts import box_corners, extruded
@@ -144,15 +144,15 @@ def test_what_is_done_is_kept_and_not_done_again(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    output, follow, done = tmp_path / "results", recipe_job.follow_recipe, []
+    output, done = tmp_path / "results", list[int]()
 
     def interrupted(*words: Any) -> Any:
         if len(done) == 1:
             raise KeyboardInterrupt
         done.append(1)
-        return follow(*words)
+        return follow_recipe(*words)
 
-    monkeypatch.setattr(recipe_job, "follow_recipe", interrupted)
+    monkeypatch.setattr("armscan.jobs.inspection.recipe.follow_recipe", interrupted)
     scans = [str(bench / "scans" / f"part-{k}.ply") for k in (1, 2)]
     command = ["inspect", "recipe", str(bench / "recipe.toml"), *scans, "-o", str(output)]
     assert main(command) == 130

@@ -213,7 +213,8 @@ def align(
         Which of them.
     """
     if method == "none":
-        return scale_mismatch(surface, cloud.points_mm) or align_none(cloud)
+        mismatch = scale_mismatch(surface, cloud.points_mm)
+        return align_none(cloud) if mismatch is None else mismatch
     best = align_best(surface, cloud, errors_known)
     if method == "best" or isinstance(best, FitFailure):
         return best

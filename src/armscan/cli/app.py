@@ -82,6 +82,7 @@ inspect_group.command("plane", epilog=inspect.PLANE_EXAMPLE)(inspect.plane)
 inspect_group.command("sphere", epilog=inspect.SPHERE_EXAMPLE)(inspect.sphere)
 inspect_group.command("step", epilog=inspect.STEP_EXAMPLE)(inspect.step)
 inspect_group.command("cad", epilog=inspect_cad.CAD_EXAMPLE)(inspect_cad.cad)
+inspect_group.command("recipe", epilog=inspect_cad.RECIPE_EXAMPLE)(inspect_cad.recipe)
 inspect_group.command("line", epilog=inspect_features.LINE_EXAMPLE)(inspect_features.line)
 inspect_group.command("circle", epilog=inspect_features.CIRCLE_EXAMPLE)(inspect_features.circle)
 inspect_group.command("cylinder", epilog=inspect_features.CYLINDER_EXAMPLE)(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan inspect cad``: a cloud against the model of its part."""
+"""``armscan inspect cad``, a cloud against its part's model, and ``recipe``, the same for many."""
 
 from __future__ import annotations
 
@@ -26,6 +26,12 @@ CAD_EXAMPLE = (
     "  armscan inspect cad cloud.ply part.step --tolerance 0.05 -o part-inspection.html\n\n"
     "\b\nWith a tolerance, exit code 0: every face that was seen passed. 1: one failed or is\n"
     "undecided. 2: the input stood in the way."
+)
+RECIPE_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan inspect recipe recipe.toml scans/ -o results/\n\n"
+    "\b\nExit code 0: every part passed. 1: one failed, is undecided or could not be inspected.\n"
+    "2: the recipe is wrong. What is done is kept when it is interrupted, and not done again."
 )
 PART = "armscan.jobs.inspection.cad:PartOptions."
 CAD = "armscan.inspection.cad.comparison:CadOptions."
@@ -134,3 +140,34 @@ def cad(
         force=force,
     )  # fmt: skip
     return 0 if summary.data.get("verdict", "pass") == "pass" else EXIT_NOT_PASSED
+
+
+def recipe(
+    recipe: Annotated[
+        Path, typer.Argument(help="What to do with every part (TOML).", show_default=False)
+    ],
+    clouds: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Clouds of parts, and folders of them, in the order of the trend.",
+            show_default=False,
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Folder of the results, new or of earlier ones."),
+    ],
+    force: Force = False,
+    as_json: AsJson = False,
+) -> int:
+    """Clean, align, compare and measure many parts alike: one table, with the trend."""
+    from armscan.jobs.inspection.recipe import inspect_recipe
+
+    summary = run(
+        lambda job: inspect_recipe(job, recipe, clouds),
+        as_json=as_json,
+        output=output,
+        force=force,
+    )
+    return 0 if summary.data["all_passed"] else EXIT_NOT_PASSED

@@ -8,6 +8,7 @@ from .features import Relation as Relation
 from .features import inspect_feature as inspect_feature
 from .features import relate as relate
 from .plane import inspect_plane as inspect_plane
+from .recipe import follow_recipe as follow_recipe
 from .results import Deviations as Deviations
 from .results import MeasuredLength as MeasuredLength
 from .results import PlaneInspection as PlaneInspection

@@ -174,6 +174,41 @@ def inspect_feature(
     return _described(selection, wanted, shape, chosen, is_fitted)
 
 
+def inspect_points(
+    cloud: PointCloud, wanted: WantedFeature, rule: str
+) -> FeatureInspection | FitFailure:
+    """Fit a feature to points that are known to be of it, as those of a face of the part's model.
+
+    Parameters
+    ----------
+    cloud
+        The points, and no others.
+    wanted
+        What they are points of.
+    rule
+        How they were chosen, in words, after "points".
+
+    Raises
+    ------
+    InputError
+        If there are too few points.
+    """
+    selection = select(cloud, wanted.region, None)
+    points = selection.points_mm
+    first = fit_shape(wanted.kind, points)
+    if isinstance(first, FitFailure):
+        return first
+    fit = fit_robustly(points, first.value, _fitter(first.value))
+    if isinstance(fit, FitFailure):
+        return fit
+    shape, is_fitted = fit
+    chosen = np.ones(len(points), dtype=np.bool_)
+    failure = _unlike(selection, chosen, shape, wanted)
+    if failure is not None:
+        return failure
+    return _described(selection, wanted, shape, chosen, is_fitted, rule=rule)
+
+
 def _fitter(start: Shape) -> Callable[[FloatArray], Estimate[Shape] | FitFailure]:
     return partial(_refit, start)
 
@@ -232,15 +267,13 @@ def _described(
     shape: Shape,
     chosen: BoolArray,
     is_fitted: BoolArray,
+    *,
+    rule: str = "",
 ) -> FeatureInspection | FitFailure:
     cloud, rows = selection.cloud, selection.rows[chosen]
     points = cloud.points_mm[rows]
     shape = _facing(shape, wanted, cloud, rows)
-    rule = f"points within {selection.feature_mm:g} mm of the fitted {shape.kind}"
-    if shape.kind not in ("line", "circle"):
-        rule += " on faces that look the way it does, to 30 degrees"
-    if wanted.seed_mm is not None:
-        rule += ", that hang together with the seed"
+    rule = f"points {rule}" if rule else _found_rule(selection, shape, wanted)
     counts = PointCounts(
         n_given=len(cloud),
         n_region=len(selection.rows),
@@ -279,6 +312,16 @@ def _described(
         if shape.kind in ("line", "cylinder", "cone")
         else 0.0,
     )
+
+
+def _found_rule(selection: Selection, shape: Shape, wanted: WantedFeature) -> str:
+    """How the points of a feature that was looked for were chosen, in words."""
+    rule = f"points within {selection.feature_mm:g} mm of the fitted {shape.kind}"
+    if shape.kind not in ("line", "circle"):
+        rule += " on faces that look the way it does, to 30 degrees"
+    if wanted.seed_mm is not None:
+        rule += ", that hang together with the seed"
+    return rule
 
 
 def _diameter(shape: Shape) -> float:

@@ -57,13 +57,20 @@ class Legend:
 
 
 @dataclass(frozen=True, slots=True)
+class Links:
+    """Pages beside this one: (relative address, text)."""
+
+    entries: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Text:
     """A paragraph."""
 
     text: str
 
 
-Block: TypeAlias = Gallery | Facts | Legend | Text | Table
+Block: TypeAlias = Gallery | Facts | Legend | Links | Text | Table
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +191,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for kind in (Gallery, Facts, Legend, Text, Table):
+    for kind in (Gallery, Facts, Legend, Links, Text, Table):
         name = kind.__name__.lower()
         environment.tests[name] = lambda block, kind=kind: isinstance(block, kind)
     return environment

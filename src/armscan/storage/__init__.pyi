@@ -22,6 +22,7 @@ from .images import read_exposure as read_exposure
 from .images import read_exposures as read_exposures
 from .observations import Observations as Observations
 from .observations import read_observations as read_observations
+from .parts.recipes import read_recipe as read_recipe
 from .points import read_marker_list as read_marker_list
 from .points import read_probed_points as read_probed_points
 from .points import read_profiles as read_profiles

@@ -196,6 +196,31 @@ def scale_mismatch(surface: PartSurface, points_mm: FloatArray) -> FitFailure | 
     return None
 
 
+def align(
+    surface: PartSurface,
+    cloud: PointCloud,
+    method: AlignMethod,
+    datums: Sequence[int],
+    errors_known: bool,
+) -> Alignment | FitFailure:
+    """Lay a cloud on its part by `align_best`, `align_none` or, from the best fit, `align_datums`.
+
+    Parameters
+    ----------
+    surface, cloud, datums, errors_known
+        As of these.
+    method
+        Which of them.
+    """
+    if method == "none":
+        mismatch = scale_mismatch(surface, cloud.points_mm)
+        return align_none(cloud) if mismatch is None else mismatch
+    best = align_best(surface, cloud, errors_known)
+    if method == "best" or isinstance(best, FitFailure):
+        return best
+    return align_datums(surface, cloud, datums, best)
+
+
 def align_best(
     surface: PartSurface, cloud: PointCloud, errors_known: bool
 ) -> Alignment | FitFailure:

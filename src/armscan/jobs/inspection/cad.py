@@ -11,14 +11,7 @@ from typing import Any
 import numpy as np
 
 from armscan.errors import InputError, OptionError
-from armscan.inspection.cad.alignment import (
-    Alignment,
-    AlignMethod,
-    align_best,
-    align_datums,
-    align_none,
-    scale_mismatch,
-)
+from armscan.inspection.cad.alignment import Alignment, AlignMethod, align
 from armscan.inspection.cad.comparison import CadOptions, compare_with_part
 from armscan.inspection.cad.distance import PartSurface
 from armscan.jobs.inspection.shapes import region_of
@@ -181,15 +174,7 @@ def _aligned(
         raise InputError(
             "no point is left of the cloud", where=str(where), remedy="give another --region"
         )
-    if how.align == "none":
-        mismatch = scale_mismatch(surface, cloud.points_mm)
-        if mismatch is not None:
-            solved(mismatch, where)
-        return align_none(cloud)
-    best = solved(align_best(surface, cloud, errors_known), where)
-    if how.align == "best":
-        return best
-    return solved(align_datums(surface, cloud, datums, best), where)
+    return solved(align(surface, cloud, how.align, datums, errors_known), where)
 
 
 def _tell(job: Job, done: int, item: str = "") -> None:

@@ -74,7 +74,7 @@ def read_tolerances(text: str, part: PartModel) -> tuple[float, dict[str, float]
     else:
         default, faces = _toml_tolerances(parse_toml(data, where, HOW_TO_WRITE), where)
     for name in faces:
-        _require_face(name, part, where)
+        require_face(name, part, where)
     return default, faces
 
 
@@ -94,7 +94,7 @@ def datum_faces(names: str, part: PartModel) -> tuple[int, ...]:
             remedy=f"name three of the faces, such as {', '.join(part.face_names[:3])}",
         )
     for word in words:
-        _require_face(word, part, "--datums")
+        require_face(word, part, "--datums")
     return tuple(part.face_names.index(word) for word in words)
 
 
@@ -110,7 +110,14 @@ def _toml_tolerances(content: dict[str, Any], where: str) -> tuple[float, dict[s
     return float(default), {str(name): float(one) for name, one in faces.items()}
 
 
-def _require_face(name: str, part: PartModel, where: str) -> None:
+def require_face(name: str, part: PartModel, where: str) -> None:
+    """Refuse the name of a face that the part lacks.
+
+    Raises
+    ------
+    FileFormatError
+        If it has none of that name; the nearest one is proposed.
+    """
     if name in part.face_names:
         return
     near = get_close_matches(name, part.face_names, 1)

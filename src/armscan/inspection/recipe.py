@@ -1,0 +1,369 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recipe: cleaning, alignment, comparison and features that are the same for every part."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from armscan.errors import InputError
+from armscan.geometry.estimate import FitFailure
+from armscan.geometry.poses import Cad, Part, Pose
+from armscan.inspection.cad.alignment import AlignMethod, align
+from armscan.inspection.cad.comparison import (
+    DECISIONS,
+    OF_VALIDITY,
+    CadComparison,
+    CadOptions,
+    Decision,
+    FaceComparison,
+    compare_with_part,
+)
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cleaning import Cleaning, CleaningOptions, clean_cloud
+from armscan.inspection.conformity import COVERAGE, judge
+from armscan.inspection.features import FeatureInspection, inspect_feature, inspect_points
+from armscan.inspection.search import WantedFeature
+from armscan.records.cloud import PointCloud
+
+QuantityKind = Literal["feature", "mean", "spot"]
+PartDecision = Literal["pass", "undecided", "fail", "not seen", ""]
+
+
+@dataclass(frozen=True, slots=True)
+class RecipeFeature:
+    """A feature that every part has.
+
+    Parameters
+    ----------
+    name
+        Of the feature on the drawing.
+    wanted
+        What is looked for, in the model's frame.
+    nominal, tolerance
+        Of its diameter in mm, or a cone's half angle in degrees; NaN for none.
+    face
+        Name of the model's face that it is, whose points are its own; empty to look for it.
+    """
+
+    name: str
+    wanted: WantedFeature
+    nominal: float = math.nan
+    tolerance: float = math.nan
+    face: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recipe:
+    """What is done with every part.
+
+    Parameters
+    ----------
+    title
+        Of the inspection.
+    surface
+        Of the part's model; None to measure features alone, in the cloud's own frame.
+    align, datums
+        How the cloud is laid on it; three numbers of faces for ``321``.
+    options
+        Tolerances of the faces.
+    cleaning
+        Filters before all else; None for none.
+    features
+        What is measured after the alignment.
+    """
+
+    title: str = ""
+    surface: PartSurface | None = None
+    align: AlignMethod = "best"
+    datums: tuple[int, ...] = ()
+    options: CadOptions = field(default_factory=CadOptions)
+    cleaning: CleaningOptions | None = None
+    features: tuple[RecipeFeature, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class PartQuantity:
+    """One measured value of a part.
+
+    Parameters
+    ----------
+    name
+        Of the feature or face.
+    kind
+        ``feature``: its diameter or half angle; ``mean``, ``spot``: of a face, its mean deviation
+        and that of the spot that deviates most.
+    unit
+        mm or degrees.
+    value, u_value
+        Measured, and its U (k = 2); NaN where not known.
+    nominal, tolerance
+        What it should be, and the largest deviation from it; NaN for none.
+    decision
+        By ISO 14253-1; empty without a tolerance. Of a spot it is that of all spots of the face.
+    """
+
+    name: str
+    kind: QuantityKind
+    unit: Literal["mm", "degrees"]
+    value: float
+    u_value: float
+    nominal: float
+    tolerance: float
+    decision: PartDecision
+
+    @property
+    def label(self) -> str:
+        """The name, of a face with what it is of it."""
+        return self.name if self.kind == "feature" else f"{self.name}, {self.kind}"
+
+    @property
+    def deviation(self) -> float:
+        """Value less nominal."""
+        return self.value - self.nominal
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowedRecipe:
+    """What a recipe found on one part.
+
+    Parameters
+    ----------
+    cloud
+        After cleaning, in the cloud's own frame.
+    cleaning
+        What the filters took; None without filters.
+    errors_known
+        True if the cloud's covariances were used.
+    comparison
+        With the model; None without one.
+    placed
+        The same cloud where the features were measured: in Cad, or its own frame.
+    features
+        Those that were found, by name.
+    quantities
+        Each value: features as in the recipe, then the faces that have a tolerance.
+    notes
+        Features that were not found, and why.
+    """
+
+    cloud: PointCloud
+    cleaning: Cleaning | None
+    errors_known: bool
+    comparison: CadComparison | None
+    placed: PointCloud
+    features: dict[str, FeatureInspection]
+    quantities: tuple[PartQuantity, ...]
+    notes: tuple[str, ...]
+
+
+def follow_recipe(recipe: Recipe, cloud: PointCloud) -> FollowedRecipe | FitFailure:
+    """Do with a cloud what a recipe says.
+
+    Parameters
+    ----------
+    recipe
+        As of `armscan.storage.parts.recipes.read_recipe`.
+    cloud
+        Of one part, in any frame.
+
+    Returns
+    -------
+    FitFailure
+        If the cloud cannot be laid on the model.
+
+    Raises
+    ------
+    InputError
+        If a filter needs what the cloud does not carry, or no point is left.
+    """
+    cleaning = None if recipe.cleaning is None else clean_cloud(cloud, recipe.cleaning)
+    cleaned = cloud if cleaning is None else cleaning.cloud
+    if len(cleaned) == 0:
+        raise InputError("the cloud holds no point", remedy="give the scan of a part")
+    known = bool(cleaned.covariance_mm2.any()) and not math.isfinite(recipe.options.uncertainty_mm)
+    comparison, placed = None, cleaned
+    if recipe.surface is not None:
+        alignment = align(recipe.surface, cleaned, recipe.align, recipe.datums, known)
+        if isinstance(alignment, FitFailure):
+            return alignment
+        found = compare_with_part(recipe.surface, cleaned, alignment, recipe.options, known)
+        if isinstance(found, FitFailure):
+            return found
+        comparison, placed = found, placed_cloud(cleaned, alignment.cad_from_part)
+    features: dict[str, FeatureInspection] = {}
+    quantities, notes = [], []
+    for one in recipe.features:
+        feature = _feature(placed, one, comparison)
+        if isinstance(feature, FitFailure):
+            notes.append(f"{one.name}: {feature.reason}")
+        else:
+            features[one.name] = feature
+        quantities.append(feature_value(one, features.get(one.name)))
+    faces = () if comparison is None else comparison.faces
+    return FollowedRecipe(
+        cloud=cleaned,
+        cleaning=cleaning,
+        errors_known=known,
+        comparison=comparison,
+        placed=placed,
+        features=features,
+        quantities=(*quantities, *(value for face in faces for value in face_values(face))),
+        notes=tuple(notes),
+    )
+
+
+def placed_cloud(cloud: PointCloud, pose: Pose[Cad, Part]) -> PointCloud:
+    """A cloud moved into the model's frame, covariances and directions turned with it."""
+    seen_from = None if cloud.seen_from_mm is None else pose.apply(cloud.seen_from_mm)
+    return replace(
+        cloud,
+        frame="Cad",
+        points_mm=pose.apply(cloud.points_mm),
+        covariance_mm2=pose.rotate_covariance(cloud.covariance_mm2),
+        normals=None if cloud.normals is None else pose.rotate(cloud.normals),
+        seen_from_mm=seen_from,
+    )
+
+
+def _feature(
+    cloud: PointCloud, one: RecipeFeature, comparison: CadComparison | None
+) -> FeatureInspection | FitFailure:
+    try:
+        if not one.face or comparison is None:
+            return inspect_feature(cloud, one.wanted)
+        number = [face.name for face in comparison.faces].index(one.face)
+        own = (comparison.face == number) & ~comparison.is_beside_edge
+        points = cloud.select(comparison.rows[own])
+        return inspect_points(points, one.wanted, f"nearest to the face {one.face} of the model")
+    except InputError as error:
+        return FitFailure(error.what, error.remedy)
+
+
+def feature_value(one: RecipeFeature, found: FeatureInspection | None) -> PartQuantity:
+    """The diameter or half angle of a feature with its decision; ``not seen`` if it is None."""
+    is_cone = one.wanted.kind == "cone"
+    value = sigma = math.nan
+    if found is not None and found.half_angle is not None:
+        value = math.degrees(found.half_angle.value_rad)
+        sigma = math.degrees(found.half_angle.sigma_rad)
+    elif found is not None and found.diameter is not None:
+        value, sigma = found.diameter.value_mm, found.diameter.sigma_mm
+    decision: PartDecision = ""
+    if math.isfinite(one.tolerance):
+        verdict = judge(value - one.nominal, one.tolerance, COVERAGE * sigma)
+        decision = "not seen" if found is None else OF_VALIDITY[verdict]
+    return PartQuantity(
+        name=one.name,
+        kind="feature",
+        unit="degrees" if is_cone else "mm",
+        value=value,
+        u_value=COVERAGE * sigma,
+        nominal=one.nominal,
+        tolerance=one.tolerance,
+        decision=decision,
+    )
+
+
+def face_values(face: FaceComparison) -> tuple[PartQuantity, ...]:
+    """Mean and worst spot of a face with their decisions; empty without a tolerance.
+
+    The worse of both decisions is the face's.
+    """
+    if not math.isfinite(face.tolerance_mm):
+        return ()
+    found: list[PartQuantity] = []
+    mean, spot = (face.statistics.mean_mm, face.u_mean_mm), (face.spot_mm, face.u_spot_mm)
+    pairs: tuple[tuple[QuantityKind, tuple[float, float]], ...] = (("mean", mean), ("spot", spot))
+    for kind, (value, u) in pairs:
+        decision = face.decision
+        if decision in DECISIONS:
+            own = OF_VALIDITY[judge(value, face.tolerance_mm, u)]
+            # another spot may decide the face, and what one exposure alone shows fails nothing
+            is_worse = DECISIONS.index(own) > DECISIONS.index(decision)
+            is_by_spots = kind == "spot" and all(one.decision != decision for one in found)
+            decision = decision if is_worse or is_by_spots else own
+        found.append(
+            PartQuantity(
+                name=face.name,
+                kind=kind,
+                unit="mm",
+                value=value,
+                u_value=u,
+                nominal=0.0,
+                tolerance=face.tolerance_mm,
+                decision=decision,
+            )
+        )
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class PartRow:
+    """One part in the table of all.
+
+    Parameters
+    ----------
+    name
+        Of the part, and of its folder.
+    cloud
+        File that it was scanned to.
+    quantities
+        What was measured; empty if it was not.
+    notes
+        What a person should know, in words.
+    reason
+        Why it was not inspected; empty if it was.
+    n_points
+        Of the cloud after cleaning.
+    is_simulated, forced
+        As of the cloud.
+    """
+
+    name: str
+    cloud: str
+    quantities: tuple[PartQuantity, ...] = ()
+    notes: tuple[str, ...] = ()
+    reason: str = ""
+    n_points: int = 0
+    is_simulated: bool = False
+    forced: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The worst decision; ``not inspected`` with a reason, empty if nothing has a tolerance.
+
+        A feature that is not found is undecided, and so is a part of which no face is seen; a face
+        among others that the scan does not show is not judged, as in a comparison by itself.
+        """
+        if self.reason:
+            return "not inspected"
+        found: list[Decision] = [
+            "undecided" if one.decision == "not seen" else one.decision
+            for one in self.quantities
+            if one.decision and (one.decision != "not seen" or one.kind == "feature")
+        ]
+        is_wanted = any(one.decision for one in self.quantities)
+        return max(found, key=DECISIONS.index, default="undecided" if is_wanted else "")
+
+    @property
+    def is_passed(self) -> bool:
+        """True if it was inspected and nothing stands against it."""
+        return self.verdict in ("pass", "")
+
+    @property
+    def wrong(self) -> tuple[PartQuantity, ...]:
+        """What did not pass, failures first, and the farthest off before others."""
+        found = [one for one in self.quantities if one.decision in ("fail", "undecided")]
+        lost = [
+            one for one in self.quantities if one.decision == "not seen" and one.kind == "feature"
+        ]
+        return (*sorted(found, key=_badness), *lost)
+
+
+def _badness(one: PartQuantity) -> tuple[bool, float]:
+    ratio = abs(one.deviation) / one.tolerance
+    return one.decision != "fail", -ratio if np.isfinite(ratio) else 0.0

@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recipes of an inspection (TOML), what one found on a part (JSON), and the table of parts."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from armscan.errors import ArmscanError, FileFormatError, OptionError
+from armscan.geometry.arrays import Box, FloatArray
+from armscan.geometry.features import ShapeKind
+from armscan.inspection.cad.comparison import CadOptions
+from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.part import PartModel
+from armscan.inspection.cleaning import CleaningOptions
+from armscan.inspection.recipe import FollowedRecipe, PartQuantity, PartRow, Recipe, RecipeFeature
+from armscan.inspection.search import WantedFeature
+from armscan.storage.codec import (
+    FieldCodec,
+    Layout,
+    MismatchError,
+    RecordCodec,
+    json_bytes,
+    parse_json,
+    parse_toml,
+)
+from armscan.storage.files import is_file, path_text, read_bytes
+from armscan.storage.parts.meshes import read_part
+from armscan.storage.parts.tables import datum_faces, require_face
+from armscan.storage.tables import csv_bytes, number_text
+
+REMEDY = "write it as in the reference of recipes (docs/reference/files.md)"
+POSITIVE_MM = (1e-6, 1e4)
+CLEAN_KEYS = tuple(item.name for item in fields(CleaningOptions))
+TABLE_NOTE = "parts by a recipe; u: expanded uncertainty, k = 2; decision by ISO 14253-1"
+RESULT_SCHEMA: Mapping[str, str] = {"schema": "armscan/inspected-part"}
+
+
+def _read_faces(content: Any, key: str) -> dict[str, float]:
+    """Tolerances by the names of faces."""
+    if not isinstance(content, dict):
+        raise MismatchError(key, "is no table of faces and mm")
+    for name, value in content.items():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not POSITIVE_MM[0] <= value <= POSITIVE_MM[1]:
+            raise MismatchError(f"{key}.{name}", "is no length above 0 in mm")
+    return {str(name): float(value) for name, value in content.items()}
+
+
+def _read_box(content: Any, key: str) -> Box:
+    """A box of six numbers."""
+    is_list = isinstance(content, list)
+    if not is_list or not all(type(one) in (int, float) for one in content):
+        raise MismatchError(key, "is no list of xmin, xmax, ymin, ymax, zmin, zmax in mm")
+    try:
+        return Box.from_limits([float(one) for one in content], key)
+    except OptionError as error:
+        raise MismatchError(key, f"does not do: {error.what}") from error
+
+
+def _same(value: Any) -> Any:
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class _FeatureKeys:
+    """``[[feature]]``."""
+
+    name: str
+    kind: ShapeKind
+    face: str | None = None
+    diameter_mm: float | None = None
+    diameter_range_mm: tuple[float, float] | None = None
+    half_angle_deg: float | None = None
+    axis: tuple[float, ...] | None = None
+    seed_mm: tuple[float, ...] | None = None
+    region: Box | None = None
+    nominal_mm: float | None = None
+    tolerance_mm: float | None = None
+    nominal_deg: float | None = None
+    tolerance_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _RecipeKeys:
+    """The whole file."""
+
+    title: str = ""
+    part: str | None = None
+    unit: Literal["mm", "cm", "m", "inch"] = "mm"
+    align: Literal["best", "none", "321"] = "best"
+    datums: str | None = None
+    tolerance_mm: float | None = None
+    uncertainty_mm: float | None = None
+    reach_mm: float | None = None
+    faces: Mapping[str, float] | None = None
+    clean: CleaningOptions | None = None
+    feature: tuple[_FeatureKeys, ...] = ()
+
+
+BOX = FieldCodec(_same, _read_box)
+LAYOUTS: Mapping[type, Layout] = {
+    _RecipeKeys: Layout(
+        codecs={"faces": FieldCodec(_same, _read_faces)},
+        limits={
+            "tolerance_mm": POSITIVE_MM, "uncertainty_mm": POSITIVE_MM, "reach_mm": POSITIVE_MM,
+        },
+    ),
+    CleaningOptions: Layout(
+        codecs={"region": BOX},
+        limits={
+            item.name: (1e-6, 89.999) if item.name.endswith("_deg") else (1e-6, 9999.0)
+            for item in fields(CleaningOptions)
+        },
+    ),
+    _FeatureKeys: Layout(
+        codecs={"region": BOX},
+        limits={"tolerance_mm": POSITIVE_MM, "tolerance_deg": (1e-6, 90.0)},
+    ),
+    PartQuantity: Layout(is_evidence=True),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecipeFile:
+    """A recipe with the model that it names.
+
+    Parameters
+    ----------
+    recipe
+        What to do.
+    part
+        The model; None without one.
+    inputs
+        The recipe's file, and the model's.
+    """
+
+    recipe: Recipe
+    part: PartModel | None
+    inputs: tuple[Path, ...]
+
+
+def read_recipe(path: Path) -> RecipeFile:
+    """Read a recipe and the model that it names, relative to it.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no TOML, a key is not known or has a wrong value, or the model has no such face.
+    OptionError
+        If the model's format needs a package that is not installed.
+    """
+    where = path_text(path)
+    content = parse_toml(read_bytes(path), where, 'write lines as align = "best"')
+    try:
+        keys = RecordCodec(LAYOUTS).read(_RecipeKeys, content)
+    except MismatchError as error:
+        remedy = REMEDY
+        if isinstance(content.get("feature"), dict):
+            remedy = "write [[feature]] with two brackets, once a feature"
+        raise FileFormatError(str(error), where=where, remedy=remedy) from error
+    except OptionError as error:
+        # filters are counted before keys that are no filters are noticed
+        odd = [name for name in content["clean"] if name not in CLEAN_KEYS]
+        what = f"'clean.{odd[0]}' is not known" if odd else f"'clean': {error.what}"
+        raise FileFormatError(
+            what, where=where, remedy=f"give one or more of {', '.join(CLEAN_KEYS)}"
+        ) from error
+    _check(keys, content, where)
+    features = tuple(_feature(one, where) for one in keys.feature)
+    recipe = Recipe(title=keys.title or path.stem, cleaning=keys.clean, features=features)
+    if keys.part is None:
+        return RecipeFile(recipe, None, (path,))
+    part_path = path.parent / keys.part
+    if not is_file(part_path):
+        raise FileFormatError(
+            f"'part' is {path_text(part_path)}, and there is no such file",
+            where=where,
+            remedy="name the model by its place beside the recipe",
+        )
+    part = read_part(part_path, unit=keys.unit)
+    recipe = replace(
+        recipe,
+        surface=PartSurface(part),
+        align=keys.align,
+        datums=_datums(keys, part, where),
+        options=_options(keys, part, where),
+    )
+    return RecipeFile(recipe, part, (path, part_path))
+
+
+def _check(keys: _RecipeKeys, content: Mapping[str, Any], where: str) -> None:
+    """Refuse what contradicts itself or would have no effect."""
+    of_part = ("unit", "align", "datums", "tolerance_mm", "uncertainty_mm", "reach_mm", "faces")
+    vain = [name for name in of_part if name in content] if keys.part is None else []
+    names = [one.name for one in keys.feature]
+    twice = [name for name, n in Counter(names).items() if n > 1]
+    is_unnamed = any(not name.strip() or not name.isprintable() for name in names)
+    faults = (
+        (bool(vain), f"'{''.join(vain[:1])}' has no effect without 'part'",
+         "name the model, or leave it out"),
+        (keys.part is None and any(one.face is not None for one in keys.feature),
+         "'feature.face' has no effect without 'part'", "name the model, or leave it out"),
+        (keys.part is None and not names, "it names neither a 'part' nor a 'feature'",
+         "say what to inspect"),
+        ((keys.align == "321") != bool(keys.datums),
+         "'datums' goes with align = \"321\", and only with it", "give both or none of them"),
+        (bool(twice), f"'feature.name' is '{''.join(twice[:1])}' twice",
+         "give each feature its own name"),
+        (is_unnamed, "'feature.name' is empty or holds a line break", "give each feature a name"),
+    )  # fmt: skip
+    for is_wrong, what, remedy in faults:
+        if is_wrong:
+            raise FileFormatError(what, where=where, remedy=remedy)
+
+
+def _feature(keys: _FeatureKeys, where: str) -> RecipeFeature:
+    """A feature; the size that is looked for is the nominal one where no other is given."""
+    place, is_cone = f"{where}: feature '{keys.name}'", keys.kind == "cone"
+    in_mm, in_deg = (keys.nominal_mm, keys.tolerance_mm), (keys.nominal_deg, keys.tolerance_deg)
+    own, foreign = (in_deg, in_mm) if is_cone else (in_mm, in_deg)
+    refused = (*own, *foreign) if keys.kind in ("plane", "line") else foreign
+    if any(one is not None for one in refused):
+        raise FileFormatError(
+            f"a {keys.kind} has no size in that unit, so no such nominal value or tolerance",
+            where=place,
+            remedy="give nominal_mm and tolerance_mm of a diameter, nominal_deg and tolerance_deg "
+            "of a cone, and none of a plane or line",
+        )
+    nominal, tolerance = own
+    if nominal is None:
+        nominal = keys.half_angle_deg if is_cone else keys.diameter_mm
+    if tolerance is not None and nominal is None:
+        raise FileFormatError(
+            "it has a tolerance and no nominal value", where=place, remedy="give both"
+        )
+    try:
+        wanted = WantedFeature(
+            kind=keys.kind,
+            diameter_mm=keys.diameter_mm,
+            diameter_range_mm=keys.diameter_range_mm,
+            half_angle_deg=keys.half_angle_deg,
+            axis=keys.axis,
+            seed_mm=keys.seed_mm,
+            region=keys.region,
+        )
+    except OptionError as error:
+        raise FileFormatError(error.what, where=place, remedy=error.remedy) from error
+    if keys.face is not None and keys.seed_mm is not None:
+        raise FileFormatError(
+            "'seed_mm' has no effect beside 'face'", where=place, remedy="give one of them"
+        )
+    return RecipeFeature(
+        name=keys.name,
+        wanted=wanted,
+        nominal=math.nan if nominal is None else nominal,
+        tolerance=math.nan if tolerance is None else tolerance,
+        face=keys.face or "",
+    )
+
+
+def _datums(keys: _RecipeKeys, part: PartModel, where: str) -> tuple[int, ...]:
+    if keys.datums is None:
+        return ()
+    try:
+        return datum_faces(keys.datums, part)
+    except ArmscanError as error:
+        raise FileFormatError(
+            error.what, where=f"{where}: 'datums'", remedy=error.remedy
+        ) from error
+
+
+def _options(keys: _RecipeKeys, part: PartModel, where: str) -> CadOptions:
+    faces = keys.faces or {}
+    for name in faces:
+        require_face(name, part, f"{where}: 'faces'")
+    for one in keys.feature:
+        if one.face is not None:
+            require_face(one.face, part, f"{where}: feature '{one.name}'")
+    given = {
+        "tolerance_mm": keys.tolerance_mm,
+        "uncertainty_mm": keys.uncertainty_mm,
+        "reach_mm": keys.reach_mm,
+    }
+    known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    return CadOptions(face_tolerances_mm=faces, **known)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundFeature:
+    """Where a feature of a part was found: place, direction, form and points."""
+
+    name: str
+    kind: ShapeKind
+    point_mm: FloatArray
+    direction: FloatArray
+    form_mm: float
+    n_points: int
+
+
+@dataclass(frozen=True, slots=True)
+class PartResult:
+    """``features.json``: what a recipe found on a part, and from which files.
+
+    Parameters
+    ----------
+    armscan_version, recipe_sha256, part_sha256, cloud_sha256
+        A part that is done by the same is not done again; the model's is empty without one.
+    row
+        Its row of the table.
+    features
+        Those that were found.
+    """
+
+    armscan_version: str
+    recipe_sha256: str
+    part_sha256: str
+    cloud_sha256: str
+    row: PartRow
+    features: tuple[FoundFeature, ...]
+
+
+RESULT = RecordCodec({**LAYOUTS, PartResult: Layout(constants=RESULT_SCHEMA)})
+
+
+def found_features(run: FollowedRecipe) -> tuple[FoundFeature, ...]:
+    """The features of a part, for its file."""
+    return tuple(
+        FoundFeature(
+            name=name,
+            kind=one.shape.kind,
+            point_mm=one.shape.point_mm,
+            direction=one.shape.direction,
+            form_mm=one.fitted.value("range_mm"),
+            n_points=one.counts.n_feature,
+        )
+        for name, one in run.features.items()
+    )
+
+
+def part_result_bytes(result: PartResult) -> bytes:
+    """JSON of a part's result."""
+    return json_bytes(RESULT.write(result))
+
+
+def read_part_result(path: Path) -> PartResult:
+    """Read a part's result.
+
+    Raises
+    ------
+    FileFormatError
+        If it is not one.
+    """
+    where = path_text(path)
+    try:
+        return RESULT.read(PartResult, parse_json(read_bytes(path), where))
+    except MismatchError as error:
+        raise FileFormatError(str(error), where=where, remedy="inspect the part anew") from error
+
+
+def is_part_table(path: Path) -> bool:
+    """True for a table that `part_table_bytes` made."""
+    return is_file(path) and path.read_bytes().startswith(f"# {TABLE_NOTE}".encode())
+
+
+def part_table_bytes(rows: Sequence[PartRow]) -> bytes:
+    """CSV with a row a part and, a quantity, its value, U (k = 2) and decision."""
+    columns: dict[str, tuple[str, ...]] = {
+        "part": tuple(row.name for row in rows),
+        "cloud": tuple(row.cloud for row in rows),
+        "verdict": tuple(row.verdict for row in rows),
+        "reason": tuple(row.reason for row in rows),
+    }
+    comments = [TABLE_NOTE]
+    held = [{one.label: one for one in row.quantities} for row in rows]
+    known = {label: one for by_label in held for label, one in by_label.items()}
+    for label, one in known.items():
+        unit = "mm" if one.unit == "mm" else "deg"
+        name = label.replace(",", "")
+        each = [by_label.get(label) for by_label in held]
+        columns[f"{name}_{unit}"] = tuple(_cell(one, "value") for one in each)
+        columns[f"{name}_u_{unit}"] = tuple(_cell(one, "u_value") for one in each)
+        columns[f"{name}_decision"] = tuple("" if one is None else one.decision for one in each)
+        if math.isfinite(one.tolerance) and one.kind != "spot":
+            comments.append(f"{one.name}: {one.nominal:g} +- {one.tolerance:g} {one.unit}")
+    return csv_bytes(columns, comments)
+
+
+def _cell(one: PartQuantity | None, name: str) -> str:
+    return "" if one is None else number_text(getattr(one, name))

@@ -155,11 +155,14 @@ def table(lines: list[dict[str, Any]]) -> str:
         for name, face in one["faces"].items()
         if name not in MADE_MM and face["decision"] not in ("pass", "not seen")
     ]
+    commits = ", ".join(sorted({one["commit"] for one in lines}))
+    n_other = len(seen) - len(MADE_MM) * len(lines)
     rows += [
         "",
-        f"{len(lines)} seeds, commit {', '.join(sorted({one['commit'] for one in lines}))}. "
-        f"{held} of {len(seen)} face means hold the truth within their U. Called wrong: pad {called[PAD]}, bore {called[BORE]} of {len(lines)}. "
-        f"Other faces not passed: {len(wrong)} of {len(seen) - 2 * len(lines)}"
+        f"{len(lines)} seeds, commit {commits}. {held} of {len(seen)} face means hold the truth "
+        f"within their U. Called wrong: pad {called[PAD]}, bore {called[BORE]} of {len(lines)}; "
+        f"other faces not passed: {len(wrong)} of {n_other}, of which failed "
+        f"{sum(text.endswith('fail') for text in wrong)}"
         + (f" ({'; '.join(wrong)})." if wrong else "."),
     ]
     return "\n".join(rows)

@@ -53,6 +53,39 @@ def test_two_clouds_become_one(
     assert "why" in output.with_suffix(".html").read_text()
 
 
+def test_points_that_would_count_twice_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same file, a copy of it, and a fused cloud in a format without ``n_points``."""
+    first, copy, fused = folder / "a.ply", folder / "copy.ply", folder / "fused.pcd"
+    copy.write_bytes(first.read_bytes())
+    for words in ([first, first], [first, copy]):
+        told = ["fuse", *map(str, words), "--voxel", "1", "-o", str(folder / "c.ply")]
+        assert main(told) == 2
+        assert "would count twice" in capsys.readouterr().err
+    words = ["--voxel", "1.5", "-o", str(fused)]
+    assert main(["fuse", str(first), str(folder / "b.ply"), *words]) == 0
+    assert "does not hold the column n_points" in capsys.readouterr().out
+    assert main(["fuse", str(fused), str(first), "-o", str(folder / "c.ply"), *words[:2]]) == 2
+    assert "the cloud is a fused one" in capsys.readouterr().err
+    assert not (folder / "c.ply").exists()
+
+
+def test_no_sigma_is_told_of_points_without_covariance(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n")
+    (tmp_path / "b.xyz").write_text("1 2 9\n4 5 16\n")
+    words = ["fuse", str(tmp_path / "a.xyz"), str(tmp_path / "b.xyz"), "--voxel", "1"]
+    assert main([*words, "-o", str(tmp_path / "c.ply")]) == 0
+    text = capsys.readouterr().out
+    assert text.count("not known") >= 2
+    assert "0 mm" not in text
+    assert "How far to trust" not in (tmp_path / "c.html").read_text()
+    assert main([*words, "-o", str(tmp_path / "d.ply"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sigma_median_mm"] is None
+
+
 @pytest.mark.parametrize(
     "case", ["missing", "empty", "cut", "nan", "frame", "size", "suffix", "exists"]
 )

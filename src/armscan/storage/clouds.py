@@ -32,7 +32,7 @@ from armscan.storage.formats.ply import (
     ply_pieces,
     read_ply,
 )
-from armscan.storage.formats.text import XYZ_LOSES, xyz_bytes
+from armscan.storage.formats.text import SIGMA_LOSS, XYZ_LOSES, xyz_bytes
 
 __all__ = (
     "CLOUD_SUFFIXES",
@@ -163,10 +163,7 @@ def read_cloud_file(path: Path) -> CloudFile:
             remedy=f"give a file {', '.join(BY_SUFFIX)} with x y z in mm",
         )
     found = known.read(data, path)
-    remarks = found.remarks
-    if dropped_columns(found) and not found.is_own:
-        remarks = (*remarks, NO_SIGMA)
-    return CloudFile(cloud_of_columns(found, path), remarks, dropped_columns(found))
+    return CloudFile(cloud_of_columns(found, path), found.remarks, dropped_columns(found))
 
 
 def cloud_bytes(cloud: PointCloud, path: Path) -> bytes:
@@ -319,7 +316,9 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         content = cloud_bytes(cloud, output)
         what = f"cloud to {BY_SUFFIX[suffix].name}"
         losses = cloud_losses(cloud, output, found.dropped)
-        conversion = Conversion(what, losses, found.remarks, cloud.forced)
+        holds_sigma = SIGMA_LOSS not in losses
+        without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
+        conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
         camera, forced = _camera(source)
         content = camera_info_yaml(camera, comments=forced).encode()

@@ -23,9 +23,10 @@ from armscan.storage.formats.columns import (
 )
 from armscan.storage.formats.ply import vertices_remark
 from armscan.storage.formats.stl import stl_corners
+from armscan.storage.formats.text import SIGMA_LOSS
 
 OBJ_LOSES = (
-    "sigma_mm and covariance",
+    SIGMA_LOSS,
     "sheet, exposure and segment",
     "intensity",
     "where the sensor stood",

@@ -32,9 +32,10 @@ from armscan.storage.formats.columns import (
     structured,
 )
 
+SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
     "normals",
-    "sigma_mm and covariance",
+    SIGMA_LOSS,
     "sheet, exposure and segment",
     "intensity",
     "where the sensor stood",

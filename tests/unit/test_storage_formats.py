@@ -406,10 +406,10 @@ def test_a_part_and_a_cloud_of_an_stl_have_the_same_corners(tmp_path: Path) -> N
     """A binary file whose header begins with "solid", and an indented text in capitals."""
     box = trimesh.creation.box((3, 4, 5))
     data = trimesh.exchange.stl.export_stl(box)
-    text = trimesh.exchange.stl.export_stl_ascii(box)
-    for k, content in enumerate((b"solid facet vertex".ljust(80) + data[80:], text.upper())):
+    text = str(trimesh.exchange.stl.export_stl_ascii(box)).upper().encode()
+    for k, content in enumerate((b"solid facet vertex".ljust(80) + data[80:], text)):
         path = tmp_path / f"{k}.stl"
-        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        path.write_bytes(content)
         found = read_cloud(path).points_mm
         assert sorted(found.tolist()) == sorted(box.vertices.tolist())
         assert read_part(path).corners_mm.shape == (12, 3, 3)

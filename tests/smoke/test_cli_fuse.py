@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,6 +52,39 @@ def test_two_clouds_become_one(
     table = clouds_module.parse_ply(output.read_bytes(), "fused").table
     assert int(table["n_points"].sum()) == told["n_measured"]
     assert "why" in output.with_suffix(".html").read_text()
+
+
+def test_points_that_would_count_twice_are_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same file, a copy of it, and a fused cloud in a format without ``n_points``."""
+    first, copy, fused = folder / "a.ply", folder / "copy.ply", folder / "fused.pcd"
+    copy.write_bytes(first.read_bytes())
+    for words in ([first, first], [first, copy]):
+        told = ["fuse", *map(str, words), "--voxel", "1", "-o", str(folder / "c.ply")]
+        assert main(told) == 2
+        assert "would count twice" in capsys.readouterr().err
+    size = ["--voxel", "1.5"]
+    assert main(["fuse", str(first), str(folder / "b.ply"), *size, "-o", str(fused)]) == 0
+    assert "does not hold the column n_points" in capsys.readouterr().out
+    assert main(["fuse", str(fused), str(first), "-o", str(folder / "c.ply"), *size]) == 2
+    assert "the cloud is a fused one" in capsys.readouterr().err
+    assert not (folder / "c.ply").exists()
+
+
+def test_no_sigma_is_told_of_points_without_covariance(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.xyz").write_text("1 2 3\n4 5 6\n")
+    (tmp_path / "b.xyz").write_text("1 2 9\n4 5 16\n")
+    words = ["fuse", str(tmp_path / "a.xyz"), str(tmp_path / "b.xyz"), "--voxel", "1"]
+    assert main([*words, "-o", str(tmp_path / "c.ply")]) == 0
+    text = capsys.readouterr().out
+    assert re.search("Sigma of a point +not known", text)
+    assert re.search("Noise left in it +not known", text)
+    assert "How far to trust" not in (tmp_path / "c.html").read_text()
+    assert main([*words, "-o", str(tmp_path / "d.ply"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sigma_median_mm"] is None
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,23 @@ import pytest
 import trimesh
 
 from armscan.cli import main
-from armscan.errors import FileFormatError, OptionError
+from armscan.errors import FileFormatError, InputError, OptionError
 from armscan.jobs.info import describe_files
 from armscan.records.cloud import PointCloud, largest_eigenvalue
-from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_losses, read_cloud, write_cloud
+from armscan.storage.clouds import (
+    CLOUD_SUFFIXES,
+    CloudPiece,
+    cloud_losses,
+    ply_parts,
+    read_cloud,
+    read_cloud_file,
+    read_cloud_pieces,
+    write_cloud,
+)
+from armscan.storage.formats import columns
 from armscan.storage.formats.las import FINEST_STEP_MM, step_mm
+from armscan.storage.parts.meshes import read_part
+from rigs.inspection_clouds import cloud_of
 
 NAMES = ("A.1", 'B "ü"\n2')
 LOSSLESS = {".ply": 0.0, ".e57": 1e-12, ".pcd": 0.0, ".laz": 0.51e-6, ".las": 0.51e-6, ".csv": 1e-7}
@@ -332,3 +344,72 @@ def test_a_missing_package_is_named(
         read_cloud(path)
     with pytest.raises(OptionError, match=r"armscan\[formats\]"):
         write_cloud(tmp_path / f"other{suffix}", cloud())
+
+
+def test_columns_that_are_not_carried_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a fused cloud, of what `inspect cad` writes, and of a table."""
+    one = CloudPiece(cloud(), n_points=np.arange(len(cloud())))
+    fused = tmp_path / "fused.ply"
+    fused.write_bytes(b"".join(ply_parts(cloud(), len(cloud()), [one], is_fused=True)))
+    for suffix, told in ((".ply", "the column n_points"), (".xyz", "n_points of a fused cloud")):
+        assert main(["convert", str(fused), str(tmp_path / f"copy{suffix}")]) == 0
+        text = capsys.readouterr().out
+        assert text.count("n_points") == 1
+        assert told in text
+    assert main(["clean", str(fused), "-o", str(tmp_path / "clean.ply"), "--density", "9"]) == 0
+    assert "the column n_points" in capsys.readouterr().out
+    table = tmp_path / "deviations.csv"
+    table.write_text("x,y,z,deviation_mm,face\n1,2,3,0.1,1\n4,5,6,0.2,1\n")
+    assert main(["convert", str(table), str(tmp_path / "table.ply")]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert "the columns deviation_mm, face" in text
+    assert "stands for not known" in text
+    own = read_cloud_file(tmp_path / "copy.ply")
+    assert (own.dropped, own.remarks) == ((), ())
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_a_scan_of_very_many_exposures_is_read_again(tmp_path: Path, suffix: str) -> None:
+    """Two lines of the header an exposure: 24 MB here, which no cap may cut."""
+    n, path = 200_000, tmp_path / f"long{suffix}"
+    places = np.stack([np.arange(n) / 7.0, np.zeros(n), np.ones(n)], axis=1)
+    one = cloud_of(np.eye(3), np.array([0, 9, n - 1]))
+    long = replace(
+        one,
+        exposure_sources=tuple(f"camera0/image{k:07d}.png" for k in range(n)),
+        seen_from_mm=places,
+    )
+    write_cloud(path, long)
+    found = read_cloud(path)
+    assert path.stat().st_size > 16 * 2**20
+    assert found.exposure_sources == long.exposure_sources
+    assert np.array_equal(found.exposure, long.exposure)
+    assert found.seen_from_mm is not None
+    assert np.array_equal(found.seen_from_mm, places)
+    (piece,) = read_cloud_pieces(path)
+    assert piece.exposure_sources == long.exposure_sources
+
+
+def test_a_header_that_could_not_be_read_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(columns, "MOST_HEADER_BYTES", 100)
+    for suffix in (".ply", ".pcd"):
+        with pytest.raises(InputError, match="names of the exposures"):
+            write_cloud(tmp_path / f"cloud{suffix}", cloud())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_and_a_cloud_of_an_stl_have_the_same_corners(tmp_path: Path) -> None:
+    """A binary file whose header begins with "solid", and an indented text in capitals."""
+    box = trimesh.creation.box((3, 4, 5))
+    data = trimesh.exchange.stl.export_stl(box)
+    text = str(trimesh.exchange.stl.export_stl_ascii(box)).upper().encode()
+    for k, content in enumerate((b"solid facet vertex".ljust(80) + data[80:], text)):
+        path = tmp_path / f"{k}.stl"
+        path.write_bytes(content)
+        found = read_cloud(path).points_mm
+        assert sorted(found.tolist()) == sorted(box.vertices.tolist())
+        assert read_part(path).corners_mm.shape == (12, 3, 3)

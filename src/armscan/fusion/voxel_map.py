@@ -23,10 +23,8 @@ from armscan.errors import InputError, OptionError
 from armscan.fusion.cell_sums import MOST_BYTES, CellSums
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.voxels import BLOCK_BITS, MIDDLE, N_VALUES, PART_BITS, voxel_values
-from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.cloud import FUSED, CloudFrame, PointCloud
 
-FUSED = "fused"
-"""Name of the one sheet and the one exposure of a fused cloud: its points come from many."""
 AT_ONCE = 50_000
 """Points whose rows are made at a time: 11 MB."""
 LEAST_AGREEMENT = 0.5
@@ -112,11 +110,16 @@ class VoxelMap:
         Raises
         ------
         InputError
-            If it is in another frame than those before, if its points reach too far for voxels of
-            this size, or if covariances are known of some points only.
+            If it is fused already, in another frame than those before, if its points reach too far
+            for voxels of this size, or if covariances are known of some points only.
         OutputError
             If the disk is full or refuses.
         """
+        if cloud.is_fused:
+            raise InputError(
+                "the cloud is a fused one, whose points stand for many",
+                remedy="fuse the clouds that it was made of",
+            )
         if self.frame not in (None, cloud.frame):
             raise InputError(
                 f"points in {cloud.frame} do not fuse with points in {self.frame}",

@@ -242,6 +242,11 @@ def _stripes(cloud: PointCloud, hole_mm: float | None) -> _Stripes:
 
 
 def _refuse_without_stripes(cloud: PointCloud) -> None:
+    if cloud.is_fused:
+        raise InputError(
+            "the cloud is a fused one, whose points are of no stripe any more",
+            remedy="clean the clouds before they are fused, or leave out the filters of lines",
+        )
     if len(cloud.exposure_sources) < 2 and not cloud.covariance_mm2.any():
         raise InputError(
             "the cloud does not say which points are of one stripe",

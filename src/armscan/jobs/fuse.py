@@ -12,19 +12,21 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.fusion.digest import CloudDigest, percentiles
 from armscan.fusion.point_spool import PointSpool
-from armscan.fusion.voxel_map import FUSED, VoxelMap
+from armscan.fusion.voxel_map import VoxelMap
 from armscan.jobs.job import Job
 from armscan.pipeline.progress import ProgressEvent
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import FUSED, PointCloud
 from armscan.report.fuse import FusedCloud, fused_page, fused_quantities
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
+    N_POINTS,
     CloudPiece,
     cloud_losses,
     cloud_parts,
     read_cloud_pieces,
 )
+from armscan.storage.documents import fingerprint
 from armscan.storage.files import scratch_folder, told_of
 
 STAGE = "fuse"
@@ -48,9 +50,11 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
     Raises
     ------
     ArmscanError
-        If a file cannot be read, clouds do not fuse, or there is no point; nothing is written then.
+        If a file cannot be read or is given twice, clouds do not fuse, or there is no point;
+        nothing is written then.
     """
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
+    _refuse_twice(paths)
     with scratch_folder(places[0]) as scratch:
         voxels = VoxelMap(size_mm, scratch)
         try:
@@ -65,6 +69,19 @@ def fuse(job: Job, paths: Sequence[Path], size_mm: float) -> Summary:
             return _written(job, paths, places, voxels, scratch)
         finally:
             voxels.close()
+
+
+def _refuse_twice(paths: Sequence[Path]) -> None:
+    """Points that count twice would seem more certain than they are."""
+    first: dict[str, Path] = {}
+    for path in paths:
+        same = first.setdefault(fingerprint(path).sha256, path)
+        if same is not path:
+            raise InputError(
+                f"its content is that of {same}: its points would count twice",
+                where=str(path),
+                remedy="give each cloud once",
+            )
 
 
 def _written(
@@ -84,7 +101,13 @@ def _written(
         digest = CloudDigest.of_spool(points, marks)
         n_points = len(points)
         private = percentiles(lambda: (part[:, 1] for part in points.sigmas()), (50.0,), n_points)
-    result = FusedCloud(voxels.size_mm, voxels.n_points, digest, float(private[0]))
+    result = FusedCloud(
+        voxels.size_mm,
+        voxels.n_points,
+        digest,
+        float(private[0]),
+        has_covariance=voxels.has_covariance,
+    )
     warnings = () if voxels.has_covariance else (NOT_KNOWN,)
     provenance = job.provenance(paths, (), warnings=warnings, forced=voxels.forced)
     pieces = (
@@ -92,7 +115,9 @@ def _written(
     )
     content = cloud_parts(places[0], marks, n_points, pieces, is_fused=True)
     written = job.write({places[0]: content, places[1]: fused_page(result, provenance, warnings)})
-    losses = cloud_losses(marks, places[0])
+    # how many points each stands for is in PLY files alone
+    dropped = () if places[0].suffix.lower() == ".ply" else (N_POINTS,)
+    losses = cloud_losses(marks, places[0], dropped)
     kind = places[0].suffix.lstrip(".").upper()
     lost = (f"the {kind} file does not hold {', '.join(losses)}",) if losses else ()
     return Summary(

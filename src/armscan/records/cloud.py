@@ -17,6 +17,10 @@ SMALLEST_EXTENT_MM = 2.0
 probed to place a scanner or carries markers, and a plate in metres is not larger."""
 
 
+FUSED = "fused"
+"""Name of the one sheet and the one exposure of a fused cloud."""
+
+
 class PointCloud(RowRecord):
     """Points in one frame; every point carries its covariance from the first day.
 
@@ -91,6 +95,11 @@ class PointCloud(RowRecord):
             raise InputError(
                 f"{len(self.seen_from_mm)} places for {len(self.exposure_sources)} exposures"
             )
+
+    @property
+    def is_fused(self) -> bool:
+        """Whether each point stands for measured ones of many stripes."""
+        return FUSED in self.sheet_names and FUSED in self.exposure_sources
 
     @property
     def sigma_mm(self) -> FloatArray:

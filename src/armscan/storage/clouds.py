@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,9 +18,11 @@ from armscan.storage.foreign import camera_info_yaml
 from armscan.storage.formats import e57, las, meshes, pcd, text
 from armscan.storage.formats.columns import (
     FOREIGN_FRAME,
+    N_POINTS,
     CloudColumns,
     CloudPiece,
     cloud_of_columns,
+    dropped_columns,
 )
 from armscan.storage.formats.ply import (
     parse_ply,
@@ -30,12 +32,14 @@ from armscan.storage.formats.ply import (
     ply_pieces,
     read_ply,
 )
-from armscan.storage.formats.text import XYZ_LOSES, xyz_bytes
+from armscan.storage.formats.text import SIGMA_LOSS, XYZ_LOSES, xyz_bytes
 
 __all__ = (
     "CLOUD_SUFFIXES",
     "FOREIGN_FRAME",
+    "N_POINTS",
     "XYZ_LOSES",
+    "CloudFile",
     "CloudPiece",
     "cloud_bytes",
     "cloud_losses",
@@ -45,6 +49,7 @@ __all__ = (
     "ply_bytes",
     "ply_parts",
     "read_cloud",
+    "read_cloud_file",
     "read_cloud_pieces",
     "read_ply",
     "write_cloud",
@@ -118,11 +123,36 @@ def read_cloud(path: Path) -> PointCloud:
     OptionError
         If its format needs a package that is not installed.
     """
-    return _read(path)[0]
+    return read_cloud_file(path).cloud
 
 
-def _read(path: Path) -> tuple[PointCloud, tuple[str, ...]]:
-    """A cloud, and what a person should know of how it was read."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudFile:
+    """A cloud as a file held it.
+
+    Parameters
+    ----------
+    cloud
+        The points.
+    remarks
+        What a person should know of how it was read, in words.
+    dropped
+        Names of the file's columns that the cloud does not carry.
+    """
+
+    cloud: PointCloud
+    remarks: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+
+
+def read_cloud_file(path: Path) -> CloudFile:
+    """As `read_cloud`, with what a person should know of the reading.
+
+    Raises
+    ------
+    ArmscanError
+        As `read_cloud`.
+    """
     data = read_bytes(path)
     # a PLY file says so itself, whatever its name
     known = BY_SUFFIX.get(".ply" if data.startswith(b"ply") else path.suffix.lower())
@@ -133,7 +163,7 @@ def _read(path: Path) -> tuple[PointCloud, tuple[str, ...]]:
             remedy=f"give a file {', '.join(BY_SUFFIX)} with x y z in mm",
         )
     found = known.read(data, path)
-    return cloud_of_columns(found, path), found.remarks
+    return CloudFile(cloud_of_columns(found, path), found.remarks, dropped_columns(found))
 
 
 def cloud_bytes(cloud: PointCloud, path: Path) -> bytes:
@@ -184,6 +214,9 @@ def cloud_parts(
         )
 
 
+MOST_NAMED = 12
+"""Columns that are named, of a file that may have a thousand."""
+NO_SIGMA = "the source tells no covariance of its points: it stays zero, which stands for not known"
 PIECE_POINTS = 200_000
 """Points of a file that are read at a time: 60 MB with all that is made of them."""
 
@@ -204,9 +237,18 @@ def read_cloud_pieces(path: Path) -> Iterator[PointCloud]:
         yield cloud_of_columns(found, path)
 
 
-def cloud_losses(cloud: PointCloud, path: Path) -> tuple[str, ...]:
-    """What a file of a cloud in the format of the path's suffix does not hold, in words."""
-    return BY_SUFFIX[path.suffix.lower()].losses(cloud)
+def cloud_losses(cloud: PointCloud, path: Path, dropped: Sequence[str] = ()) -> tuple[str, ...]:
+    """What a file of a cloud in the format of the path's suffix does not hold, in words.
+
+    ``dropped`` are columns of the source that the cloud does not carry; some of many are named.
+    """
+    losses = BY_SUFFIX[path.suffix.lower()].losses(cloud)
+    told = [name for name in dropped if not any(text.startswith(name) for text in losses)]
+    if not told:
+        return losses
+    more = f" and {len(told) - MOST_NAMED} more" if len(told) > MOST_NAMED else ""
+    word = "column" if len(told) == 1 else "columns"
+    return (*losses, f"the {word} {', '.join(told[:MOST_NAMED])}{more}")
 
 
 def write_cloud(path: Path, cloud: PointCloud, *, is_overwriting: bool = False) -> None:
@@ -269,10 +311,14 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
         )
     check_outputs((output,), is_overwriting=is_overwriting)
     if is_cloud:
-        cloud, remarks = _read(source)
+        found = read_cloud_file(source)
+        cloud = found.cloud
         content = cloud_bytes(cloud, output)
         what = f"cloud to {BY_SUFFIX[suffix].name}"
-        conversion = Conversion(what, cloud_losses(cloud, output), remarks, cloud.forced)
+        losses = cloud_losses(cloud, output, found.dropped)
+        holds_sigma = SIGMA_LOSS not in losses
+        without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
+        conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)
     else:
         camera, forced = _camera(source)
         content = camera_info_yaml(camera, comments=forced).encode()

@@ -163,3 +163,22 @@ def test_angles_of_incidence_stay_when_a_cloud_is_carried_to_another_frame() -> 
     before, after = (clean_cloud(one, options).taken_by for one in (cloud, moved))
     assert np.array_equal(before, after)
     assert 0 < int((before >= 0).sum()) < len(before)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        CleaningOptions(edge_mm=0.3),
+        CleaningOptions(line_deviation_mm=0.3),
+        CleaningOptions(line_spacing_mm=0.3),
+        CleaningOptions(line_to_line_mm=0.3),
+        CleaningOptions(overlap_mm=0.3),
+    ],
+)
+def test_a_fused_cloud_has_no_stripes(options: CleaningOptions) -> None:
+    fused = replace(
+        cloud_of(plate().points_mm), sheet_names=("fused",), exposure_sources=("fused",)
+    )
+    with pytest.raises(InputError, match="fused one"):
+        clean_cloud(fused, options)
+    assert len(clean_cloud(fused, CleaningOptions(density_mm=1.0)).cloud)

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import warnings
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
@@ -15,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from armscan.errors import InputError, OptionError
+from armscan.errors import ArmscanError, InputError, OptionError
 from armscan.pipeline.cluster import extraction
 from armscan.pipeline.cluster.extraction import Chunk, ClusterAddress, ClusterReader, extract_chunk
 from armscan.pipeline.measure import cameras_of
@@ -125,3 +127,45 @@ def test_a_cluster_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(extraction, "CONNECT_SECONDS", 0.3)
     with pytest.raises(OptionError, match="no scheduler answers"):
         ClusterAddress("tcp://127.0.0.1:9").connect()
+
+
+def test_a_worker_that_does_not_see_the_recording_is_refused(
+    recording: FolderRecording, tmp_path: Path
+) -> None:
+    """Else each of its instants would be unreadable by itself, and the scan thinner."""
+    chunk = Chunk(tmp_path / "unmounted", (), (), (), StripeOptions(), None, code_version())
+    with pytest.raises(InputError, match="does not see the recording"):
+        extract_chunk(chunk)
+    assert extract_chunk(replace(chunk, folder=recording.folder)) == []
+
+
+class _Failed:
+    """A chunk that ended with an error, as Dask gives it."""
+
+    status = "error"
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def done(self) -> bool:
+        return True
+
+    def exception(self) -> Exception:
+        return self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("no room for 9 GB\nmore"), "failed: MemoryError: no room for 9 GB$"),
+        (ValueError(), "failed: ValueError$"),
+        (type("KilledWorker", (Exception,), {})("x"), "workers were lost"),
+    ],
+)
+def test_what_failed_on_a_worker_is_named(
+    recording: FolderRecording, error: Exception, told: str
+) -> None:
+    reader = ClusterReader(ClusterAddress("tcp://host:1"), recording, (), StripeOptions())
+    with pytest.raises(ArmscanError) as caught:
+        reader._next(None, deque([((), _Failed(error))]))
+    assert re.search(told, caught.value.what)

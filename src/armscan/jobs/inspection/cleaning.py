@@ -10,7 +10,7 @@ from armscan.inspection.cleaning import CleaningOptions, clean_cloud
 from armscan.jobs.job import Job
 from armscan.report.inspection.cleaning import cleaning_page, cleaning_quantities, cleaning_table
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_bytes, cloud_losses, read_cloud
+from armscan.storage.clouds import CLOUD_SUFFIXES, cloud_bytes, cloud_losses, read_cloud_file
 
 
 def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
@@ -33,9 +33,10 @@ def clean(job: Job, path: Path, options: CleaningOptions) -> Summary:
     if job.output is None:
         raise OptionError("no output is named", where="-o", remedy="name the cloud to write")
     places = job.places(*CLOUD_SUFFIXES, beside=(".html",))
-    cloud = read_cloud(path)
+    source = read_cloud_file(path)
+    cloud = source.cloud
     found = clean_cloud(cloud, options)
-    losses = cloud_losses(found.cloud, job.output)
+    losses = cloud_losses(found.cloud, job.output, source.dropped)
     lost = (f"the new file does not hold: {', '.join(losses)}",) if losses else ()
     warnings = (*found.warnings, *lost)
     provenance = job.provenance((path,), (options,), warnings=warnings, forced=cloud.forced)

@@ -8,6 +8,7 @@ is lost is done again by another. Few chunks are under way, so that memory does 
 
 from __future__ import annotations
 
+import platform
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +29,7 @@ from armscan.records.profile import Profile
 from armscan.records.recording import CameraSetup, ExposureRow
 from armscan.storage.detection_cache import DetectionCache, code_version
 from armscan.storage.recording import FolderRecording, read_recorded
+from armscan.storage.recording_session import EXPOSURES_FILE
 from armscan.vision.stripe.image import StripeOptions
 
 CHUNK_INSTANTS = 8
@@ -132,13 +134,20 @@ def extract_chunk(chunk: Chunk) -> list[Found]:
     Raises
     ------
     InputError
-        If the worker has other code, or an image is not of its camera's sensor.
+        If the worker has other code, does not see the recording's folder, or an image is not of
+        its camera's sensor.
     """
     if code_version() != chunk.version:
         raise InputError(
             "a worker of the cluster runs another version of armscan or of its libraries",
             where=WHERE,
             remedy="install the same ones everywhere",
+        )
+    if not (chunk.folder / EXPOSURES_FILE).is_file():
+        raise InputError(
+            f"the worker on {platform.node()} does not see the recording",
+            where=str(chunk.folder),
+            remedy="put it in a folder that every worker sees under the same path",
         )
     dark: dict[int, tuple[ExposureRow, Exposure]] = {}
 
@@ -253,10 +262,23 @@ class ClusterReader:
                 raise self._lost()
         if future.status != "finished":
             error = future.exception() if future.status == "error" else None
-            raise error if isinstance(error, ArmscanError) else self._lost() from error
+            raise self._failure(error) from error
         results: list[Found] = future.result()
         pending.popleft()
         return chunk, results
+
+    def _failure(self, error: BaseException | None) -> ArmscanError:
+        if isinstance(error, ArmscanError):
+            return error
+        # Dask's own name for work whose workers died again and again
+        if error is None or type(error).__name__ == "KilledWorker":
+            return self._lost()
+        text = str(error).strip().partition("\n")[0]
+        return InputError(
+            f"a worker of the cluster failed: {type(error).__name__}" + f": {text}" * bool(text),
+            where=f"{WHERE} {self.address.url}",
+            remedy="see what the workers say; without --cluster the scan is done here",
+        )
 
     def _lost(self) -> OptionError:
         return OptionError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NoReturn, cast, get_args
 
@@ -49,6 +50,8 @@ FOREIGN_FRAME: CloudFrame = "Part"
 """Frame of points about which a file says nothing."""
 
 DAMAGED = "copy the file again; it may be cut or damaged"
+MOST_HEADER_BYTES = 512 * 2**20
+"""Of a PLY or PCD file: two notes for each of four million exposures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +68,15 @@ class CloudColumns:
         Names of the exposures of a file that is not armscan's; empty for the file's own.
     remarks
         What a person should know of the reading, in words.
+    passed_over
+        Names of columns that the file has and that were not read.
     """
 
     columns: Mapping[str, Column]
     notes: tuple[str, ...] = ()
     sources: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    passed_over: tuple[str, ...] = ()
 
     @property
     def is_own(self) -> bool:
@@ -98,11 +104,13 @@ class CloudPiece:
 
 
 def cloud_columns(piece: PointCloud | CloudPiece) -> CloudColumns:
-    """All that a cloud carries.
-
-    ``sigma_mm`` is there for other programs; it follows from the covariance.
-    """
+    """All that a cloud carries."""
     piece = piece if isinstance(piece, CloudPiece) else CloudPiece(piece)
+    return CloudColumns(point_columns(piece), cloud_notes(piece.cloud))
+
+
+def point_columns(piece: CloudPiece) -> dict[str, Column]:
+    """Columns of a cloud; ``sigma_mm`` is there for other programs and follows from the rest."""
     cloud = piece.cloud
     columns: dict[str, Column] = {name: cloud.points_mm[:, k] for k, name in enumerate(POINT)}
     if cloud.normals is not None:
@@ -116,7 +124,7 @@ def cloud_columns(piece: PointCloud | CloudPiece) -> CloudColumns:
     columns |= {name: getattr(cloud, name) for name in INDICES}
     if piece.n_points is not None:
         columns[N_POINTS] = piece.n_points
-    return CloudColumns(columns, cloud_notes(cloud))
+    return columns
 
 
 def cloud_notes(cloud: PointCloud) -> tuple[str, ...]:
@@ -136,13 +144,42 @@ def cloud_notes(cloud: PointCloud) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def structured(found: CloudColumns, names: Sequence[str] = ()) -> NDArray[Any]:
-    """(N,) structured array of columns, float64 and int32; all of them if none is named."""
-    chosen = names or tuple(found.columns)
-    kinds = [(name, "<i4" if name in WHOLE else "<f8") for name in chosen]
-    table = np.zeros(len(found.columns["x"]), dtype=kinds)
-    for name in chosen:
-        table[name] = found.columns[name]
+def header_bytes(lines: Sequence[str]) -> bytes:
+    """Lines of a header that can be read again.
+
+    Raises
+    ------
+    InputError
+        If it is longer than `MOST_HEADER_BYTES`.
+    """
+    header = ("\n".join(lines) + "\n").encode("ascii")
+    if len(header) > MOST_HEADER_BYTES:
+        raise InputError(
+            f"the names of the exposures fill {len(header):,} bytes of the header, more than "
+            f"the {MOST_HEADER_BYTES:,} that are read",
+            remedy="write the scan in parts",
+        )
+    return header
+
+
+def dropped_columns(found: CloudColumns) -> tuple[str, ...]:
+    """Columns that `cloud_of_columns` passes over, in the order of the file."""
+    kept = {*POINT, "intensity"}
+    if set(NORMAL) <= set(found.columns):
+        kept |= set(NORMAL)
+    if found.is_own:
+        kept |= {"sigma_mm", "sigma_noise_mm", NOISE_LENGTH, *COVARIANCE, *INDICES}
+    elif found.sources:
+        kept.add("exposure")
+    return (*(name for name in found.columns if name not in kept), *found.passed_over)
+
+
+def structured(columns: Mapping[str, Column]) -> NDArray[Any]:
+    """(N,) structured array of columns, float64 and int32."""
+    kinds = [(name, "<i4" if name in WHOLE else "<f8") for name in columns]
+    table = np.zeros(len(columns["x"]), dtype=kinds)
+    for name, values in columns.items():
+        table[name] = values
     return table
 
 
@@ -219,25 +256,23 @@ def own_cloud(found: CloudColumns, where: str) -> PointCloud:
     points = _joined(columns, POINT)
     refuse_beyond_reach(points, where)
     with told_of(where):
-        frame = _frame(found.notes)
-        if frame is None:
-            raise InputError("the header does not name the frame of the points")
+        named = _named(found.notes)
         return PointCloud(
-            frame=frame,
+            frame=named.frame,
             points_mm=points,
             covariance_mm2=covariance,
             sigma_noise_mm=columns["sigma_noise_mm"],
             sheet=columns["sheet"],
-            sheet_names=_names(found.notes, "sheet"),
+            sheet_names=named.sheets,
             exposure=columns["exposure"],
-            exposure_sources=_names(found.notes, "exposure"),
+            exposure_sources=named.exposures,
             segment=columns["segment"],
             intensity=columns["intensity"],
             normals=_joined(columns, NORMAL) if set(NORMAL) <= set(columns) else None,
             noise_length=columns.get(NOISE_LENGTH),
-            seen_from_mm=_places(found.notes),
-            is_simulated=SIMULATED in found.notes,
-            forced=_names(found.notes, FORCED),
+            seen_from_mm=named.places_mm,
+            is_simulated=named.is_simulated,
+            forced=named.forced,
         )
 
 
@@ -276,6 +311,37 @@ def _unit(columns: Mapping[str, Column]) -> FloatArray | None:
     normals = _finite(_joined(columns, NORMAL))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(normals / np.where(length > 0.0, length, 1.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Named:
+    """Names and marks of a cloud, as its notes tell them; ``places_mm``: (E, 3) or None."""
+
+    frame: CloudFrame
+    sheets: tuple[str, ...]
+    exposures: tuple[str, ...]
+    places_mm: FloatArray | None
+    is_simulated: bool
+    forced: tuple[str, ...]
+
+
+@lru_cache(maxsize=1)
+def _named(notes: tuple[str, ...]) -> _Named:
+    """Kept for the next piece of the same file: a long scan has a million notes.
+
+    Raises
+    ------
+    InputError
+        If they name no frame, or are damaged.
+    """
+    frame = _frame(notes)
+    if frame is None:
+        raise InputError("the header does not name the frame of the points")
+    places = _places(notes)
+    if places is not None:
+        places.setflags(write=False)
+    sheets, exposures, forced = (_names(notes, word) for word in ("sheet", "exposure", FORCED))
+    return _Named(frame, sheets, exposures, places, SIMULATED in notes, forced)
 
 
 def _frame(notes: Sequence[str]) -> CloudFrame | None:

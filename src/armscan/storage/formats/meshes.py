@@ -22,16 +22,18 @@ from armscan.storage.formats.columns import (
     CloudColumns,
 )
 from armscan.storage.formats.ply import vertices_remark
+from armscan.storage.formats.stl import stl_corners
+from armscan.storage.formats.text import SIGMA_LOSS
 
 OBJ_LOSES = (
-    "sigma_mm and covariance",
+    SIGMA_LOSS,
     "sheet, exposure and segment",
     "intensity",
+    "where the sensor stood",
+    "n_points of a fused cloud",
     "digits beyond 0.1 nm",
 )
 """What an OBJ file of points does not hold."""
-TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-HEADER_BYTES = 80
 
 
 def stl_columns(data: bytes, path: Path) -> CloudColumns:
@@ -42,50 +44,12 @@ def stl_columns(data: bytes, path: Path) -> CloudColumns:
     FileFormatError
         If it is cut short, or no STL file.
     """
-    where = path_text(path)
-    corners = _ascii_corners(data, where) if _is_ascii(data) else _binary_corners(data, where)
-    points = np.unique(corners, axis=0)
+    corners = stl_corners(data, path_text(path))
+    points = np.unique(corners.reshape(-1, 3), axis=0)
     return CloudColumns(
         {name: points[:, k] for k, name in enumerate(POINT)},
-        remarks=(vertices_remark(len(corners) // 3),),
+        remarks=(vertices_remark(len(corners)),),
     )
-
-
-def _is_ascii(data: bytes) -> bool:
-    """Whether the text names corners: binary headers may begin with "solid" too."""
-    return data[:5].lower() == b"solid" and b"vertex" in data[:2000]
-
-
-def _ascii_corners(data: bytes, where: str) -> FloatArray:
-    """(3 M, 3) corners of the triangles."""
-    words = [line.split() for line in data.splitlines()]
-    try:
-        found = [[float(word) for word in row[1:4]] for row in words if row[:1] == [b"vertex"]]
-        corners = np.array(found, dtype=np.float64).reshape(len(found), 3)
-    except ValueError as error:
-        raise FileFormatError(
-            "the corners of the STL file are not understood", where=where, remedy=DAMAGED
-        ) from error
-    if len(corners) % 3 or b"endsolid" not in data[-1000:].lower():
-        raise FileFormatError("the STL file is cut short", where=where, remedy=DAMAGED)
-    return corners
-
-
-def _binary_corners(data: bytes, where: str) -> FloatArray:
-    """(3 M, 3) corners of the triangles."""
-    room = len(data) - HEADER_BYTES - 4
-    if room < 0:
-        raise FileFormatError("this is not an STL file", where=where, remedy=DAMAGED)
-    told = int.from_bytes(data[HEADER_BYTES : HEADER_BYTES + 4], "little")
-    held = room // TRIANGLE.itemsize
-    if held < told:
-        raise FileFormatError(
-            f"the STL file holds {held} of {told} triangles",
-            where=where,
-            remedy="copy the file again",
-        )
-    table = np.frombuffer(data, TRIANGLE, told, HEADER_BYTES + 4)
-    return np.asarray(table["corners"].reshape(-1, 3), dtype=np.float64)
 
 
 def obj_columns(data: bytes, path: Path) -> CloudColumns:

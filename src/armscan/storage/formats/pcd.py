@@ -19,17 +19,18 @@ from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
+    MOST_HEADER_BYTES,
     POINT,
     CloudColumns,
     cloud_columns,
     columns_of,
+    header_bytes,
     structured,
 )
 
 KINDS = {"F": "f", "I": "i", "U": "u"}
 SIZES = {1, 2, 4, 8}
 RENAMED = {"normal_x": "nx", "normal_y": "ny", "normal_z": "nz"}
-MOST_HEADER_BYTES = 16 * 2**20
 MOST_VALUES = 10_000
 """Values of a point: descriptors of hundreds are usual, more is a damaged header."""
 MOST_PACKED = 88
@@ -56,7 +57,7 @@ class _Header:
 def pcd_bytes(cloud: PointCloud) -> bytes:
     """Content of a binary PCD file that holds all of a cloud, in float64 and int32."""
     found = cloud_columns(cloud)
-    table = structured(found)
+    table = structured(found.columns)
     renamed = {own: theirs for theirs, own in RENAMED.items()}
     kinds = [table.dtype[name] for name in table.dtype.names or ()]
     header = [
@@ -73,7 +74,7 @@ def pcd_bytes(cloud: PointCloud) -> bytes:
         f"POINTS {len(table)}",
         "DATA binary",
     ]
-    return b"".join((("\n".join(header) + "\n").encode("ascii"), table.data))
+    return b"".join((header_bytes(header), table.data))
 
 
 def pcd_columns(data: bytes, path: Path) -> CloudColumns:

@@ -17,12 +17,14 @@ from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text, read_bytes
 from armscan.storage.formats.columns import (
     DAMAGED,
+    MOST_HEADER_BYTES,
     CloudColumns,
     CloudPiece,
-    cloud_columns,
     cloud_notes,
     columns_of,
+    header_bytes,
     own_cloud,
+    point_columns,
     structured,
 )
 
@@ -47,8 +49,6 @@ TYPES = {
 WRITTEN_TYPES = {"f8": "double", "i4": "int"}
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 END_HEADER = re.compile(rb"end_header\r?\n")
-MOST_HEADER_BYTES = 16 * 2**20
-"""A comment for each of a hundred thousand exposures."""
 MOST_PROPERTIES, MOST_DIGITS = 1000, 15
 
 
@@ -84,7 +84,7 @@ def ply_header(kind: np.dtype[Any], count: int, comments: Iterable[str]) -> byte
         *properties,
         "end_header",
     ]
-    return ("\n".join(lines) + "\n").encode("ascii")
+    return header_bytes(lines)
 
 
 def parse_ply(data: bytes, where: str) -> PlyVertices:
@@ -95,9 +95,10 @@ def parse_ply(data: bytes, where: str) -> PlyVertices:
     FileFormatError
         If it is no PLY file, its vertices are lists or not first, or it is cut short.
     """
-    end = data.find(b"\nend_header", 0, MOST_HEADER_BYTES)
+    is_ply = data.startswith(b"ply")
+    end = data.find(b"\nend_header", 0, MOST_HEADER_BYTES) if is_ply else -1
     start = data.find(b"\n", end + 1) + 1
-    if END_HEADER.fullmatch(data[end + 1 : start]) is None or data[:3] != b"ply":
+    if END_HEADER.fullmatch(data[end + 1 : start]) is None or not is_ply:
         raise FileFormatError(
             "this is not a PLY file with a complete header", where=where, remedy=DAMAGED
         )
@@ -188,9 +189,9 @@ def ply_parts(
     none = CloudPiece(
         marks.select(slice(0)), np.zeros(0), np.zeros(0, np.int64) if is_fused else None
     )
-    yield ply_header(structured(cloud_columns(none)).dtype, n_points, cloud_notes(marks))
+    yield ply_header(structured(point_columns(none)).dtype, n_points, cloud_notes(marks))
     for piece in pieces:
-        yield structured(cloud_columns(piece)).tobytes()
+        yield structured(point_columns(piece)).tobytes()
 
 
 def ply_columns(data: bytes, path: Path) -> CloudColumns:
@@ -209,11 +210,14 @@ def ply_pieces(path: Path, most_points: int) -> Iterator[CloudColumns] | None:
         While it is read, if it is cut short.
     """
     with path.open("rb") as file:
-        start = b""
-        while (line := file.readline()) and len(start) < MOST_HEADER_BYTES:
-            start += line
-            if not start.startswith(b"ply") or END_HEADER.fullmatch(line):
+        lines: list[bytes] = []
+        n_bytes = 0
+        while (line := file.readline()) and n_bytes < MOST_HEADER_BYTES:
+            lines.append(line)
+            n_bytes += len(line)
+            if not lines[0].startswith(b"ply") or END_HEADER.fullmatch(line):
                 break
+    start = b"".join(lines)
     is_binary = start.startswith(b"ply") and b"\nformat binary" in start[:100]
     if not (is_binary and END_HEADER.fullmatch(line)):
         return None

@@ -32,11 +32,14 @@ from armscan.storage.formats.columns import (
     structured,
 )
 
+SIGMA_LOSS = "sigma_mm and covariance"
 XYZ_LOSES = (
     "normals",
-    "sigma_mm and covariance",
+    SIGMA_LOSS,
     "sheet, exposure and segment",
     "intensity",
+    "where the sensor stood",
+    "n_points of a fused cloud",
     "digits beyond 0.1 nm",
 )
 """What an XYZ file does not hold."""
@@ -79,7 +82,7 @@ def csv_bytes(cloud: PointCloud) -> bytes:
     notes = "".join(f"# {note}\n" for note in found.notes)
     buffer = io.StringIO()
     row = ",".join(formats.get(name, "%.9g") for name in found.columns)
-    np.savetxt(buffer, structured(found), fmt=row)
+    np.savetxt(buffer, structured(found.columns), fmt=row)
     return f"{heading}\n{notes}{buffer.getvalue()}".encode()
 
 
@@ -111,7 +114,10 @@ def text_columns(data: bytes, path: Path) -> CloudColumns:
     named = _named(heading)
     values = _values("\n".join(body), tuple(named.values()), path)
     columns = {name: values[:, k] for k, name in enumerate(named)}
-    return CloudColumns(columns, _notes(lines))
+    read = set(named.values())
+    passed_over = tuple(word for k, word in enumerate(heading) if k not in read)
+    is_table = len(_words(filled[0])) == len(heading)
+    return CloudColumns(columns, _notes(lines), passed_over=passed_over if is_table else ())
 
 
 def _named(heading: list[str]) -> dict[str, int]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,16 +11,14 @@ from armscan.errors import FileFormatError, OptionError
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.storage.files import path_text, read_bytes
+from armscan.storage.formats.columns import DAMAGED as CUT
 from armscan.storage.formats.ply import BYTE_ORDERS, TYPES, parse_ply
+from armscan.storage.formats.stl import float_numbers, stl_corners
 from armscan.storage.parts.step import STEP_SUFFIXES, ChordError, read_step
 
 MESH_SUFFIXES = (".stl", ".ply", ".obj")
 UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
 """Length of each unit that a mesh may be in; mesh files do not tell."""
-STL_HEADER, STL_RECORD = 84, 50
-STL_TYPE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-VERTEX = re.compile(rb"^[ \t]*vertex[ \t]+(.*)$", re.MULTILINE)
-CUT = "copy the file again; it may be cut or damaged"
 MOST_CORNERS = 1000
 """Corners of one polygon."""
 
@@ -72,54 +69,8 @@ def read_part(path: Path, *, unit: str = "mm", chord: ChordError | None = None) 
     if suffix == ".obj":
         corners, face, names = _obj(data, where)
     else:
-        corners = _stl(data, where) if suffix == ".stl" else _ply(data, where)
+        corners = stl_corners(data, where) if suffix == ".stl" else _ply(data, where)
     return part_of(corners * UNITS_MM[unit], source=path.name, face=face, face_names=names)
-
-
-def _stl(data: bytes, where: str) -> FloatArray:
-    """(F, 3, 3) corners; the normals in the file are not used: the order of corners tells them."""
-    count = int.from_bytes(data[80:84], "little") if len(data) >= STL_HEADER else -1
-    is_text = data.lstrip()[:5].lower() == b"solid" and b"facet" in data[:4096]
-    if count >= 0 and len(data) == STL_HEADER + STL_RECORD * count:
-        is_text = False
-    if is_text:
-        return _stl_text(data, where)
-    held = (len(data) - STL_HEADER) // STL_RECORD
-    if count < 0 or held < count:
-        raise FileFormatError(
-            f"the STL file holds {max(held, 0):,} of {count:,} triangles"
-            if count >= 0
-            else "this is no STL file",
-            where=where,
-            remedy=CUT,
-        )
-    if held > count + 1 and count == 0:
-        raise FileFormatError("this is no STL file", where=where, remedy=CUT)
-    table = np.frombuffer(data, STL_TYPE, count, STL_HEADER)
-    return np.asarray(table["corners"], dtype=np.float64)
-
-
-def _stl_text(data: bytes, where: str) -> FloatArray:
-    if b"endsolid" not in data[-4096:].lower():
-        raise FileFormatError("the STL file does not end with endsolid", where=where, remedy=CUT)
-    words = b" ".join(VERTEX.findall(data.replace(b"\r", b"\n").lower())).split()
-    numbers = _numbers(words, where, "STL")
-    if len(numbers) % 9:
-        raise FileFormatError(
-            f"the STL file holds {len(numbers)} coordinates, which make no whole triangles",
-            where=where,
-            remedy=CUT,
-        )
-    return numbers.reshape(-1, 3, 3)
-
-
-def _numbers(words: list[bytes], where: str, kind: str) -> FloatArray:
-    try:
-        return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
-    except ValueError as error:
-        raise FileFormatError(
-            f"numbers of the {kind} file are not understood", where=where, remedy=CUT
-        ) from error
 
 
 def _ply(data: bytes, where: str) -> FloatArray:
@@ -277,7 +228,7 @@ def _obj(data: bytes, where: str) -> tuple[FloatArray, IntArray | None, tuple[st
             "a vertex of the OBJ file has no three numbers", where=where, remedy=CUT
         )
     words_of_all = [word for row in vertices for word in row]
-    points = _numbers(words_of_all, where, "OBJ").reshape(-1, 3)
+    points = float_numbers(words_of_all, where, "OBJ").reshape(-1, 3)
     corners = _triangulated(points, polygons, where)
     if len(set(owner)) < 2:
         return corners, None, ()

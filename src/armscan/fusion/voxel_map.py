@@ -23,10 +23,8 @@ from armscan.errors import InputError, OptionError
 from armscan.fusion.cell_sums import MOST_BYTES, CellSums
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.kernels.voxels import BLOCK_BITS, MIDDLE, N_VALUES, PART_BITS, voxel_values
-from armscan.records.cloud import CloudFrame, PointCloud
+from armscan.records.cloud import FUSED, CloudFrame, PointCloud
 
-FUSED = "fused"
-"""Name of the one sheet and the one exposure of a fused cloud: its points come from many."""
 AT_ONCE = 50_000
 """Points whose rows are made at a time: 11 MB."""
 LEAST_AGREEMENT = 0.5

@@ -12,10 +12,10 @@ import numpy as np
 from armscan.errors import InputError
 from armscan.fusion.digest import CloudDigest, percentiles
 from armscan.fusion.point_spool import PointSpool
-from armscan.fusion.voxel_map import FUSED, VoxelMap
+from armscan.fusion.voxel_map import VoxelMap
 from armscan.jobs.job import Job
 from armscan.pipeline.progress import ProgressEvent
-from armscan.records.cloud import PointCloud
+from armscan.records.cloud import FUSED, PointCloud
 from armscan.report.fuse import FusedCloud, fused_page, fused_quantities
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import (

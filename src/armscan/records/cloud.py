@@ -12,6 +12,8 @@ from armscan.geometry.arrays import FloatArray, IntArray, RowRecord, floats, int
 
 CloudFrame = Literal["Sensor", "Base", "Part", "Cad"]
 
+FUSED = "fused"
+"""Name of the one sheet and the one exposure of a fused cloud: its points come from many."""
 SMALLEST_EXTENT_MM = 2.0
 """Points that all lie this near to each other are taken for metres: nothing that small is measured,
 probed to place a scanner or carries markers, and a plate in metres is not larger."""
@@ -91,6 +93,11 @@ class PointCloud(RowRecord):
             raise InputError(
                 f"{len(self.seen_from_mm)} places for {len(self.exposure_sources)} exposures"
             )
+
+    @property
+    def is_fused(self) -> bool:
+        """True if each point is of several exposures, no longer told apart."""
+        return self.exposure_sources == (FUSED,)
 
     @property
     def sigma_mm(self) -> FloatArray:

@@ -17,10 +17,10 @@ from armscan.inspection.cad.alignment import (
     align_best,
     align_datums,
     align_none,
-    scale_mismatch,
 )
 from armscan.inspection.cad.comparison import CadOptions, compare_with_part
 from armscan.inspection.cad.distance import PartSurface
+from armscan.inspection.cad.units import scale_mismatch
 from armscan.jobs.inspection.shapes import region_of
 from armscan.jobs.job import Job, solved
 from armscan.pipeline.progress import ProgressEvent

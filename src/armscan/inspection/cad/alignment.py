@@ -267,14 +267,16 @@ def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> Fi
     noise = float(np.median(cloud.sigma_mm[rows]))
     near = max(NEAR * surface.diagonal_mm, 5.0 * noise)
     share = float((d <= near).mean())
-    if share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise):
+    typical, size = float(np.median(d)), min(across_mm(cloud.points_mm), surface.diagonal_mm)
+    is_off = typical > max(TYPICAL * size, 5.0 * noise)
+    is_near = share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise)
+    if is_near and not is_off:
         return None
     if share > HOPELESS:
         failure = _mirrored(surface, cloud, rows, near, 1.0 - share)
         if failure is not None:
             return failure
-    typical, size = float(np.median(d)), min(across_mm(cloud.points_mm), surface.diagonal_mm)
-    if typical > max(TYPICAL * size, 5.0 * noise):
+    if is_off:
         return FitFailure(
             f"the cloud does not fit the model: its points lie {typical:.3g} mm off it (median), "
             f"wherever it is laid, and it measures {size:.4g} mm",

@@ -155,17 +155,17 @@ def test_a_small_cloud_that_fits_much_better_enlarged_is_in_another_unit(
 
 def test_a_small_patch_of_the_part_is_in_the_right_unit() -> None:
     """A tenth of the plate, 0.05 mm of noise: scaling makes it fit no better over its size."""
-    points, normals = scanned(PLATE, 200_000, 0.05)
+    points, normals = scanned(PLATE, 60_000, 0.05)
     patch = (normals[:, 2] > 0.9) & (np.abs(points - [50, 40, 5])[:, :2].max(axis=1) < 5.0)
     cloud = cloud_of(points[patch], sigma_mm=0.001, normals=normals[patch])
-    assert len(cloud) > 500
+    assert len(cloud) > 150
     assert isinstance(align_best(PartSurface(PLATE), cloud, True), Alignment)
 
 
 def test_a_cloud_that_lies_a_hundredth_of_its_size_off_is_of_another_part() -> None:
-    """Waves of 1 mm on a patch of 30 mm, near the plate as its size goes, and not of it."""
-    x, y = np.meshgrid(np.linspace(-15, 15, 80), np.linspace(-15, 15, 80))
-    waves = np.column_stack([x.ravel(), y.ravel(), 1.0 * np.sin(x.ravel()) * np.sin(y.ravel())])
+    """Waves of 2 mm on a patch of 30 mm, near the plate as its size goes, and not of it."""
+    x, y = np.meshgrid(np.linspace(-15, 15, 40), np.linspace(-15, 15, 40))
+    waves = np.column_stack([x.ravel(), y.ravel(), 2.0 * np.sin(x.ravel()) * np.sin(y.ravel())])
     found = align_best(PartSurface(PLATE), cloud_of(waves), True)
     assert isinstance(found, FitFailure)
     assert "does not fit" in found.reason

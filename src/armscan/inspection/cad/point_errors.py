@@ -168,7 +168,8 @@ def scatter_of_means(
         return np.zeros(count)
     width = int(exposure.max()) + 1
     pair, index = np.unique(label[inside] * width + exposure[inside], return_inverse=True)
-    total, size = np.bincount(index, deviations_mm[inside]), np.bincount(index).astype(np.float64)
+    total = np.bincount(index, deviations_mm[inside]).astype(np.float64)
+    size = np.bincount(index).astype(np.float64)
     group = pair // width
     seen = np.bincount(group, minlength=count)
     place = np.arange(len(pair)) - (np.cumsum(seen) - seen)[group]
@@ -179,7 +180,7 @@ def scatter_of_means(
             key = group[chosen] * most + place[chosen] * most // seen[group[chosen]]
             used, block = np.unique(key, return_inverse=True)
             owner = used // most
-            sums = [np.bincount(block, one[chosen]) for one in (total, size)]
+            sums = [np.bincount(block, one[chosen]).astype(float) for one in (total, size)]
             blocks = np.bincount(owner, minlength=count)
             found = np.maximum(found, _jackknife(owner, blocks, sums[0], sums[1]))
     return found

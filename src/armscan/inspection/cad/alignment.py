@@ -28,6 +28,7 @@ from armscan.inspection.cad.search import (
     spread_rows,
     tukey_weights,
 )
+from armscan.inspection.cad.units import across_mm, scale_mismatch, unit_mismatch
 from armscan.records.cloud import PointCloud
 
 AlignMethod = Literal["best", "none", "321"]
@@ -45,21 +46,19 @@ STAYED = 0.5
 """And the part of that way at which it must stay when it is fitted again."""
 DATUM_HOLDS = 0.02
 """A datum face holds a motion that moves its points by this part along their normals (rms)."""
-LEAST_POINTS = 100
 FITTING = 0.6
 """Part of the points that must lie near the surface for a cloud to be of this part."""
 NEAR = 0.01
 """What near means, over the diagonal: distances of a wrong part are larger."""
 WELL_FITTING = 0.98
 """Below this part the mirrored model is tried as well."""
+TYPICAL = 0.01
+"""Typical (median) distance over the size of cloud or part, the smaller, beyond which it is another
+part: what a face of a part made badly may have, and far more than points scatter."""
 HOPELESS = 0.2
 """Below this part not even that: another part."""
 MIRRORED = 0.5
 """A mirrored cloud of which fewer than this part of the points lie off is the mirrored part's."""
-UNIT_RATIOS = (("metres", 1000.0), ("inches", 25.4))
-TOO_LARGE, TOO_SMALL = 6.0, 0.004
-"""Extent of a cloud over the part's: a scan on a table is no six times larger than its part, nor is
-a scan worth its name so small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,36 +165,6 @@ def free_text(free: Sequence[FreeMotion]) -> str:
     return " nor ".join(texts)
 
 
-def scale_mismatch(surface: PartSurface, points_mm: FloatArray) -> FitFailure | None:
-    """Notice a cloud or a part in another unit by comparing their sizes."""
-    if len(points_mm) < LEAST_POINTS:
-        return FitFailure(
-            f"the cloud holds {len(points_mm)} points; {LEAST_POINTS} are needed",
-            "scan more of the part",
-        )
-    low, high = np.percentile(points_mm, [1.0, 99.0], axis=0)
-    ours, theirs = float(np.linalg.norm(high - low)), surface.diagonal_mm
-    if not ours > TOO_SMALL * theirs or not ours < TOO_LARGE * theirs:
-        ratio = ours / theirs
-        larger = ratio > 1.0
-        unit = min(
-            UNIT_RATIOS, key=lambda pair: abs(math.log((ratio if larger else 1 / ratio) / pair[1]))
-        )[0]
-        which = "model" if larger else "cloud"
-        remedy = (
-            f"if the model is in {unit}, give --unit {'m' if unit == 'metres' else 'inch'}; else "
-            "cut the cloud to the part with --region"
-            if larger
-            else f"multiply the cloud's coordinates, if they are in {unit}"
-        )
-        return FitFailure(
-            f"the cloud measures {ours:.4g} and the part {theirs:.4g} mm across: the {which} "
-            f"seems to be in {unit}",
-            remedy,
-        )
-    return None
-
-
 def align(
     surface: PartSurface,
     cloud: PointCloud,
@@ -249,7 +218,9 @@ def align_best(
     if failure is not None:
         return failure
     found = search_pose(surface, cloud.points_mm, cloud.normals)
-    failure = _foreign(surface, cloud, found[0])
+    failure = unit_mismatch(surface, cloud, found[0])
+    if failure is None:
+        failure = _foreign(surface, cloud, found[0])
     if failure is not None:
         return failure
     best = fit_to_part(surface, cloud, found[0].cad_from_part, errors_known)
@@ -321,12 +292,21 @@ def _foreign(surface: PartSurface, cloud: PointCloud, best: PoseCandidate) -> Fi
     noise = float(np.median(cloud.sigma_mm[rows]))
     near = max(NEAR * surface.diagonal_mm, 5.0 * noise)
     share = float((d <= near).mean())
-    if share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise):
+    typical, size = float(np.median(d)), min(across_mm(cloud.points_mm), surface.diagonal_mm)
+    is_off = typical > max(TYPICAL * size, 5.0 * noise)
+    is_near = share >= WELL_FITTING and best.scale_mm <= max(0.25 * near, 3.0 * noise)
+    if is_near and not is_off:
         return None
     if share > HOPELESS:
         failure = _mirrored(surface, cloud, rows, near, 1.0 - share)
         if failure is not None:
             return failure
+    if is_off:
+        return FitFailure(
+            f"the cloud does not fit the model: its points lie {typical:.3g} mm off it (median), "
+            f"wherever it is laid, and it measures {size:.4g} mm",
+            "give the model of this part, and look at its unit and the cloud's",
+        )
     if share >= FITTING:
         return None
     return FitFailure(

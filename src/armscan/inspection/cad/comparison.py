@@ -23,7 +23,7 @@ from armscan.geometry.arrays import (
 from armscan.geometry.estimate import FitFailure
 from armscan.inspection.cad.alignment import Alignment, measured
 from armscan.inspection.cad.distance import PartSurface
-from armscan.inspection.cad.point_errors import PointErrors
+from armscan.inspection.cad.point_errors import PointErrors, scatter_of_means
 from armscan.inspection.conformity import COVERAGE, judge
 from armscan.inspection.conformity import Verdict as Validity
 from armscan.records.cloud import PointCloud
@@ -139,7 +139,8 @@ class FaceComparison:
     statistics
         Of its points.
     u_mean_mm
-        U (k = 2) of the mean; NaN where not known.
+        U (k = 2) of the mean, of the points' errors or of how far exposures disagree, the larger;
+        NaN where not known, and of a face without points.
     spot_mm, u_spot_mm, spot_place_mm
         Median deviation of the spot that deviates most, its U, and (3,) where in Cad it is; NaN
         where no spot has enough points.
@@ -195,6 +196,8 @@ class CadComparison(RowRecord):
         Points of the cloud.
     spot_width_mm
         Width of a spot.
+    is_fused
+        True if the cloud no longer tells its exposures apart.
     """
 
     alignment: Alignment
@@ -212,6 +215,7 @@ class CadComparison(RowRecord):
     faces: tuple[FaceComparison, ...]
     n_given: int
     spot_width_mm: float
+    is_fused: bool = False
 
     @property
     def verdict(self) -> Decision | Literal[""]:
@@ -291,15 +295,17 @@ def compare_with_part(
         u_point, u_face, u_spot = _uncertainties(
             cloud, alignment, normals, jacobian, ((face, n_faces), (spot, n_spots))
         )
+        scatter = scatter_of_means(face, n_faces, d, cloud.exposure)
+        u_face = np.maximum(u_face, COVERAGE * scatter)
     else:
         u = options.uncertainty_mm
         u_point, u_face, u_spot = (np.full(n, u) for n in (len(cloud), n_faces, n_spots))
     limits = np.array([options.tolerance_of(name) for name in part.face_names])
     of_spot = np.zeros(n_spots, np.int64)
     of_spot[spot[face >= 0]] = face[face >= 0]
-    once = _shown_once(spot, cloud.exposure, d, limits[of_spot] + u_spot)
+    once = _shown_once(spot, cloud, d, limits[of_spot] + u_spot)
     spots = _spot_results(spot, face, d, found.closest_mm, u_spot, is_once=once)
-    once = _shown_once(face, cloud.exposure, d, limits + u_face)
+    once = _shown_once(face, cloud, d, limits + u_face)
     by_face = _rows_by(face, n_faces)
     faces = tuple(
         _face(
@@ -329,6 +335,7 @@ def compare_with_part(
         faces=faces,
         n_given=len(cloud),
         spot_width_mm=spot_width,
+        is_fused=cloud.is_fused,
     )
 
 
@@ -370,13 +377,16 @@ def _rows_by(label: IntArray, count: int) -> list[IntArray]:
 
 
 def _shown_once(
-    label: IntArray, exposure: IntArray, d: FloatArray, least_mm: FloatArray
+    label: IntArray, cloud: PointCloud, d: FloatArray, least_mm: FloatArray
 ) -> BoolArray:
     """(L,) labels that no two exposures of a cloud of several show to deviate.
 
     An exposure shows it if the mean of what it saw there deviates by more than ``least_mm`` (L,).
+    Of a fused cloud, whose exposures are forgotten, these are all labels.
     """
-    count = len(least_mm)
+    count, exposure = len(least_mm), cloud.exposure
+    if cloud.is_fused:
+        return np.ones(count, bool)
     if len(exposure) == 0 or exposure.min() == exposure.max():
         return np.zeros(count, bool)
     inside = label >= 0
@@ -470,7 +480,7 @@ def _face(
     return FaceComparison(
         name=name,
         statistics=statistics,
-        u_mean_mm=u_mean,
+        u_mean_mm=u_mean if statistics.n else math.nan,
         spot_mm=float(spots.deviation_mm[worst]) if worst >= 0 else math.nan,
         u_spot_mm=float(spots.u_mm[worst]) if worst >= 0 else math.nan,
         spot_place_mm=spots.place_mm[worst] if worst >= 0 else np.full(3, math.nan),

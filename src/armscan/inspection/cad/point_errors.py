@@ -14,6 +14,8 @@ MOST_BLOCKS = 200
 """Neighbouring exposures beyond so many are taken together."""
 REGIONS = 2
 """Along each axis, of a cloud of one exposure, whose points are taken to err together."""
+LARGEST_TABLE = 5_000_000
+"""Entries of a table of groups by blocks that are worked on at once: 40 MB an array."""
 
 
 class PointErrors(RowRecord):
@@ -113,21 +115,89 @@ class PointErrors(RowRecord):
         both = influence * v @ influence.T
         private = own - 2.0 * np.einsum("fk,fk->f", jacobian, cross)
         private += np.einsum("fk,kl,fl->f", jacobian, both, jacobian)
+        shared = self._shared_variances(label, count, jacobian, influence)
+        return np.asarray(np.maximum(private, 0.0) + shared)
+
+    def _shared_variances(
+        self, label: IntArray, count: int, jacobian: FloatArray, influence: FloatArray
+    ) -> FloatArray:
+        """(count,) variances that blocks' common errors give to `group_variances`."""
+        inside = np.flatnonzero(label >= 0)
+        n = np.maximum(np.bincount(label[inside], minlength=count), 1)
+        order = inside[np.argsort(label[inside], kind="stable")]
         largest = np.zeros(count)
         for block in self.blocks:
             b = int(block.max()) + 1
-            if b * count > 20_000_000:
-                continue
-            place = group * b + block[inside]
-            mean = [
-                np.bincount(place, self.normals[inside, k], count * b).reshape(count, b)
-                for k in range(3)
-            ]
-            pull = np.stack(mean, axis=2) / n[:, None, None]
-            pull -= np.einsum("fk,kbi->fbi", jacobian, _pulls(influence, self.normals, block, b))
+            pulls = _pulls(influence, self.normals, block, b)
             covariance = _block_means(self.covariance_mm2, block, b)
-            largest = np.maximum(largest, np.einsum("fbi,bij,fbj->f", pull, covariance, pull))
-        return np.asarray(np.maximum(private, 0.0) + largest)
+            chunk = max(1, LARGEST_TABLE // b)
+            for first in range(0, count, chunk):
+                last = min(first + chunk, count)
+                low, high = np.searchsorted(label[order], [first, last])
+                rows, size = order[low:high], last - first
+                place = (label[rows] - first) * b + block[rows]
+                sums = [
+                    np.bincount(place, self.normals[rows, k], size * b).reshape(size, b)
+                    for k in range(3)
+                ]
+                pull = np.stack(sums, axis=2) / n[first:last, None, None]
+                pull -= np.einsum("fk,kbi->fbi", jacobian[first:last], pulls)
+                shared = np.einsum("fbi,bij,fbj->f", pull, covariance, pull)
+                largest[first:last] = np.maximum(largest[first:last], shared)
+        return largest
+
+
+def scatter_of_means(
+    label: IntArray, count: int, deviations_mm: FloatArray, exposure: IntArray
+) -> FloatArray:
+    """(count,) standard deviations of groups' means, by how far exposures disagree.
+
+    Delete-a-block jackknife over the exposures that saw a group, and over blocks of neighbouring
+    ones; the largest. Zero for a group that one exposure saw, which tells nothing. That a face is
+    not of its nominal form is in it, where exposures saw different places of the face.
+
+    Parameters
+    ----------
+    label, count
+        (N,) group of each point, -1 for none, and how many groups there are.
+    deviations_mm, exposure
+        (N,) of the points.
+    """
+    inside = np.flatnonzero(label >= 0)
+    if len(inside) == 0:
+        return np.zeros(count)
+    width = int(exposure.max()) + 1
+    pair, index = np.unique(label[inside] * width + exposure[inside], return_inverse=True)
+    total = np.bincount(index, deviations_mm[inside]).astype(np.float64)
+    size = np.bincount(index).astype(np.float64)
+    group = pair // width
+    seen = np.bincount(group, minlength=count)
+    place = np.arange(len(pair)) - (np.cumsum(seen) - seen)[group]
+    found = _jackknife(group, seen, total, size)
+    for most in COARSE_BLOCKS:
+        chosen = seen[group] >= 2 * most
+        if chosen.any():
+            key = group[chosen] * most + place[chosen] * most // seen[group[chosen]]
+            used, block = np.unique(key, return_inverse=True)
+            owner = used // most
+            sums = [np.bincount(block, one[chosen]).astype(float) for one in (total, size)]
+            blocks = np.bincount(owner, minlength=count)
+            found = np.maximum(found, _jackknife(owner, blocks, sums[0], sums[1]))
+    return found
+
+
+def _jackknife(
+    owner: IntArray, n_blocks: IntArray, total: FloatArray, size: FloatArray
+) -> FloatArray:
+    """(L,) of the means of L owners, from the sums and sizes of their blocks, (B,) each."""
+    count = len(n_blocks)
+    all_sum, all_size = (np.bincount(owner, one, count) for one in (total, size))
+    rest = np.maximum(all_size[owner] - size, 1.0)
+    without = np.where(n_blocks[owner] > 1, (all_sum[owner] - total) / rest, 0.0)
+    divisor = np.maximum(n_blocks, 1)
+    change = without - (np.bincount(owner, without, count) / divisor)[owner]
+    squares = np.bincount(owner, change**2, count)
+    return np.asarray(np.sqrt((divisor - 1) / divisor * squares))
 
 
 def _blocks(cloud: PointCloud, rows: IntArray) -> list[IntArray]:

@@ -110,6 +110,10 @@ def cad_quantities(found: CadComparison, part: PartModel) -> tuple[Quantity, ...
     return tuple(told)
 
 
+URGENCY = {"fail": 0, "undecided": 1, "pass": 2}
+"""Order of rows; faces not seen come last."""
+MARKS = {"fail": "! ", "undecided": "? "}
+"""Before the word, so that grey print shows these rows at a glance."""
 UNSIGNED = ("std_mm", "rms_mm")
 ALIGNMENTS = {
     "best": "best fit of the whole cloud, found without a guess",
@@ -204,7 +208,14 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
         named = ", ".join(unseen[:6]) + (" and others" if len(unseen) > 6 else "")
         texts.append(f"not seen by the scan, so not judged: {named}")
     once = [one.name for one in found.faces if one.is_seen_once]
-    if once:
+    if found.is_fused:
+        texts.append(
+            "the cloud is fused, so a single stripe that errs cannot be told from a dent: what "
+            "would fail is undecided"
+            + (f" ({', '.join(once)})" if once else "")
+            + "; inspect the cloud from before it was fused"
+        )
+    elif once:
         texts.append(
             f"undecided because no two exposures show the deviation: {', '.join(once)}; scan there "
             "again, or look at that stripe: along an edge or a shadow it may err by tenths of a mm"
@@ -213,15 +224,16 @@ def cad_warnings(found: CadComparison, errors_known: bool) -> tuple[str, ...]:
 
 
 def verdict_table(found: CadComparison) -> Table:
-    """A row a face: decision, tolerance, mean and worst spot, each with its U."""
+    """A row a face, failing ones first: decision, tolerance, mean and worst spot, with U."""
     has_limit = found.options.has_tolerance
     decided = ("decision", "tolerance") if has_limit else ()
     heads = ("face", *decided, "points", "mean", "U of mean", "spot", "U of spot")
     rows = []
-    for one in found.faces:
+    for one in sorted(found.faces, key=lambda face: URGENCY.get(face.decision, len(URGENCY))):
         pairs = ((one.statistics.mean_mm, one.u_mean_mm), (one.spot_mm, one.u_spot_mm))
         cells = [text for value, u in pairs for text in (_length(value), _length(u, sign=""))]
-        limit = (one.decision, _length(one.tolerance_mm, sign="")) if has_limit else ()
+        word = MARKS.get(one.decision, "") + one.decision
+        limit = (word, _length(one.tolerance_mm, sign="")) if has_limit else ()
         rows.append((one.name, *limit, f"{one.statistics.n:,}", *cells))
     title = "Decision by face, mm" if has_limit else "Faces, mm"
     return Table(heads, tuple(rows), title, (1,) if has_limit else ())
@@ -280,7 +292,7 @@ def cad_page(
         ("spot", f"median deviation of the spot that deviates most, of all spots {_width(found)} "
          "wide with ten points or more"),
         ("U", "expanded uncertainty, k = 2: of the points, what exposures have in common, and the "
-         "alignment"),
+         "alignment; of a face's mean how far exposures disagree, where that is more"),
     )  # fmt: skip
     return page_of(
         provenance,

@@ -20,6 +20,15 @@ from armscan.storage.files import path_text, read_bytes
 STEP_SUFFIXES = (".step", ".stp")
 LEAST_CHORD_MM = 1e-5
 QUOTED = re.compile(rb"'[^']*'")
+KINDS = {
+    "surfaceofextrusion": "extruded",
+    "surfaceofrevolution": "turned",
+    "beziersurface": "free form",
+    "bsplinesurface": "free form",
+    "offsetsurface": "offset",
+    "othersurface": "surface",
+}
+"""Words for kinds of surface that are no plane, cylinder, cone, sphere or torus."""
 REFERRED, DEFINED = re.compile(rb"#(\d{1,18})"), re.compile(rb"#(\d{1,18})\s*=")
 
 
@@ -107,6 +116,7 @@ def _shape(data: bytes, name: str, where: str) -> Any:
         from OCP.Message import Message
         from OCP.STEPControl import STEPControl_Reader
     except ImportError as error:
+        _raise_interrupt(error)
         raise OptionError(
             "STEP files need the extra 'cad', which is not installed",
             where=where,
@@ -123,6 +133,19 @@ def _shape(data: bytes, name: str, where: str) -> Any:
             "the STEP file is not understood", where=where, remedy="export it again"
         )
     return reader.OneShape()
+
+
+def _raise_interrupt(error: BaseException) -> None:
+    """Raise the Ctrl-C that an import, stopped within a compiled module, reports as its failure."""
+    seen: list[BaseException] = []
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, KeyboardInterrupt):
+            raise one
+        if one is not None and one not in seen:
+            seen.append(one)
+            waiting += [one.__cause__, one.__context__]
 
 
 def _triangles_of_faces(shape: Any, chord: ChordError) -> tuple[list[FloatArray], list[str]]:
@@ -147,9 +170,15 @@ def _triangles_of_faces(shape: Any, chord: ChordError) -> tuple[list[FloatArray]
         if mesh is not None:
             is_turned = face.Orientation() == TopAbs_REVERSED
             corners.append(_corners(mesh, location.Transformation(), is_turned))
-            kinds.append(BRepAdaptor_Surface(face).GetType().name.removeprefix("GeomAbs_").lower())
+            kinds.append(face_kind(BRepAdaptor_Surface(face).GetType().name))
         faces.Next()
     return corners, kinds
+
+
+def face_kind(name: str) -> str:
+    """Word for a kind of surface, from its name in OCP, such as ``GeomAbs_BSplineSurface``."""
+    plain = name.removeprefix("GeomAbs_").lower()
+    return KINDS.get(plain, plain)
 
 
 def _corners(mesh: Any, transformation: Any, is_turned: bool) -> FloatArray:

@@ -18,12 +18,12 @@ from armscan.inspection.cad.alignment import (
     align_none,
     fit_to_part,
     free_text,
-    scale_mismatch,
 )
 from armscan.inspection.cad.comparison import CadComparison, CadOptions, compare_with_part
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import PartModel, part_of
 from armscan.inspection.cad.search import even_turns, spread_rows
+from armscan.inspection.cad.units import scale_mismatch
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners, turned, wedge_part
 
@@ -136,6 +136,39 @@ def test_units_are_noticed(factor: float, word: str) -> None:
     else:
         assert found is not None
         assert word in found.reason
+
+
+@pytest.mark.parametrize(
+    ("factor", "word"),
+    [(1 / 25.4, "cloud seems to be in inches"), (0.1, "cloud seems to be in centimetres")],
+)
+def test_a_small_cloud_that_fits_much_better_enlarged_is_in_another_unit(
+    factor: float, word: str
+) -> None:
+    """Small as it is, it fits on one face; its own relief tells the unit."""
+    points, _ = scanned(WEDGE.part)
+    found = align_best(WEDGE, cloud_of(points * factor), True)
+    assert isinstance(found, FitFailure)
+    assert word in found.reason
+    assert "leave --unit" in found.remedy
+
+
+def test_a_small_patch_of_the_part_is_in_the_right_unit() -> None:
+    """A tenth of the plate, 0.05 mm of noise: scaling makes it fit no better over its size."""
+    points, normals = scanned(PLATE, 60_000, 0.05)
+    patch = (normals[:, 2] > 0.9) & (np.abs(points - [50, 40, 5])[:, :2].max(axis=1) < 5.0)
+    cloud = cloud_of(points[patch], sigma_mm=0.001, normals=normals[patch])
+    assert len(cloud) > 150
+    assert isinstance(align_best(PartSurface(PLATE), cloud, True), Alignment)
+
+
+def test_a_cloud_that_lies_a_hundredth_of_its_size_off_is_of_another_part() -> None:
+    """Waves of 2 mm on a patch of 30 mm, near the plate as its size goes, and not of it."""
+    x, y = np.meshgrid(np.linspace(-15, 15, 40), np.linspace(-15, 15, 40))
+    waves = np.column_stack([x.ravel(), y.ravel(), 2.0 * np.sin(x.ravel()) * np.sin(y.ravel())])
+    found = align_best(PartSurface(PLATE), cloud_of(waves), True)
+    assert isinstance(found, FitFailure)
+    assert "does not fit" in found.reason
 
 
 def test_too_few_points_are_refused() -> None:

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from armscan.errors import OptionError
 from armscan.geometry.estimate import FitFailure
+from armscan.inspection.cad import point_errors
 from armscan.inspection.cad.alignment import align_none
 from armscan.inspection.cad.comparison import (
     DECISIONS,
@@ -20,6 +23,10 @@ from armscan.inspection.cad.comparison import (
 )
 from armscan.inspection.cad.distance import PartSurface
 from armscan.inspection.cad.part import part_of
+from armscan.inspection.cad.point_errors import scatter_of_means
+from armscan.records.cloud import FUSED
+from armscan.report.inspection.cad import cad_warnings, verdict_table
+from armscan.storage.parts.tables import face_table_bytes
 from rigs.inspection_clouds import cloud_of
 from rigs.parts import box_corners
 
@@ -175,6 +182,90 @@ def test_what_no_two_exposures_show_is_undecided(
     top = next(one for one in found.faces if one.statistics.n)
     assert (top.decision, top.is_seen_once) == (decision, decision == "undecided")
     assert found.verdict == decision
+
+
+def test_a_fused_cloud_fails_nothing_and_one_exposure_of_another_kind_does() -> None:
+    points = top_points(3000, 20.2)
+    decisions = []
+    for name in (FUSED, "part.xyz"):
+        cloud = replace(cloud_of(points, sigma_mm=0.002), exposure_sources=(name,))
+        found = compare_with_part(
+            BOX, cloud, align_none(cloud), CadOptions(tolerance_mm=0.05), errors_known=True
+        )
+        assert isinstance(found, CadComparison)
+        decisions.append(found.verdict)
+        told = [text for text in cad_warnings(found, errors_known=True) if "is fused" in text]
+        assert len(told) == (name == FUSED)
+    assert decisions == ["undecided", "fail"]
+
+
+def test_two_exposures_that_disagree_widen_the_u_of_their_face() -> None:
+    """0.08 mm apart: the mean of both has a standard deviation of 0.04 mm by their difference."""
+    points, exposure = top_points(4000), np.arange(4000) % 2
+    points[:, 2] += np.where(exposure == 0, 0.04, -0.04)
+    top = next(one for one in scanned(points, exposure).faces if one.statistics.n)
+    assert top.u_mean_mm == pytest.approx(0.08, rel=1e-3)
+    calm = next(one for one in scanned(top_points(4000), exposure).faces if one.statistics.n)
+    assert calm.u_mean_mm == pytest.approx(2.0 * 0.002 / math.sqrt(2.0), rel=1e-3)
+
+
+def test_u_of_a_face_covers_unstated_errors_of_exposures_and_is_never_reduced() -> None:
+    """Exposures err by 0.02 mm where 0.002 is stated; U covers 95 % of many scans' means."""
+    ratios = []
+    exposure = np.arange(1200) % 20
+    stated = 2.0 * 0.002 / math.sqrt(20)
+    for seed in range(150):
+        random = np.random.default_rng(seed)
+        points = top_points(1200, seed=seed)
+        points[:, 2] += random.normal(0.0, 0.02, 20)[exposure]
+        top = next(one for one in scanned(points, exposure).faces if one.statistics.n)
+        assert top.u_mean_mm >= stated * (1.0 - 1e-9)
+        ratios.append(abs(top.statistics.mean_mm) / top.u_mean_mm)
+    # k = 2 and 19 degrees of freedom: 94 %; blocks of neighbours can only widen
+    assert 0.89 < np.mean(np.array(ratios) < 1.0) < 0.999
+
+
+def test_scatter_is_that_of_a_jackknife_by_hand() -> None:
+    random = np.random.default_rng(3)
+    label, exposure = random.integers(-1, 3, 600), random.integers(0, 7, 600)
+    exposure[label == 2] = 4
+    d = random.normal(size=600)
+    found = scatter_of_means(label, 4, d, exposure)
+    for k in (0, 1):
+        left = np.array([d[(label == k) & (exposure != e)].mean() for e in range(7)])
+        assert found[k] == pytest.approx(math.sqrt(6 / 7 * ((left - left.mean()) ** 2).sum()))
+    assert found[2] == found[3] == 0.0
+
+
+def test_many_groups_get_the_shared_error_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, exposure = top_points(3000), np.arange(3000) % 10
+    whole = scanned(points, exposure)
+    monkeypatch.setattr(point_errors, "LARGEST_TABLE", 25)
+    parts = scanned(points, exposure)
+    for one, other in zip(whole.faces, parts.faces, strict=True):
+        assert one.u_mean_mm == pytest.approx(other.u_mean_mm, rel=1e-12, nan_ok=True)
+        assert one.u_spot_mm == pytest.approx(other.u_spot_mm, rel=1e-12, nan_ok=True)
+    assert max(one.u_spot_mm for one in parts.faces if one.statistics.n) > 1e-3
+
+
+def test_of_a_face_not_seen_nothing_is_told() -> None:
+    found = compared(top_points(3000), sigma=0.01, tolerance_mm=0.05)
+    unseen = [one for one in found.faces if one.statistics.n == 0]
+    assert unseen
+    assert all(math.isnan(one.u_mean_mm) for one in unseen)
+    shown = {row[0]: row for row in verdict_table(found).rows}
+    assert {shown[one.name][5] for one in unseen} == {"-"}
+    lines = [line for line in face_table_bytes(found).decode().splitlines() if line[:1] != "#"]
+    rows = list(csv.DictReader(lines))
+    assert {row["u_mean_mm"] for row in rows if row["n"] == "0"} == {""}
+
+
+def test_failing_faces_stand_first_and_are_marked() -> None:
+    """The side is as it should be, the top 0.2 mm high; the top has the higher number."""
+    points = np.concatenate([top_points(3000, 20.2), top_points(3000, 0.0)])
+    found = compared(points, sigma=0.002, tolerance_mm=0.05)
+    words = [row[1] for row in verdict_table(found).rows]
+    assert words == ["! fail", "pass", *["not seen"] * 4]
 
 
 def test_points_beyond_an_edge_count_for_no_face() -> None:

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import builtins
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ import trimesh
 from armscan.errors import ArmscanError, FileFormatError, InputError, OptionError
 from armscan.inspection.cad.part import part_of
 from armscan.storage.parts.meshes import read_part
-from armscan.storage.parts.step import ChordError
+from armscan.storage.parts.step import ChordError, face_kind
 from armscan.storage.parts.tables import datum_faces, read_tolerances
 from rigs.parts import box_corners, extruded, wedge_part
 
@@ -240,3 +242,30 @@ def test_datums_are_three_faces() -> None:
     for names in ("face 1,face 2", "face 1,face 1,face 2", "face 1,face 2,face 99"):
         with pytest.raises(ArmscanError):
             datum_faces(names, PART)
+
+
+@pytest.mark.parametrize(
+    ("name", "word"),
+    [("Plane", "plane"), ("Cylinder", "cylinder"), ("Torus", "torus"),
+     ("SurfaceOfExtrusion", "extruded"), ("SurfaceOfRevolution", "turned"),
+     ("BSplineSurface", "free form"), ("BezierSurface", "free form")],
+)  # fmt: skip
+def test_kinds_of_faces_are_words(name: str, word: str) -> None:
+    assert face_kind(f"GeomAbs_{name}") == word
+
+
+def test_ctrl_c_while_the_step_reader_loads_stays_ctrl_c(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A compiled module reports it as an import that failed."""
+    path = step_file(tmp_path)
+    real = builtins.__import__
+
+    def stopped(name: str, *how: Any, **more: Any) -> Any:
+        if name.startswith("OCP"):
+            raise ImportError("initialization failed") from KeyboardInterrupt()
+        return real(name, *how, **more)
+
+    monkeypatch.setattr(builtins, "__import__", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        read_part(path)

@@ -20,7 +20,6 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.search import (
-    SAME_SIDE,
     Sample,
     WantedFeature,
     connected,
@@ -190,8 +189,7 @@ def _belonging(
     chosen = np.abs(shape.distance_mm(points)) <= selection.feature_mm
     if shape.kind not in ("line", "circle"):
         near = points[chosen]
-        facing = np.einsum("ni,ni->n", shape.outward(near), sample.normals_at(near))
-        chosen[chosen] = np.abs(facing) >= SAME_SIDE
+        chosen[chosen] = sample.facing(shape, near, sample.nearest(near))
     if wanted.seed_mm is not None and chosen.any():
         step = GAP_SPACINGS * sample.spacing_mm
         chosen[chosen] = connected(points[chosen], np.asarray(wanted.seed_mm), step)

@@ -58,8 +58,10 @@ that a large cylinder touches.
 """
 SAME_SIDE = math.cos(math.radians(30.0))
 """Normals of a point and of the surface that differ by more than 30 degrees are of two faces."""
-SAME_FACE = math.cos(math.radians(10.0))
-"""Normals within 10 degrees are taken for those of parallel faces."""
+ACROSS = math.sqrt(1.0 - SAME_SIDE**2)
+"""The same of a direction that lies in the surface."""
+SAME_FACE, NEXT_FACE = math.cos(math.radians(2.0)), math.cos(math.radians(10.0))
+"""Normals within 2 degrees make a face's; within 10 degrees of it no other is looked for."""
 SAME_AXIS = math.cos(math.radians(20.0))
 """How far a candidate's axis may be off the one that was given: it is a rough direction."""
 RADIUS_SLACK = 0.1
@@ -74,6 +76,8 @@ N_POLISHED = 10
 """Best candidates that are fitted to the points on them before one is chosen."""
 FULLY_BENT = 0.05
 """Second moment of normals, 0 of a flat face and 0.5 of half a cylinder: an arc of 45 degrees."""
+SHELL_BANDS = 5.0
+"""Half width, in bands, of the shell in which points beside a shape count against it."""
 ROUNDS = 3
 
 
@@ -206,7 +210,7 @@ class Sample:
         cosine = np.abs(np.einsum("ni,ni->n", outward, normals))
         sine = np.abs(np.einsum("ni,ni->n", outward, self.along[which]))
         is_square = (cosine >= SAME_SIDE) | ~normals.any(axis=1)
-        return np.asarray(is_square & (sine <= math.sqrt(1.0 - SAME_SIDE**2)))
+        return np.asarray(is_square & (sine <= ACROSS))
 
 
 def sample_of(selection: Selection) -> Sample:
@@ -304,6 +308,7 @@ def _score(sample: Sample, shape: Shape) -> float:
     """Count of the points on a shape, less where they hardly show that it is curved.
 
     A strip of a flat face lies on any large cylinder that touches it; its normals are all alike.
+    A cylinder that cuts through faces has as many points just beside it as on it.
     """
     is_near = _support(sample, shape)
     n = float(is_near.sum())
@@ -311,7 +316,9 @@ def _score(sample: Sample, shape: Shape) -> float:
         return n
     normals = shape.outward(sample.points_mm[is_near])
     bent = float(np.linalg.eigvalsh(normals.T @ normals)[1]) / n
-    return n * min(1.0, bent / FULLY_BENT)
+    off = np.abs(shape.distance_mm(sample.points_mm))
+    beside = (off <= SHELL_BANDS * sample.noise_mm) & sample.facing(shape, sample.points_mm)
+    return n * min(1.0, bent / FULLY_BENT) * n / float(beside.sum())
 
 
 def _pool(sample: Sample, wanted: WantedFeature) -> IntArray:
@@ -358,8 +365,8 @@ def _square_to_faces(sample: Sample, wanted: WantedFeature, pool: IntArray) -> I
     for axis in (*given, *_face_normals(sample.normals)):
         axes = across(axis)
         normal, along = sample.normals[pool] @ axes[2], sample.along[pool]
-        is_side = np.abs(normal) <= math.sqrt(1.0 - SAME_SIDE**2)
-        is_side &= sample.normals[pool].any(axis=1) | (np.abs(along @ axes[2]) >= 1.0 - SAME_SIDE)
+        is_side = np.abs(normal) <= ACROSS
+        is_side &= sample.normals[pool].any(axis=1) | (np.abs(along @ axes[2]) >= ACROSS)
         side = sample.points_mm[pool[is_side]]
         if len(side) < 3:
             continue
@@ -378,7 +385,7 @@ def _square_to_faces(sample: Sample, wanted: WantedFeature, pool: IntArray) -> I
 
 
 def _face_normals(normals: FloatArray) -> list[FloatArray]:
-    """Directions (3,) that most known normals share to 10 degrees, the commonest first."""
+    """Directions (3,) that most known normals share, the commonest first."""
     left = normals[normals.any(axis=1)]
     found: list[FloatArray] = []
     while len(left) >= MIN_POINTS and len(found) < FACES:
@@ -386,7 +393,7 @@ def _face_normals(normals: FloatArray) -> list[FloatArray]:
         best = tried[int(np.argmax((np.abs(tried @ left.T) >= SAME_FACE).sum(axis=1)))]
         is_alike = np.abs(left @ best) >= SAME_FACE
         found.append(np.linalg.eigh(left[is_alike].T @ left[is_alike])[1][:, 2])
-        left = left[~is_alike]
+        left = left[np.abs(left @ found[-1]) < NEXT_FACE]
     return found
 
 

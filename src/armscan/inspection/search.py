@@ -41,15 +41,19 @@ N_TRIALS = {
     "cylinder": 1200,
     "cone": 1500,
 }
-THINNEST_LINE = 0.1
+THINNEST_LINE = 0.3
 """Breadth of a neighbourhood, as a part of its length, below which it is a line without a normal:
 stripes lie along it, not across."""
-THICKEST_FACE = 0.3
+THICKEST_FACE = 0.2
 """Thickness of a neighbourhood, as a part of its breadth, above which it is no face."""
 ALONG_STRIPE = 12
 """Points of one exposure that give the direction of the stripe."""
+SPARSER = 2
+"""How many times fewer points are looked at where neighbours lie in a line."""
 BISECTIONS = 16
 """Halvings of the side of the cubes by which a cloud is thinned."""
+THICKEST_STRIPE = 0.15
+"""Breadth of these, as a part of their length, above which they are in no line."""
 FACES = 3
 """Faces of a part that a cylinder is tried square to."""
 NOISE_BAND, LEAST_BAND_MM = 4.0, 0.02
@@ -66,6 +70,8 @@ SAME_AXIS = math.cos(math.radians(20.0))
 """How far a candidate's axis may be off the one that was given: it is a rough direction."""
 RADIUS_SLACK = 0.1
 """How far a diameter may be from the nominal one, as a part of it, where no range is given."""
+LEAST_HALF_ANGLE_DEG = 0.5
+"""Half angle below which a cone is a cylinder, or the points are of neither."""
 SEED_POINTS = 120
 """Sample points about a seed from which candidates are made."""
 NEAR_POINTS = 150
@@ -131,6 +137,9 @@ class WantedFeature:
              "the axis is no direction", "give three numbers x,y,z, not all 0"),
             (self.seed_mm is not None and not _are_three(self.seed_mm),
              "the seed is no point", "give three numbers x,y,z in mm"),
+            (self.kind in ("line", "circle") and (self.seed_mm or self.region) is None,
+             f"a {self.kind} is not looked for in a whole cloud: any face holds some",
+             "show its edge, rim or thin section with --region, or a point on it with --seed"),
         )  # fmt: skip
         for is_wrong, what, remedy in faults:
             if is_wrong:
@@ -155,12 +164,15 @@ class WantedFeature:
         if self.kind == "cone":
             wanted = self.half_angle_deg
             found = math.degrees(shape.half_angle_rad)
-            return wanted is None or abs(found - wanted) <= max(3.0, RADIUS_SLACK * wanted)
+            is_near = wanted is None or abs(found - wanted) <= max(3.0, RADIUS_SLACK * wanted)
+            return found >= LEAST_HALF_ANGLE_DEG and is_near
         low, high = self.radii_mm
         return self.kind in ("plane", "line") or low <= shape.radius_mm <= high
 
     def __str__(self) -> str:
         size = "" if self.diameter_mm is None else f" of {self.diameter_mm:g} mm"
+        if self.half_angle_deg is not None:
+            size = f" of {self.half_angle_deg:g} degrees"
         return f"{self.kind}{size}"
 
 
@@ -217,22 +229,44 @@ def sample_of(selection: Selection) -> Sample:
     """Thin the points that are looked at, and estimate normals."""
     chosen = _thinned(selection.points_mm, N_SAMPLE)
     drawn, along = selection.points_mm[chosen], _along_stripes(selection, chosen)
-    _, near = cKDTree(drawn).query(drawn, min(N_NEIGHBOURS, len(drawn)))
-    about = drawn[near] - drawn[near].mean(axis=1, keepdims=True)
-    values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
-    thickness, breadth, length = np.sqrt(np.maximum(values, 0.0)).T
-    is_face = (breadth >= THINNEST_LINE * length) & (thickness <= THICKEST_FACE * breadth)
-    normals = np.where(is_face[:, None], axes[:, :, 0], 0.0)
+    normals, thickness, spacing = _normals(drawn, along)
     own = selection.cloud.normals
     if own is not None:
         given = own[selection.rows[chosen]]
         is_given = np.isfinite(given).all(axis=1) & given.any(axis=1)
         normals[is_given] = given[is_given]
-    flat = thickness[is_face] if is_face.any() else thickness
-    narrow = NOISE_BAND * float(np.median(flat)) / math.sqrt(max(about.shape[1] - 3, 1))
-    band = min(max(narrow, LEAST_BAND_MM), SEARCH_BAND_MM)
-    spacing = float(np.median(np.linalg.norm(about, axis=2).max(axis=1)))
+    band = min(max(NOISE_BAND * thickness, LEAST_BAND_MM), SEARCH_BAND_MM)
     return Sample(drawn, normals, along, selection.search_band_mm[chosen], band, spacing)
+
+
+def _normals(points: FloatArray, along: FloatArray) -> tuple[FloatArray, float, float]:
+    """Normals (M, 3) of neighbourhoods, 0 where there is none, their thickness, and how wide.
+
+    Where the nearest points lie along one stripe they are taken of ever fewer, until they span
+    several stripes.
+    """
+    normals, is_line = np.zeros_like(points), np.ones(len(points), dtype=np.bool_)
+    thick: list[FloatArray] = []
+    wide: list[FloatArray] = []
+    most = len(points)
+    while is_line.any() and most >= MIN_POINTS:
+        sparse = points[_thinned(points, most)]
+        rows = np.flatnonzero(is_line)
+        near = cKDTree(sparse).query(points[rows], min(N_NEIGHBOURS, len(sparse)))[1]
+        about = sparse[near] - sparse[near].mean(axis=1, keepdims=True)
+        values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
+        thickness, breadth, length = np.sqrt(np.maximum(values, 0.0)).T
+        is_flat = (breadth >= THINNEST_LINE * length) & (thickness <= THICKEST_FACE * breadth)
+        # a stripe lies in its face
+        is_flat &= np.abs(np.einsum("ni,ni->n", axes[:, :, 0], along[rows])) <= ACROSS
+        normals[rows[is_flat]] = axes[is_flat, :, 0]
+        thick.append(thickness[is_flat] / math.sqrt(max(about.shape[1] - 3, 1)))
+        wide.append(np.linalg.norm(about, axis=2).max(axis=1)[is_flat])
+        is_line[rows] = breadth < THINNEST_LINE * length
+        most //= SPARSER
+    if not normals.any():
+        return normals, 0.0, float(np.ptp(points, axis=0).max()) / math.sqrt(len(points))
+    return normals, float(np.median(np.concatenate(thick))), float(np.median(np.concatenate(wide)))
 
 
 def _thinned(points: FloatArray, most: int) -> IntArray:
@@ -266,7 +300,7 @@ def _along_stripes(selection: Selection, chosen: IntArray) -> FloatArray:
     near = cKDTree(placed).query(placed[chosen], min(ALONG_STRIPE, len(points)))[1]
     about = points[near] - points[near].mean(axis=1, keepdims=True)
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
-    is_line = values[:, 1] <= THINNEST_LINE**2 * values[:, 2]
+    is_line = values[:, 1] <= THICKEST_STRIPE**2 * values[:, 2]
     is_line &= (exposure[near] == exposure[chosen][:, None]).all(axis=1)
     return np.where(is_line[:, None], axes[:, :, 2], 0.0)
 

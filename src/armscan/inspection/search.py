@@ -41,7 +41,7 @@ N_TRIALS = {
     "cylinder": 1200,
     "cone": 1500,
 }
-THINNEST_LINE = 0.3
+THINNEST_LINE = 0.1
 """Breadth of a neighbourhood, as a part of its length, below which it is a line without a normal:
 stripes lie along it, not across."""
 THICKEST_FACE = 0.2

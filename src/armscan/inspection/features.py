@@ -10,6 +10,7 @@ from functools import partial
 
 import numpy as np
 
+from armscan.errors import OptionError
 from armscan.geometry.arrays import ArrayRecord, BoolArray, FloatArray, IntArray, bools, ints
 from armscan.geometry.estimate import Estimate, FitFailure
 from armscan.geometry.features import Linearised, Shape, fit_shape, linearise, moved
@@ -20,7 +21,6 @@ from armscan.inspection.results import (
     describe_deviations,
 )
 from armscan.inspection.search import (
-    SAME_SIDE,
     Sample,
     WantedFeature,
     connected,
@@ -225,8 +225,7 @@ def _belonging(
     chosen = np.abs(shape.distance_mm(points)) <= selection.feature_mm
     if shape.kind not in ("line", "circle"):
         near = points[chosen]
-        facing = np.einsum("ni,ni->n", shape.outward(near), sample.normals_at(near))
-        chosen[chosen] = np.abs(facing) >= SAME_SIDE
+        chosen[chosen] = sample.facing(shape, near, sample.nearest(near))
     if wanted.seed_mm is not None and chosen.any():
         step = GAP_SPACINGS * sample.spacing_mm
         chosen[chosen] = connected(points[chosen], np.asarray(wanted.seed_mm), step)
@@ -239,9 +238,11 @@ def _unlike(
     """Why the shape is none of that kind; None if it is one."""
     remedy = "check the nominal values, or show where it is with --region or --seed"
     if not wanted.may_be(shape):
-        size = "" if not shape.radius_mm else f" of {2.0 * shape.radius_mm:.4g} mm"
         if shape.kind == "cone":
-            size = f" of {math.degrees(shape.half_angle_rad):.4g} degrees"
+            return FitFailure(
+                f"there is no {wanted}: the points at the best place are of none", remedy
+            )
+        size = "" if not shape.radius_mm else f" of {2.0 * shape.radius_mm:.4g} mm"
         what = f"there is no {wanted}: the nearest that the points allow is a {shape.kind}{size}"
         return FitFailure(what, remedy)
     # as far as their own sigma throws points off, else a quarter of what would be filled evenly
@@ -495,11 +496,29 @@ class Relation:
 
 PARALLEL = math.radians(10.0)
 """Planes and axes within 10 degrees of parallel have a distance; others cross."""
+SAME_PART = 0.5
+"""Part of the points of one feature that another may share: corners and edges, not a face."""
 POINTLIKE = ("circle", "sphere")
 
 
 def relate(cloud: PointCloud, first: FeatureInspection, second: FeatureInspection) -> Relation:
-    """Distance and angle of two features of one cloud, with their standard deviations."""
+    """Distance and angle of two features of one cloud, with their standard deviations.
+
+    Raises
+    ------
+    OptionError
+        If more than half of the points of one are the other's: both are the same.
+    """
+    shared = len(np.intersect1d(first.rows, second.rows))
+    if shared > SAME_PART * min(len(first.rows), len(second.rows)):
+        x, y, z = first.shape.point_mm
+        raise OptionError(
+            f"both features are one: they share {shared} of {len(first.rows)} and "
+            f"{len(second.rows)} points, about {x:.4g},{y:.4g},{z:.4g}",
+            where="the second feature",
+            remedy=f"give it the seed or region of another {second.shape.kind}, as "
+            f"{second.shape.kind}:seed=x,y,z with a point on that",
+        )
     fits = tuple(Fitted(one.shape, cloud, one.rows[one.is_fitted]) for one in (first, second))
     angle, angle_text = None, "one of them has no direction"
     if first.shape.kind != "sphere" and second.shape.kind != "sphere":

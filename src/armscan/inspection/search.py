@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where in a cloud a feature is: candidates through a few points, judged by how many lie on them.
 
-Points are thinned evenly and given the normals of their neighbourhoods; a candidate goes through
-one, two or three of them with their normals (Schnabel, Wahl, Klein, Comput. Graph. Forum 26
-(2007) 214).
+Points are thinned evenly in space and given normals: their own, or those of their neighbourhoods.
+A candidate goes through one, two or three of them with their normals (Schnabel, Wahl, Klein,
+Comput. Graph. Forum 26 (2007) 214). On walls that few stripes cross there are no normals: there a
+cylinder goes through three points, square to a face of the part or along the axis that was given.
 """
 
 from __future__ import annotations
@@ -40,24 +41,49 @@ N_TRIALS = {
     "cylinder": 1200,
     "cone": 1500,
 }
+THINNEST_LINE = 0.1
+"""Breadth of a neighbourhood, as a part of its length, below which it is a line without a normal:
+stripes lie along it, not across."""
+THICKEST_FACE = 0.2
+"""Thickness of a neighbourhood, as a part of its breadth, above which it is no face."""
+ALONG_STRIPE = 12
+"""Points of one exposure that give the direction of the stripe."""
+SPARSER = 2
+"""How many times fewer points are looked at where neighbours lie in a line."""
+BISECTIONS = 16
+"""Halvings of the side of the cubes by which a cloud is thinned."""
+THICKEST_STRIPE = 0.15
+"""Breadth of these, as a part of their length, above which they are in no line."""
+FACES = 3
+"""Faces of a part that a cylinder is tried square to."""
 NOISE_BAND, LEAST_BAND_MM = 4.0, 0.02
 """A candidate's band, in thicknesses of neighbourhoods: a wide one would be filled by flat faces
 that a large cylinder touches.
 """
 SAME_SIDE = math.cos(math.radians(30.0))
 """Normals of a point and of the surface that differ by more than 30 degrees are of two faces."""
+ACROSS = math.sqrt(1.0 - SAME_SIDE**2)
+"""The same of a direction that lies in the surface."""
+SAME_FACE, NEXT_FACE = math.cos(math.radians(2.0)), math.cos(math.radians(10.0))
+"""Normals within 2 degrees make a face's; within 10 degrees of it no other is looked for."""
 SAME_AXIS = math.cos(math.radians(20.0))
 """How far a candidate's axis may be off the one that was given: it is a rough direction."""
 RADIUS_SLACK = 0.1
 """How far a diameter may be from the nominal one, as a part of it, where no range is given."""
+LEAST_HALF_ANGLE_DEG = 0.5
+"""Half angle below which a cone is a cylinder, or the points are of neither."""
 SEED_POINTS = 120
 """Sample points about a seed from which candidates are made."""
 NEAR_POINTS = 150
 """Points of the neighbourhood from which a candidate is made."""
+SIDE_POINTS = 60
+"""The same where only points that may be of the cylinder are looked at."""
 N_POLISHED = 10
 """Best candidates that are fitted to the points on them before one is chosen."""
 FULLY_BENT = 0.05
 """Second moment of normals, 0 of a flat face and 0.5 of half a cylinder: an arc of 45 degrees."""
+SHELL_BANDS = 5.0
+"""Half width, in bands, of the shell in which points beside a shape count against it."""
 ROUNDS = 3
 
 
@@ -111,6 +137,9 @@ class WantedFeature:
              "the axis is no direction", "give three numbers x,y,z, not all 0"),
             (self.seed_mm is not None and not _are_three(self.seed_mm),
              "the seed is no point", "give three numbers x,y,z in mm"),
+            (self.kind in ("line", "circle") and (self.seed_mm or self.region) is None,
+             f"a {self.kind} is not looked for in a whole cloud: any face holds some",
+             "show its edge, rim or thin section with --region, or a point on it with --seed"),
         )  # fmt: skip
         for is_wrong, what, remedy in faults:
             if is_wrong:
@@ -135,12 +164,15 @@ class WantedFeature:
         if self.kind == "cone":
             wanted = self.half_angle_deg
             found = math.degrees(shape.half_angle_rad)
-            return wanted is None or abs(found - wanted) <= max(3.0, RADIUS_SLACK * wanted)
+            is_near = wanted is None or abs(found - wanted) <= max(3.0, RADIUS_SLACK * wanted)
+            return found >= LEAST_HALF_ANGLE_DEG and is_near
         low, high = self.radii_mm
         return self.kind in ("plane", "line") or low <= shape.radius_mm <= high
 
     def __str__(self) -> str:
         size = "" if self.diameter_mm is None else f" of {self.diameter_mm:g} mm"
+        if self.half_angle_deg is not None:
+            size = f" of {self.half_angle_deg:g} degrees"
         return f"{self.kind}{size}"
 
 
@@ -150,12 +182,14 @@ def _are_three(values: tuple[float, ...]) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sample:
-    """Points drawn evenly in space, with the normals of their neighbourhoods.
+    """Points drawn evenly in space, with normals and directions of their stripes.
 
     Parameters
     ----------
     points_mm, normals
-        (M, 3) each; a normal's sign is any.
+        (M, 3) each; a normal's sign is any. It is 0 where there is none: about a lone stripe.
+    along
+        (M, 3) unit directions of the stripes, of any sign; 0 where points lie in no line.
     band_mm
         (M,) how far off the shape each may lie by its own sigma.
     noise_mm
@@ -166,31 +200,109 @@ class Sample:
 
     points_mm: FloatArray
     normals: FloatArray
+    along: FloatArray
     band_mm: FloatArray
     noise_mm: float
     spacing_mm: float
 
-    def normals_at(self, points_mm: FloatArray) -> FloatArray:
-        """(N, 3) normals of the sample points nearest to points (N, 3)."""
-        return np.asarray(self.normals[cKDTree(self.points_mm).query(points_mm)[1]])
+    def nearest(self, points_mm: FloatArray) -> IntArray:
+        """(N,) rows of the sample points nearest to points (N, 3)."""
+        return np.asarray(cKDTree(self.points_mm).query(points_mm)[1])
+
+    def facing(
+        self, shape: Shape, points_mm: FloatArray, nearest: IntArray | None = None
+    ) -> BoolArray:
+        """(N,) whether points (N, 3) look as the surface does there, as far as that is known.
+
+        What is known is that of the sample points ``nearest``, of themselves if None. The surface
+        is square to a normal, and along a stripe, to 30 degrees.
+        """
+        which = slice(None) if nearest is None else nearest
+        outward, normals = shape.outward(points_mm), self.normals[which]
+        cosine = np.abs(np.einsum("ni,ni->n", outward, normals))
+        sine = np.abs(np.einsum("ni,ni->n", outward, self.along[which]))
+        is_square = (cosine >= SAME_SIDE) | ~normals.any(axis=1)
+        return np.asarray(is_square & (sine <= ACROSS))
 
 
 def sample_of(selection: Selection) -> Sample:
     """Thin the points that are looked at, and estimate normals."""
-    points = selection.points_mm
-    rng = np.random.default_rng(0)
-    chosen = rng.permutation(len(points))[:N_SAMPLE]
-    drawn = points[chosen]
-    _, near = cKDTree(drawn).query(drawn, min(N_NEIGHBOURS, len(drawn)))
-    about = drawn[near] - drawn[near].mean(axis=1, keepdims=True)
+    chosen = _thinned(selection.points_mm, N_SAMPLE)
+    drawn, along = selection.points_mm[chosen], _along_stripes(selection, chosen)
+    normals, thickness, spacing = _normals(drawn, along)
+    own = selection.cloud.normals
+    if own is not None:
+        given = own[selection.rows[chosen]]
+        is_given = np.isfinite(given).all(axis=1) & given.any(axis=1)
+        normals[is_given] = given[is_given]
+    band = min(max(NOISE_BAND * thickness, LEAST_BAND_MM), SEARCH_BAND_MM)
+    return Sample(drawn, normals, along, selection.search_band_mm[chosen], band, spacing)
+
+
+def _normals(points: FloatArray, along: FloatArray) -> tuple[FloatArray, float, float]:
+    """Normals (M, 3) of neighbourhoods, 0 where there is none, their thickness, and how wide.
+
+    Where the nearest points lie along one stripe they are taken of ever fewer, until they span
+    several stripes.
+    """
+    normals, is_line = np.zeros_like(points), np.ones(len(points), dtype=np.bool_)
+    thick: list[FloatArray] = []
+    wide: list[FloatArray] = []
+    most = len(points)
+    while is_line.any() and most >= MIN_POINTS:
+        sparse = points[_thinned(points, most)]
+        rows = np.flatnonzero(is_line)
+        near = cKDTree(sparse).query(points[rows], min(N_NEIGHBOURS, len(sparse)))[1]
+        about = sparse[near] - sparse[near].mean(axis=1, keepdims=True)
+        values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
+        thickness, breadth, length = np.sqrt(np.maximum(values, 0.0)).T
+        is_flat = (breadth >= THINNEST_LINE * length) & (thickness <= THICKEST_FACE * breadth)
+        # a stripe lies in its face
+        is_flat &= np.abs(np.einsum("ni,ni->n", axes[:, :, 0], along[rows])) <= ACROSS
+        normals[rows[is_flat]] = axes[is_flat, :, 0]
+        thick.append(thickness[is_flat] / math.sqrt(max(about.shape[1] - 3, 1)))
+        wide.append(np.linalg.norm(about, axis=2).max(axis=1)[is_flat])
+        is_line[rows] = breadth < THINNEST_LINE * length
+        most //= SPARSER
+    if not normals.any():
+        return normals, 0.0, float(np.ptp(points, axis=0).max()) / math.sqrt(len(points))
+    return normals, float(np.median(np.concatenate(thick))), float(np.median(np.concatenate(wide)))
+
+
+def _thinned(points: FloatArray, most: int) -> IntArray:
+    """Rows of points (N, 3), one of each cube of space, so that they are ``most`` or a few less.
+
+    Dense stripes far apart would else take every place, and steep walls have few points.
+    """
+    order = np.random.default_rng(0).permutation(len(points))
+    if len(points) <= most:
+        return order
+    low, high = 0.0, float(np.ptp(points, axis=0).max())
+    kept = order[:most]
+    for _ in range(BISECTIONS):
+        side = 0.5 * (low + high)
+        cells = np.floor((points[order] - points.min(axis=0)) / side).astype(np.int64)
+        numbers = np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1))
+        first = np.unique(numbers, return_index=True)[1]
+        if len(first) > most:
+            low = side
+        else:
+            high, kept = side, order[np.sort(first)]
+    return np.asarray(kept)
+
+
+def _along_stripes(selection: Selection, chosen: IntArray) -> FloatArray:
+    """(M, 3) directions of the stripes at chosen points; 0 where an exposure's are in no line."""
+    points, exposure = selection.points_mm, selection.cloud.exposure[selection.rows]
+    apart = 1e3 * float(np.ptp(points, axis=0).max())
+    # no point of another exposure is ever nearer than one of the same
+    placed = np.column_stack([points, apart * exposure])
+    near = cKDTree(placed).query(placed[chosen], min(ALONG_STRIPE, len(points)))[1]
+    about = points[near] - points[near].mean(axis=1, keepdims=True)
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", about, about))
-    thickness = np.sqrt(np.maximum(values[:, 0], 0.0) / max(about.shape[1] - 3, 1))
-    wide = selection.search_band_mm[chosen]
-    narrow = NOISE_BAND * float(np.median(thickness))
-    spacing = float(np.median(np.linalg.norm(about, axis=2).max(axis=1)))
-    return Sample(
-        drawn, axes[:, :, 0], wide, min(max(narrow, LEAST_BAND_MM), SEARCH_BAND_MM), spacing
-    )
+    is_line = values[:, 1] <= THICKEST_STRIPE**2 * values[:, 2]
+    is_line &= (exposure[near] == exposure[chosen][:, None]).all(axis=1)
+    return np.where(is_line[:, None], axes[:, :, 2], 0.0)
 
 
 def find_shape(sample: Sample, wanted: WantedFeature) -> Shape | FitFailure:
@@ -230,6 +342,7 @@ def _score(sample: Sample, shape: Shape) -> float:
     """Count of the points on a shape, less where they hardly show that it is curved.
 
     A strip of a flat face lies on any large cylinder that touches it; its normals are all alike.
+    A cylinder that cuts through faces has as many points just beside it as on it.
     """
     is_near = _support(sample, shape)
     n = float(is_near.sum())
@@ -237,7 +350,9 @@ def _score(sample: Sample, shape: Shape) -> float:
         return n
     normals = shape.outward(sample.points_mm[is_near])
     bent = float(np.linalg.eigvalsh(normals.T @ normals)[1]) / n
-    return n * min(1.0, bent / FULLY_BENT)
+    off = np.abs(shape.distance_mm(sample.points_mm))
+    beside = (off <= SHELL_BANDS * sample.noise_mm) & sample.facing(shape, sample.points_mm)
+    return n * min(1.0, bent / FULLY_BENT) * n / float(beside.sum())
 
 
 def _pool(sample: Sample, wanted: WantedFeature) -> IntArray:
@@ -254,14 +369,15 @@ def _support(sample: Sample, shape: Shape) -> BoolArray:
     if shape.kind in ("line", "circle"):
         return np.asarray(off <= sample.band_mm)
     is_near = off <= sample.noise_mm
-    facing = np.einsum("ni,ni->n", shape.outward(sample.points_mm), sample.normals)
-    return np.asarray(is_near & (np.abs(facing) >= SAME_SIDE))
+    return np.asarray(is_near & sample.facing(shape, sample.points_mm))
 
 
 def _candidates(sample: Sample, wanted: WantedFeature, pool: IntArray) -> Iterator[Shape]:
     rng = np.random.default_rng(0)
     p, n = sample.points_mm, sample.normals
     yield from _by_all(p[pool], wanted)
+    if wanted.kind == "cylinder":
+        yield from _square_to_faces(sample, wanted, pool)
     first = rng.integers(0, len(pool), N_TRIALS[wanted.kind])
     # every other one from a neighbourhood: a feature may be a small part of the whole
     near = np.asarray(cKDTree(p[pool]).query(p[pool[first]], min(NEAR_POINTS, len(pool)))[1])
@@ -271,6 +387,48 @@ def _candidates(sample: Sample, wanted: WantedFeature, pool: IntArray) -> Iterat
         shape = _through(wanted.kind, p[[i, j, k]], n[[i, j, k]])
         if shape is not None:
             yield shape
+
+
+def _square_to_faces(sample: Sample, wanted: WantedFeature, pool: IntArray) -> Iterator[Shape]:
+    """Cylinders along the axis that was given or square to a face, through three points nearby.
+
+    Only points that may look away from the axis are tried: on a part most are of flat faces.
+    """
+    rng = np.random.default_rng(1)
+    given = np.zeros((0, 3)) if wanted.axis is None else np.array([wanted.axis])
+    for axis in (*given, *_face_normals(sample.normals)):
+        axes = across(axis)
+        normal, along = sample.normals[pool] @ axes[2], sample.along[pool]
+        is_side = np.abs(normal) <= ACROSS
+        is_side &= sample.normals[pool].any(axis=1) | (np.abs(along @ axes[2]) >= ACROSS)
+        side = sample.points_mm[pool[is_side]]
+        if len(side) < 3:
+            continue
+        flat = np.column_stack([side @ axes[:2].T, np.zeros(len(side))])
+        first = rng.integers(0, len(side), N_TRIALS["cylinder"])
+        tree = cKDTree(flat)
+        near = np.asarray(tree.query(flat[first], min(SIDE_POINTS, len(side)))[1])
+        for trial, at in enumerate(first.tolist()):
+            j, k = near[trial, rng.integers(0, near.shape[1], 2)].tolist()
+            circle = _circle_through(flat[[at, j, k]])
+            if circle is not None:
+                middle = circle.point_mm @ np.vstack([axes[:2], np.zeros(3)])
+                middle += float(side[at] @ axes[2]) * axes[2]
+                radius = circle.radius_mm
+                yield Shape(kind="cylinder", point_mm=middle, axes=axes, radius_mm=radius)
+
+
+def _face_normals(normals: FloatArray) -> list[FloatArray]:
+    """Directions (3,) that most known normals share, the commonest first."""
+    left = normals[normals.any(axis=1)]
+    found: list[FloatArray] = []
+    while len(left) >= MIN_POINTS and len(found) < FACES:
+        tried = left[:: max(1, len(left) // 200)]
+        best = tried[int(np.argmax((np.abs(tried @ left.T) >= SAME_FACE).sum(axis=1)))]
+        is_alike = np.abs(left @ best) >= SAME_FACE
+        found.append(np.linalg.eigh(left[is_alike].T @ left[is_alike])[1][:, 2])
+        left = left[np.abs(left @ found[-1]) < NEXT_FACE]
+    return found
 
 
 def _by_all(points: FloatArray, wanted: WantedFeature) -> Iterator[Shape]:

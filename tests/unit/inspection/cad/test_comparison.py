@@ -188,7 +188,9 @@ def test_a_fused_cloud_fails_nothing_and_one_exposure_of_another_kind_does() -> 
     points = top_points(3000, 20.2)
     decisions = []
     for name in (FUSED, "part.xyz"):
-        cloud = replace(cloud_of(points, sigma_mm=0.002), exposure_sources=(name,))
+        cloud = replace(
+            cloud_of(points, sigma_mm=0.002), exposure_sources=(name,), sheet_names=(name,)
+        )
         found = compare_with_part(
             BOX, cloud, align_none(cloud), CadOptions(tolerance_mm=0.05), errors_known=True
         )

@@ -60,5 +60,9 @@ class OptionError(ArmscanError):
     """A command-line option or a target specification is wrong."""
 
 
+class DeviceError(ArmscanError):
+    """A camera, arm or laser controller is not there, does not answer or says what cannot be."""
+
+
 class EstimationError(ArmscanError):
     """The data do not determine what was asked for."""

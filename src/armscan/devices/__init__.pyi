@@ -1,5 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 # What `from armscan.devices import ...` offers; loaded when it is first asked for.
+from .protocols import Arm as Arm
+from .protocols import ArmFlag as ArmFlag
+from .protocols import ArmSample as ArmSample
+from .protocols import Camera as Camera
+from .protocols import CameraSettings as CameraSettings
+from .protocols import DeviceDriver as DeviceDriver
+from .protocols import DeviceInfo as DeviceInfo
+from .protocols import Frame as Frame
+from .protocols import LaserController as LaserController
+from .protocols import LaserEvent as LaserEvent
 from .sources import ScanSource as ScanSource
 from .sources import SimulatedScan as SimulatedScan
 from .sources import Twin as Twin

@@ -74,7 +74,7 @@ def test_names_say_something() -> None:
 
 
 @pytest.mark.parametrize(
-    "path", sorted((ROOT / "src/armscan/cli").glob("*.py")), ids=lambda p: p.name
+    "path", sorted((ROOT / "src/armscan/cli").rglob("*.py")), ids=lambda p: p.name
 )
 def test_command_files_are_thin(path: Path) -> None:
     text = path.read_text("utf-8")

@@ -148,7 +148,7 @@ def test_a_jump_less_than_a_step_is_doubtful_until_it_is_certain():
     device, true = stream(80.0, 20.0, 30e-6)
     host = arrivals(true, 1e6 + rng.exponential(3e5, len(true)))
     device = device - 5_000_000 * (np.arange(len(device)) >= 800)
-    monitor, status = run(device, host)
+    _, status = run(device, host)
     jump = status.index(ElementStatus.JUMP)
     assert set(status[:800]) == {ElementStatus.USABLE}
     assert set(status[800:jump]) == {ElementStatus.DOUBTFUL}

@@ -19,8 +19,8 @@ from armscan.devices.clocks import ElementStatus, StreamMonitor
 from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.arm import ArmModel, forward
-from armscan.reconstruction.sync import PoseStatus, bridged_ns, poses_by_time
-from armscan.records.recording import ArmTrack, ExposureRow
+from armscan.reconstruction.sync import PoseStatus, bridged_ns, poses_at
+from armscan.records.recording import ArmTrack
 
 T = TypeVar("T")
 
@@ -322,8 +322,8 @@ class InstantMatcher:
         piece = slice(max(k - 2, 0), k + 2)
         track = arm_track(self._times[piece], self._poses[piece])
         limit = bridged_ns(np.array(self._steps, dtype=np.int64)) if self._steps else 0
-        row = ExposureRow(0, one.t_ns, 0, "")
-        found = poses_by_time([row], track, self.latency_ns, max_gap_ns=limit)
+        time = np.array([one.t_ns + self.latency_ns], dtype=np.int64)
+        found = poses_at(time, track, max_gap_ns=limit)
         status = PoseStatus(int(found.status[0]))
         return (found.pose(0) if status == PoseStatus.FOUND else None), status
 

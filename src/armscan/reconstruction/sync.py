@@ -305,19 +305,17 @@ def _at_samples(arm: ArmTrack, found: IntArray, status: IntArray) -> tuple[Float
     return rotations, translations
 
 
-def poses_by_time(
-    rows: Sequence[ExposureRow],
-    arm: ArmTrack,
-    latency_ns: int = 0,
-    *,
-    max_gap_ns: int | None = None,
-) -> ExposurePoses:
-    """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`.
+def poses_by_time(rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int = 0) -> ExposurePoses:
+    """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
+    return poses_at(np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns, arm)
+
+
+def poses_at(times: IntArray, arm: ArmTrack, *, max_gap_ns: int | None = None) -> ExposurePoses:
+    """Poses at times (N,) of the arm's clock in ns; see `exposure_poses`.
 
     ``max_gap_ns`` is the widest step that is bridged; None takes it from the track, which must
     then be longer than the piece around an exposure that a live rig asks for.
     """
-    times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
     max_gap = largest_gap_ns(arm) if max_gap_ns is None else max_gap_ns
     before = np.searchsorted(arm.t_ns, times, side="right") - 1
     after = np.minimum(before + 1, len(arm) - 1)

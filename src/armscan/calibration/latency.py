@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.estimate import Estimate, FitFailure
-from armscan.geometry.least_squares import robust_sigma
+from armscan.geometry.least_squares import huber_weights, robust_sigma
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.reconstruction.sync import largest_gap_ns, poses_at
 from armscan.records.recording import ArmTrack
@@ -49,7 +49,10 @@ STEPS, SETTLED_NS = 20, 50.0
 MOVE = "move the head nearer and away by 10 mm or more, once a second, for 10 s"
 ODD_SIGMAS, SMALLEST_DRIFT = 4.0, 5e-6
 MANY_OUT, ROUGH_MM = 0.1, 0.1
-PLATE_NAMES = ("tilt_1_rad", "tilt_2_rad", "height_mm")
+TERM_MM, N_TERMS = 20.0, 7
+"""Errors that depend on the place are taken as quadratic over what a hand scans, scaled by this."""
+UNEVEN = ("z", "zz", "xz", "yz", "xx", "xy", "yy")
+PLATE_NAMES = ("tilt_1_rad", "tilt_2_rad", "height_mm", *(f"uneven_{one}_mm" for one in UNEVEN))
 
 
 class PlateLooks(RowRecord):
@@ -153,8 +156,8 @@ class LatencyFit:
     ----------
     estimate
         Value: the time in whole ns at ``t_middle_ns``. Parameters: ``latency_ns``, ``drift`` for
-        separate clocks, two tilts of the plate in rad and its height in mm. Residuals (K,): heights
-        of the plate over its fit, mm, of the exposures used.
+        separate clocks, two tilts of the plate in rad, its height in mm, and what depends on
+        stand-off z and place x, y, per `TERM_MM`. Residuals (K,): heights over that fit, mm.
     t_middle_ns
         Camera's time for which the latency holds; elsewhere the drift adds to it.
     drift
@@ -204,28 +207,31 @@ class LatencyFit:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """Time shift at the middle, drift, and plate ``normal . p = height`` in Base."""
+    """Time shift at the middle, drift, and plate ``normal . p = height + uneven . terms``."""
 
     shift_ns: int
     drift: float
     normal: FloatArray
     height_mm: float
+    uneven_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Placed:
-    """Exposures with a pose: rows, and centre (K, 3) and axes (K, 2, 3) in Base."""
+    """Exposures with a pose: rows; centre, sensor (K, 3) and axes (K, 2, 3) in Base."""
 
     rows: IntArray
+    sensor_mm: FloatArray
     centre_mm: FloatArray
     axes_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    """The looks in Tool and the arm's track."""
+    """The looks and the sensor's origin in Tool, and the arm's track."""
 
     t_ns: IntArray
+    sensor_mm: FloatArray
     centre_mm: FloatArray
     axes_mm: FloatArray
     arm: ArmTrack
@@ -248,7 +254,8 @@ class _Problem:
         turn = poses.rotations[has]
         centre = np.einsum("nij,nj->ni", turn, self.centre_mm[has]) + poses.translations_mm[has]
         axes = np.einsum("nij,nkj->nki", turn, self.axes_mm[has])
-        return _Placed(has, centre, axes)
+        sensor = turn @ self.sensor_mm + poses.translations_mm[has]
+        return _Placed(has, sensor, centre, axes)
 
 
 def calibrate_latency(
@@ -319,6 +326,7 @@ def _problem(
     n_axes = 2 if np.median(np.linalg.norm(looks.axes_mm[:, 1], axis=1)) > 0.0 else 1
     return _Problem(
         t_ns=looks.t_ns,
+        sensor_mm=tool_from_sensor.translation_mm,
         centre_mm=tool_from_sensor.apply(looks.centre_mm),
         axes_mm=tool_from_sensor.rotate(looks.axes_mm[:, :n_axes]),
         arm=arm,
@@ -354,7 +362,7 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
         )
     placed = problem.place(shift)
     middle, axes, _ = _plate(placed)
-    state = _State(shift, 0.0, axes[2], float(axes[2] @ middle))
+    state = _State(shift, 0.0, axes[2], float(axes[2] @ middle), np.zeros(N_TERMS))
     spread = (placed.centre_mm - middle) @ axes[:2].T
     aside = np.vstack([spread, *(one @ axes[:2].T for one in placed.axes_mm.swapaxes(0, 1))])
     narrow = float(np.linalg.svd(aside, compute_uv=False)[1] / np.sqrt(len(spread)))
@@ -470,12 +478,16 @@ class _System:
         scale = np.where(scale > 0.0, scale, 1.0)
         matrix, target, chi2 = np.zeros((len(scale), len(scale))), np.zeros(len(scale)), 0.0
         for k, (part, jacobian) in enumerate(zip(self.residuals, self.jacobians, strict=True)):
-            plain = ResidualNoise(max(robust_sigma(part), 1e-9), 0.0, 1.0)
-            inverse = _Covariance(plain if noise is None else noise[k], self.seconds)
-            weighed = inverse.solve(jacobian / scale)
+            if noise is None:
+                sigma = max(robust_sigma(part), 1e-9)
+                weights = huber_weights(part / sigma) / sigma**2
+                weighed, against = weights[:, None] * (jacobian / scale), weights * part
+            else:
+                inverse = _Covariance(noise[k], self.seconds)
+                weighed, against = inverse.solve(jacobian / scale), inverse.solve(part)
             matrix += weighed.T @ (jacobian / scale)
             target -= weighed.T @ part
-            chi2 += float(part @ inverse.solve(part))
+            chi2 += float(part @ against)
         values, vectors = np.linalg.eigh(matrix)
         if values[0] <= 1e-10 * values[-1]:
             return None
@@ -504,19 +516,36 @@ def _linearise(problem: _Problem, state: _State, kept: BoolArray) -> tuple[_Syst
     centres = [one.centre_mm[index] for one, index in zip(placed, at, strict=True)]
     axes = [one.axes_mm[index] for one, index in zip(placed, at, strict=True)]
     middle = centres[0].mean(axis=0) if len(rows) else np.zeros(3)
-    across = np.linalg.svd(state.normal[None])[2][1:]
+    across = _across(state.normal)
+    stand_off = (placed[0].sensor_mm[at[0]] - centres[0]) @ state.normal
+    terms = _terms((centres[0] - middle) @ across.T, stand_off)
     residuals, jacobians = [], []
     for k in range(-1, problem.axes_mm.shape[1]):
         now, ahead, behind = centres if k < 0 else [one[:, k] for one in axes]
         by_time = (ahead - behind) @ state.normal / (2.0 * lag)
         by_drift = [by_time * problem.since_ns[rows]] if problem.has_drift else []
         by_tilt = ((now - middle) if k < 0 else now) @ across.T
-        by_height = np.full(len(rows), -1.0 if k < 0 else 0.0)
-        residuals.append(now @ state.normal - (state.height_mm if k < 0 else 0.0))
-        jacobians.append(np.column_stack([by_time, *by_drift, by_tilt, by_height]))
+        by_plate = np.column_stack([np.ones(len(rows)), terms]) * (-1.0 if k < 0 else 0.0)
+        plate = state.height_mm + terms @ state.uneven_mm if k < 0 else 0.0
+        residuals.append(now @ state.normal - plate)
+        jacobians.append(np.column_stack([by_time, *by_drift, by_tilt, by_plate]))
     names = ("latency_ns", *(["drift"] if problem.has_drift else []), *PLATE_NAMES)
     seconds = 1e-9 * problem.since_ns[rows]
     return _System(rows, seconds, tuple(residuals), tuple(jacobians), names), middle
+
+
+def _across(normal: FloatArray) -> FloatArray:
+    """(2, 3) two directions in the plate, that turn with its normal without a leap."""
+    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)])
+
+
+def _terms(aside_mm: FloatArray, stand_off_mm: FloatArray) -> FloatArray:
+    """(K, 7) what depends smoothly on the place: scale, unevenness and the arm's own errors."""
+    x, y = aside_mm.T / TERM_MM
+    z = (stand_off_mm - stand_off_mm.mean()) / TERM_MM
+    return np.column_stack([z, z * z, x * z, y * z, x * x, x * y, y * y])
 
 
 def _solve(
@@ -541,7 +570,7 @@ def _solve(
                 "time and plate cannot be told apart", MOVE
             )
         step, covariance, chi2 = found
-        if abs(step[0]) < SETTLED_NS:
+        if abs(step[0]) < max(SETTLED_NS, 0.01 * np.sqrt(covariance[0, 0])):
             return _Solution(state, system, covariance, chi2, noise or ())
         state = _after(problem, state, step, middle)
     return _refused(system.motion) or FitFailure(
@@ -551,15 +580,16 @@ def _solve(
 
 def _after(problem: _Problem, state: _State, step: FloatArray, middle: FloatArray) -> _State:
     drift = float(step[1]) if problem.has_drift else 0.0
-    across = np.linalg.svd(state.normal[None])[2][1:]
-    tilted = state.normal + step[-3:-1] @ across
+    by_tilt, by_plate = step[-N_TERMS - 3 : -N_TERMS - 1], step[-N_TERMS - 1 :]
+    tilted = state.normal + by_tilt @ _across(state.normal)
     normal = tilted / np.linalg.norm(tilted)
     above = state.height_mm - float(state.normal @ middle)
     return _State(
         shift_ns=state.shift_ns + round(float(step[0])),
         drift=state.drift + drift,
         normal=normal,
-        height_mm=float(normal @ middle) + above + float(step[-1]),
+        height_mm=float(normal @ middle) + above + float(by_plate[0]),
+        uneven_mm=state.uneven_mm + by_plate[1:],
     )
 
 
@@ -661,7 +691,7 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
 
 
 def _shifted(state: _State, shift_ns: int) -> _State:
-    return _State(shift_ns, 0.0, state.normal, state.height_mm)
+    return _State(shift_ns, 0.0, state.normal, state.height_mm, state.uneven_mm)
 
 
 def _drift_left(system: _System, noise: tuple[ResidualNoise, ...]) -> tuple[float, float]:

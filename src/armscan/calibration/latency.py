@@ -13,9 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky_banded, solveh_banded
-from scipy.optimize import minimize
 
+from armscan.calibration.residual_noise import (
+    NoiseCovariance,
+    ResidualNoise,
+    likeliest_noise,
+    score_sigma,
+)
 from armscan.errors import InputError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.estimate import Estimate, FitFailure
@@ -129,23 +133,6 @@ class StandOffMotion:
     telling_mm_s: float
     n_reversals: int
     seconds: float
-
-
-@dataclass(frozen=True, slots=True)
-class ResidualNoise:
-    """Scatter of one kind of residual: white, and one that fades exponentially in time.
-
-    Parameters
-    ----------
-    white_mm, slow_mm
-        Standard deviations.
-    fades_s
-        Time in which the correlation of the slow part falls to 1/e.
-    """
-
-    white_mm: float
-    slow_mm: float
-    fades_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -389,38 +376,6 @@ def _flatness(placed: _Placed, n: int) -> float:
     return _plate(placed)[2]
 
 
-class _Covariance:
-    """Of residuals at times (K,) in s: ``white^2 I + slow^2 exp(-|dt| / fades)``.
-
-    The slow part alone is a Markov process, its inverse Q tridiagonal, so that
-    ``C^-1 = (I - (Q + I / white^2)^-1 / white^2) / white^2`` is applied in O(K).
-    """
-
-    def __init__(self, noise: ResidualNoise, seconds: FloatArray) -> None:
-        self._white2 = noise.white_mm**2
-        self.log_determinant = len(seconds) * np.log(self._white2)
-        self._banded: FloatArray | None = None
-        if noise.slow_mm == 0.0:
-            return
-        follows = np.exp(-np.diff(seconds) / noise.fades_s)
-        new = noise.slow_mm**2 * np.maximum(1.0 - follows**2, 1e-12)
-        diagonal = np.full(len(seconds), 1.0 / self._white2)
-        diagonal[0] += 1.0 / noise.slow_mm**2
-        diagonal[1:] += 1.0 / new
-        diagonal[:-1] += follows**2 / new
-        self._banded = np.vstack([np.append(0.0, -follows / new), diagonal])
-        pivots = cholesky_banded(self._banded)[1]
-        self.log_determinant += 2.0 * float(np.log(pivots).sum())
-        self.log_determinant += float(np.log(new).sum()) + 2.0 * np.log(noise.slow_mm)
-
-    def solve(self, values: FloatArray) -> FloatArray:
-        """``C^-1`` times values (K,) or (K, P)."""
-        plain = values / self._white2
-        if self._banded is None:
-            return np.asarray(plain)
-        return np.asarray(plain - solveh_banded(self._banded, plain) / self._white2)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _System:
     """The problem at a state, of K exposures: kinds of residuals are heights, then leans.
@@ -451,7 +406,7 @@ class _System:
     def noise(self) -> tuple[ResidualNoise, ...]:
         """Of each kind, by restricted maximum likelihood."""
         return tuple(
-            _likeliest_noise(part, jacobian, self.seconds)
+            likeliest_noise(part, jacobian, self.seconds)
             for part, jacobian in zip(self.residuals, self.jacobians, strict=True)
         )
 
@@ -483,7 +438,7 @@ class _System:
                 weights = huber_weights(part / sigma) / sigma**2
                 weighed, against = weights[:, None] * (jacobian / scale), weights * part
             else:
-                inverse = _Covariance(noise[k], self.seconds)
+                inverse = NoiseCovariance(noise[k], self.seconds)
                 weighed, against = inverse.solve(jacobian / scale), inverse.solve(part)
             matrix += weighed.T @ (jacobian / scale)
             target -= weighed.T @ part
@@ -607,47 +562,10 @@ def _refused(motion: StandOffMotion) -> FitFailure | None:
     return None
 
 
-def _likeliest_noise(
-    residuals: FloatArray, jacobian: FloatArray, seconds: FloatArray
-) -> ResidualNoise:
-    """White and slow scatter of residuals (K,) after a fit by a Jacobian (K, P)."""
-    size = max(robust_sigma(residuals), 1e-9)
-    scale = np.abs(jacobian).max(axis=0)
-    columns = jacobian[:, scale > 0.0] / scale[scale > 0.0]
-    columns = np.linalg.qr(columns)[0]
-    step, span = float(np.median(np.diff(seconds))), float(seconds[-1] - seconds[0])
-
-    def noise_of(logs: FloatArray) -> ResidualNoise:
-        white, slow = np.exp(np.clip(logs[:2], -7.0, 3.0))
-        return ResidualNoise(
-            float(size * white), float(size * slow), float(np.clip(np.exp(logs[2]), step, span))
-        )
-
-    def misfit(logs: FloatArray) -> float:
-        inverse = _Covariance(noise_of(logs), seconds)
-        weighed = inverse.solve(columns)
-        normal = columns.T @ weighed
-        fitted = np.linalg.solve(normal, weighed.T @ residuals)
-        left = residuals - columns @ fitted
-        chi2 = float(left @ inverse.solve(left))
-        return float(inverse.log_determinant + chi2 + np.linalg.slogdet(normal)[1])
-
-    starts = [np.log([0.9, 0.3, 0.1 * span]), np.log([0.7, 0.7, 4.0 * step])]
-    found = [
-        minimize(
-            misfit,
-            np.asarray(start, dtype=np.float64),
-            method="Nelder-Mead",
-            options={"maxiter": 200, "xatol": 0.02, "fatol": 0.02},
-        )
-        for start in starts
-    ]
-    return noise_of(min(found, key=lambda one: float(one.fun)).x)
-
-
 def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | FitFailure:
-    sigma_ns = float(np.sqrt(fine.covariance[0, 0]))
     motion, system = fine.system.motion, fine.system
+    covariance = _widened(fine, motion)
+    sigma_ns = float(np.sqrt(covariance[0, 0]))
     refused = _refused(motion)
     if refused is not None:
         return refused
@@ -661,7 +579,7 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         )
     drift, sigma_drift = fine.state.drift, 0.0
     if problem.has_drift:
-        sigma_drift = float(np.sqrt(fine.covariance[1, 1]))
+        sigma_drift = float(np.sqrt(covariance[1, 1]))
     else:
         drift, sigma_drift = _drift_left(system, fine.noise)
     kept = np.zeros(len(problem.t_ns), dtype=np.bool_)
@@ -671,7 +589,7 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         estimate=Estimate(
             value=fine.state.shift_ns,
             parameter_names=system.names,
-            covariance=fine.covariance,
+            covariance=covariance,
             residuals=system.residuals[0],
             degrees_of_freedom=sum(map(len, system.residuals)) - len(system.names),
             chi2=fine.chi2,
@@ -688,6 +606,25 @@ def _result(problem: _Problem, fine: _Solution, before_ns: int) -> LatencyFit | 
         n_left_out=len(problem.t_ns) - len(system.rows),
         warnings=_warnings(problem, fine, drift, sigma_drift),
     )
+
+
+def _widened(fine: _Solution, motion: StandOffMotion) -> FloatArray:
+    """(P, P) covariance in which time and drift scatter as their scores do, if that is more.
+
+    What depends on the place follows the motion's own rhythm, where the slow process has little:
+    scores are correlated over half the time between two reversals.
+    """
+    system, factors = fine.system, np.ones(len(fine.covariance))
+    lag = max(int(0.5 * len(system.rows) / max(motion.n_reversals, 1)), 1)
+    for k in range(2 if "drift" in system.names else 1):
+        scores = np.zeros(len(system.rows))
+        for noise, part, jacobian in zip(
+            fine.noise, system.residuals, system.jacobians, strict=True
+        ):
+            inverse = NoiseCovariance(noise, system.seconds)
+            scores += inverse.solve(jacobian @ fine.covariance[k]) * part
+        factors[k] = max(1.0, score_sigma(scores, lag) / float(np.sqrt(fine.covariance[k, k])))
+    return np.asarray(fine.covariance * np.outer(factors, factors))
 
 
 def _shifted(state: _State, shift_ns: int) -> _State:

@@ -189,7 +189,7 @@ def exposure_poses(
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
             remedy="record trigger_id in both tables, or times of one clock "
-            'and then clock = "shared"',
+            'and then clock = "shared"; `armscan calibrate latency` tells offset and drift',
         )
     poses = _without_contradicted(poses, rows, arm, latency_ns)
     if not poses.has_pose.any():

@@ -5,8 +5,8 @@ Draws arms, rates, noise, motions and heads at random; every draw is a calibrati
 
     python benchmarks/latency.py --draws 200 --seed 1
 
-prints how often the 95 % region holds the truth (182-197 of 200 is what a right sigma gives), and the
-sigma of 10 s at 30 mm/s rms with an arm of 0.02 mm. Simulated; about 0.5 s a draw.
+prints how often the 95 % region holds the truth (182-197 of 200 is what a right sigma gives), and
+the sigma of 10 s at 30 mm/s rms with an arm of 0.02 mm. Simulated; about 0.5 s a draw.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
-from rigs.latency import LatencyCase, draw
 
 from armscan.calibration.latency import calibrate_latency
 from armscan.geometry.estimate import FitFailure
+from rigs.latency import LatencyCase, draw
 
 
 def drawn_case(seed: int) -> LatencyCase:

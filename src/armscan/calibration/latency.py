@@ -10,7 +10,7 @@ same sign and does not look like time, but only if the motion reverses.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -56,6 +56,8 @@ MANY_OUT, ROUGH_MM = 0.1, 0.1
 TERM_MM, N_TERMS = 20.0, 7
 """Errors that depend on the place are taken as quadratic over what a hand scans, scaled by this."""
 UNEVEN = ("z", "zz", "xz", "yz", "xx", "xy", "yy")
+LEAN_NAMES = ("lean_1_mm", "lean_2_mm")
+"""Of the stripes' axes on the plate, which a turn of the hand-eye leaves."""
 PLATE_NAMES = ("tilt_1_rad", "tilt_2_rad", "height_mm", *(f"uneven_{one}_mm" for one in UNEVEN))
 
 
@@ -194,13 +196,14 @@ class LatencyFit:
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """Time shift at the middle, drift, and plate ``normal . p = height + uneven . terms``."""
+    """Time at the middle, drift, plate ``normal . p = height + uneven . terms``, leans of axes."""
 
     shift_ns: int
     drift: float
     normal: FloatArray
     height_mm: float
     uneven_mm: FloatArray
+    leans_mm: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -349,7 +352,7 @@ def _search(problem: _Problem, is_shared: bool) -> _State | FitFailure:
         )
     placed = problem.place(shift)
     middle, axes, _ = _plate(placed)
-    state = _State(shift, 0.0, axes[2], float(axes[2] @ middle), np.zeros(N_TERMS))
+    state = _State(shift, 0.0, axes[2], float(axes[2] @ middle), np.zeros(N_TERMS), np.zeros(2))
     spread = (placed.centre_mm - middle) @ axes[:2].T
     aside = np.vstack([spread, *(one @ axes[:2].T for one in placed.axes_mm.swapaxes(0, 1))])
     narrow = float(np.linalg.svd(aside, compute_uv=False)[1] / np.sqrt(len(spread)))
@@ -474,17 +477,26 @@ def _linearise(problem: _Problem, state: _State, kept: BoolArray) -> tuple[_Syst
     across = _across(state.normal)
     stand_off = (placed[0].sensor_mm[at[0]] - centres[0]) @ state.normal
     terms = _terms((centres[0] - middle) @ across.T, stand_off)
-    residuals, jacobians = [], []
-    for k in range(-1, problem.axes_mm.shape[1]):
+    residuals, jacobians, n_axes = [], [], problem.axes_mm.shape[1]
+    for k in range(-1, n_axes):
         now, ahead, behind = centres if k < 0 else [one[:, k] for one in axes]
         by_time = (ahead - behind) @ state.normal / (2.0 * lag)
         by_drift = [by_time * problem.since_ns[rows]] if problem.has_drift else []
         by_tilt = ((now - middle) if k < 0 else now) @ across.T
         by_plate = np.column_stack([np.ones(len(rows)), terms]) * (-1.0 if k < 0 else 0.0)
-        plate = state.height_mm + terms @ state.uneven_mm if k < 0 else 0.0
+        by_lean = np.zeros((len(rows), 2))
+        by_lean[:, max(k, 0)] = 0.0 if k < 0 else -1.0
+        plate = state.height_mm + terms @ state.uneven_mm if k < 0 else state.leans_mm[k]
         residuals.append(now @ state.normal - plate)
-        jacobians.append(np.column_stack([by_time, *by_drift, by_tilt, by_plate]))
-    names = ("latency_ns", *(["drift"] if problem.has_drift else []), *PLATE_NAMES)
+        jacobians.append(
+            np.column_stack([by_time, *by_drift, by_tilt, by_plate, by_lean[:, :n_axes]])
+        )
+    names = (
+        "latency_ns",
+        *(["drift"] if problem.has_drift else []),
+        *PLATE_NAMES,
+        *LEAN_NAMES[:n_axes],
+    )
     seconds = 1e-9 * problem.since_ns[rows]
     return _System(rows, seconds, tuple(residuals), tuple(jacobians), names), middle
 
@@ -535,7 +547,9 @@ def _solve(
 
 def _after(problem: _Problem, state: _State, step: FloatArray, middle: FloatArray) -> _State:
     drift = float(step[1]) if problem.has_drift else 0.0
-    by_tilt, by_plate = step[-N_TERMS - 3 : -N_TERMS - 1], step[-N_TERMS - 1 :]
+    first, n_axes = 2 if problem.has_drift else 1, problem.axes_mm.shape[1]
+    by_tilt, by_plate = step[first : first + 2], step[first + 2 : first + 3 + N_TERMS]
+    by_lean = np.append(step[-n_axes:], np.zeros(2 - n_axes))
     tilted = state.normal + by_tilt @ _across(state.normal)
     normal = tilted / np.linalg.norm(tilted)
     above = state.height_mm - float(state.normal @ middle)
@@ -545,6 +559,7 @@ def _after(problem: _Problem, state: _State, step: FloatArray, middle: FloatArra
         normal=normal,
         height_mm=float(normal @ middle) + above + float(by_plate[0]),
         uneven_mm=state.uneven_mm + by_plate[1:],
+        leans_mm=state.leans_mm + by_lean,
     )
 
 
@@ -612,10 +627,10 @@ def _widened(fine: _Solution, motion: StandOffMotion) -> FloatArray:
     """(P, P) covariance in which time and drift scatter as their scores do, if that is more.
 
     What depends on the place follows the motion's own rhythm, where the slow process has little:
-    scores are correlated over half the time between two reversals.
+    scores are correlated over the time between two reversals.
     """
     system, factors = fine.system, np.ones(len(fine.covariance))
-    lag = max(int(0.5 * len(system.rows) / max(motion.n_reversals, 1)), 1)
+    lag = max(len(system.rows) // max(motion.n_reversals, 1), 1)
     for k in range(2 if "drift" in system.names else 1):
         scores = np.zeros(len(system.rows))
         for noise, part, jacobian in zip(
@@ -628,7 +643,7 @@ def _widened(fine: _Solution, motion: StandOffMotion) -> FloatArray:
 
 
 def _shifted(state: _State, shift_ns: int) -> _State:
-    return _State(shift_ns, 0.0, state.normal, state.height_mm, state.uneven_mm)
+    return replace(state, shift_ns=shift_ns, drift=0.0)
 
 
 def _drift_left(system: _System, noise: tuple[ResidualNoise, ...]) -> tuple[float, float]:

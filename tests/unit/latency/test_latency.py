@@ -125,7 +125,7 @@ def test_commensurate_rates_do_not_pull_towards_the_middle_between_samples():
     for seed in range(40, 46):
         fit, truth = fitted(case, seed)
         ratios.append((fit.latency_ns - truth) / fit.sigma_ns)
-        assert fit.sigma_ns < 60_000
+        assert fit.sigma_ns < 80_000
     assert abs(np.mean(ratios)) < 3.0 / np.sqrt(len(ratios))
 
 
@@ -140,9 +140,9 @@ def test_exposures_of_something_else_are_left_out():
     [
         (LatencyCase(speed_mm_s=1.0, aside_mm_s=30.0), "mm/s rms"),
         (LatencyCase(speed_mm_s=3.0), "mm/s rms"),
-        (LatencyCase(reversing_hz=0.03, speed_mm_s=8.0), "reversed"),
+        (LatencyCase(reversing_hz=0.03, speed_mm_s=8.0, rocking_deg=0.3), "reversed"),
         (LatencyCase(seconds=0.5), "60 are needed"),
-        (LatencyCase(seconds=3.0, arm_mm=0.3, camera_hz=30.0), "sigma of"),
+        (LatencyCase(arm_mm=1.0, arm_turn_rad=1e-2, camera_hz=30.0), "sigma of"),
     ],
     ids=["tangential", "too slow", "hardly reversing", "too short", "too noisy"],
 )

@@ -680,6 +680,7 @@ def latency_page(
             axes.plot(1e-9 * (t_ns - start), heights, ".", ms=3, color=colour, label=label)
         axes.set_xlabel("time, s")
         axes.set_ylabel("height over the plate, mm")
+        axes.set_ylim(top=1.3 * axes.get_ylim()[1])
         axes.legend(loc="upper right", ncols=2)
     picture = Picture(chart_markup(figure, title), "One dot an exposure.", title)
     return page_of(

@@ -200,6 +200,23 @@ def test_a_count_that_wraps_is_no_jump_of_the_clock():
     assert monitor.counts.n_restarts == 1 and monitor.counts.n_jumps == 0
 
 
+@pytest.mark.parametrize("first", [0, 300])
+def test_a_device_that_was_started_anew_goes_on_at_once(first):
+    """Count and clock begin at their start again, early in the stream."""
+    monitor = StreamMonitor()
+    for k in range(400):
+        monitor.check(first + k, k * 10**7, k * 10**7 + 10**6)
+    assert monitor.clock.to_other_ns(390 * 10**7) == 390 * 10**7 + 10**6
+    status = [
+        monitor.check(k, k * 10**7 + 5, (k + 500) * 10**7 + 10**6) for k in range(first, first + 80)
+    ]
+    assert status[0] == ElementStatus.JUMP
+    assert set(status[1:]) == {ElementStatus.USABLE}
+    assert monitor.counts.n_restarts == 1 and monitor.counts.n_duplicates == 0
+    found = monitor.clock.to_other_ns((first + 79) * 10**7 + 5)
+    assert found == pytest.approx((first + 579) * 10**7 + 10**6, abs=3)
+
+
 def test_an_hour_of_state_does_not_grow_and_takes_microseconds():
     monitor = StreamMonitor()
     start = time.process_time()

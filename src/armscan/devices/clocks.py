@@ -356,7 +356,7 @@ class StreamCounts:
 
 
 REMEMBERED = 1024
-"""Numbers so far back are told apart from a count that began anew."""
+"""Elements that are known again, and lost ones that are still awaited."""
 
 
 class StreamMonitor:
@@ -377,7 +377,8 @@ class StreamMonitor:
         self.counts = StreamCounts()
         self._number: int | None = None
         self._t_device_ns = 0
-        self._seen: deque[int] = deque(maxlen=REMEMBERED)
+        self._seen: deque[tuple[int, int]] = deque(maxlen=REMEMBERED)
+        self._missing: deque[int] = deque(maxlen=REMEMBERED)
         self._period_ns = 0.0
         self._uneven_ns = 0.0
         self._excess_ns = 0.0
@@ -396,19 +397,22 @@ class StreamMonitor:
         self.counts.n_elements += 1
         last = self._number
         if last is not None and number <= last:
-            if last - number < REMEMBERED:
-                return self._old(number)
+            old = self._old(number, t_device_ns)
+            if old is not None:
+                return old
             self.counts.n_restarts += 1
             self._seen.clear()
+            self._missing.clear()
             last = None
         step = 0 if last is None else number - last
         if step > 1:
             self.counts.n_gaps += 1
             self.counts.n_missing += step - 1
+            self._missing.extend(range(max(number - REMEMBERED, number - step + 1), number))
         has_time = self._number is not None
         back = has_time and t_device_ns <= self._t_device_ns
         uneven = has_time and self._is_uneven(step, t_device_ns)
-        self._seen.append(number)
+        self._seen.append((number, t_device_ns))
         self._number, self._t_device_ns = number, t_device_ns
         if back:
             self.clock.restart()
@@ -422,11 +426,15 @@ class StreamMonitor:
             return ElementStatus.DOUBTFUL
         return ElementStatus.USABLE
 
-    def _old(self, number: int) -> ElementStatus:
-        if number in self._seen:
+    def _old(self, number: int, t_device_ns: int) -> ElementStatus | None:
+        """What a number not above the last one is; None if the count began anew."""
+        if (number, t_device_ns) in self._seen:
             self.counts.n_duplicates += 1
             return ElementStatus.DUPLICATE
-        self._seen.append(number)
+        if number not in self._missing:
+            return None
+        self._missing.remove(number)
+        self._seen.append((number, t_device_ns))
         self.counts.n_late += 1
         self.counts.n_missing -= 1
         return ElementStatus.LATE

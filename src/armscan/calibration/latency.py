@@ -123,8 +123,8 @@ class StandOffMotion:
     speed_mm_s
         Root mean square speed along the plate's normal.
     telling_mm_s
-        What is left of it beyond what a shift and a tilt of the plate, and a drift where it is
-        estimated, explain as well.
+        What is left of it beyond what the plate's place, errors that depend on the place, and a
+        drift where it is estimated, explain as well.
     n_reversals
         How often the head turned from coming nearer to going away or back.
     seconds
@@ -567,8 +567,8 @@ def _refused(motion: StandOffMotion) -> FitFailure | None:
     """Why the motion does not tell the time; None if it does."""
     told = (
         f"the stand-off moved at {motion.speed_mm_s:.3g} mm/s rms for {motion.seconds:.3g} s and "
-        f"reversed {motion.n_reversals} times; beyond what a shifted and tilted plate explains as "
-        f"well, {motion.telling_mm_s:.3g} mm/s are left"
+        f"reversed {motion.n_reversals} times; beyond what the plate and smooth errors of the place "
+        f"explain as well, {motion.telling_mm_s:.3g} mm/s are left"
     )
     if motion.n_reversals < FEWEST_REVERSALS:
         return FitFailure(f"{told}; {FEWEST_REVERSALS} reversals are needed", MOVE)

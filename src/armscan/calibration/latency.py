@@ -567,8 +567,8 @@ def _refused(motion: StandOffMotion) -> FitFailure | None:
     """Why the motion does not tell the time; None if it does."""
     told = (
         f"the stand-off moved at {motion.speed_mm_s:.3g} mm/s rms for {motion.seconds:.3g} s and "
-        f"reversed {motion.n_reversals} times; beyond what the plate and smooth errors of the place "
-        f"explain as well, {motion.telling_mm_s:.3g} mm/s are left"
+        f"reversed {motion.n_reversals} times; beyond what the plate and smooth errors of the "
+        f"place explain as well, {motion.telling_mm_s:.3g} mm/s are left"
     )
     if motion.n_reversals < FEWEST_REVERSALS:
         return FitFailure(f"{told}; {FEWEST_REVERSALS} reversals are needed", MOVE)

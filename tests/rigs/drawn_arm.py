@@ -51,7 +51,7 @@ _ARM_HEADER = "t_ns,x_mm,y_mm,z_mm," + ",".join(f"r{i}{j}" for i in (1, 2, 3) fo
 
 
 def base_from_tool(
-    tilt_x_deg: float, tilt_y_deg: float, z_mm: float, k: int
+    tilt_x_deg: float, tilt_y_deg: float, z_mm: float, k: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotation and place of the tool for one image of the board; ``k`` turns it on the plate."""
     in_sensor = cv2.Rodrigues(np.array([0.0, np.deg2rad(tilt_y_deg), 0.0]))[0]
@@ -66,3 +66,33 @@ def base_from_tool(
     sensor_place = middle - base_from_sensor @ [0.0, 0.0, z_mm]
     rotation = base_from_sensor @ ROTATION.T
     return rotation, sensor_place - rotation @ TRANSLATION_MM
+
+
+LATENCY_NS = 6_300_000
+_ASIDE_HZ, _TURN_HZ = 0.31, 0.43
+
+
+def draw_bounce(folder: Path, *, seconds: float = 6.0, bounce_mm: float = 6.0) -> None:
+    """The head moved nearer and away for seconds; the arm tells its times `LATENCY_NS` late."""
+
+    def held(t_s: float) -> tuple[float, float, float, float]:
+        away = np.sin(2 * np.pi * 0.9 * t_s) + 0.6 * np.sin(2 * np.pi * 1.43 * t_s + 1.0)
+        tilt = 8.0 + 4.0 * np.sin(2 * np.pi * _TURN_HZ * t_s)
+        return tilt, -3.0, 150.0 + bounce_mm * away, 1.0 + 0.5 * np.sin(2 * np.pi * _ASIDE_HZ * t_s)
+
+    (folder / "images").mkdir(parents=True)
+    exposures, samples = ["index,t_ns,camera,file,lasers"], [_ARM_HEADER]
+    for k in range(round(20 * seconds)):
+        t_s = 1.0 + k / 20
+        tilt_x, tilt_y, z_mm, _ = held(t_s)
+        image = draw(tilt_x, tilt_y, z_mm, has_laser=True, is_plain=True)
+        cv2.imwrite(str(folder / "images" / f"{k:03d}.png"), image)
+        exposures.append(f"{k},{round(1e9 * t_s)},0,images/{k:03d}.png,A")
+    for k in range(round(200 * (seconds + 0.4))):
+        t_s = 0.8 + k / 200
+        rotation, place = base_from_tool(*held(t_s))
+        numbers = ",".join(f"{value!r}" for value in [*place.tolist(), *rotation.ravel().tolist()])
+        samples.append(f"{round(1e9 * t_s) + LATENCY_NS},{numbers}")
+    (folder / "session.toml").write_text(SESSION)
+    (folder / "exposures.csv").write_text("\n".join(exposures) + "\n")
+    (folder / "arm.csv").write_text("\n".join(samples) + "\n")

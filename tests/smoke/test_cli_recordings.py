@@ -59,7 +59,6 @@ BAD = {
     "swapped columns": ({"arm": ARM.replace("z_mm,qw", "qw,z_mm")}, "norm is 400"),
     "duplicate times": ({"arm": ARM.replace("3500,", "1500,")}, "appears again"),
     "metres": ({"arm": ARM.replace("_mm", "_m")}, "in metres"),
-    "no clock": ({"session": SESSION.replace("shared", "separate")}, "neither a shared clock"),
     "lost image": ({"exposures": EXPOSURES.replace("1.png", "7.png")}, "do not exist"),
     "wrong key": ({"session": SESSION.replace('"mono"', "7")}, "camera.0.colour"),
     "cut": ({"arm": ARM[:-6]}, "may be cut"),

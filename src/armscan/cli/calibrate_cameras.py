@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan calibrate camera`` and ``stereo``: photographs of a flat target."""
+"""``armscan calibrate camera`` and ``stereo``, from a flat target; ``latency``, from a plate."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from armscan.cli.options import (
+    ArmFile,
     AsJson,
     BitsAlign,
     BitsUsed,
@@ -18,6 +19,7 @@ from armscan.cli.options import (
     Document,
     Force,
     ForceBad,
+    LaserColourOption,
     Method,
     MethodOption,
     OptionalTarget,
@@ -40,6 +42,12 @@ STEREO_EXAMPLE = (
     "      --target chessboard:9x6:25 -o stereo.json\n\n"
     "\b\nTake 10 to 20 pairs at rest, both images at one instant; the board is tilted by 20 to 45\n"
     "degrees to all sides and reaches the corners of both images. Lists pair in their order."
+)
+LATENCY_EXAMPLE = (
+    "\b\nExample:\n"
+    "  armscan calibrate latency scans/latency --scanner scanner.json -o scanner-timed.json\n\n"
+    "\b\nFor 10 s, move the head over a flat plate nearer and away by 10 mm or more, once a\n"
+    "second, unevenly, and sideways by 20 mm meanwhile. The plate fills the view all the time."
 )
 Photographs = Annotated[
     list[str] | None,
@@ -223,4 +231,27 @@ def stereo(
         force=force,
         force_bad=force_bad,
         cache=cache,
+    )
+
+
+def latency(
+    *,
+    scan: Annotated[Path, typer.Argument(help="Recording of the plate.", show_default=False)],
+    scanner: Annotated[Path, typer.Option(help="The scanner's document.", show_default=False)],
+    arm: ArmFile = None,
+    output: Document = Path("scanner-timed.json"),
+    laser_colour: LaserColourOption = None,
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Find the time between camera and arm, from a plate and a stand-off that moves."""
+    from armscan.jobs.hand_eye import calibrate_latency
+    from armscan.vision.stripe.image import StripeOptions
+
+    stripes = given(StripeOptions, laser_colour=laser_colour)
+    run(
+        lambda job: calibrate_latency(job, scan, scanner, arm=arm, stripe_options=stripes),
+        as_json=as_json,
+        output=output,
+        force=force,
     )

@@ -49,6 +49,7 @@ class Scene(StrEnum):
     PROBING = "probing"
     STILL_PART = "still-part"
     WORKPIECE = "workpiece"
+    LATENCY = "latency"
 
 
 class PresetName(StrEnum):
@@ -148,7 +149,8 @@ def simulate(
     one exposure of the steps, and still-part one of the part, with the same view without laser;
     markers is a part with ring markers, place by place, and markers-moved the same
     part after the arm was put down elsewhere; probing is the plate touched with a tip; workpiece is
-    a part with two faults, whose CAD model comes with armscan.
+    a part with two faults, whose CAD model comes with armscan; latency is the plate with the head
+    moved nearer and away, and an arm with a clock of its own.
     """
     from armscan.jobs.simulate import SimulateRequest, run_simulation
     from armscan.pipeline.simulate import SimulateOptions

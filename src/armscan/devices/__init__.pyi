@@ -1,5 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 # What `from armscan.devices import ...` offers; loaded when it is first asked for.
+from .clocks import ClockFit as ClockFit
+from .clocks import ClockModel as ClockModel
+from .clocks import ElementStatus as ElementStatus
+from .clocks import StreamMonitor as StreamMonitor
+from .matching import InstantMatcher as InstantMatcher
+from .matching import MatchedInstant as MatchedInstant
+from .matching import TimedSample as TimedSample
 from .protocols import Arm as Arm
 from .protocols import ArmFlag as ArmFlag
 from .protocols import ArmSample as ArmSample

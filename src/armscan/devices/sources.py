@@ -56,6 +56,7 @@ TwinScene = Literal[
     "probing",
     "still-part",
     "workpiece",
+    "latency",
 ]
 Preset = Literal["clean", "thesis", "harsh"]
 
@@ -205,6 +206,8 @@ class Twin(Protocol):
         with the lasers; in ``markers-moved`` the part is still there, but the arm stands in
         another place, and so does Base. ``workpiece`` is the part of the CAD model that comes with
         the simulator, made with two faults, or another part in its place.
+        ``latency`` is the plate with a reversing stand-off, found by time alone: the arm's times
+        are later by a latency, which `TwinTruth.document` tells.
         """
 
     def probe_plate(self) -> Probing:

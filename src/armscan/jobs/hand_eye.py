@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From recordings or profiles over a plate or a sphere to a scanner document and its page."""
+"""From recordings or profiles over a plate or a sphere to a scanner document and its page.
+
+Hand-eye first; then, from a plate and a stand-off that moves, the time between camera and arm.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,20 @@ from armscan.calibration.hand_eye.probed_plate import (
     plate_from_coefficients,
 )
 from armscan.calibration.hand_eye.result import HandEyeFit
-from armscan.errors import OptionError
+from armscan.calibration.latency import calibrate_latency as fit_latency
+from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Pose, Sensor, Tool
 from armscan.geometry.rotations import EulerConvention
 from armscan.jobs.job import Job, solved
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
-from armscan.pipeline.hand_eye import ObservedStripes, observe_stripes, posed_stripes_from_profiles
+from armscan.pipeline.hand_eye import (
+    ObservedStripes,
+    observe_plate,
+    observe_stripes,
+    posed_stripes_from_profiles,
+)
 from armscan.pipeline.measure import MeasureOptions
 from armscan.pipeline.progress import Progress, ProgressEvent
 from armscan.reconstruction.labels import LabelledProfile, PointStatus
@@ -36,6 +45,8 @@ from armscan.report.hand_eye import (
     TITLE,
     hand_eye_page,
     hand_eye_quantities,
+    latency_page,
+    latency_quantities,
     posture_table,
     repeat_blocks,
 )
@@ -43,7 +54,11 @@ from armscan.report.page import Text
 from armscan.report.photographs import MAX_PICTURES, TriedImage, evenly_chosen, refused_page
 from armscan.report.quantity import Summary, Table, fact, sentences, significant
 from armscan.storage.arm import ARM_FILE, read_arm_model
-from armscan.storage.documents import read_sensor_calibration, scanner_document
+from armscan.storage.documents import (
+    read_scanner_calibration,
+    read_sensor_calibration,
+    scanner_document,
+)
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.observations import pack_posed_stripes
 from armscan.storage.points import (
@@ -297,6 +312,95 @@ def calibrate_hand_eye(
         extra = {**summary.extra, "thesis": data}
         summary = replace(summary, tables=(*summary.tables, table), extra=extra)
     return replace(summary, forced=provenance.forced)
+
+
+def calibrate_latency(
+    job: Job,
+    scan: Path,
+    scanner: Path,
+    *,
+    arm: Path | None = None,
+    stripe_options: StripeOptions | None = None,
+) -> Summary:
+    """Find the time between camera and arm, and write the scanner's document with it.
+
+    Clocks that are not shared have a time of their own in every recording: it is told, and no
+    document is written.
+
+    Parameters
+    ----------
+    job
+        Where to write the document ``NAME.json`` and its page.
+    scan
+        Recording of a flat plate, the head moved nearer and away.
+    scanner
+        The document ``scanner.json`` so far.
+    arm
+        ``arm.toml`` for recordings of joint angles; None to look for it in the recording.
+    stripe_options
+        Of stripe extraction.
+
+    Raises
+    ------
+    ArmscanError
+        If a file is unreadable, or the motion does not tell the time; nothing is written then.
+    """
+    stripe_options = stripe_options or StripeOptions()
+    places = job.places(".json", beside=(".html",))
+    before = read_scanner_calibration(scanner)
+    if before.sensor is None:
+        raise InputError(
+            "the scanner's document has no camera and light sheet",
+            where=str(scanner),
+            remedy="give one with a sensor",
+        )
+    recording = read_recording(scan, None if arm is None else read_arm_model(arm))
+    if recording.arm is None:
+        raise InputError(
+            "the recording has no samples of the arm",
+            where=str(scan),
+            remedy=f"record the arm's poses in {ARM_FILE}",
+        )
+    is_shared = recording.session.clock == "shared"
+    measure = MeasureOptions(stripes=stripe_options)
+    looks = observe_plate(recording, before.sensor, measure, progress=job.progress)
+    fit = solved(
+        fit_latency(looks, recording.arm, before.hand_eye.tool_from_sensor, is_shared=is_shared),
+        scan,
+    )
+    odd = (*recording.warnings, *recording.session.assumed, *fit.warnings)
+    if not is_shared:
+        odd += ("the clocks are separate: the time holds for this recording, nothing is written",)
+    is_simulated = recording.is_simulated or are_simulated([scanner])
+    files = [path for path in (*(scan / name for name in TABLES), scanner, arm) if path]
+    provenance = job.provenance(
+        [path for path in files if path.exists()],
+        (stripe_options,),
+        parents=(before.provenance,),
+        warnings=odd,
+    )
+    written: tuple[Path, ...] = ()
+    if is_shared:
+        timed = replace(
+            before,
+            provenance=provenance,
+            latency_ns=fit.latency_ns,
+            latency_sigma_ns=fit.sigma_ns,
+        )
+        page = latency_page(fit, provenance, warnings=odd, is_simulated=is_simulated)
+        contents = (scanner_document(timed), page)
+        written = job.write(dict(zip(places, contents, strict=True)))
+    return Summary(
+        title="Latency calibrated" + (" from simulated images." if is_simulated else "."),
+        quantities=latency_quantities(fit),
+        warnings=sentences(odd),
+        written=written,
+        next_step=f"armscan reconstruct SCAN --scanner {written[0]} -o cloud.ply"
+        if written
+        else "",
+        extra={"kind": "latency calibration", "simulated": is_simulated},
+        forced=provenance.forced,
+    )
 
 
 def _beside_thesis(

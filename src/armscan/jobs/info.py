@@ -151,7 +151,7 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
     pose = hand_eye.tool_from_sensor
     values = [*pose.rotation_vector_rad, *pose.translation_mm]
     names = [name.replace("rotation_", "rotation_vector_") for name in HAND_EYE_PARAMETER_NAMES]
-    known = hand_eye.diagnostics
+    known, timed = hand_eye.diagnostics, calibration.latency_sigma_ns
     return {
         "what": f"scanner calibration, {sheets}",
         **({} if second is None else second_camera_facts(second)),
@@ -164,6 +164,7 @@ def describe_scanner(calibration: ScannerCalibration) -> dict[str, Any]:
         "points": hand_eye.n_points,
         **({} if known is None else {"method": known.method, "condition": known.condition}),
         "latency_ns": calibration.latency_ns,
+        **({} if timed is None else {"latency_sigma_ns": timed}),
     }
 
 

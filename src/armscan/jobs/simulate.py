@@ -77,6 +77,8 @@ def _next_step(scene: TwinScene, found: SimulatedScene) -> str:
             f"armscan calibrate hand-eye {folder} --sensor sensor.json --plate plate.csv "
             "-o scanner.json"
         )
+    if scene == "latency":
+        return f"armscan calibrate latency {folder} --scanner scanner.json -o scanner-timed.json"
     if scene in ("markers", "markers-moved"):
         return _next_for_markers(found)
     return f"armscan reconstruct {folder} --scanner scanner.json -o cloud.ply"

@@ -519,13 +519,16 @@ class ScannerCalibration:
     provenance
         How it came to be.
     latency_ns
-        Added to an exposure's time before the arm's pose is looked up.
+        Added to an exposure's time before the arm's pose is looked up by time.
+    latency_sigma_ns
+        Its standard deviation; None where it was not calibrated.
     """
 
     sensor: SensorCalibration | None
     hand_eye: HandEyeCalibration
     provenance: Provenance
     latency_ns: int = 0
+    latency_sigma_ns: float | None = None
 
     def __post_init__(self) -> None:
         coupling = self.hand_eye.dhand_eye_dsensor

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a hand-eye calibration observes: stripes in the images of a scan."""
+"""What calibrations of hand-eye and latency observe: stripes in the images of a scan."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from armscan.calibration.hand_eye.observations import (
     MIN_POINTS,
     PosedStripe,
 )
+from armscan.calibration.latency import PlateLooks, plate_looks
 from armscan.devices.sources import ScanSource
 from armscan.errors import EstimationError
 from armscan.geometry.arrays import IntArray
@@ -35,7 +36,7 @@ from armscan.reconstruction.triangulate import sensor_columns
 from armscan.records.profile import PointProfile
 from armscan.records.recording import ExposureRow
 
-STAGE = "stripes of the postures"
+STAGE, LOOKS = "stripes of the postures", "stripes on the plate"
 MAX_EXPOSURES = 200
 """Of a longer scan, so many are used, evenly spread."""
 SAME_PLACE_MM = 0.05
@@ -161,6 +162,48 @@ def observe_stripes(
         *summarised(weak),
     )
     return ObservedStripes(tuple(stripes), tuple(images), not_used, warnings)
+
+
+MAX_LOOKS = 2000
+"""Of a longer recording of a moving stand-off, so many exposures are used, evenly spread."""
+
+
+def observe_plate(
+    source: ScanSource,
+    sensor: SensorCalibration,
+    options: MeasureOptions | None = None,
+    *,
+    progress: Progress = silent,
+) -> PlateLooks:
+    """Measure the stripes of every exposure of a plate, whether it has a pose or not.
+
+    Parameters
+    ----------
+    source, sensor, options, progress
+        As for `observe_stripes`; the plate should fill the view.
+
+    Raises
+    ------
+    InputError
+        If the scan has not the sensor's cameras, or its images are not of the camera's sensor.
+    EstimationError
+        If the sheet of a stripe is ambiguous.
+    """
+    options = options or MeasureOptions()
+    scan = ScanInstants(source, len(cameras_of(sensor)))
+    chosen = [scan.lit[k] for k in _spread(np.arange(len(scan.lit)), MAX_LOOKS)]
+    times, points = [], []
+    for one in measure_instants(
+        scan.read(chosen, LOOKS, progress),
+        labeller_for(sensor, options),
+        sensor,
+        options,
+        is_pass=False,
+    ):
+        times.append(source.rows[one.images.instant.rows[0]].t_ns)
+        found = [profile.points.points_mm for profile in one.profiles]
+        points.append(np.concatenate([np.zeros((0, 3)), *found]))
+    return plate_looks(times, points)
 
 
 def _left_out(n_chosen: int, n_posed: int, not_used: Sequence[tuple[str, str]]) -> tuple[str, ...]:

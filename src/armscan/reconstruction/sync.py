@@ -40,6 +40,9 @@ class PoseStatus(IntEnum):
     """Between two samples too far apart, or next to one without pose."""
     CONTRADICTED = 7
     """At samples that the arm's own track shows to be wrong."""
+    NO_TIME = 8
+    """Its time on the common clock is not known: the device's clock is not related to it yet, or
+    jumped."""
 
     @property
     def label(self) -> str:
@@ -56,6 +59,7 @@ _LABELS = {
     PoseStatus.AFTER_TRACK: "after the arm's last sample",
     PoseStatus.GAP: "in a gap of the arm's samples",
     PoseStatus.CONTRADICTED: "at samples that the arm's own track shows to be wrong",
+    PoseStatus.NO_TIME: "whose clock was not related to the arm's",
 }
 
 
@@ -185,7 +189,7 @@ def exposure_poses(
         raise InputError(
             "exposures and arm samples have separate clocks and no trigger ids in common",
             remedy="record trigger_id in both tables, or times of one clock "
-            'and then clock = "shared"',
+            'and then clock = "shared"; `armscan calibrate latency` tells offset and drift',
         )
     poses = _without_contradicted(poses, rows, arm, latency_ns)
     if not poses.has_pose.any():
@@ -236,8 +240,12 @@ def largest_gap_ns(arm: ArmTrack) -> int:
     """Widest step between samples that is bridged; 0 if the track has one sample only."""
     if len(arm) < 2:
         return 0
-    median = float(np.median(np.diff(arm.t_ns)))
-    return int(min(GAP_PERIODS * median, LARGEST_GAP_NS))
+    return bridged_ns(np.diff(arm.t_ns))
+
+
+def bridged_ns(steps_ns: IntArray) -> int:
+    """Widest step that is bridged, by the usual steps (N,) of a track."""
+    return int(min(GAP_PERIODS * float(np.median(steps_ns)), LARGEST_GAP_NS))
 
 
 def _by_trigger(
@@ -299,8 +307,16 @@ def _at_samples(arm: ArmTrack, found: IntArray, status: IntArray) -> tuple[Float
 
 def poses_by_time(rows: Sequence[ExposureRow], arm: ArmTrack, latency_ns: int = 0) -> ExposurePoses:
     """Poses by times of one clock alone, whatever trigger ids there are; see `exposure_poses`."""
-    times = np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns
-    max_gap = largest_gap_ns(arm)
+    return poses_at(np.array([row.t_ns for row in rows], dtype=np.int64) + latency_ns, arm)
+
+
+def poses_at(times: IntArray, arm: ArmTrack, *, max_gap_ns: int | None = None) -> ExposurePoses:
+    """Poses at times (N,) of the arm's clock in ns; see `exposure_poses`.
+
+    ``max_gap_ns`` is the widest step that is bridged; None takes it from the track, which must
+    then be longer than the piece around an exposure that a live rig asks for.
+    """
+    max_gap = largest_gap_ns(arm) if max_gap_ns is None else max_gap_ns
     before = np.searchsorted(arm.t_ns, times, side="right") - 1
     after = np.minimum(before + 1, len(arm) - 1)
     start = np.maximum(before, 0)

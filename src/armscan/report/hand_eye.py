@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The page of a hand-eye calibration, and its numbers: matrix, Euler angles, lengths."""
+"""Pages of hand-eye and latency calibrations, and their numbers: matrix, angles, lengths, time."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 
 from armscan.calibration.hand_eye.observations import PosedStripe
 from armscan.calibration.hand_eye.result import HandEyeFit, PostureResult, study_repeats
+from armscan.calibration.latency import LatencyFit
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.geometry.rotations import euler_from_rotations, rotation_from_vector
 from armscan.geometry.shapes import Plane
-from armscan.models.calibration import HandEyeCalibration, ScannerCalibration
+from armscan.models.calibration import HandEyeCalibration, Provenance, ScannerCalibration
 from armscan.reconstruction.labels import LabelledProfile
 from armscan.records.exposure import Exposure
 from armscan.report.charts import (
@@ -598,3 +599,99 @@ def _plate_edges(plate: Plane, points_mm: FloatArray) -> FloatArray:
     (u0, v0), (u1, v1) = low - 0.1 * (high - low), high + 0.1 * (high - low)
     corners = np.array([[u0, v0], [u1, v0], [u1, v1], [u0, v1]])
     return closed_outline(plate.point_mm + corners @ plate.axes[:2])
+
+
+LATENCY_TITLE = "Latency calibration"
+LATENCY_TEXT = (
+    "A wrong time places the plate too high while the head goes one way and too low on the way "
+    "back: the height is off by stand-off speed times time. What depends on where the head is "
+    "comes back with the same sign, and is solved along as a smooth function of the place. The "
+    "latency is added to an exposure's time before the arm's pose is looked up by time; poses "
+    "found by trigger id do not need it."
+)
+
+
+def latency_quantities(fit: LatencyFit) -> tuple[Quantity, ...]:
+    """What is told of a latency: the time, the drift, the motion and what is left over."""
+    motion = fit.motion
+    rms = float(np.sqrt((np.asarray(fit.estimate.residuals) ** 2).mean()))
+    before = float(np.sqrt((fit.before_mm**2).mean()))
+    noise = fit.noise[0]
+    return (
+        Quantity("latency_ns", "", fit.latency_ns),
+        Quantity("latency_sigma_ns", "", fit.sigma_ns),
+        Quantity(
+            "latency_ms",
+            "Latency",
+            1e-6 * fit.latency_ns,
+            1e-6 * fit.sigma_ns,
+            "ms",
+            "added to an exposure's time",
+        ),
+        Quantity(
+            "drift_ppm",
+            "Drift",
+            1e6 * fit.drift,
+            1e6 * fit.sigma_drift,
+            "ppm",
+            "by which the arm's clock runs faster",
+        ),
+        Quantity("t_middle_ns", "", fit.t_middle_ns),
+        Quantity(
+            "stand_off_mm_s",
+            "Speed of the stand-off",
+            motion.speed_mm_s,
+            unit="mm/s rms",
+            meaning=f"{significant(motion.telling_mm_s)} mm/s of it tell the time, "
+            f"{motion.n_reversals} reversals in {motion.seconds:.1f} s",
+        ),
+        Quantity("telling_mm_s", "", motion.telling_mm_s),
+        Quantity("n_reversals", "", motion.n_reversals),
+        Quantity("n_exposures", "Exposures used", len(fit.t_ns)),
+        Quantity("n_left_out", "Left out", fit.n_left_out),
+        Quantity(
+            "rms_mm", "Heights of the plate", rms, unit="mm rms", meaning=f"{before:.3g} before"
+        ),
+        Quantity(
+            "white_mm",
+            "Their scatter",
+            noise.white_mm,
+            unit="mm",
+            meaning=f"each by itself, and {significant(noise.slow_mm)} mm that fade in "
+            f"{noise.fades_s:.2g} s",
+        ),
+    )
+
+
+def latency_page(
+    fit: LatencyFit, provenance: Provenance, *, warnings: Sequence[str], is_simulated: bool
+) -> Page:
+    """Lay out the report of a latency, a picture of the plate's heights before and after."""
+    told = latency_quantities(fit)
+    title = "Heights of the plate"
+    with styled():
+        figure = new_figure(PAGE_WIDTH, 3.4)
+        axes = figure.add_subplot()
+        start = int(fit.t_ns[0])
+        for t_ns, heights, colour, label in (
+            (fit.before_t_ns, fit.before_mm, ACCENT_LIGHT, "without the latency"),
+            (fit.t_ns, np.asarray(fit.estimate.residuals), ACCENT, "with it"),
+        ):
+            axes.plot(1e-9 * (t_ns - start), heights, ".", ms=3, color=colour, label=label)
+        axes.set_xlabel("time, s")
+        axes.set_ylabel("height over the plate, mm")
+        axes.set_ylim(top=1.3 * axes.get_ylim()[1])
+        axes.legend(loc="upper right", ncols=2)
+    picture = Picture(chart_markup(figure, title), "One dot an exposure.", title)
+    return page_of(
+        provenance,
+        LATENCY_TITLE,
+        f"The time between camera and arm, from {len(fit.t_ns):,} exposures of a plate",
+        [
+            Section("The time", (Facts(for_people(told)), Gallery((picture,), 1000))),
+            Section("How it is found", (Text(LATENCY_TEXT),)),
+        ],
+        cards=tuple(item for item in told if item.label in ("Latency", "Heights of the plate")),
+        warnings=warnings,
+        is_simulated=is_simulated,
+    )

@@ -7,6 +7,7 @@ Before the target no arm takes part: Base is the Sensor frame there, and the tar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +19,9 @@ from armscan.simulation.arm.hand import (
     PLANS,
     HeadOrientation,
     SweptScene,
+    Trajectory,
     aim_point_mm,
+    bounce,
     facing_both,
     scan_passes,
     sensor_over,
@@ -206,6 +209,29 @@ def scan_scene(instrument: Instrument, scene: SweptScene, rng: np.random.Generat
     station = getattr(instrument.fixtures, f"with_{scene}")()
     passes = scan_passes(scene, head, instrument.fixtures)
     sweeps = [sweep(one, head, arm.true, hand, rng) for one in passes]
+    return _swept(instrument, station, sweeps, rng)
+
+
+LATENCY_EXPOSURES = 160
+
+
+def latency_scene(instrument: Instrument, latency_ns: int, rng: np.random.Generator) -> Recorded:
+    """The plate with the head moved nearer and away; the arm tells its times later than it is."""
+    head, fixtures = instrument.head, instrument.fixtures
+    first = replace(scan_passes("plate", head, fixtures)[0], n_exposures=LATENCY_EXPOSURES)
+    middle = fixtures.base_from_plate.translation_mm
+    moved = bounce(middle, first, head, instrument.arm.true, rng)
+    shots, track = _swept(instrument, fixtures.with_plate(), [moved], rng)
+    return shots, replace(track, t_ns=track.t_ns + latency_ns, trigger_ids=None)
+
+
+def _swept(
+    instrument: Instrument,
+    station: Station,
+    sweeps: Sequence[Trajectory],
+    rng: np.random.Generator,
+) -> Recorded:
+    head, arm = instrument.head, instrument.arm
     light = Light(head.sources, is_windowed=True)
     # pose in the middle of an exposure, then the two whose mean square is that of all
     half = instrument.mechanics.exposure_s / np.sqrt(12.0)

@@ -31,6 +31,7 @@ from armscan.simulation.scenes import (
     camera_shots,
     hand_eye_scene,
     laser_shots,
+    latency_scene,
     marker_scene,
     scan_scene,
     still_part_scene,
@@ -164,6 +165,7 @@ class InstrumentTruth:
                 "ring_diameter_mm": RING_DIAMETER_MM,
                 "base_new_from_base_old": _pose(self.moved_from_base),
             },
+            "latency_ns": latency_ns(self.seed),
             "probe": {
                 "tool_from_probe_mm": TRUE_PROBE_MM.tolist(),
                 "tip_diameter_mm": TIP_DIAMETER_MM,
@@ -195,8 +197,13 @@ def _pose(pose: Pose[Any, Any]) -> dict[str, Any]:
 
 
 _SCENES: tuple[TwinScene, ...] = get_args(TwinScene)
-_PLAN, _NOISE, _PROBING = 10, 11, 12
+_PLAN, _NOISE, _PROBING, _CLOCK = 10, 11, 12, 13
 """Streams of random numbers, besides those that the instrument is drawn from."""
+
+
+def latency_ns(seed: int) -> int:
+    """By how much later than it is the arm of the scene ``latency`` tells its times, in ns."""
+    return round(float(np.random.default_rng([seed, _CLOCK]).uniform(-8e6, 8e6)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,6 +283,8 @@ class SimulatedInstrument:
             return still_step_scene(tools, rng)
         if scene == "still-part":
             return still_part_scene(tools, rng)
+        if scene == "latency":
+            return latency_scene(tools, latency_ns(self.seed), rng)
         if scene in ("markers", "markers-moved"):
             return marker_scene(tools, scene == "markers-moved", rng)
         return scan_scene(tools, cast(SweptScene, scene), rng)

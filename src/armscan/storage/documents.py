@@ -293,7 +293,11 @@ LAYOUTS: Mapping[type, Layout] = {
     ),
     ScannerCalibration: Layout(
         codecs={"sensor": FieldCodec(_sensor_tree, _sensor_of_tree)},
-        limits={"latency_ns": (-LARGEST_LATENCY_NS, LARGEST_LATENCY_NS)},
+        limits={
+            "latency_ns": (-LARGEST_LATENCY_NS, LARGEST_LATENCY_NS),
+            "latency_sigma_ns": (0.0, LARGEST_LATENCY_NS),
+        },
+        optional=("latency_sigma_ns",),
     ),
     Plane: Layout(
         keys={"point_mm": "point_base_mm"},

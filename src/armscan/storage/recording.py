@@ -79,8 +79,8 @@ def check_clock(
     Raises
     ------
     FileFormatError
-        If there are neither common trigger ids nor a shared clock, no exposure is within the
-        arm's times, or one table's times are in another unit.
+        If no trigger id is in both tables, no exposure is within the arm's times, or one table's
+        times are in another unit.
     """
     where = str(folder / EXPOSURES_FILE)
     ids = {row.trigger_id for row in rows} - {None}
@@ -94,11 +94,7 @@ def check_clock(
             remedy="write the number of one trigger into both tables, or leave the columns out",
         )
     if said.session.clock == "separate":
-        raise FileFormatError(
-            "cameras and arm have neither a shared clock nor trigger ids, so no pose can be found",
-            where=where,
-            remedy="record trigger ids, or bring the times to one clock and say clock = 'shared'",
-        )
+        return [], ["cameras and arm have neither a shared clock nor trigger ids: no pose is known"]
     times = np.array([row.t_ns for row in rows], dtype=np.int64)
     warnings = _unit_warning(times, arm.t_ns, len({_arrangement(row) for row in rows}), where)
     if not _is_within(times, arm.t_ns).any():

@@ -153,7 +153,7 @@ def test_the_command_knows_all_scenes_and_presets() -> None:
 def test_the_report_says_what_comes_next(tmp_path: Path, scene: TwinScene) -> None:
     summary = run_simulation(SimulateRequest(HEAD, scene, tmp_path / "scan"))
     word = {"camera": "camera", "laser": "laser", "hand-eye": "hand-eye", "probing": "probe"}
-    word |= {"markers": "markers", "markers-moved": "markers"}
+    word |= {"markers": "markers", "markers-moved": "markers", "latency": "latency"}
     assert f" {word.get(scene, 'reconstruct')} " in summary.next_step
     assert str(tmp_path / "scan") in summary.next_step
     assert summary.data["simulated"] is True and summary.data["seed"] == 1

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from armscan.errors import FileFormatError
+from armscan.errors import FileFormatError, InputError
+from armscan.reconstruction.sync import exposure_poses
 from armscan.storage.recording import read_recording
 from rigs.recording_folders import (
     ARM,
@@ -182,14 +183,18 @@ def test_ids_in_one_table_only_leave_it_to_the_clock(tmp_path: Path) -> None:
     for k, poses in enumerate((ARM, empty)):
         scan = read_recording(lab_folder(tmp_path / str(k), exposures=listed, arm=poses))
         assert scan.rows[1].trigger_id == 5
-    separate = SESSION.replace("shared", "separate")
-    message = refusal(tmp_path, exposures=listed, arm=empty, session=separate)
-    assert "neither a shared clock nor trigger ids" in message
+    session = SESSION.replace("shared", "separate")
+    folder = lab_folder(tmp_path / "separate", exposures=listed, arm=empty, session=session)
+    assert "neither a shared clock nor trigger ids" in read_recording(folder).warnings[-1]
 
 
-def test_neither_a_shared_clock_nor_ids_is_refused(tmp_path: Path) -> None:
-    message = refusal(tmp_path, session=SESSION.replace("shared", "separate"))
-    assert "neither a shared clock nor trigger ids" in message
+def test_neither_a_shared_clock_nor_ids_gives_no_pose(tmp_path: Path) -> None:
+    """A latency calibration reads it all the same: it finds offset and drift."""
+    folder = lab_folder(tmp_path / "lab", session=SESSION.replace("shared", "separate"))
+    scan = read_recording(folder)
+    assert "neither a shared clock nor trigger ids" in scan.warnings[-1]
+    with pytest.raises(InputError, match="separate clocks"):
+        exposure_poses(scan.rows, scan.arm, scan.session.clock)
 
 
 def test_times_of_another_unit_are_noticed_by_their_range(tmp_path: Path) -> None:

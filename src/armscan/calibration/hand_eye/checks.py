@@ -5,8 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import comb
 
 import numpy as np
+from scipy.special import fdtrc
 
 from armscan.calibration.hand_eye.alternatives import (
     BETTER,
@@ -89,8 +91,9 @@ FREE_PLANE_SHARE = 0.2
 MAX_WRONG_SHARE = 0.34
 LEAST_LEFT = 6
 SUSPECT_PROBABILITY = 0.2
-WRONG_PROBABILITY = 1e-5
-"""Probability, among as many postures, of a shift and slope like those of the posture."""
+WRONG_PROBABILITY = 1e-3
+"""Probability, over all choices of as many postures, of a shift and slope like those of the posture
+where the scatter is only as well known as the others show it."""
 AS_WELL = 1.5
 """What moved is believed if it leaves the arm less scatter than this many times what leaving
 postures out does."""
@@ -407,11 +410,12 @@ def _without_wrong_postures(
 ) -> CheckedFit | FitFailure:
     """Leave out postures whose pose is wrong.
 
-    Gross ones are known from the start. Of the rest, the posture that the others predict worst is
-    left out for trial; if the scatter of the others then makes its distance all but impossible, it
-    stays out, and the next one is tried. ``first`` is the fit without the gross ones.
+    Those that seem gross at the start come back where the others do not contradict them. Of the
+    rest, the posture that the others predict worst is left out for trial; if the scatter of the
+    others then makes its distance all but impossible, it stays out, and the next one is tried.
+    ``first`` is the fit without the gross ones.
     """
-    wrong, fit = start.is_wrong.copy(), first
+    wrong, fit = _with_doubted_postures(problem, start, first)
     while True:
         refusal = _refuse_many(problem.observations, wrong)
         if refusal is not None:
@@ -422,7 +426,10 @@ def _without_wrong_postures(
         trial = wrong.copy()
         trial[suspect] = True
         without = estimate(problem.without(trial), fit.state)
-        if without is None or not _is_contradicted(fit.problem, without, suspect):
+        if without is None:
+            break
+        chances = _chances(problem.without(wrong), without, int(trial.sum()))
+        if chances.get(suspect, 1.0) >= WRONG_PROBABILITY:
             break
         wrong, fit = trial, without
     return CheckedFit(fit, _left_out_in_words(problem.observations, wrong, start))
@@ -434,13 +441,57 @@ def _suspect(fit: HandEyeSolution) -> int | None:
     return worst if left[worst].probability * len(left) < SUSPECT_PROBABILITY else None
 
 
-def _is_contradicted(problem: Problem, without: HandEyeSolution, suspect: int) -> bool:
-    """Predict the suspect with the scatter that the other postures show."""
-    judged = estimate(problem, without.state, without.noise.sigmas, hold_noise=True)
+def _with_doubted_postures(
+    problem: Problem, start: Start, first: HandEyeSolution
+) -> tuple[BoolArray, HandEyeSolution]:
+    """Take back, one by one, gross postures that the others do not contradict.
+
+    The start fits few numbers with six unknowns: most postures of a few lie close to it, whatever
+    they scatter, and the rest then seems gross.
+    """
+    wrong, fit = start.is_wrong.copy(), first
+    while wrong.any():
+        chances = {}
+        for posture in np.flatnonzero(wrong).tolist():
+            trial = wrong.copy()
+            trial[posture] = False
+            among = _chances(problem.without(trial), fit, int(wrong.sum()))
+            chances[posture] = among.get(posture, 0.0)
+        likeliest = max(chances, key=lambda posture: chances[posture])
+        if chances[likeliest] < WRONG_PROBABILITY:
+            break
+        trial = wrong.copy()
+        trial[likeliest] = False
+        found = estimate(problem.without(trial), fit.state)
+        if found is None:
+            break
+        wrong, fit = trial, found
+    return wrong, fit
+
+
+def _chances(problem: Problem, others: HandEyeSolution, n_chosen: int) -> dict[int, float]:
+    """Probability of each posture of a problem by the scatter that ``others`` of it show.
+
+    Scatter that was estimated from few postures is badly known, and it is least where the
+    farthest were left out: Fisher's distribution stands for the normal one's chi-square, and the
+    search over all choices of ``n_chosen`` postures counts. Empty where there is no solution.
+    """
+    judged = estimate(problem, others.state, others.noise.sigmas, hold_noise=True)
     if judged is None:
-        return False
-    left = leave_each_out(judged)
-    return left[suspect].probability * len(left) < WRONG_PROBABILITY
+        return {}
+    n_others = len(others.problem.observations.used_postures)
+    freedom = max(TOLD_BY_STRIPE * n_others - len(problem.columns), 1)
+    choices = comb(n_others + n_chosen, n_chosen)
+    is_given = problem.options.arm_position_mm is not None
+    return {
+        posture: choices
+        * (
+            left.probability
+            if is_given
+            else float(fdtrc(TOLD_BY_STRIPE, freedom, left.pose_sigmas**2))
+        )
+        for posture, left in leave_each_out(judged).items()
+    }
 
 
 def _refuse_many(observations: CondensedObservations, wrong: BoolArray) -> FitFailure | None:
@@ -461,7 +512,8 @@ def _left_out_in_words(
 ) -> tuple[str, ...]:
     """Name the postures that were left out."""
     names, warnings = observations.postures, []
-    gross, mild = np.flatnonzero(start.is_wrong), np.flatnonzero(wrong & ~start.is_wrong)
+    gross = np.flatnonzero(wrong & start.is_wrong)
+    mild = np.flatnonzero(wrong & ~start.is_wrong)
     if len(gross):
         named = ", ".join(f"{names[k]} ({start.rms_mm[k]:.2f} mm)" for k in gross)
         warnings.append(

@@ -347,6 +347,43 @@ def sweep(
     )
 
 
+_BOUNCE_HZ = (0.8, 1.3, 2.1)
+_BOUNCE_MM_S, _ASIDE_MM = 30.0, 8.0
+"""Speed of the stand-off, and way to the side, rms."""
+
+
+def bounce(
+    spot_mm: FloatArray, start: ScanPass, head: Head, arm: ScrewArm, rng: np.random.Generator
+) -> Trajectory:
+    """Hold the head over a spot (3,) as a pass begins, moved nearer and away, aside and tilted.
+
+    Exposures are ``start.n_exposures`` at every second tick of the camera's clock.
+
+    Raises
+    ------
+    EstimationError
+        If the arm does not reach.
+    """
+    ticks = 2 * np.arange(1, start.n_exposures + 1, dtype=np.int64)
+    knots = np.arange(-2 * _MARGIN_S, 1e-9 * CAMERA_CLOCK_NS * ticks[-1] + 2 * _MARGIN_S, _KNOT_S)
+    rates = 2.0 * np.pi * np.array(_BOUNCE_HZ)
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(rates))
+    sizes = _BOUNCE_MM_S * np.sqrt(2.0 / len(rates)) / rates
+    away = np.sin(np.outer(knots, rates) + phases) @ sizes
+    x, y, tilt_x, tilt_y = (size * sway(rng, knots) for size in (_ASIDE_MM, _ASIDE_MM, 1.5, 1.5))
+    sensor_from_tool = head.tool_from_sensor.inverse()
+    joints = [COMFORTABLE_RAD]
+    for k, depth in enumerate(away):
+        held = start.aim.turned(tilt_x[k], tilt_y[k], 0.0, depth)
+        spot = spot_mm + start.base_from_face[:, :2] @ [x[k], y[k]]
+        middle = aim_point_mm(head, held.depth_mm)
+        pose = sensor_over(start.base_from_face, spot, held, middle)
+        joints.append(reach(arm, pose @ sensor_from_tool, joints[-1]))
+    return Trajectory(
+        t_s=knots, joints_rad=np.array(joints[1:]), exposure_t_ns=CAMERA_CLOCK_NS * ticks
+    )
+
+
 def _even_ticks(n_exposures: int, duration_s: float) -> IntArray:
     """(n,) ticks of the camera's clock from the start of a stroke to its end."""
     frames = int(duration_s * 1e9) // CAMERA_CLOCK_NS

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Streams of a rig brought together live, and again from the tables that they leave."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from armscan.devices.matching import InstantMatcher, arm_track
+from armscan.devices.protocols import ArmFlag, ArmSample, Frame, LaserEvent
+from armscan.geometry.poses import Pose
+from armscan.reconstruction.sync import PoseStatus, exposure_poses
+from armscan.records.recording import ExposureRow
+
+IMAGE = np.zeros((1, 1), dtype=np.uint8)
+LATENCY_NS = -4_000_000
+
+
+def true_pose(t_s):
+    place = np.array([30 * np.sin(2 * t_s), 20 * np.cos(1.3 * t_s), 100 + 8 * np.sin(5 * t_s)])
+    return Pose.from_vectors([0.2 * np.sin(t_s), 0.1, 0.3 * np.cos(0.7 * t_s)], place)
+
+
+class Rig:
+    """Two streams with clocks, delays and faults of their own, in the order of arrival."""
+
+    def __init__(self, seed, *, seconds=4.0, drift=1e-4, has_ids=False, n_cameras=1):
+        rng = np.random.default_rng(seed)
+        self.items = []
+        for camera in range(n_cameras):
+            for k in range(round(80 * seconds)):
+                t = k / 80 + 1.0
+                stamp = round((t * (1 + drift) + 77.0 + camera) * 1e9)
+                host = round(t * 1e9 + 5e6 + rng.exponential(2e5))
+                frame = Frame(IMAGE, k, stamp, host, trigger_id=k if has_ids else None)
+                self.items.append((host, "frame", camera, frame, t))
+        for k in range(round(240 * (seconds + 0.1))):
+            t = k / 240 + 0.9931
+            host = round(t * 1e9 + 1e6 + rng.exponential(2e5))
+            stamp = round((t * (1 - drift) - 300.0) * 1e9)
+            sample = ArmSample(k, stamp, host, pose=true_pose(t))
+            self.items.append((host, "sample", 0, sample, t))
+        if has_ids:
+            for k in range(round(80 * seconds)):
+                t = k / 80 + 1.0
+                host = round(t * 1e9 + 2e6 + rng.exponential(2e5))
+                pose = true_pose(t)
+                event = LaserEvent(k, round(t * 1e9), host, ("A",) if k % 2 else ("B",))
+                self.items.append((host, "event", 0, event, t))
+                triggered = ArmSample(k, round((t - 300) * 1e9), host, pose=pose, trigger_id=k)
+                self.items.append((host, "triggered", 0, triggered, t))
+        self.items.sort(key=lambda item: item[0])
+
+    def run(self, matcher, kinds=("frame", "sample", "event"), drop=lambda kind, element: False):
+        """Instants and timed samples, fed and asked for at every arrival."""
+        instants, timed = [], []
+        for host, kind, camera, element, _ in self.items:
+            if kind not in kinds or drop(kind, element):
+                continue
+            if kind == "frame":
+                matcher.add_frame(element, camera)
+            elif kind == "event":
+                matcher.add_events((element,))
+            else:
+                timed += matcher.add_samples((element,))
+            instants += matcher.take(host)
+        return [*instants, *matcher.take(host + 10**9)], timed
+
+
+def of_tables(instants, timed):
+    """What the recording's tables give in batch."""
+    known = [one for one in timed if one.t_ns is not None]
+    track = arm_track([one.t_ns for one in known], [one.pose for one in known])
+    listed = [one for one in instants if one.t_ns is not None]
+    rows = [
+        ExposureRow(k, one.t_ns, 0, str(k), trigger_id=one.trigger_id)
+        for k, one in enumerate(listed)
+    ]
+    return listed, exposure_poses(rows, track, latency_ns=LATENCY_NS)
+
+
+def hole(kind, element):
+    """Samples lost for 0.2 s; a sample here and there; unreferenced for a while."""
+    return kind == "sample" and (400 <= element.number < 448 or element.number % 97 == 5)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_live_and_batch_give_the_same_poses(seed):
+    matcher = InstantMatcher(has_controller=False, latency_ns=LATENCY_NS)
+    instants, timed = Rig(seed).run(matcher, drop=hole)
+    assert [one.frames[0].number for one in instants] == list(range(320))
+    listed, poses = of_tables(instants, timed)
+    assert poses.status.tolist() == [one.status for one in listed]
+    for k, one in enumerate(listed):
+        if one.pose is not None:
+            assert np.array_equal(poses.rotations[k], one.pose.rotation)
+            assert np.array_equal(poses.translations_mm[k], one.pose.translation_mm)
+    status = [one.status for one in instants]
+    # the first half second has no clock yet; the hole of 48 samples at 240/s takes 16 exposures
+    first = status.index(PoseStatus.FOUND)
+    assert 25 <= first < 100 and all(one.t_ns is None for one in instants[:25])
+    assert 15 <= status.count(PoseStatus.GAP) <= 18
+    assert status.count(PoseStatus.FOUND) > 200
+    assert matcher.arm.counts.n_missing == 48 + 11
+
+
+def test_poses_are_where_the_tool_truly_was():
+    """The two least delays, 5 and 1 ms, leave 4 ms between the clocks: that is the latency."""
+    matcher = InstantMatcher(has_controller=False, latency_ns=LATENCY_NS)
+    rig = Rig(7)
+    instants, _ = rig.run(matcher)
+    t_of = {element.number: t for _, kind, _, element, t in rig.items if kind == "frame"}
+    errors = [
+        one.pose.translation_mm - true_pose(t_of[one.frames[0].number]).translation_mm
+        for one in instants
+        if one.pose is not None
+    ]
+    # 30 us of two clocks at 70 mm/s, and the chord's 40 mm/s^2 (4.2 ms)^2 / 8
+    assert len(errors) > 200
+    assert np.linalg.norm(errors, axis=1).max() < 0.01
+
+
+def test_trigger_ids_alone_decide_where_there_are_any():
+    matcher = InstantMatcher(is_triggered=True)
+    kinds = ("frame", "triggered", "event")
+    rig = Rig(4, has_ids=True)
+    lost = {17, 60, 61}
+
+    def drop(kind, element):
+        return kind == "triggered" and element.number in lost
+
+    instants, _ = rig.run(matcher, kinds, drop)
+    assert len(instants) == 320
+    for k, one in enumerate(instants):
+        assert one.trigger_id == k
+        assert one.lasers == (("A",) if k % 2 else ("B",))
+        wanted = PoseStatus.UNKNOWN_TRIGGER if k in lost else PoseStatus.FOUND
+        assert one.status == wanted
+        if one.pose is not None:
+            truth = true_pose(k / 80 + 1.0)
+            assert np.array_equal(one.pose.translation_mm, truth.translation_mm)
+
+
+def test_two_cameras_make_one_instant_and_a_lost_partner_is_left_open():
+    matcher = InstantMatcher(2, is_triggered=True)
+    kinds = ("frame", "triggered", "event")
+    rig = Rig(5, has_ids=True, n_cameras=2)
+    seen = set()
+
+    def drop(kind, element):
+        if kind != "frame" or element.number not in (9, 200):
+            return False
+        twice = (kind, element.number) in seen
+        seen.add((kind, element.number))
+        return not twice
+
+    instants, _ = rig.run(matcher, kinds, drop)
+    assert [one.trigger_id for one in instants] == list(range(320))
+    open_ones = [k for k, one in enumerate(instants) if None in one.frames]
+    assert open_ones == [9, 200]
+
+
+def test_two_cameras_without_ids_meet_by_their_clocks():
+    matcher = InstantMatcher(2, has_controller=False, has_arm=False)
+    instants, _ = Rig(6, n_cameras=2).run(matcher, ("frame",))
+    pairs = [one for one in instants if None not in one.frames]
+    assert len(pairs) > 270
+    assert all(one.frames[0].number == one.frames[1].number for one in pairs)
+
+
+def test_lasers_without_ids_are_told_only_where_they_did_not_change():
+    matcher = InstantMatcher(has_arm=False)
+    found = []
+    for k in range(400):
+        t = k * 12_500_000
+        on = ("A",) if k < 200 else ("B",)
+        matcher.add_events((LaserEvent(k, t, t + 1_000_000, on),))
+        matcher.add_frame(Frame(IMAGE, k, t, t + 15_000_000))
+        found += [one.lasers for one in matcher.take(t + 15_000_000)]
+    assert set(found[60:190]) == {("A",)}
+    assert set(found[210:380]) == {("B",)}
+    assert set(found[196:202]) == {None}
+
+
+def test_an_unreferenced_arm_gives_no_pose():
+    matcher = InstantMatcher(has_controller=False)
+    for k in range(600):
+        t = k * 5_000_000
+        flags = ArmFlag.NONE if 300 <= k < 400 else ArmFlag.REFERENCED
+        matcher.add_samples((ArmSample(k, t, t + 10**6, pose=true_pose(t * 1e-9), flags=flags),))
+        matcher.add_frame(Frame(IMAGE, k, t, t + 10**6))
+    status = [one.status for one in matcher.take(10**12)]
+    assert set(status[310:390]) == {PoseStatus.UNKNOWN_SAMPLE}
+    assert set(status[410:590]) == {PoseStatus.FOUND}

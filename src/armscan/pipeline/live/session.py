@@ -421,10 +421,9 @@ class LiveSession:
         if pose is None or frame is None:
             return LiveStatus.NO_POSE
         last, t_ns = self._last_moved, frame.t_device_ns
-        if last is not None and _turn_rad(last, pose) < STILL_RAD:
-            if np.linalg.norm(last.translation_mm - pose.translation_mm) < STILL_MM:
-                self._wants_pass |= t_ns - self._moved_ns > STOP_NS
-                return LiveStatus.STILL
+        if last is not None and _is_still(last, pose):
+            self._wants_pass |= t_ns - self._moved_ns > STOP_NS
+            return LiveStatus.STILL
         self._last_moved, self._moved_ns = pose, t_ns
         return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None
 
@@ -500,6 +499,11 @@ class LiveSession:
 
     def _has_turned(self, pose: Pose[Base, Tool]) -> bool:
         return _turn_rad(self._passes[-1].first, pose) > NEW_PASS_RAD
+
+
+def _is_still(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
+    path = float(np.linalg.norm(one.translation_mm - other.translation_mm))
+    return path < STILL_MM and _turn_rad(one, other) < STILL_RAD
 
 
 def _turn_rad(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> float:

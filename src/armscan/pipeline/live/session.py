@@ -1,0 +1,546 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live scan: what the command line and the console drive."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+
+from armscan.devices.matching import MatchedInstant
+from armscan.devices.protocols import Frame
+from armscan.errors import ArmscanError, DeviceError, InputError, OptionError
+from armscan.geometry.arrays import FloatArray, ImageArray, IntArray
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.instants import Instant, InstantImages
+from armscan.pipeline.live.acquire import Acquisition, LiveEvent, Recorder
+from armscan.pipeline.live.rig import Rig
+from armscan.pipeline.measure import (
+    MeasuredInstant,
+    MeasureOptions,
+    cameras_of,
+    labeller_for,
+    measure_instants,
+)
+from armscan.reconstruction.labels import PointStatus, StripeLabeller
+from armscan.reconstruction.place import BaseTransform, propagate_to_base
+from armscan.records.cloud import PointCloud
+from armscan.records.exposure import Exposure
+from armscan.records.recording import CameraSetup
+
+NEW_PASS_RAD = np.radians(25.0)
+"""The head shows another side: a pass of its own, that can be undone by itself."""
+STILL_MM, STILL_RAD = 0.05, 5e-4
+"""A hand at rest and an arm's scatter move the tool by less between exposures."""
+STOP_NS = 500_000_000
+"""Standing still for so long ends a pass."""
+MOST_AHEAD = 16
+"""Instants that wait to be measured; further ones are recorded and not shown."""
+LATENCIES = 500
+"""Latest instants over which rate and latency are told."""
+
+SessionState = Literal["closed", "ready", "scanning", "paused", "stopped"]
+
+
+class LiveStatus(Enum):
+    """What became of an instant in the live chain; the recording holds them all."""
+
+    PLACED = "placed in Base"
+    NO_POSE = "without pose"
+    LASER_OFF = "laser off"
+    LASER_UNKNOWN = "what laser was on is not known"
+    INCOMPLETE = "parts of an image were lost"
+    NO_PARTNER = "the other camera's image is missing"
+    STILL = "the hand stood still"
+    NOT_SHOWN = "not measured live: the chain was behind"
+    FAILED = "could not be measured"
+
+
+@dataclass(frozen=True, slots=True)
+class LiveOptions:
+    """How a live scan is measured and shown.
+
+    Parameters
+    ----------
+    measure
+        As of `armscan.pipeline.measure.measure_instants`.
+    voxel_mm
+        One point a voxel and pass is shown.
+    measured_every
+        Every so many instants is measured live.
+    """
+
+    measure: MeasureOptions = field(default_factory=MeasureOptions)
+    voxel_mm: float = 0.5
+    measured_every: int = 1
+
+    def __post_init__(self) -> None:
+        if not 1e-3 <= self.voxel_mm <= 1e3 or self.measured_every < 1:
+            raise OptionError(
+                f"voxels of {self.voxel_mm:g} mm, every {self.measured_every}th instant",
+                remedy="give an edge from 0.001 to 1000 mm and a count from 1",
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraView:
+    """The latest image of one camera.
+
+    Parameters
+    ----------
+    image
+        As delivered.
+    lasers
+        Sources that were on; None where it is not known.
+    points_px
+        (N, 2) measured stripe points, full-sensor pixels.
+    sheet
+        (N,) index into the sensor's sheets.
+    """
+
+    image: ImageArray
+    lasers: tuple[str, ...] | None
+    points_px: FloatArray
+    sheet: IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LiveSnapshot:
+    """What a page shows of a session at one moment.
+
+    Parameters
+    ----------
+    state
+        What it does.
+    cameras
+        One a camera that delivered an image.
+    base_from_tool
+        The latest pose; None where it is not known.
+    range_mm
+        Median depth in Sensor of the latest points; None where nothing was measured.
+    incidence_rad
+        Not measured yet: None.
+    n_passes, n_points
+        Passes and shown points.
+    cloud_version
+        Changes when `LiveSession.cloud` does.
+    counts
+        Instants by status since the start.
+    rate_hz
+        Instants a second that arrived lately.
+    latency_ms
+        Median and 95 % of exposure to shown; None before anything was placed.
+    n_waiting
+        Elements that wait to be recorded.
+    streams
+        What was wrong in each stream, in words: cameras, arm, laser controller.
+    """
+
+    state: SessionState
+    cameras: tuple[CameraView, ...]
+    base_from_tool: Pose[Base, Tool] | None
+    range_mm: float | None
+    incidence_rad: float | None
+    n_passes: int
+    n_points: int
+    cloud_version: int
+    counts: dict[LiveStatus, int]
+    rate_hz: float
+    latency_ms: tuple[float, float] | None
+    n_waiting: int
+    streams: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownCloud:
+    """Points of the live cloud, one a voxel and pass.
+
+    Parameters
+    ----------
+    points_mm
+        (N, 3) in Base.
+    sheet
+        (N,) index into the sensor's sheets.
+    sigma_mm
+        (N,) standard deviation along the worst direction.
+    exposure
+        (N,) number of the instant since the start of the session.
+    """
+
+    points_mm: FloatArray
+    sheet: IntArray
+    sigma_mm: FloatArray
+    exposure: IntArray
+
+
+@dataclass(slots=True, eq=False)
+class _Pass:
+    """Points of one pass, thinned as they come."""
+
+    first: Pose[Base, Tool]
+    voxels: set[int] = field(default_factory=set)
+    pieces: list[ShownCloud] = field(default_factory=list)
+
+    def add(self, cloud: PointCloud, number: int, voxel_mm: float) -> None:
+        cells = np.floor(cloud.points_mm / voxel_mm).astype(np.int64) & (2**21 - 1)
+        keys, places = np.unique(cells @ [1 << 42, 1 << 21, 1], return_index=True)
+        is_new = np.array([key not in self.voxels for key in keys.tolist()], dtype=np.bool_)
+        self.voxels.update(keys[is_new].tolist())
+        kept = cloud.select(np.sort(places[is_new]))
+        exposure = np.full(len(kept), number)
+        self.pieces.append(ShownCloud(kept.points_mm, kept.sheet, kept.sigma_mm, exposure))
+
+
+class LiveSession:
+    """Drives a rig; every method may be called from any thread.
+
+    Parameters
+    ----------
+    rig
+        Opened; `stop` stops it, who opened it closes it.
+    scanner
+        Places what is seen in Base; None only to show images and to record.
+    options
+        Defaults if None.
+    recorder
+        Keeps all that arrives while scanning; None to keep nothing.
+    keep_cloud
+        Told of the full points in Base of every instant placed, with its rows' number.
+
+    Raises
+    ------
+    InputError
+        If the rig has not the scanner's cameras, or no arm.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        scanner: ScannerCalibration | None = None,
+        *,
+        options: LiveOptions | None = None,
+        recorder: Recorder | None = None,
+        keep_cloud: Callable[[int, PointCloud], None] | None = None,
+    ) -> None:
+        self.options = options or LiveOptions()
+        self._rig, self._scanner, self._recorder = rig, scanner, recorder
+        self._keep_cloud = keep_cloud
+        self._labeller = self._checked(rig, scanner)
+        latency_ns = 0 if scanner is None else scanner.latency_ns
+        self._acquisition = Acquisition(rig, self._take, self._tell, latency_ns=latency_ns)
+        self._lock = threading.RLock()
+        self._listeners: list[Callable[[LiveEvent], None]] = []
+        self._state: SessionState = "closed"
+        self._todo: queue.Queue[tuple[int, MatchedInstant] | None] = queue.Queue(MOST_AHEAD)
+        self._measuring = threading.Thread(target=self._measure, daemon=True)
+        self._passes: list[_Pass] = []
+        self._version = self._n_instants = 0
+        self._counts: Counter[LiveStatus] = Counter()
+        self._frames: dict[int, tuple[Frame, tuple[str, ...] | None]] = {}
+        self._stripes: dict[int, tuple[FloatArray, IntArray]] = {}
+        self._latest: Pose[Base, Tool] | None = None
+        self._moved_ns = 0
+        self._last_moved: Pose[Base, Tool] | None = None
+        self._range_mm: float | None = None
+        self._arrivals: deque[int] = deque(maxlen=LATENCIES)
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)
+        self._wants_pass = True
+        self._now: tuple[int, MatchedInstant] | None = None
+
+    def _checked(self, rig: Rig, scanner: ScannerCalibration | None) -> StripeLabeller | None:
+        if scanner is None:
+            return None
+        if scanner.sensor is None or rig.arm is None:
+            raise InputError("a live scan needs a scanner with cameras and an arm")
+        n = len(cameras_of(scanner.sensor))
+        if n != len(rig.cameras):
+            raise InputError(
+                f"the rig has {len(rig.cameras)} cameras, the scanner {n}",
+                remedy="give the scanner's calibration that belongs to this rig",
+            )
+        return labeller_for(scanner.sensor, self.options.measure, is_scan=True)
+
+    def add_listener(self, listener: Callable[[LiveEvent], None]) -> None:
+        """Have events told; from the threads in which they happen."""
+        self._listeners.append(listener)
+
+    def open(self) -> None:
+        """Start the rig and show its images; nothing is recorded yet.
+
+        Raises
+        ------
+        DeviceError
+            If a device does not answer, or the session was opened before.
+        """
+        if self._state != "closed":
+            raise DeviceError("a session is opened once", remedy="make a new one")
+        self._acquisition.start()
+        self._measuring.start()
+        self._change("ready")
+
+    def start(self) -> None:
+        """Begin to scan with a new pass; opens the rig if nobody did."""
+        if self._state == "closed":
+            self.open()
+        self.resume()
+
+    def resume(self) -> None:
+        """Go on with a new pass."""
+        self._wants_pass = True
+        self._acquisition.recorder = self._recorder
+        self._change("scanning")
+
+    def pause(self) -> None:
+        """Show images, and neither record nor place."""
+        self._acquisition.recorder = None
+        self._change("paused")
+
+    def undo_pass(self) -> None:
+        """Take the last pass out of the live cloud; the recording keeps it."""
+        with self._lock:
+            if self._passes:
+                self._passes.pop()
+            self._wants_pass = True
+            self._version += 1
+        self._tell(LiveEvent("pass", "the last pass was taken back"))
+
+    def clear(self) -> None:
+        """Empty the live cloud; the recording keeps all."""
+        with self._lock:
+            self._passes.clear()
+            self._wants_pass = True
+            self._version += 1
+
+    def stop(self) -> None:
+        """Lasers off; what arrived is recorded and measured to its end."""
+        if self._state in ("closed", "stopped"):
+            return
+        self._acquisition.stop()
+        self._todo.put(None)
+        self._measuring.join()
+        self._change("stopped")
+
+    def snapshot(self) -> LiveSnapshot:
+        """What there is to show now."""
+        nobody = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+        with self._lock:
+            views = tuple(
+                CameraView(frame.image, lasers, *self._stripes.get(k, nobody))
+                for k, (frame, lasers) in sorted(self._frames.items())
+            )
+            times, late = list(self._arrivals), list(self._latencies)
+            span = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else 0.0
+            matcher = self._acquisition.matcher
+            monitors = (*matcher.cameras, matcher.arm, matcher.controller)
+            return LiveSnapshot(
+                state=self._state,
+                cameras=views,
+                base_from_tool=self._latest,
+                range_mm=self._range_mm,
+                incidence_rad=None,
+                n_passes=len(self._passes),
+                n_points=sum(len(one.voxels) for one in self._passes),
+                cloud_version=self._version,
+                counts=dict(self._counts),
+                rate_hz=(len(times) - 1) / span if span > 0.0 else 0.0,
+                latency_ms=(float(np.median(late)), float(np.quantile(late, 0.95)))
+                if late
+                else None,
+                n_waiting=self._acquisition.n_waiting,
+                streams=tuple(one.counts.words for one in monitors),
+            )
+
+    def cloud(self) -> ShownCloud:
+        """The live cloud of all passes that were not taken back."""
+        with self._lock:
+            pieces = [piece for one in self._passes for piece in one.pieces]
+        if not pieces:
+            none = np.zeros(0, dtype=np.int64)
+            return ShownCloud(np.zeros((0, 3)), none, np.zeros(0), none)
+        return ShownCloud(
+            np.concatenate([one.points_mm for one in pieces]),
+            np.concatenate([one.sheet for one in pieces]),
+            np.concatenate([one.sigma_mm for one in pieces]),
+            np.concatenate([one.exposure for one in pieces]),
+        )
+
+    def _change(self, state: SessionState) -> None:
+        self._state = state
+        self._tell(LiveEvent("state", state))
+
+    def _tell(self, event: LiveEvent) -> None:
+        for listener in tuple(self._listeners):
+            listener(event)
+
+    def _take(self, instant: MatchedInstant) -> None:
+        """Decide what becomes of an instant; from the matching thread."""
+        frames = enumerate(instant.frames)
+        with self._lock:
+            self._frames |= {k: (one, instant.lasers) for k, one in frames if one is not None}
+            self._arrivals.append(time.monotonic_ns())
+            self._latest = instant.pose
+            if self._state != "scanning" or self._labeller is None:
+                return
+            number = self._n_instants
+            self._n_instants += 1
+            status = self._fault(instant) or self._moved(instant, number)
+            if status is not None:
+                self._counts[status] += 1
+                return
+        try:
+            self._todo.put_nowait((number, instant))
+        except queue.Full:
+            self._count(LiveStatus.NOT_SHOWN)
+
+    def _count(self, status: LiveStatus) -> None:
+        with self._lock:
+            self._counts[status] += 1
+
+    def _fault(self, instant: MatchedInstant) -> LiveStatus | None:
+        if any(frame is None for frame in instant.frames):
+            return LiveStatus.NO_PARTNER
+        if not all(frame is not None and frame.is_complete for frame in instant.frames):
+            return LiveStatus.INCOMPLETE
+        if instant.lasers is None and self._rig.lasers is not None:
+            return LiveStatus.LASER_UNKNOWN
+        if instant.lasers == ():
+            return LiveStatus.LASER_OFF
+        return LiveStatus.NO_POSE if instant.pose is None else None
+
+    def _moved(self, instant: MatchedInstant, number: int) -> LiveStatus | None:
+        """Drop what the hand shows while it is still, and thin what is measured."""
+        pose, frame = instant.pose, instant.frames[0]
+        if pose is None or frame is None:
+            return LiveStatus.NO_POSE
+        last, t_ns = self._last_moved, frame.t_device_ns
+        if last is not None and _is_still(last, pose):
+            self._wants_pass |= t_ns - self._moved_ns > STOP_NS
+            return LiveStatus.STILL
+        self._last_moved, self._moved_ns = pose, t_ns
+        return LiveStatus.NOT_SHOWN if number % self.options.measured_every else None
+
+    def _feed(self) -> Iterator[InstantImages]:
+        while (found := self._todo.get()) is not None:
+            self._now = found
+            number, instant = found
+            if self._scanner is None or instant.pose is None:
+                continue
+            setups = [camera.setup for camera in self._rig.cameras]
+            both = zip(instant.frames, setups, strict=True)
+            exposures = [
+                exposure_of(frame, setup, instant, camera)
+                for camera, (frame, setup) in enumerate(both)
+                if frame is not None
+            ]
+            yield InstantImages(
+                tuple((exposure, None) for exposure in exposures),
+                instant.pose @ self._scanner.hand_eye.tool_from_sensor,
+                Instant((number,) * len(exposures), _time_ns(instant)),
+            )
+        self._now = None
+
+    def _measure(self) -> None:
+        if self._scanner is None or self._scanner.sensor is None or self._labeller is None:
+            while self._todo.get() is not None:
+                """Nothing can be placed."""
+            return
+        transform = BaseTransform.of(self._scanner)
+        while True:
+            try:
+                for one in measure_instants(
+                    self._feed(), self._labeller, self._scanner.sensor, self.options.measure,
+                    is_pass=True, reads_ahead=False,
+                ):  # fmt: skip
+                    if self._now is not None:
+                        self._place(one, *self._now, transform)
+                return
+            except ArmscanError as error:
+                self._count(LiveStatus.FAILED)
+                self._tell(LiveEvent("warning", str(error)))
+
+    def _place(
+        self, one: MeasuredInstant, number: int, instant: MatchedInstant, transform: BaseTransform
+    ) -> None:
+        """Put the points of an instant into the pass that it belongs to."""
+        pose = instant.pose
+        if pose is None:
+            return
+        clouds, depths = [], []
+        for found in one.profiles:
+            labelled = found.labelled
+            clouds.append(propagate_to_base(found.points, labelled.profile, pose, transform))
+            depths.append(found.points.points_mm[:, 2])
+        with self._lock:
+            if self._wants_pass or not self._passes or self._has_turned(pose):
+                self._passes.append(_Pass(pose))
+                self._wants_pass = False
+            for camera, (found, cloud) in enumerate(zip(one.profiles, clouds, strict=True)):
+                seen = found.labelled.status == PointStatus.MEASURED
+                pixels = found.labelled.profile.points_px[seen]
+                self._stripes[camera] = pixels, found.labelled.sheet[seen]
+                self._passes[-1].add(cloud, number, self.options.voxel_mm)
+            depth = np.concatenate(depths)
+            self._range_mm = float(np.median(depth)) if len(depth) else None
+            self._counts[LiveStatus.PLACED] += 1
+            self._version += 1
+            start = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)
+            self._latencies.append((time.monotonic_ns() - start) / 1e6)
+        if self._keep_cloud is not None:
+            for cloud in clouds:
+                self._keep_cloud(number, cloud)
+
+    def _has_turned(self, pose: Pose[Base, Tool]) -> bool:
+        return _turn_rad(self._passes[-1].first, pose) > NEW_PASS_RAD
+
+
+def _is_still(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:
+    path = float(np.linalg.norm(one.translation_mm - other.translation_mm))
+    return path < STILL_MM and _turn_rad(one, other) < STILL_RAD
+
+
+def _turn_rad(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> float:
+    chord = float(np.linalg.norm(one.rotation - other.rotation)) / np.sqrt(8.0)
+    return float(2.0 * np.arcsin(min(chord, 1.0)))
+
+
+def _time_ns(instant: MatchedInstant) -> int:
+    first = next(frame for frame in instant.frames if frame is not None)
+    return first.t_device_ns if instant.t_ns is None else instant.t_ns
+
+
+def exposure_of(
+    frame: Frame, setup: CameraSetup, instant: MatchedInstant, camera: int = 0
+) -> Exposure:
+    """An image as the measuring loop takes it, equal to what a recording of it gives.
+
+    Raises
+    ------
+    DeviceError
+        If the camera delivers a Bayer pattern.
+    """
+    if setup.colour == "bayer_rggb":
+        raise DeviceError(
+            "the camera delivers a Bayer pattern, which is not measured live",
+            remedy="set the camera to mono or RGB, or reconstruct the recording",
+        )
+    image = frame.image
+    if setup.align == "high":
+        image = np.right_shift(image, 8 * image.dtype.itemsize - setup.bits_used)
+    return Exposure(
+        image,
+        f"camera {camera} frame {frame.number}",
+        bits_used=setup.bits_used,
+        window=frame.window,
+        lasers=instant.lasers or (),
+        t_ns=_time_ns(instant),
+        camera=camera,
+        trigger_id=frame.trigger_id,
+    )

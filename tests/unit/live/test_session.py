@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from armscan.devices.protocols import ArmSample, Frame
-from armscan.errors import DeviceError
+from armscan.devices.protocols import ArmSample, CameraSettings, Frame
+from armscan.errors import DeviceError, OutputError
 from armscan.pipeline.live.rig import Rig, RigDescription
 from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
 from armscan.pipeline.scan import ScanOptions, measure_scan
@@ -43,6 +43,13 @@ class Device:
         if isinstance(element, Frame):
             return replace(element, t_host_ns=now)
         return tuple(replace(one, t_host_ns=now) for one in element)
+
+    @property
+    def settings(self) -> CameraSettings:
+        return CameraSettings()
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        return settings
 
     def stop(self) -> None:
         self.calls.append("stop")
@@ -167,3 +174,51 @@ def test_a_rig_opens_all_devices_or_none() -> None:
     with pytest.raises(DeviceError, match="taken"):
         Rig.open(RigDescription(("a", "b"), arm="c"), open_device)
     assert [device.calls for device in opened] == [["close"], ["close"]]
+
+
+class FaultyRecorder:
+    """Fails at the first image: as a full disk, or by a fault of its own."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def add_frame(self, camera: int, frame: Frame, status: object) -> None:
+        raise self.error
+
+    def add_samples(self, samples: object) -> None:
+        """Keeps none."""
+
+    def add_events(self, events: object) -> None:
+        """Keeps none."""
+
+    def add_instant(self, instant: object) -> None:
+        """Keeps none."""
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_scan() -> None:
+    scan = triggered_scan(4)
+    recorder = FaultyRecorder(OutputError("the disk is full"))
+    session, _, told = run(rig_of(scan), 4, recorder=recorder)
+    assert session.snapshot().counts == {LiveStatus.PLACED: 4}
+    assert [event.text for event in told if event.kind == "warning"] == [
+        "the recording ended: the disk is full."
+    ]
+
+
+def test_a_fault_in_matching_is_told_and_nobody_waits_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("armscan.pipeline.live.acquire.MOST_WAITING", 2)
+    scan = triggered_scan(8)
+    rig = rig_of(scan)
+    told: list[Any] = []
+    session = LiveSession(rig, scanner(), recorder=FaultyRecorder(ValueError("a fault of its own")))
+    session.add_listener(told.append)
+    session.start()
+    end = time.monotonic() + 10.0
+    while not any(event.kind == "fault" for event in told) and time.monotonic() < end:
+        time.sleep(0.01)
+    session.stop()
+    assert [e.text for e in told if e.kind == "fault"] == [
+        "the images are no longer matched: ValueError: a fault of its own"
+    ]

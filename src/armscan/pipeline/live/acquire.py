@@ -22,6 +22,7 @@ SILENT_S = 2.0
 """A device that delivers nothing for so long is pointed out."""
 MOST_WAITING = 512
 """Elements that wait to be matched and recorded; more, and this computer cannot keep up."""
+BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"
 
 EventKind = Literal["state", "pass", "fault", "recovered", "button", "warning"]
 
@@ -97,6 +98,7 @@ class Acquisition:
         self._deliver, self._tell = deliver, tell
         self._arrived: queue.Queue[tuple[str, int, Any]] = queue.Queue(MOST_WAITING)
         self._stopping = threading.Event()
+        self._is_broken = threading.Event()
         self._threads: list[threading.Thread] = []
         self._buttons = 0
 
@@ -106,9 +108,13 @@ class Acquisition:
         Raises
         ------
         DeviceError
-            If a device does not answer.
+            If a device does not answer; all are stopped then.
         """
-        self.rig.start()
+        try:
+            self.rig.start()
+        except DeviceError:
+            self.rig.stop()
+            raise
         for k, camera in enumerate(self.rig.cameras):
             self._run(self._read, "frame", k, camera)
         if self.rig.arm is not None:
@@ -151,13 +157,35 @@ class Acquisition:
                 if is_silent:
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
                 last, is_silent = time.monotonic(), False
-                self._arrived.put((what, k, found))
+                self._put(what, k, found)
             elif not is_silent and (fault or time.monotonic() - last > SILENT_S):
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
                 self._tell(LiveEvent("fault", fault or since, device.name))
 
+    def _put(self, what: str, k: int, found: Any) -> None:
+        """Hand on what arrived; while there is no room the device's own buffer must hold."""
+        is_told = False
+        while not self._is_broken.is_set():
+            try:
+                self._arrived.put((what, k, found), timeout=READ_S)
+            except queue.Full:
+                if not is_told:
+                    self._tell(LiveEvent("warning", BEHIND, "recorder"))
+                is_told = True
+            else:
+                return
+
     def _match(self) -> None:
+        """Match until all is read; whatever ends it early is told, and no reader waits for it."""
+        try:
+            self._match_all()
+        except Exception as error:  # any fault of it must not hang those that wait
+            self._is_broken.set()
+            text = f"the images are no longer matched: {type(error).__name__}: {error}"
+            self._tell(LiveEvent("fault", text))
+
+    def _match_all(self) -> None:
         readers = self._threads[:-1] if self._threads else []
         while True:
             try:
@@ -182,8 +210,11 @@ class Acquisition:
 
     def _hand_out(self, now_ns: int) -> None:
         for instant in self.matcher.take(now_ns):
-            self._record(lambda recorder, one=instant: recorder.add_instant(one))
+            self._record_instant(instant)
             self._deliver(instant)
+
+    def _record_instant(self, instant: MatchedInstant) -> None:
+        self._record(lambda recorder: recorder.add_instant(instant))
 
     def _record(self, write: Callable[[Recorder], None]) -> None:
         recorder = self.recorder

@@ -498,7 +498,7 @@ class LiveSession:
                 self._keep_cloud(number, cloud)
 
     def _has_turned(self, pose: Pose[Base, Tool]) -> bool:
-        return _turn_rad(self._passes[-1].first, pose) > NEW_PASS_RAD
+        return bool(_turn_rad(self._passes[-1].first, pose) > NEW_PASS_RAD)
 
 
 def _is_still(one: Pose[Base, Tool], other: Pose[Base, Tool]) -> bool:

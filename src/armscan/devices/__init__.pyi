@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # What `from armscan.devices import ...` offers; loaded when it is first asked for.
+from .inbox import Inbox as Inbox
 from .protocols import Arm as Arm
 from .protocols import ArmFlag as ArmFlag
 from .protocols import ArmSample as ArmSample
@@ -10,6 +11,11 @@ from .protocols import DeviceInfo as DeviceInfo
 from .protocols import Frame as Frame
 from .protocols import LaserController as LaserController
 from .protocols import LaserEvent as LaserEvent
+from .protocols import SimulatedRig as SimulatedRig
+from .registry import DriverReport as DriverReport
+from .registry import find_devices as find_devices
+from .registry import open_device as open_device
+from .registry import survey_drivers as survey_drivers
 from .sources import ScanSource as ScanSource
 from .sources import SimulatedScan as SimulatedScan
 from .sources import Twin as Twin

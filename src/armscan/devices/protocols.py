@@ -232,7 +232,7 @@ class LaserController(Protocol):
     def set_schedule(self, steps: Sequence[tuple[str, ...]]) -> None:
         """Sources of one trigger after the other, repeated; holds until it is set anew.
 
-        Before the first call no laser comes on.
+        Until the first call it is the controller's own, if it has one.
         """
 
     def set_next(self, lasers: tuple[str, ...]) -> None:
@@ -271,7 +271,7 @@ class SimulatedRig(Protocol):
         """
 
     def press(self, button: int, seconds: float = 0.2) -> None:
-        """Hold a button of the arm."""
+        """Hold a button of the arm, counted from 0."""
 
     def inject(self, device: str, fault: Fault, amount: float = 1.0) -> None:
         """Make a device fail.

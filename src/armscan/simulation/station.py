@@ -460,6 +460,23 @@ class TwinScan:
             view=shot.row.view,
         )
 
+    def as_set(self, brighter: float, window: Window | None) -> TwinScan:
+        """The scan by cameras that gather more light, and read another part of the sensor."""
+        head = self.head
+        lasers = tuple(replace(one, irradiance=brighter * one.irradiance) for one in head.lasers)
+        imaging = replace(head.imaging, ambient=brighter * head.imaging.ambient)
+        shots = []
+        for shot in self.shots:
+            light = shot.settings.room_light
+            settings = replace(
+                shot.settings,
+                window=window or shot.settings.window,
+                room_light=None if light is None else brighter * light,
+            )
+            shots.append(replace(shot, settings=settings))
+        brighter_head = replace(head, lasers=lasers, imaging=imaging)
+        return replace(self, head=brighter_head, shots=tuple(shots))
+
     def true_pose(self, row: int) -> Pose[Base, Sensor]:
         """Where the head truly is in the middle of an exposure."""
         return self.shots[row].base_from_sensor

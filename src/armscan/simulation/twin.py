@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -14,7 +16,8 @@ from armscan.errors import OptionError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, CameraRight, Part, Pose, Sensor, Tool
 from armscan.records.recording import SessionKind
-from armscan.simulation.arm.hand import SweptScene
+from armscan.simulation.arm.arm import COMFORTABLE_RAD, reach
+from armscan.simulation.arm.hand import HandWay, SweptScene
 from armscan.simulation.head import HEADS, RIGHT, sheet_points_mm
 from armscan.simulation.instrument import (
     TIP_DIAMETER_MM,
@@ -288,6 +291,71 @@ class SimulatedInstrument:
         if scene in ("markers", "markers-moved"):
             return marker_scene(tools, scene == "markers-moved", rng)
         return scan_scene(tools, cast(SweptScene, scene), rng)
+
+
+STROKE_NS = 1_000_000_000
+"""Instants of a scene that are farther apart belong to two strokes: passes last 0.4 s a step at
+most, postures are 2 s apart at least."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneStage:
+    """A scene as it is gone through.
+
+    Parameters
+    ----------
+    scene, scan
+        Its name, and its images.
+    instants
+        Rows of each instant, one a camera.
+    way
+        Of the arm.
+    """
+
+    scene: TwinScene
+    scan: TwinScan
+    instants: tuple[tuple[int, ...], ...]
+    way: HandWay
+
+    @staticmethod
+    def of(twin: SimulatedInstrument, scene: TwinScene) -> SceneStage:
+        """Find the way through a scene; raises as `SimulatedInstrument.scan` does."""
+        scan = twin.scan(scene)
+        instants: dict[tuple[int, int | None], list[int]] = {}
+        for number, row in enumerate(scan.rows):
+            instants.setdefault((row.t_ns, row.trigger_id), []).append(number)
+        rows = tuple(tuple(found) for found in instants.values())
+        strokes = [0]
+        for last, this in pairwise(rows):
+            a, b = scan.rows[last[0]], scan.rows[this[0]]
+            is_one = b.t_ns - a.t_ns < STROKE_NS or (a.view is not None and a.view == b.view)
+            strokes.append(strokes[-1] + (not is_one))
+        if scan.arm is None:
+            joints = np.tile(COMFORTABLE_RAD, (len(rows), 1))
+        else:
+            joints = _joints_rad(twin, scan, [found[0] for found in rows])
+        return SceneStage(scene, scan, rows, HandWay(joints, strokes))
+
+    def rows_lit_by(self, k: int, lasers: tuple[str, ...]) -> tuple[int, ...]:
+        """Rows of an instant; of one of the same view, if the scene has one with these lasers."""
+        own = self.scan.rows[self.instants[k][0]]
+        if own.lasers == lasers or own.view is None:
+            return self.instants[k]
+        for rows in self.instants:
+            other = self.scan.rows[rows[0]]
+            if other.view == own.view and other.lasers == lasers:
+                return rows
+        return self.instants[k]
+
+
+def _joints_rad(twin: SimulatedInstrument, scan: TwinScan, rows: Sequence[int]) -> FloatArray:
+    """(N, 7) true joint angles with which the arm holds the head as the rows' images saw it."""
+    tools = twin.instrument
+    sensor_from_tool = tools.head.tool_from_sensor.inverse()
+    joints = [COMFORTABLE_RAD]
+    for row in rows:
+        joints.append(reach(tools.arm.true, scan.true_pose(row) @ sensor_from_tool, joints[-1]))
+    return np.array(joints[1:])
 
 
 def build_twin(

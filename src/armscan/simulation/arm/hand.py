@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a person holds and leads the head: orientations over a face, scan passes, tremor."""
+"""How a person holds and leads the head: orientations over a face, scan passes, tremor, ways."""
 
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, Literal
@@ -517,3 +518,90 @@ def still_step(fixtures: Fixtures, head: Head) -> tuple[FloatArray, FloatArray, 
     face, origin = fixtures.base_from_ground.rotation, fixtures.base_from_ground.translation_mm
     lift = 0.5 * STEP_HEIGHTS_MM[block] * face[:, 2]
     return face, on_face(face, origin, STEP_CENTRES_MM[block]) + lift, light_upright(head)
+
+
+_REST_SHARE = 0.2
+"""Part of the way from stroke to stroke that the hand waits at its end."""
+
+
+class HandWay:
+    """Joint angles at each instant of a scene, and between them.
+
+    Within a stroke a spline that begins and ends at rest; from stroke to stroke, and from the last
+    instant back to the first, the smoothest way there, then a wait.
+
+    Parameters
+    ----------
+    joints_rad
+        (N, 7) at the instants.
+    stroke
+        N numbers: instants of one stroke have the same and follow each other.
+    """
+
+    def __init__(self, joints_rad: FloatArray, stroke: Sequence[int]) -> None:
+        self.joints_rad = joints_rad
+        self._stroke = list(stroke)
+        self._first = [self._stroke.index(number) for number in self._stroke]
+        self._splines = {
+            first: CubicSpline(np.arange(n), joints_rad[first : first + n], bc_type="clamped")
+            for first in set(self._first)
+            if (n := self._first.count(first)) > 1
+        }
+
+    def is_travel(self, k: int) -> bool:
+        """Whether another stroke follows after instant ``k``."""
+        return k + 1 >= len(self._stroke) or self._stroke[k] != self._stroke[k + 1]
+
+    def between(self, k: int, share: FloatArray) -> FloatArray:
+        """(N, 7) after parts (N,) of the time from instant ``k`` to the next."""
+        if not self.is_travel(k):
+            first = self._first[k]
+            return np.asarray(self._splines[first](k - first + share))
+        following = self.joints_rad[(k + 1) % len(self.joints_rad)]
+        return led(self.joints_rad[k], following, share)
+
+
+def led(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
+    """(N, 7) on the way of least jerk (Flash and Hogan 1985), which is over before the time is."""
+    u = np.clip(share / (1.0 - _REST_SHARE), 0.0, 1.0)[:, None]
+    return np.asarray(start + (end - start) * u**3 * (10.0 - 15.0 * u + 6.0 * u**2))
+
+
+_HISTORY_NS = 12_000_000_000
+"""What the hand did is forgotten after so long."""
+
+
+class HandHistory:
+    """Where the joints were over the last seconds: ways, each followed by a wait at its end.
+
+    Parameters
+    ----------
+    joints_rad
+        (7,) where the arm rests at first.
+    """
+
+    def __init__(self, joints_rad: FloatArray) -> None:
+        self._ways: deque[tuple[int, int, Callable[[FloatArray], FloatArray]]] = deque()
+        self.go(0, 0, lambda share: np.tile(joints_rad, (len(share), 1)))
+
+    @property
+    def end_ns(self) -> int:
+        """When the last way is or was over."""
+        return self._ways[-1][1]
+
+    def go(self, start_ns: int, end_ns: int, way: Callable[[FloatArray], FloatArray]) -> None:
+        """Go a way between two times: ``way`` gives angles (N, 7) after parts (N,) of them."""
+        self._ways.append((start_ns, end_ns, way))
+        while len(self._ways) > 2 and self._ways[1][0] < start_ns - _HISTORY_NS:
+            self._ways.popleft()
+
+    def joints_rad(self, t_ns: IntArray) -> FloatArray:
+        """True angles (N, 7) at times (N,); before the history where it begins."""
+        joints = np.zeros((len(t_ns), N_JOINTS))
+        starts = np.array([start_ns for start_ns, _, _ in self._ways])
+        which = np.clip(np.searchsorted(starts, t_ns, side="right") - 1, 0, None)
+        for k in np.unique(which):
+            (start_ns, end_ns, way), here = self._ways[int(k)], which == k
+            share = (t_ns[here] - start_ns) / max(end_ns - start_ns, 1)
+            joints[here] = way(np.clip(share, 0.0, 1.0))
+        return joints

@@ -150,9 +150,12 @@ def test_another_thing_is_put_before_the_head(bench: Bench) -> None:
     bench.until(lambda: len(bench.frames) >= 1)
     bench.camera.show("ball")  # type: ignore[attr-defined]
     n = len(bench.frames)
-    bench.until(lambda: len(bench.frames) >= n + 4)
-    wanted = bench.rig.scan_by(0, bench.rig._stage).expose(0, ("A",)).image
-    assert any(np.array_equal(frame.image, wanted) for frame in bench.frames[n:])
+    scan = bench.rig.scan_by(0, bench.rig._stage)
+    wanted = [scan.expose(k, ("A",)).image for k in range(3)]
+    # images of the scene before may be on their way, and a busy machine skips triggers
+    bench.until(
+        lambda: any(np.array_equal(f.image, one) for f in bench.frames[n:] for one in wanted)
+    )
     assert bench.rig.scene == "ball"
     with pytest.raises(OptionError, match="no images of a scene"):
         bench.rig.show("moon")

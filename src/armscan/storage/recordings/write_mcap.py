@@ -45,6 +45,7 @@ CHUNK_SECONDS = 0.5
 SYNC_SECONDS = 1.0
 """So often the system is asked to put all on the disk: a power cut loses about as much."""
 NS_PER_S = 1_000_000_000
+NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
 
 EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC = "/exposures", "/arm/samples", "/events"
 TRANSFORM_TOPIC = "/tf"
@@ -181,7 +182,7 @@ class RecordingWriter:
         """
         self._session = session
         try:
-            self._handle = os.open(self._path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+            self._handle = os.open(self._path, NEW_FILE, 0o666)
             self._write((MAGIC, _record(records.Header("", "armscan"))))
             self._declare(len(session.cameras))
             for name, data in {SESSION_FILE: session_toml(session), **(documents or {})}.items():
@@ -195,7 +196,11 @@ class RecordingWriter:
         self._thread.start()
 
     def add_exposure(
-        self, row: ExposureRow, image: ImageArray | bytes, flags: Sequence[str] = ()
+        self,
+        row: ExposureRow,
+        image: ImageArray | bytes,
+        flags: Sequence[str] = (),
+        cells: Mapping[str, str] | None = None,
     ) -> float:
         """Record one exposure; its pixels are copied, the caller may use the array again.
 
@@ -207,6 +212,8 @@ class RecordingWriter:
             (H, W) uint8 or uint16, (H, W, 3) uint8 red, green, blue; or a whole image file.
         flags
             Marks of the synchronisation, as ``no-pose``.
+        cells
+            Its line of ``exposures.csv`` as it stands there; made of ``row`` if None.
 
         Returns
         -------
@@ -222,7 +229,8 @@ class RecordingWriter:
             raise InputError(f"camera {row.camera} is not among those of the session")
         pieces, facts = _image_message(row, image, self._session)
         topic = f"/camera/{row.camera}/" + facts["stored"]
-        cells = {name: column[0] for name, column in exposure_columns((row,), {}).items()}
+        if cells is None:
+            cells = {name: column[0] for name, column in exposure_columns((row,), {}).items()}
         said: dict[str, Any] = {
             "index": row.index,
             "t_ns": row.t_ns,
@@ -232,14 +240,17 @@ class RecordingWriter:
             "trigger_id": row.trigger_id,
             "view": row.view,
             "flags": list(flags),
-            "cells": cells,
+            "cells": dict(cells),
             "image": {"topic": topic, **facts},
         }
         pixels = _Message(self._of_topic[topic], "images", row.t_ns, pieces)
         return self._put(pixels, self._json(EXPOSURE_TOPIC, row.t_ns, said, n_exposures=1))
 
     def add_arm_samples(
-        self, track: ArmTrack, columns: Mapping[str, Sequence[str]] | None = None
+        self,
+        track: ArmTrack,
+        columns: Mapping[str, Sequence[str]] | None = None,
+        cells: Mapping[str, Sequence[str]] | None = None,
     ) -> float:
         """Record samples of the arm.
 
@@ -249,6 +260,8 @@ class RecordingWriter:
             (N,) samples as delivered.
         columns
             (N,) texts of further columns by name, as buttons.
+        cells
+            (N,) texts of all columns of ``arm.csv`` as they stand there; made of ``track`` if None.
 
         Returns
         -------
@@ -257,7 +270,8 @@ class RecordingWriter:
         """
         session = self._session
         extra = {name: tuple(cells) for name, cells in (columns or {}).items()}
-        cells = arm_columns(track, session.pose_form, session.rotation, extra)
+        if cells is None:
+            cells = arm_columns(track, session.pose_form, session.rotation, extra)
         rows = [list(row) for row in zip(*cells.values(), strict=True)]
         first = int(track.t_ns[0]) if len(track) else 0
         table = self._json(ARM_TOPIC, first, {"columns": list(cells), "rows": rows})
@@ -443,7 +457,7 @@ class RecordingWriter:
         for first in range(0, len(pieces), 500):
             rest = [memoryview(piece) for piece in pieces[first : first + 500] if piece]
             while rest:
-                done = os.writev(self._handle, rest)
+                done = _write_some(self._handle, rest)
                 total += done
                 while rest and done >= len(rest[0]):
                     done -= len(rest.pop(0))
@@ -521,6 +535,13 @@ class RecordingWriter:
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
         footer = head + struct.pack("<I", zlib.crc32(head, zlib.crc32(body)))
         return (end, body, footer, MAGIC)
+
+
+def _write_some(handle: int, pieces: list[memoryview]) -> int:
+    """Windows cannot write several pieces at once."""
+    if hasattr(os, "writev"):
+        return os.writev(handle, pieces)
+    return os.write(handle, pieces[0])
 
 
 def _record(record: records.McapRecord) -> bytes:

@@ -52,7 +52,7 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
     chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
-    looks = ["clean", "inspect", "verify", "mesh", "convert", "info", "doctor"]
+    looks = ["clean", "inspect", "verify", "mesh", "convert", "recover", "info", "doctor"]
     assert names == [*chain, "register", *looks]
 
 

@@ -21,6 +21,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from armscan.errors import OutputError
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 
 SESSION = Session(cameras=(CameraSetup(width_px=40, height_px=30),))
@@ -121,6 +122,9 @@ def test_a_killed_recorder_keeps_all_that_is_older_than_a_second(
     listed, _ = found_in(path.read_bytes())
     assert listed == list(range(len(listed)))
     assert len(listed) > max(old, default=0) > 0
+    saved = extract_recording(path, tmp_path / "saved", is_recovering=True)
+    assert saved.n_exposures == len(listed)
+    assert saved.lost
 
 
 def test_a_full_disk_keeps_what_is_there_and_says_how_much(

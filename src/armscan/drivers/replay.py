@@ -102,6 +102,8 @@ class Playback:
             raise DeviceError("the recording holds no exposure", where=source.name)
         self.source = source
         self.sources = tuple(sorted({name for row in source.rows for name in row.lasers}))
+        ids = [row.trigger_id for row in source.rows if row.trigger_id is not None]
+        self._ids_of_round = max(ids) - min(ids) + 1 if ids else 0
         self._is_loop = is_loop
         self._plays = _plays(source)
         own_ns = _usual_step_ns(source)
@@ -271,7 +273,7 @@ class Playback:
     def _element(self, number: int, device: str, what: int) -> Any:
         """A frame, sample or event; None for an image that cannot be read."""
         rows = self.source.rows
-        passed = number * (1 + max((row.trigger_id or 0 for row in rows), default=0))
+        passed = number * self._ids_of_round
         if device == "arm":
             return self._sample(what, passed)
         row = rows[what]

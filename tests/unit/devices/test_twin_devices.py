@@ -149,8 +149,13 @@ def test_another_thing_is_put_before_the_head(bench: Bench) -> None:
     bench.start()
     bench.until(lambda: len(bench.frames) >= 1)
     bench.camera.show("ball")  # type: ignore[attr-defined]
-    wanted = bench.rig.scan_by(0, bench.rig._stage).expose(0, ("A",)).image
-    bench.until(lambda: np.array_equal(bench.frames[-1].image, wanted))
+    n = len(bench.frames)
+    scan = bench.rig.scan_by(0, bench.rig._stage)
+    wanted = [scan.expose(k, ("A",)).image for k in range(3)]
+    # images of the scene before may be on their way, and a busy machine skips triggers
+    bench.until(
+        lambda: any(np.array_equal(f.image, one) for f in bench.frames[n:] for one in wanted)
+    )
     assert bench.rig.scene == "ball"
     with pytest.raises(OptionError, match="no images of a scene"):
         bench.rig.show("moon")

@@ -16,9 +16,12 @@ INFO_EXAMPLE = "\b\nExample:\n  armscan info camera.json photos/ cloud.ply"
 CONVERT_EXAMPLE = (
     "\b\nExample:\n"
     "  armscan convert cloud.ply cloud.e57\n"
-    "  armscan convert camera.json camera_info.yaml"
+    "  armscan convert camera.json camera_info.yaml\n"
+    "  armscan convert scan/ scan.mcap"
 )
 DEVICES_EXAMPLE = "\b\nExample:\n  armscan devices\n  armscan devices --kind camera --json"
+RECOVER_EXAMPLE = "\b\nExample:\n  armscan recover broken.mcap -o scan"
+SUFFIX_OF_RECORDING = ".mcap"
 DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
 
 
@@ -42,24 +45,30 @@ def convert(
         Path,
         typer.Argument(
             help="A cloud: .ply, .e57, .laz, .las, .pcd, .csv, .xyz, .asc, .txt; vertices of .stl, "
-            ".obj; or a calibration.",
+            ".obj; a calibration; or a recording: its folder or .mcap.",
             show_default=False,
         ),
     ],
     output: Annotated[
         Path,
         typer.Argument(
-            help="A cloud: the same but .stl; of a calibration .yaml (ROS camera_info).",
+            help="A cloud: the same but .stl; of a calibration .yaml (ROS camera_info); "
+            "of a recording .mcap or a new folder.",
             show_default=False,
         ),
     ],
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a cloud in another format, or a calibration's camera for ROS."""
+    """Write a cloud or recording in another format, or a calibration's camera for ROS."""
     from armscan.report.quantity import Summary
     from armscan.storage.clouds import convert_file
 
+    if SUFFIX_OF_RECORDING in (source.suffix.lower(), output.suffix.lower()):
+        from armscan.jobs.live.recordings import convert_recording
+
+        show(convert_recording(source, output, is_overwriting=force), as_json=as_json)
+        return
     done = convert_file(source, output, is_overwriting=force)
     losses = (f"the new file does not hold: {', '.join(done.losses)}",) if done.losses else ()
     summary = Summary(
@@ -70,6 +79,20 @@ def convert(
         extra={"kind": "conversion", "what": done.what, "losses": list(done.losses)},
     )
     show(summary, as_json=as_json)
+
+
+def recover(
+    source: Annotated[Path, typer.Argument(help="A .mcap recording.", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="A new folder, or .mcap.", show_default=False)
+    ],
+    force: Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write what is whole of a recording that was killed, cut or damaged."""
+    from armscan.jobs.live.recordings import recover_recording
+
+    show(recover_recording(source, output, is_overwriting=force), as_json=as_json)
 
 
 def doctor(

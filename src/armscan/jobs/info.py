@@ -555,6 +555,10 @@ NEEDED = (
     "rich",
     "jinja2",
     "matplotlib",
+    "mcap",
+    "mcap-protobuf-support",
+    "foxglove-schemas-protobuf",
+    "zstandard",
 )
 OPENCV_NAMES = (
     "opencv-python-headless",

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings from a folder to one file and back, and what is whole of a broken file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from armscan.errors import OptionError
+from armscan.report.quantity import Quantity, Summary
+from armscan.storage.files import check_outputs, is_folder, scratch_folder
+from armscan.storage.recordings.read_mcap import ReadBack, extract_recording, record_folder
+
+SUFFIX = ".mcap"
+
+
+def convert_recording(source: Path, output: Path, *, is_overwriting: bool = False) -> Summary:
+    """Write a folder recording as one file, or the other way.
+
+    Raises
+    ------
+    OptionError
+        If neither is a folder.
+    FileFormatError
+        If the source cannot be read, or is unfinished.
+    OutputError
+        If the output exists or cannot be written.
+    """
+    if source.suffix.lower() == SUFFIX and output.suffix.lower() != SUFFIX:
+        return _summary("Converted: recording to a folder.", extract_recording(source, output),
+                        output)  # fmt: skip
+    if not is_folder(source):
+        raise OptionError(
+            f"there is no conversion from {source.name} to {output.name}",
+            remedy="convert the folder of a recording to .mcap, or a .mcap to a folder",
+        )
+    check_outputs((output,), is_overwriting=is_overwriting)
+    status = record_folder(source, output)
+    return Summary(
+        title="Converted: recording to one file.",
+        quantities=(Quantity("exposures", "exposures", status.n_written),),
+        written=(output,),
+        next_step=f"armscan convert {output} FOLDER",
+        extra={"kind": "conversion"},
+    )
+
+
+def recover_recording(source: Path, output: Path, *, is_overwriting: bool = False) -> Summary:
+    """Write what is whole of a killed or damaged file as a folder, or as a file that has its end.
+
+    Raises
+    ------
+    FileFormatError
+        If no exposure is whole.
+    OutputError
+        If the output exists or cannot be written.
+    """
+    title = "Recovered."
+    if output.suffix.lower() != SUFFIX:
+        return _summary(title, extract_recording(source, output, is_recovering=True), output)
+    check_outputs((output,), is_overwriting=is_overwriting)
+    with scratch_folder(output) as scratch:
+        folder = scratch / "recording"
+        found = extract_recording(source, folder, is_recovering=True)
+        record_folder(folder, output)
+    return _summary(title, found, output)
+
+
+def _summary(title: str, found: ReadBack, output: Path) -> Summary:
+    aside = (
+        (f"{found.n_aside} exposures or samples were set aside: their times or numbers repeat or "
+         "go back, or their names cannot be used",)
+        if found.n_aside
+        else ()
+    )  # fmt: skip
+    is_file = output.suffix.lower() == SUFFIX
+    return Summary(
+        title=title,
+        quantities=(
+            Quantity("exposures", "exposures", found.n_exposures),
+            Quantity("arm_samples", "arm samples", found.n_samples),
+            Quantity("events", "events", found.n_events),
+            Quantity("set_aside", "set aside", found.n_aside),
+            Quantity("seconds", "duration", found.seconds, unit="s"),
+        ),
+        warnings=(*(f"lost: {text}" for text in found.lost), *aside, *found.warnings),
+        written=(output,),
+        next_step=f"armscan convert {output} FOLDER" if is_file else f"armscan info {output}",
+        extra={"kind": "recording", "lost": list(found.lost)},
+    )

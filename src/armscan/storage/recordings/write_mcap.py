@@ -1,0 +1,601 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A live recording written to one MCAP file by a thread of its own; a killed run loses at most what
+was still waiting and the open chunks.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import threading
+import time
+import zlib
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+import numpy as np
+import zstandard
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap_protobuf.schema import build_file_descriptor_set
+from scipy.spatial.transform import Rotation
+
+from armscan.errors import InputError, OutputError
+from armscan.geometry.arrays import ImageArray
+from armscan.records.recording import ArmTrack, ExposureRow, Session
+from armscan.storage.arm import arm_columns
+from armscan.storage.files import path_text
+from armscan.storage.images import image_format
+from armscan.storage.recording_session import SESSION_FILE, exposure_columns, session_toml
+
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_BYTES = 4 << 20
+"""Of images in one chunk: reading one exposure unpacks no more than this and one image."""
+CHUNK_SECONDS = 0.5
+"""After so long a chunk is closed and handed to the system; a killed process loses no more."""
+SYNC_SECONDS = 1.0
+"""So often the system is asked to put all on the disk: a power cut loses about as much."""
+NS_PER_S = 1_000_000_000
+NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
+
+EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC = "/exposures", "/arm/samples", "/events"
+TRANSFORM_TOPIC = "/tf"
+Compression = Literal["auto", "raw", "zstd"]
+
+
+@dataclass(frozen=True, slots=True)
+class WriterOptions:
+    """How a recording is written; nothing of it changes a pixel.
+
+    Parameters
+    ----------
+    compression
+        ``raw``; ``zstd`` at level 1; ``auto`` packs while less than half of the queue is filled,
+        on a machine of at least two cores.
+    queue_bytes
+        Images that may wait; a caller waits when they are that many.
+    """
+
+    compression: Compression = "auto"
+    queue_bytes: int = 256 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class WriterStatus:
+    """How far a recording is.
+
+    Parameters
+    ----------
+    n_accepted, n_written
+        Exposures that were given, and those whose chunk the system has.
+    fill
+        Part of the queue that is filled, 0 to 1.
+    n_waits
+        How often a caller had to wait for room.
+    n_bytes
+        Size of the file.
+    """
+
+    n_accepted: int
+    n_written: int
+    fill: float
+    n_waits: int
+    n_bytes: int
+
+
+@dataclass
+class _Message:
+    channel: int
+    kind: str
+    t_ns: int
+    pieces: tuple[bytes, ...]
+    n_exposures: int = 0
+
+    @property
+    def n_bytes(self) -> int:
+        return sum(map(len, self.pieces))
+
+
+@dataclass
+class _Chunk:
+    """An open chunk: messages whose bytes are not joined before they are written."""
+
+    pieces: list[bytes] = field(default_factory=list)
+    n_bytes: int = 0
+    times: list[int] = field(default_factory=list)
+    index: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    n_exposures: int = 0
+
+    def add(self, message: _Message, sequence: int) -> None:
+        time_ns = max(message.t_ns, 0)
+        length = 22 + message.n_bytes
+        head = struct.pack(
+            "<BQHIQQ", Opcode.MESSAGE, length, message.channel, sequence, time_ns, time_ns
+        )
+        self.index.setdefault(message.channel, []).append((time_ns, self.n_bytes))
+        self.pieces += (head, *message.pieces)
+        self.n_bytes += 9 + length
+        self.times.append(time_ns)
+        self.n_exposures += message.n_exposures
+
+
+class RecordingWriter:
+    """Writes a recording while it is taken.
+
+    Exposures, samples of the arm and events may be added from several threads. Times may be in any
+    order: what is recorded is what was delivered. A file whose `close` never came has no summary;
+    its chunks are whole and checksummed, and a reader that goes through a file from its beginning
+    finds them.
+
+    Parameters
+    ----------
+    path
+        File to write; must not exist.
+    options
+        How it is written.
+    """
+
+    def __init__(self, path: Path, options: WriterOptions | None = None) -> None:
+        self._path, self._options = path, options or WriterOptions()
+        self._ready = threading.Condition()
+        self._queue: deque[_Message] = deque()
+        self._queued_bytes = 0
+        self._is_closing = False
+        self._failure: OSError | None = None
+        self._n_accepted = self._n_written = self._n_waits = 0
+        self._handle = -1
+        self._size = 0
+        self._schemas: list[records.Schema] = []
+        self._channels: list[records.Channel] = []
+        self._attachments: list[records.AttachmentIndex] = []
+        self._chunks: list[records.ChunkIndex] = []
+        self._sequence: Counter[int] = Counter()
+        self._counts: Counter[int] = Counter()
+        self._synced = 0.0
+        self._session = Session()
+        self._of_topic: dict[str, int] = {}
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+
+    def begin(self, session: Session, documents: Mapping[str, bytes] | None = None) -> None:
+        """Make the file, with what holds for all of it.
+
+        Parameters
+        ----------
+        session
+            Cameras, clock and form of the poses; written as ``session.toml``.
+        documents
+            Further files of a recording by name, as ``arm.toml``.
+
+        Raises
+        ------
+        OutputError
+            If the file exists or cannot be made.
+        """
+        self._session = session
+        try:
+            self._handle = os.open(self._path, NEW_FILE, 0o666)
+            self._write((MAGIC, _record(records.Header("", "armscan"))))
+            self._declare(len(session.cameras))
+            for name, data in {SESSION_FILE: session_toml(session), **(documents or {})}.items():
+                self._attach(name, data)
+        except OSError as error:
+            raise OutputError(
+                f"the recording cannot be begun ({error.strerror})",
+                where=path_text(self._path),
+                remedy="choose another name or folder",
+            ) from error
+        self._thread.start()
+
+    def add_exposure(
+        self,
+        row: ExposureRow,
+        image: ImageArray | bytes,
+        flags: Sequence[str] = (),
+        cells: Mapping[str, str] | None = None,
+    ) -> float:
+        """Record one exposure; its pixels are copied, the caller may use the array again.
+
+        Parameters
+        ----------
+        row
+            Its facts; ``source`` is its name in a folder.
+        image
+            (H, W) uint8 or uint16, (H, W, 3) uint8 red, green, blue; or a whole image file.
+        flags
+            Marks of the synchronisation, as ``no-pose``.
+        cells
+            Its line of ``exposures.csv`` as it stands there; made of ``row`` if None.
+
+        Returns
+        -------
+        fill
+            Part of the queue that is filled, 0 to 1; at 1 the next call waits.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or refuses; says how much is safe.
+        """
+        if not 0 <= row.camera < len(self._session.cameras):
+            raise InputError(f"camera {row.camera} is not among those of the session")
+        pieces, facts = _image_message(row, image, self._session)
+        topic = f"/camera/{row.camera}/" + facts["stored"]
+        if cells is None:
+            cells = {name: column[0] for name, column in exposure_columns((row,), {}).items()}
+        said: dict[str, Any] = {
+            "index": row.index,
+            "t_ns": row.t_ns,
+            "camera": row.camera,
+            "file": row.source,
+            "lasers": list(row.lasers),
+            "trigger_id": row.trigger_id,
+            "view": row.view,
+            "flags": list(flags),
+            "cells": dict(cells),
+            "image": {"topic": topic, **facts},
+        }
+        pixels = _Message(self._of_topic[topic], "images", row.t_ns, pieces)
+        return self._put(pixels, self._json(EXPOSURE_TOPIC, row.t_ns, said, n_exposures=1))
+
+    def add_arm_samples(
+        self,
+        track: ArmTrack,
+        columns: Mapping[str, Sequence[str]] | None = None,
+        cells: Mapping[str, Sequence[str]] | None = None,
+    ) -> float:
+        """Record samples of the arm.
+
+        Parameters
+        ----------
+        track
+            (N,) samples as delivered.
+        columns
+            (N,) texts of further columns by name, as buttons.
+        cells
+            (N,) texts of all columns of ``arm.csv`` as they stand there; made of ``track`` if None.
+
+        Returns
+        -------
+        fill
+            As `add_exposure`.
+        """
+        session = self._session
+        extra = {name: tuple(cells) for name, cells in (columns or {}).items()}
+        if cells is None:
+            cells = arm_columns(track, session.pose_form, session.rotation, extra)
+        rows = [list(row) for row in zip(*cells.values(), strict=True)]
+        first = int(track.t_ns[0]) if len(track) else 0
+        table = self._json(ARM_TOPIC, first, {"columns": list(cells), "rows": rows})
+        quaternions = Rotation.from_matrix(np.asarray(track.rotations)).as_quat()
+        shown = [
+            self._transform(track, k, quaternions[k])
+            for k in range(len(track))
+            if track.is_known[k]
+        ]
+        return self._put(table, *shown)
+
+    def add_event(self, t_ns: int, kind: str, facts: Mapping[str, Any] | None = None) -> float:
+        """Record what happened, as a button or a lost packet; returns as `add_exposure`."""
+        return self._put(self._json(EVENT_TOPIC, t_ns, {"kind": kind, "facts": dict(facts or {})}))
+
+    def status(self) -> WriterStatus:
+        """How far the recording is."""
+        with self._ready:
+            fill = min(1.0, self._queued_bytes / self._options.queue_bytes)
+            return WriterStatus(self._n_accepted, self._n_written, fill, self._n_waits, self._size)
+
+    def close(self) -> WriterStatus:
+        """Write all that waits, and the summary with which readers find exposures.
+
+        Raises
+        ------
+        OutputError
+            If the disk is full or refuses; says how much is safe.
+        """
+        with self._ready:
+            self._is_closing = True
+            self._ready.notify_all()
+        if self._thread.is_alive():
+            self._thread.join()
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+        self._refuse_failed()
+        return self.status()
+
+    def __enter__(self) -> RecordingWriter:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _refuse_failed(self) -> None:
+        if self._failure is not None:
+            raise OutputError(
+                f"the recording stopped ({self._failure.strerror}): {self._n_written} exposures of "
+                f"{self._n_accepted} are safe",
+                where=path_text(self._path),
+                remedy="free some space, and record the rest into a new file",
+            ) from self._failure
+
+    def _put(self, *messages: _Message) -> float:
+        n_bytes = sum(message.n_bytes for message in messages)
+        most = self._options.queue_bytes
+        with self._ready:
+            is_waiting = self._queue and self._queued_bytes + n_bytes > most
+            self._n_waits += bool(is_waiting)
+            while self._queue and self._queued_bytes + n_bytes > most and self._failure is None:
+                self._ready.wait()
+            self._refuse_failed()
+            if self._is_closing or self._handle < 0:
+                raise InputError("the recording is not open", remedy="call begin first")
+            self._queue += messages
+            self._queued_bytes += n_bytes
+            self._n_accepted += sum(message.n_exposures for message in messages)
+            self._ready.notify_all()
+            return min(1.0, self._queued_bytes / most)
+
+    def _run(self) -> None:
+        """The thread: fill chunks, close them when they are full or old, write them."""
+        chunks = {kind: _Chunk() for kind in ("images", "views", "tables")}
+        begun = time.monotonic()
+        try:
+            while True:
+                messages, is_last = self._take(begun + CHUNK_SECONDS)
+                for message in messages:
+                    chunk = chunks[message.kind]
+                    chunk.add(message, self._sequence[message.channel])
+                    self._sequence[message.channel] += 1
+                    if message.kind == "images" and chunk.n_bytes >= CHUNK_BYTES:
+                        self._close_chunk(chunks, "images")
+                    with self._ready:
+                        self._queued_bytes -= message.n_bytes
+                        self._ready.notify_all()
+                if is_last or time.monotonic() >= begun + CHUNK_SECONDS:
+                    # facts last: an exposure that is listed has its image
+                    for kind in chunks:
+                        self._close_chunk(chunks, kind)
+                    begun = time.monotonic()
+                if is_last:
+                    self._write(self._summary())
+                    os.fsync(self._handle)
+                    return
+        except OSError as error:
+            self._stop(error)
+
+    def _take(self, until: float) -> tuple[list[_Message], bool]:
+        with self._ready:
+            while not self._queue and not self._is_closing:
+                left = until - time.monotonic()
+                if left <= 0.0:
+                    break
+                self._ready.wait(left)
+            # one exposure at a time: what was taken still counts as waiting
+            taken = [self._queue.popleft()] if self._queue else []
+            return taken, self._is_closing and not self._queue
+
+    def _stop(self, error: OSError) -> None:
+        """Cut what was begun off, and close what is whole as well as the disk allows."""
+        try:
+            os.ftruncate(self._handle, self._size)
+            os.lseek(self._handle, self._size, os.SEEK_SET)
+            self._write(self._summary())
+            os.fsync(self._handle)
+        except OSError:
+            os.ftruncate(self._handle, self._size)
+        with self._ready:
+            self._failure = error
+            self._queue.clear()
+            self._queued_bytes = 0
+            self._ready.notify_all()
+
+    def _close_chunk(self, chunks: dict[str, _Chunk], kind: str) -> None:
+        chunk, chunks[kind] = chunks[kind], _Chunk()
+        if not chunk.n_bytes:
+            return
+        crc = 0
+        for piece in chunk.pieces:
+            crc = zlib.crc32(piece, crc)
+        pieces, name = chunk.pieces, ""
+        if self._is_packing():
+            pieces, name = [zstandard.ZstdCompressor(level=1).compress(b"".join(pieces))], "zstd"
+        packed = sum(map(len, pieces))
+        first, last = min(chunk.times), max(chunk.times)
+        inner = struct.pack("<QQQII", first, last, chunk.n_bytes, crc, len(name))
+        inner += name.encode() + struct.pack("<Q", packed)
+        head = struct.pack("<BQ", Opcode.CHUNK, len(inner) + packed) + inner
+        start, length = self._size, len(head) + packed
+        indexes = {n: _record(records.MessageIndex(n, at)) for n, at in chunk.index.items()}
+        offsets, place = {}, start + length
+        for channel, content in indexes.items():
+            offsets[channel] = place
+            place += len(content)
+        self._write((head, *pieces, *indexes.values()))
+        self._chunks.append(
+            records.ChunkIndex(
+                chunk_length=length,
+                chunk_start_offset=start,
+                compression=name,
+                compressed_size=packed,
+                message_end_time=last,
+                message_index_length=place - start - length,
+                message_index_offsets=offsets,
+                message_start_time=first,
+                uncompressed_size=chunk.n_bytes,
+            )
+        )
+        self._counts.update({channel: len(at) for channel, at in chunk.index.items()})
+        with self._ready:
+            self._n_written += chunk.n_exposures
+        if time.monotonic() - self._synced > SYNC_SECONDS:
+            os.fsync(self._handle)
+            self._synced = time.monotonic()
+
+    def _is_packing(self) -> bool:
+        chosen = self._options.compression
+        if chosen != "auto":
+            return chosen == "zstd"
+        return (os.cpu_count() or 1) > 1 and 2 * self._queued_bytes < self._options.queue_bytes
+
+    def _write(self, pieces: Sequence[bytes]) -> None:
+        """Write pieces that belong together; the file's size counts them when all are written."""
+        total = 0
+        for first in range(0, len(pieces), 500):
+            rest = [memoryview(piece) for piece in pieces[first : first + 500] if piece]
+            while rest:
+                done = _write_some(self._handle, rest)
+                total += done
+                while rest and done >= len(rest[0]):
+                    done -= len(rest.pop(0))
+                if done:
+                    rest[0] = rest[0][done:]
+        self._size += total
+
+    def _declare(self, n_cameras: int) -> None:
+        for kind in (RawImage, CompressedImage, FrameTransform):
+            data = build_file_descriptor_set(kind).SerializeToString()
+            self._schema(kind.DESCRIPTOR.full_name, "protobuf", data)
+        for name in ("Exposure", "ArmSamples", "Event"):
+            self._schema(f"armscan.{name}", "jsonschema", b'{"type": "object"}')
+        for camera in range(n_cameras):
+            self._channel(f"/camera/{camera}/raw", "protobuf", 1)
+            self._channel(f"/camera/{camera}/file", "protobuf", 2)
+        self._channel(TRANSFORM_TOPIC, "protobuf", 3)
+        self._channel(EXPOSURE_TOPIC, "json", 4)
+        self._channel(ARM_TOPIC, "json", 5)
+        self._channel(EVENT_TOPIC, "json", 6)
+
+    def _schema(self, name: str, encoding: str, data: bytes) -> None:
+        schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
+        self._schemas.append(schema)
+        self._write((_record(schema),))
+
+    def _channel(self, topic: str, encoding: str, schema: int) -> None:
+        channel = records.Channel(len(self._channels) + 1, topic, encoding, {}, schema)
+        self._channels.append(channel)
+        self._of_topic[topic] = channel.id
+        self._write((_record(channel),))
+
+    def _attach(self, name: str, data: bytes) -> None:
+        content = _record(records.Attachment(0, 0, name, "application/octet-stream", data))
+        index = records.AttachmentIndex(
+            self._size, len(content), 0, 0, len(data), name, "application/octet-stream"
+        )
+        self._write((content,))
+        self._attachments.append(index)
+
+    def _json(self, topic: str, t_ns: int, facts: Any, n_exposures: int = 0) -> _Message:
+        content = json.dumps(facts, ensure_ascii=False).encode()
+        return _Message(self._of_topic[topic], "tables", t_ns, (content,), n_exposures)
+
+    def _transform(self, track: ArmTrack, row: int, quaternion: Any) -> _Message:
+        shown = FrameTransform(parent_frame_id="base", child_frame_id="tool")
+        t_ns = int(track.t_ns[row])
+        _set_time(shown, t_ns)
+        shown.translation.x, shown.translation.y, shown.translation.z = (
+            1e-3 * float(value) for value in track.translations_mm[row]
+        )
+        turn = shown.rotation
+        turn.x, turn.y, turn.z, turn.w = map(float, quaternion)
+        channel = self._of_topic[TRANSFORM_TOPIC]
+        return _Message(channel, "views", t_ns, (shown.SerializeToString(),))
+
+    def _summary(self) -> tuple[bytes, ...]:
+        ends = [index.message_end_time for index in self._chunks]
+        starts = [index.message_start_time for index in self._chunks]
+        statistics = records.Statistics(
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=dict(self._counts),
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max(ends, default=0),
+            message_start_time=min(starts, default=0),
+            metadata_count=0,
+            schema_count=len(self._schemas),
+        )
+        end = _record(records.DataEnd(0))
+        listed = (*self._schemas, *self._channels, statistics, *self._chunks, *self._attachments)
+        body = b"".join(map(_record, listed))
+        start = self._size + len(end)
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0)
+        footer = head + struct.pack("<I", zlib.crc32(head, zlib.crc32(body)))
+        return (end, body, footer, MAGIC)
+
+
+def _write_some(handle: int, pieces: list[memoryview]) -> int:
+    """Windows cannot write several pieces at once."""
+    if hasattr(os, "writev"):
+        return os.writev(handle, pieces)
+    return os.write(handle, pieces[0])
+
+
+def _record(record: records.McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def _set_time(message: Any, t_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(max(t_ns, 0), NS_PER_S)
+
+
+def _varint(value: int) -> bytes:
+    content = bytearray()
+    while value > 0x7F:
+        content.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes((*content, value))
+
+
+def _image_message(
+    row: ExposureRow, image: ImageArray | bytes, session: Session
+) -> tuple[tuple[bytes, ...], dict[str, Any]]:
+    """Bytes of an image's message without a copy of the pixels into it, and what is stored."""
+    shown: Any
+    if isinstance(image, bytes):
+        kind = image_format(image)
+        if kind is None:
+            raise InputError("these bytes are no image file", where=row.source)
+        shown, data, tag = CompressedImage(frame_id="sensor", format=kind.lower()), image, 0x12
+        facts: dict[str, Any] = {"stored": "file", "format": kind.lower()}
+    else:
+        encoding = _encoding(image, session.cameras[row.camera].colour, row.source)
+        height, width = image.shape[:2]
+        data, tag = np.ascontiguousarray(image).tobytes(), 0x32
+        shown = RawImage(
+            frame_id="sensor", width=width, height=height, encoding=encoding,
+            step=len(data) // height,
+        )  # fmt: skip
+        facts = {"stored": "raw", "encoding": encoding, "width_px": width, "height_px": height}
+    _set_time(shown, row.t_ns)
+    facts |= {"crc32": zlib.crc32(data), "bytes": len(data)}
+    return (shown.SerializeToString(), bytes([tag]) + _varint(len(data)), data), facts
+
+
+def _encoding(image: ImageArray, colour: str, source: str) -> str:
+    if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
+        return "rgb8"
+    if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or not image.size:
+        raise InputError(
+            f"an image of shape {image.shape} and type {image.dtype} is not recorded raw",
+            where=source,
+            remedy="give uint8, or uint16 of one channel, or the bytes of an image file",
+        )
+    if image.dtype == np.uint16:
+        return "mono16"
+    return "bayer_rggb8" if colour == "bayer_rggb" else "mono8"

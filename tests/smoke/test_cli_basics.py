@@ -52,8 +52,19 @@ def test_help_lists_the_commands_as_the_chain(capsys: pytest.CaptureFixture[str]
     listed = capsys.readouterr().out.split("\nCommands:\n")[1].split("\n\n")[0]
     names = [line.split()[0] for line in listed.splitlines() if line[2:3].strip()]
     chain = ["demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers"]
-    looks = ["clean", "inspect", "verify", "mesh", "convert", "recover", "info", "doctor"]
-    assert names == [*chain, "register", *looks]
+    looks = ["clean", "inspect", "verify", "mesh", "convert", "recover", "info", "devices"]
+    assert names == [*chain, "register", *looks, "doctor"]
+
+
+def test_devices_lists_what_is_there_and_the_drivers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["devices", "--kind", "arm", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert {one["kind"] for one in told["devices"]} == {"arm"}
+    drivers = {one["name"]: one for one in told["drivers"]}
+    assert "webcam" not in drivers and drivers["tcp"]["problem"] == ""
+    assert main(["devices"]) == 0
+    assert "twin:thesis-single" in capsys.readouterr().out
+    assert main(["devices", "--kind", "moon"]) == 2
 
 
 @pytest.mark.parametrize("path", [(), ("calibrate",), ("inspect",)], ids=" ".join)

@@ -28,7 +28,7 @@ HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
     *("clean", "inspect", "verify", "mesh"),
-    *("convert", "recover", "info", "doctor"),
+    *("convert", "recover", "info", "devices", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
 
@@ -110,6 +110,7 @@ app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("recover", epilog=files.RECOVER_EXAMPLE)(files.recover)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)
+app.command("devices", epilog=files.DEVICES_EXAMPLE)(files.devices)
 app.command("doctor", epilog=files.DOCTOR_EXAMPLE)(files.doctor)
 
 

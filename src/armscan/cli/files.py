@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``armscan info``, ``convert`` and ``doctor``: what files are, other formats, the installation."""
+"""``armscan info``, ``convert``, ``doctor`` and ``devices``: files, formats, what is installed."""
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +19,7 @@ CONVERT_EXAMPLE = (
     "  armscan convert camera.json camera_info.yaml\n"
     "  armscan convert scan/ scan.mcap"
 )
+DEVICES_EXAMPLE = "\b\nExample:\n  armscan devices\n  armscan devices --kind camera --json"
 RECOVER_EXAMPLE = "\b\nExample:\n  armscan recover broken.mcap -o scan"
 SUFFIX_OF_RECORDING = ".mcap"
 DOCTOR_EXAMPLE = "\b\nExample:\n  armscan doctor --warm"
@@ -105,3 +108,43 @@ def doctor(
     show(summary, as_json=as_json)
     if summary.warnings:
         raise typer.Exit(1)
+
+
+class Kind(StrEnum):
+    """Kind of a device."""
+
+    CAMERA = "camera"
+    ARM = "arm"
+    LASERS = "lasers"
+
+
+def devices(
+    kind: Annotated[Kind | None, typer.Option(help="Only these.", show_default=False)] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the cameras, arms and laser controllers that are there, and the drivers for others."""
+    from armscan.devices.registry import survey_drivers
+    from armscan.report.quantity import Summary, Table
+
+    reports = [
+        one for one in survey_drivers() if kind is None or not one.kinds or kind in one.kinds
+    ]
+    found = [one for report in reports for one in report.found if kind is None or one.kind == kind]
+    listed = tuple((one.address, one.kind, one.label) for one in found)
+    drivers = tuple((one.name, ", ".join(one.kinds), one.problem or "ready") for one in reports)
+    summary = Summary(
+        title=f"{len(found)} devices say that they are there; others are opened by their address.",
+        tables=(
+            *((Table(("device", "kind", "what it is"), listed, "", (1, 2)),) if listed else ()),
+            Table(("driver", "opens", "state"), drivers, "", (1, 2)),
+        ),
+        extra={
+            "kind": "devices",
+            "devices": [asdict(one) for one in found],
+            "drivers": [
+                {"name": one.name, "kinds": list(one.kinds), "problem": one.problem}
+                for one in reports
+            ],
+        },
+    )
+    show(summary, as_json=as_json)

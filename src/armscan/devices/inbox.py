@@ -39,7 +39,7 @@ class Inbox(Generic[T]):
         self.name = name
         self.n_lost = 0
         self._most = most
-        self._waiting: deque[tuple[int, T]] = deque()
+        self._waiting: deque[tuple[int, T | DeviceError]] = deque()
         self._changed = threading.Condition()
         self._fault: DeviceError | None = None
         self._is_closed = False
@@ -56,9 +56,14 @@ class Inbox(Generic[T]):
             self._changed.notify_all()
 
     def fail(self, fault: DeviceError | None) -> None:
-        """Raise this from every `take` that finds nothing left, until None takes it back."""
+        """Raise this from every `take` that finds nothing left, until None takes it back.
+
+        It is raised once at least, between what came before and what comes after it.
+        """
         with self._changed:
             self._fault = fault
+            if fault is not None:
+                self._waiting.append((0, fault))
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> T | None:
@@ -112,7 +117,14 @@ class Inbox(Generic[T]):
         found: list[T] = []
         now_ns = time.monotonic_ns()
         while self._waiting and self._waiting[0][0] <= now_ns and len(found) < most:
-            found.append(self._waiting.popleft()[1])
+            element = self._waiting[0][1]
+            if isinstance(element, DeviceError):
+                if not found:
+                    self._waiting.popleft()
+                    raise element
+                return found
+            found.append(element)
+            self._waiting.popleft()
         return found
 
 

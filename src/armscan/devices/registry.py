@@ -101,8 +101,8 @@ def find_devices(kind: DeviceKind | None = None) -> tuple[DeviceInfo, ...]:
 
 def survey_drivers() -> tuple[DriverReport, ...]:
     """Ask all installed drivers, sorted by name, what they find."""
-    points = sorted(entry_points(group=DEVICE_GROUP), key=lambda point: point.name)
-    return tuple(_survey(point) for point in points)
+    names = sorted(entry_points(group=DEVICE_GROUP).names)
+    return tuple(_survey(_entry_point(name, name)) for name in names)
 
 
 def _survey(point: EntryPoint) -> DriverReport:

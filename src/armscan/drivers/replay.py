@@ -8,6 +8,7 @@ alike, so that what lies between them keeps its place.
 from __future__ import annotations
 
 import queue
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -102,6 +103,8 @@ class Playback:
             raise DeviceError("the recording holds no exposure", where=source.name)
         self.source = source
         self.sources = tuple(sorted({name for row in source.rows for name in row.lasers}))
+        ids = [row.trigger_id for row in source.rows if row.trigger_id is not None]
+        self._ids_of_round = max(ids) - min(ids) + 1 if ids else 0
         self._is_loop = is_loop
         self._plays = _plays(source)
         own_ns = _usual_step_ns(source)
@@ -131,6 +134,7 @@ class Playback:
         self._clock = clock
         self.started: set[str] = set()
         self.lock = threading.Condition()
+        self.scratch: tempfile.TemporaryDirectory[str] | None = None
         self._is_closed = False
         self._is_playing = False
         self._images: queue.Queue[Exposure | ArmscanError] = queue.Queue(_READ_AHEAD)
@@ -181,6 +185,8 @@ class Playback:
             self.lock.notify_all()
         for thread in self._threads:
             thread.join()
+        if self.scratch is not None:
+            self.scratch.cleanup()
 
     def _first_ns(self) -> int:
         first = self.source.rows[0].t_ns
@@ -271,7 +277,7 @@ class Playback:
     def _element(self, number: int, device: str, what: int) -> Any:
         """A frame, sample or event; None for an image that cannot be read."""
         rows = self.source.rows
-        passed = number * (1 + max((row.trigger_id or 0 for row in rows), default=0))
+        passed = number * self._ids_of_round
         if device == "arm":
             return self._sample(what, passed)
         row = rows[what]
@@ -470,7 +476,7 @@ _PLAYED_LOCK = threading.Lock()
 
 
 class ReplayDriver:
-    """Opens ``replay:PATH?rate=20``: devices of one recording, which run together.
+    """Opens ``replay:PATH?rate=20``: devices of one recording, folder or MCAP, which run together.
 
     Options: ``rate`` exposures a second of one camera, ``camera=1`` the second one, ``loop=1``
     begin anew at the end, ``ahead=1`` read all images into memory first.
@@ -509,11 +515,22 @@ class ReplayDriver:
 
 
 def _playback(plan: _Plan) -> Playback:
+    path, scratch = Path(plan.path), None
     try:
-        source = read_recording(Path(plan.path))
+        if path.is_file():
+            from armscan.storage.recordings.read_mcap import extract_recording
+
+            scratch = tempfile.TemporaryDirectory(prefix="armscan-replay-")
+            path = Path(scratch.name) / path.stem
+            extract_recording(Path(plan.path), path)
+        source = read_recording(path)
+        rig = Playback(source, rate_hz=plan.rate_hz, is_loop=plan.is_loop, is_ahead=plan.is_ahead)
     except ArmscanError as error:
+        if scratch is not None:
+            scratch.cleanup()
         raise DeviceError(error.what, where=error.where, remedy=error.remedy) from error
-    return Playback(source, rate_hz=plan.rate_hz, is_loop=plan.is_loop, is_ahead=plan.is_ahead)
+    rig.scratch = scratch
+    return rig
 
 
 DRIVER = ReplayDriver()

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -78,11 +79,12 @@ def in_processes(
     )
     try:
         with _deaf_children():
-            results = pool.map(work, items)
-        yield from results
+            waiting = deque(pool.submit(work, item) for item in items)
+        while waiting:
+            yield waiting.popleft().result()
     except BaseException as error:
-        # the pool forgets what waits before its processes end: it cannot fail what is cancelled
-        pool.shutdown(wait=False, cancel_futures=True)
+        # nothing is cancelled: a pool whose processes end fails what waits, and a cancelled
+        # element cannot be failed
         held.close()
         if isinstance(error, BrokenProcessPool):
             raise EstimationError(
@@ -91,7 +93,7 @@ def in_processes(
             ) from error
         raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        pool.shutdown(wait=True)
         held.close()
         listener.close()
 

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Industrial cameras: pylon's emulation that replays images, and Aravis's fake GigE camera."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from armscan.devices.contract import check_camera
+from armscan.devices.protocols import Camera, CameraSettings, Frame
+from armscan.devices.registry import find_devices, open_device
+from armscan.drivers.genicam import GenICamCamera, RawFrame, image_of
+from armscan.errors import DeviceError, DeviceTakenError
+from armscan.records.exposure import SensorWindow
+
+# read by pylon when it is first used
+os.environ["PYLON_CAMEMU"] = "1"
+
+
+def frames_of(camera: Camera, n: int, timeout_s: float = 10.0) -> list[Frame]:
+    came: list[Frame] = []
+    end = time.monotonic() + timeout_s
+    while len(came) < n and time.monotonic() < end:
+        frame = camera.read(0.2)
+        came += [frame] if frame else []
+    assert len(came) == n
+    return came
+
+
+def emulated() -> Camera:
+    pytest.importorskip("pypylon", reason="pypylon is not installed (extra pylon)")
+    found = [one.address for one in find_devices("camera") if one.address == "pylon:0815-0000"]
+    if not found:
+        pytest.skip("pylon was used before its emulation was switched on")
+    camera = open_device("camera", found[0])
+    camera.configure(CameraSettings(rate_hz=50.0, exposure_us=1000.0))
+    return camera
+
+
+def test_pylon_keeps_the_contract() -> None:
+    check_camera(emulated)
+
+
+def test_pylon_replays_images_and_marks_those_that_are_damaged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    images = [rng.integers(0, 256, (48, 64)).astype(np.uint8) for _ in range(3)]
+    for k, image in enumerate(images):
+        assert cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    camera: Any = emulated()
+    took = camera.configure(CameraSettings(size_px=(64, 48), window=SensorWindow()))
+    assert took.size_px == (64, 48)
+    library = camera._camera
+    library.set("TestImageSelector", "Off")
+    library.get("ImageFilename")
+    library._nodes.GetNode("ImageFilename").SetValue(str(tmp_path))
+    library.set("ImageFileMode", "On")
+    camera.start()
+    came = frames_of(camera, 6)
+    shown = [
+        next(k for k, image in enumerate(images) if np.array_equal(image, one.image))
+        for one in came
+    ]
+    assert sorted(set(shown)) == [0, 1, 2]
+    assert set(np.diff(shown) % 3) == {1}
+    library.set("ForceFailedBufferCount", 3)
+    library._nodes.GetNode("ForceFailedBuffer").Execute()
+    came = frames_of(camera, 12)
+    library.set("ImageFileMode", "Off")
+    camera.close()
+    assert sum(not frame.is_complete for frame in came) == 3
+    numbers = np.diff([frame.number for frame in came])
+    assert (numbers == 1).all()
+
+
+def test_pylon_sets_what_fits_the_camera() -> None:
+    camera = emulated()
+    took = camera.configure(
+        CameraSettings(
+            exposure_us=1e9, gain_db=-3.0, window=SensorWindow(100, 40), size_px=(200, 100)
+        )
+    )
+    assert took.exposure_us == 1e7 and took.gain_db == 0.0
+    assert camera.setup.window == SensorWindow(100, 40)
+    camera.start()
+    (frame,) = frames_of(camera, 1)
+    assert frame.image.shape == (100, 200) and frame.window == SensorWindow(100, 40)
+    took = camera.configure(CameraSettings(window=SensorWindow(0, 0), size_px=(300, 100)))
+    frames = frames_of(camera, 20)
+    assert frames[-1].image.shape == (100, 300)
+    with pytest.raises(DeviceTakenError):
+        open_device("camera", "pylon:0815-0000")
+    with pytest.raises(DeviceError, match="software trigger"):
+        camera.start("software")
+    camera.start("external")
+    while camera.read(0.0):
+        pass
+    assert camera.read(0.3) is None
+    camera.close()
+    with pytest.raises(DeviceError, match="no such camera"):
+        open_device("camera", "pylon:4711")
+
+
+FAKE = """
+import sys, time, gi
+gi.require_version("Aravis", "0.8")
+from gi.repository import Aravis
+camera = Aravis.GvFakeCamera.new("127.0.0.1", sys.argv[1])
+camera.set_property("gvsp-lost-ratio", float(sys.argv[2]))
+print(camera.is_running(), flush=True)
+time.sleep(60)
+"""
+
+
+class FakeGigE:
+    """Aravis's fake camera in a process of its own."""
+
+    def __init__(self, serial: str, lost: float = 0.0) -> None:
+        gi = pytest.importorskip("gi", reason="PyGObject is not installed")
+        try:
+            gi.require_version("Aravis", "0.8")
+        except ValueError:
+            pytest.skip("Aravis 0.8 is not installed (gir1.2-aravis-0.8)")
+        self.address = f"aravis:Aravis-{serial}"
+        self._program = [sys.executable, "-c", FAKE, serial, str(lost)]
+        self.run()
+
+    def run(self) -> None:
+        self.process = subprocess.Popen(self._program, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline().strip() == "True"
+
+    def end(self) -> None:
+        self.process.kill()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+        self.process.wait()
+
+
+@pytest.fixture
+def fake() -> Iterator[FakeGigE]:
+    running = FakeGigE("A1")
+    yield running
+    running.end()
+
+
+def small(address: str) -> Camera:
+    camera = open_device("camera", address)
+    camera.configure(
+        CameraSettings(rate_hz=50.0, exposure_us=2000.0, window=SensorWindow(), size_px=(256, 128))
+    )
+    return camera
+
+
+def test_aravis_keeps_the_contract(fake: FakeGigE) -> None:
+    assert any("Aravis" in one.label for one in find_devices("camera"))
+    check_camera(lambda: small(fake.address))
+
+
+def test_aravis_times_are_the_middle_of_the_exposure(fake: FakeGigE) -> None:
+    camera = small(fake.address)
+    camera.start()
+    came = frames_of(camera, 10)
+    # the fake camera's clock is that of the system: the frame began before it came
+    now = time.time_ns() - time.monotonic_ns()
+    delays = [one.t_host_ns + now - (one.t_device_ns - 1_000_000) for one in came]
+    assert min(delays) > 0 and np.median(delays) < 60e6
+    camera.close()
+
+
+def test_lost_packets_leave_gaps_or_frames_that_say_so() -> None:
+    fake = FakeGigE("A2", lost=0.02)
+    camera = small(fake.address)
+    lossy: list[Frame] = []
+    try:
+        camera.start()
+        end = time.monotonic() + 6.0
+        while time.monotonic() < end:
+            frame = camera.read(0.2)
+            if frame is not None:
+                lossy.append(frame)
+    finally:
+        camera.close()
+        fake.end()
+    numbers = np.diff([frame.number for frame in lossy])
+    n_missing = int((numbers - 1).sum())
+    n_marked = sum(not frame.is_complete for frame in lossy)
+    assert (numbers >= 1).all() and n_missing + n_marked > 0
+    whole = [frame for frame in lossy if frame.is_complete]
+    # the fake draws x + y + the frame's count: a part of another frame breaks the diagonals
+    assert len(whole) > 20
+    for frame in whole:
+        assert len(np.unique(frame.image)) > 20
+        np.testing.assert_array_equal(frame.image[1:, :-1], frame.image[:-1, 1:])
+
+
+def test_a_camera_that_vanishes_is_told_of(fake: FakeGigE) -> None:
+    camera = small(fake.address)
+    camera.start()
+    frames_of(camera, 2)
+    fake.end()
+    with pytest.raises(DeviceError, match="does not answer"):
+        end = time.monotonic() + 20.0
+        while time.monotonic() < end:
+            camera.read(0.2)
+    camera.close()
+
+
+class Library:
+    """A camera of 16-bit frame ids, as GigE Vision 1 counts, in memory."""
+
+    has_short_ids = True
+
+    def __init__(self) -> None:
+        self.features: dict[str, Any] = {"PixelFormat": "Mono8", "Width": 4, "Height": 2}
+        self.ids = [65_533, 65_534, 65_535, 1, 2, 5]
+
+    def has(self, feature: str) -> bool:
+        return feature in self.features
+
+    def get(self, feature: str) -> Any:
+        return self.features[feature]
+
+    def set(self, feature: str, value: Any) -> None:
+        self.features[feature] = value
+
+    def begin(self) -> None:
+        pass
+
+    def fetch(self) -> RawFrame | None:
+        if not self.ids:
+            time.sleep(0.01)
+            return None
+        image = np.zeros((2, 4), np.uint8)
+        return RawFrame(image, self.ids.pop(0), None, True)
+
+    end = close = begin
+
+
+def test_short_counts_go_on_after_their_end_and_after_a_start() -> None:
+    library = Library()
+    camera = GenICamCamera("fake 1", lambda: library, "Line1")
+    camera.start()
+    assert [frame.number for frame in frames_of(camera, 6)] == [0, 1, 2, 3, 4, 7]
+    camera.stop()
+    library.ids = [1, 2]
+    camera.start()
+    assert [frame.number for frame in frames_of(camera, 2)] == [8, 9]
+    camera.close()
+
+
+def test_pixels_of_each_format() -> None:
+    data = np.arange(12, dtype="<u2").tobytes()
+    np.testing.assert_array_equal(image_of(data, 4, 3, "Mono12"), np.arange(12).reshape(3, 4))
+    assert image_of(bytes(range(12)), 2, 2, "RGB8")[1, 0].tolist() == [6, 7, 8]
+    assert image_of(b"\x07", 2, 1, "Mono8").tolist() == [[7, 0]]
+    with pytest.raises(DeviceError, match="not read"):
+        image_of(b"", 1, 1, "Mono12p")

@@ -64,5 +64,13 @@ class DeviceError(ArmscanError):
     """A camera, arm or laser controller is not there, does not answer or says what cannot be."""
 
 
+class DriverMissingError(DeviceError):
+    """The driver of a device is known, but a package that it needs is not installed."""
+
+
+class DeviceTakenError(DeviceError):
+    """Another program, or this one, has the device open already."""
+
+
 class EstimationError(ArmscanError):
     """The data do not determine what was asked for."""

@@ -7,6 +7,7 @@ from .clocks import StreamMonitor as StreamMonitor
 from .matching import InstantMatcher as InstantMatcher
 from .matching import MatchedInstant as MatchedInstant
 from .matching import TimedSample as TimedSample
+from .inbox import Inbox as Inbox
 from .protocols import Arm as Arm
 from .protocols import ArmFlag as ArmFlag
 from .protocols import ArmSample as ArmSample
@@ -17,6 +18,11 @@ from .protocols import DeviceInfo as DeviceInfo
 from .protocols import Frame as Frame
 from .protocols import LaserController as LaserController
 from .protocols import LaserEvent as LaserEvent
+from .protocols import SimulatedRig as SimulatedRig
+from .registry import DriverReport as DriverReport
+from .registry import find_devices as find_devices
+from .registry import open_device as open_device
+from .registry import survey_drivers as survey_drivers
 from .sources import ScanSource as ScanSource
 from .sources import SimulatedScan as SimulatedScan
 from .sources import Twin as Twin

@@ -99,8 +99,8 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.LASER,
         "Light sheets",
-        "Put the target where you will scan, as drawn, so that the laser line crosses it. Each take "
-        "makes one image with the laser and one without: nothing may move between the two.",
+        "Put the target where you will scan, as drawn, so that the laser line crosses it. Each "
+        "take makes one image with the laser and one without: nothing may move between them.",
         "placements",
         LASER,
         least=6,
@@ -138,8 +138,9 @@ STEPS: tuple[Step, ...] = (
     Step(
         StepName.CHECK,
         "Daily check",
-        "Put the reference ball on the table and scan it from above and from four sides. This says "
-        "whether the scanner is still what its calibration says: do it every day, and after a knock.",
+        "Put the reference ball on the table and scan it from above and from four sides. This "
+        "says whether the scanner is still what its calibration says: do it every day, and after "
+        "a knock.",
         "motion",
         needs=(StepName.HAND_EYE,),
     ),
@@ -410,6 +411,7 @@ class Journey:
 
 
 def result_key(step: StepName, scan: str) -> str:
+    """Name under which a step's result is kept."""
     return f"{step.value}-{scan}" if scan else step.value
 
 
@@ -417,6 +419,7 @@ OF_A_SCAN = (StepName.SCAN, StepName.INSPECT)
 
 
 def digest_of(path: Path) -> str:
+    """SHA-256 of a file; empty where it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:

@@ -89,16 +89,17 @@ class _Hand:
             time.sleep(0.002)
             return None
         shot = self.source.exposure(self.at)
-        self.due, self.at = max(self.due, time.monotonic() - 1.0) + 1.0 / self.rate_hz, self.at + 1
-        return Frame(
+        frame = Frame(
             shot.image,
-            row.trigger_id if row.trigger_id is not None else row.index,
+            self.at // len(self.source.session.cameras),
             row.t_ns,
             time.monotonic_ns(),
             trigger_id=row.trigger_id,
             lasers=row.lasers,
             window=shot.window,
         )
+        self.due, self.at = max(self.due, time.monotonic() - 1.0) + 1.0 / self.rate_hz, self.at + 1
+        return frame
 
     def samples(self, timeout_s: float) -> tuple[ArmSample, ...]:
         """Samples of the arm up to the latest exposure."""

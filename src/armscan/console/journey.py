@@ -13,7 +13,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
@@ -435,7 +435,7 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
         Empty, new, or a session.
     settings
         Of a new session; what an existing one says of its rig is replaced by them, the rest of it
-        stays. None to take those of the folder.
+        stays, and what it does not know they tell. None to take those of the folder.
 
     Raises
     ------
@@ -448,7 +448,9 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
     if path.is_file():
         journey = Journey(folder, read_settings(path))
         if settings is not None:
-            journey.change(rig=settings.rig, needs_latency=settings.needs_latency)
+            known = {key: value for key, value in asdict(journey.settings).items() if value}
+            of_rig = {"rig": settings.rig, "needs_latency": settings.needs_latency}
+            journey.change(**{**asdict(settings), **known, **of_rig})
         return journey
     if folder.exists() and not folder.is_dir():
         raise OutputError("this is a file", where=path_text(folder), remedy="name a folder")

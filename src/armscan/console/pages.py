@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from html import escape
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 from urllib.parse import quote
 
 import numpy as np
@@ -37,6 +37,7 @@ from armscan.console.rig import open_bench
 from armscan.console.scan import Bench, LiveScan
 from armscan.console.scene import (
     COLOURED_BY,
+    MOST_POINTS,
     SceneView,
     ShownPoints,
     depths_mm,
@@ -66,10 +67,13 @@ WORDS = {
     "open": "to do",
     "ready": "can be calculated",
     "good": "good",
-    "doubtful": "good, with remarks",
+    "doubtful": "with remarks",
     "not good": "not good",
     "old": "out of date",
 }
+DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
+DETAIL = "up to 500,000"
+"""Shown at first: a computer without graphics processor draws two million points once a second."""
 START_BUTTON, UNDO_BUTTON = "0", "1"
 """Buttons of the arm: start or pause, and take the last pass back."""
 
@@ -155,7 +159,7 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
-        self._take = self._button("Take", self.take, "T", "Record this placement")
+        self._take = self._button("Take", self.take, "T", "Record this placement", "teal")
         self._take_all = self._button(
             "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
         )
@@ -168,16 +172,20 @@ class ConsolePage:
         self._second = gui.add_image(
             np.full((8, 640, 3), 245, dtype=np.uint8), label=None, visible=False
         )
-        self._calculate = self._button("Calculate", self.calculate, "K", "Run this step's job")
+        self._calculate = self._button(
+            "Calculate", self.calculate, "K", "Run this step's job", "teal"
+        )
         self._working = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = self._button("Cancel", self.worker.cancel, "", "End the calculation")
+        self._cancel = self._button("Cancel", self.worker.cancel, "", "End the calculation", "red")
         self._cancel.visible = False
         self._note = gui.add_html("")
-        self._next = self._button("Go on", self.go_on, "N", "To the next step")
+        self._next = self._button("Go on", self.go_on, "N", "To the next step", "teal")
         with gui.add_folder("What is shown"):
             self._colour = gui.add_dropdown("Colour by", COLOURED_BY)
             self._colour.on_update(lambda _: self._redraw())
+            self._detail = gui.add_dropdown("Points", tuple(DETAILS), initial_value=DETAIL)
+            self._detail.on_update(lambda _: self._redraw())
             self._legend = gui.add_html("")
         with gui.add_folder("Sessions", expand_by_default=False):
             self._session_list = gui.add_dropdown("Session", (self._name(),))
@@ -193,17 +201,20 @@ class ConsolePage:
     def _scanning(self) -> None:
         gui = self.server.gui
         self._range = gui.add_html("", visible=False)
-        self._start = self._button("Start", self.start_or_pause, "S", "Begin, pause, go on")
+        self._start = self._button("Start", self.start_or_pause, "S", "Begin, pause, go on", "teal")
         self._undo = self._button("Undo last pass", self.undo, "U", "Take the last pass out")
         self._clear = self._button("Clear", self.clear, "", "Take all passes out")
-        self._finish = self._button("Finish", self.finish, "F", "End the scan and calculate")
+        self._finish = self._button(
+            "Finish", self.finish, "F", "End the scan and calculate", "teal"
+        )
         self._facts = gui.add_html("", visible=False)
 
     def _inspecting(self) -> None:
         gui = self.server.gui
         self._scan_choice = gui.add_dropdown("Scan", ("none",))
         self._scan_choice.on_update(lambda _: self._choose_scan(self._scan_choice.value))
-        self._compare = gui.add_dropdown("Compare with", INSPECTIONS)
+        first = INSPECTIONS[0 if self.journey.settings.part else 1]
+        self._compare = gui.add_dropdown("Compare with", INSPECTIONS, initial_value=first)
         self._compare.on_update(lambda _: self.refresh())
         self._part = gui.add_text("Model (STL, STEP)", self.journey.settings.part)
         self._part.on_update(lambda _: self._set(part=self._part.value.strip()))
@@ -211,11 +222,16 @@ class ConsolePage:
         self._tolerance.on_update(lambda _: self._set(tolerance=self._tolerance.value.strip()))
 
     def _button(
-        self, label: str, work: Callable[[], object], key: str, hint: str
+        self,
+        label: str,
+        work: Callable[[], object],
+        key: str,
+        hint: str,
+        colour: Literal["teal", "gray", "red"] = "gray",
     ) -> viser.GuiButtonHandle:
         """A button, and a key for it, that tell a failure as its sentence."""
         named = f"{label} ({key})" if key else label
-        button = self.server.gui.add_button(named, hint=hint)
+        button = self.server.gui.add_button(named, hint=hint, color=colour)
         button.on_click(lambda _: self._tried(work))
         if key:
             command = self.server.gui.add_command(label, hotkey=cast(Any, key), description=hint)
@@ -260,7 +276,6 @@ class ConsolePage:
     def _choose_scan(self, scan: str) -> None:
         if scan in self.journey.scans and scan != self.scan:
             self.scan = scan
-            self.view.forget_view()
             self.refresh()
             self._show_stored()
 
@@ -360,12 +375,11 @@ class ConsolePage:
 
     def _tell(self, event: ProgressEvent) -> None:
         _put(self._bar, 100.0 * event.done / max(event.total, 1))
-        self._working.content = paragraph(
-            f"{event.stage.capitalize()}: {event.done} of {event.total}", MUTED
-        )
+        words = f"{event.stage.capitalize()}: {event.done} of {event.total}"
+        self._working.content = _padded(paragraph(words, MUTED))
 
     def _busy(self, words: str) -> None:
-        self._working.content = paragraph(words, MUTED)
+        self._working.content = _padded(paragraph(words, MUTED))
         for handle in (self._working, self._bar, self._cancel):
             handle.visible = bool(words)
         self._calculate.disabled = bool(words)
@@ -378,7 +392,6 @@ class ConsolePage:
         if chosen != self._name():
             self.journey = self._opened(self.journey.folder.resolve().parent / chosen)
             self.scan = self.journey.scans[-1] if self.journey.scans else ""
-            self.view.forget_view()
             self.choose(self.journey.next_step())
 
     # what is shown
@@ -402,12 +415,12 @@ class ConsolePage:
         step = BY_NAME[self.step]
         state = self.journey.state(self.step, self._scan_of(self.step))
         with self.server.atomic():
-            self._head.content = self._overview()
+            self._head.content = _padded(self._overview())
             if self._choice.value != step.title:
                 _put(self._choice, step.title)
-            self._guide.content = self._instruction(state)
+            self._guide.content = _padded(self._instruction(state))
             self._arrange(state)
-            self._note.content = self._told(state)
+            self._note.content = _padded(self._told(state))
             known = tuple(one.name for one in sessions_in(self.journey.folder.resolve().parent))
             self._session_list.options = known or (self._name(),)
 
@@ -436,14 +449,26 @@ class ConsolePage:
             self._scan_choice.options = self.journey.scans
             if self.scan in self.journey.scans:
                 _put(self._scan_choice, self.scan)
+        now = self.journey.settings
+        known: tuple[tuple[Any, object], ...] = (
+            (self._target, now.target),
+            (self._ball, now.ball_mm),
+            (self._part, now.part),
+            (self._tolerance, now.tolerance),
+        )
+        for field, value in known:
+            if field.value != value:
+                _put(field, value)
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
         uses_ball = is_inspection and self._compare.value == "ball"
         self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
         can_run = state.n_taken >= step.least or (is_inspection and not is_blocked)
         self._calculate.visible = can_run and not is_live
-        self._calculate.label = "Calculate again (K)" if state.result else "Calculate (K)"
-        is_done = state.status in ("good", "doubtful")
-        self._next.visible = is_done and not is_live and self.step is not StepName.INSPECT
+        verb = "Inspect" if is_inspection else "Calculate"
+        self._calculate.label = f"{verb} again (K)" if state.result else f"{verb} (K)"
+        is_settled = state.status in ("good", "doubtful")
+        self._calculate.color = "gray" if is_settled else "teal"
+        self._next.visible = is_settled and not is_live and self.step is not StepName.INSPECT
 
     def _start_label(self) -> str:
         if self.live is None:
@@ -499,10 +524,14 @@ class ConsolePage:
         if n >= wanted:
             return body + paragraph(f"All {wanted} are taken.", GOOD)
         shown = self._placement(n)
-        enough = f" {step.least} are enough to try." if n < step.least else ""
+        enough = f" At least {step.least} are needed." if n < step.least else ""
+        is_twin = self.bench is not None and self.bench.is_simulated
+        own = "The simulated operator follows a list of its own." if is_twin else ""
         return (
             body + f'<p style="margin:6px 0 2px;font-size:14px;color:{INK}"><b>{kind} {n + 1} of '
-            f"{wanted}:</b> {escape(shown.words)}.{enough}</p>" + drawing(shown)
+            f"{wanted}:</b> {escape(shown.words)}.{enough}</p>"
+            + drawing(shown)
+            + paragraph(own, MUTED, 12)
         )
 
     def _placement(self, k: int) -> Placement:
@@ -519,7 +548,9 @@ class ConsolePage:
         self._version = -1
         if self._shown is not None:
             by = self._colour.value
-            self._legend.content = paragraph(self.view.show(self._shown, by), MUTED, 12)
+            self._legend.content = _padded(
+                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
+            )
 
     def _show_stored(self) -> None:
         """The points that belong to this step."""
@@ -529,9 +560,12 @@ class ConsolePage:
                 self._shown = self._stored_points()
             except ArmscanError as error:
                 self._problem = str(error)
+        self.view.forget_view()
+        if self._shown is not None and self._shown.deviation_mm is not None:
+            _put(self._colour, "deviation")
         if self._shown is None:
             self.view.clear()
-            self._legend.content = paragraph("no points yet", MUTED, 12)
+            self._legend.content = _padded(paragraph("no points yet", MUTED, 12))
         self._redraw()
 
     def _stored_points(self) -> ShownPoints | None:
@@ -542,8 +576,6 @@ class ConsolePage:
             deviation = np.asarray(table["deviation_mm"], dtype=np.float64)
             limit = float(np.quantile(np.abs(deviation), 0.95)) if len(deviation) else 0.1
             sheet = np.asarray(table["sheet"], dtype=np.int64)
-            _put(self._colour, "deviation")
-            self.view.forget_view()
             return ShownPoints(
                 points, sheet, np.zeros(len(points)), None, deviation, float(f"{limit:.1g}")
             )
@@ -571,8 +603,8 @@ class ConsolePage:
             for handle, view, camera in zip(handles, shown.cameras, live.rig.cameras, strict=False):
                 handle.image = live_image(view, names, camera.setup.window)
                 handle.visible = True
-            self._range.content = range_bar(shown.range_mm, *depths_mm(sensor))
-        self._facts.content = self._live_facts(live, shown)
+            self._range.content = _padded(range_bar(shown.range_mm, *depths_mm(sensor)))
+        self._facts.content = _padded(self._live_facts(live, shown))
         self._start.label = self._start_label()
         is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
         if shown.cloud_version != self._version and is_due:
@@ -580,7 +612,9 @@ class ConsolePage:
             cloud = live.session.cloud()
             self._shown = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm)
             by = self._colour.value
-            self._legend.content = paragraph(self.view.show(self._shown, by), MUTED, 12)
+            self._legend.content = _padded(
+                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
+            )
             self.view.show_head(shown.base_from_tool, self._scanner)
 
     def _hear(self, live: LiveScan) -> None:
@@ -601,7 +635,7 @@ class ConsolePage:
         drift = live.drift_mm()
         late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
         lines = [
-            f"{live.n_recorded} exposures recorded, {shown.rate_hz:.0f} a second{late}",
+            f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
             f"{shown.n_passes} passes, {shown.n_points:,} points",
             "passes do not meet yet"
             if drift is None
@@ -618,6 +652,11 @@ class ConsolePage:
         if live.bench.is_over:
             lines.append("the simulated hand has come to its end: finish")
         return "".join(paragraph(line, INK, 13) for line in lines)
+
+
+def _padded(content: str) -> str:
+    """HTML as far from the column's edges as the controls."""
+    return f'<div style="padding:2px 10px">{content}</div>'
 
 
 def _put(handle: Any, value: object) -> None:
@@ -647,7 +686,7 @@ def result_card(state: StepState, link: str) -> str:
         f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
         f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
         f"{old}{reasons}{paragraph(result.next_step, INK, 13)}"
-        f'<details><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
+        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
         f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
         f"{link}</div>"
     )

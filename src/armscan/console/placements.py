@@ -59,7 +59,7 @@ def _words(tilt_x: float, tilt_y: float, roll: float) -> list[str]:
     """Tilts and turns in words; small ones go without saying."""
     found = []
     if abs(tilt_x) >= 8.0:
-        found.append(f"upper edge {'away from you' if tilt_x > 0 else 'towards you'}")
+        found.append(f"upper edge {'away from the camera' if tilt_x > 0 else 'towards the camera'}")
     if abs(tilt_y) >= 8.0:
         found.append(f"{'left' if tilt_y > 0 else 'right'} edge away")
     size = max(abs(tilt_x), abs(tilt_y))
@@ -82,7 +82,11 @@ def _targets(
         ]
         place = " ".join(word for word in reversed(places) if word) or "in the middle"
         far = "near" if distance < 0.93 else "far" if distance > 1.07 else ""
-        words = [place, *([far] if far else []), *(_words(tilt_x, tilt_y, roll) or ["facing you"])]
+        words = [
+            place,
+            *([far] if far else []),
+            *(_words(tilt_x, tilt_y, roll) or ["facing the camera"]),
+        ]
         text = ", ".join(words)
         found.append(
             Placement(kind, text.capitalize(), tilt_x, tilt_y, roll, across, down, distance)

@@ -33,6 +33,8 @@ FINE_POINTS = 400_000
 """Up to so many points are sent with 32 bits a coordinate; more with 16, about their middle."""
 COVERED_MM, WELL_COVERED = 2.0, 8
 """A cell of this size is well covered by so many points."""
+GROWN = 1.6
+"""The view follows points that have spread by more than this since it was turned to them."""
 IMAGE_WIDTH = 640
 STEEP_DEG = 60.0
 """Lines seen at a steeper angle scatter; colours of incidence end here."""
@@ -141,15 +143,16 @@ class SceneView:
         self._cloud: viser.PointCloudHandle | None = None
         self._head: list[Any] = []
         self._has_view = False
+        self._seen_mm = 0.0
         server.scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
 
-    def show(self, shown: ShownPoints, by: ColourBy) -> str:
-        """Show points in place of those before; returns what their colours mean."""
+    def show(self, shown: ShownPoints, by: ColourBy, most: int = MOST_POINTS) -> str:
+        """Show points in place of those before, thinned; returns what their colours mean."""
         self.clear()
         if not len(shown.points_mm):
             return "no points yet"
-        chosen = thinned(len(shown.points_mm))
+        chosen = thinned(len(shown.points_mm), most)
         points = shown.points_mm[chosen]
         colours, text = point_colours(shown, by)
         middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
@@ -164,14 +167,15 @@ class SceneView:
             precision="float32" if len(points) <= FINE_POINTS else "float16",
             position=tuple((middle / UNIT_MM).tolist()),
         )
-        if not self._has_view:
+        if not self._has_view or size > GROWN * self._seen_mm:
             self.look_at(middle, size)
         return f"{len(points):,} of {len(shown.points_mm):,} points; {text}"
 
     def look_at(self, middle_mm: FloatArray, size_mm: float) -> None:
         """Turn the view of every browser, also of those to come, to a place."""
         middle = middle_mm / UNIT_MM
-        eye = middle + max(size_mm, 60.0) / UNIT_MM * np.array([0.55, -1.0, 0.75])
+        self._seen_mm = max(size_mm, 60.0)
+        eye = middle + self._seen_mm / UNIT_MM * np.array([0.36, -0.66, 0.5])
         self._camera.look_at, self._camera.position = middle, eye
         for client in self._server.get_clients().values():
             client.camera.look_at, client.camera.position = middle, eye
@@ -206,7 +210,9 @@ class SceneView:
                     "/head/camera",
                     fov=float(fov),
                     aspect=camera.width_px / camera.height_px,
-                    scale=0.3,
+                    scale=0.12,
+                    thickness=1.5,
+                    thickness_units="screen",
                     color=rgb(ACCENT),
                     wxyz=wxyz,
                     position=place,

@@ -12,10 +12,11 @@ import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.cookies import CookieError, SimpleCookie
+from io import StringIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
@@ -195,7 +196,8 @@ def open_server(
         raise OptionError(f"port {port}", where="--port", remedy="give 1024 to 65535")
     token = secrets.token_urlsafe(24)
     chosen = _free_port(host, PORT if port is None else port, is_asked=port is not None)
-    with _guarded(Door(token, folder_of_pages)):
+    # viser prints a box with its own addresses: ours is told by who opens the console
+    with _guarded(Door(token, folder_of_pages)), redirect_stdout(StringIO()):
         server = viser.ViserServer(host=host, port=chosen, label="armscan", verbose=False)
     shown = f"http://{'localhost' if is_loopback(host) else host}:{server.get_port()}/"
     return server, shown if is_loopback(host) else f"{shown}?token={token}"

@@ -326,7 +326,7 @@ def _judged(step: StepName, summary: Summary) -> StepResult:
         verdict = {"still valid": verdict, "not valid": "not good"}.get(said, "doubtful")
     reasons = (*summary.forced, *summary.warnings)
     if step is StepName.CHECK and verdict != "good":
-        reasons = (sentence(f"the scanner is {said}"), *reasons)
+        reasons = (sentence(f"the check says: {said}"), *reasons)
     if step is StepName.INSPECT and said in ("fail", "undecided"):
         verdict = "not good" if said == "fail" else "doubtful"
         reasons = (sentence(f"the part's verdict is {said}"), *reasons)
@@ -357,7 +357,8 @@ def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
     place = order.index(step) + 1
     following = f"Go on with '{BY_NAME[order[place]].title}'." if place < len(order) else ""
     if result.verdict == "doubtful":
-        return f"Read the remarks above; if they do not matter to you: {following or 'done.'}"
+        rest = f" If they do not matter: {following[0].lower()}{following[1:]}" if following else ""
+        return f"Read the remarks above.{rest}"
     return following or "The report is ready."
 
 

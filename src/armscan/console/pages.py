@@ -146,12 +146,12 @@ class ConsolePage:
     def _build(self) -> None:
         gui = self.server.gui
         gui.configure_theme(
-            control_layout="fixed",
             control_width="large",
             show_logo=False,
             show_share_button=False,
             brand_color=(11, 110, 135),
         )
+        gui.main_panel.dock_right()
         gui.set_panel_label("armscan")
         self._head = gui.add_html("")
         titles = [step.title for step in self.journey.steps]

@@ -98,7 +98,8 @@ class _Hand:
             lasers=row.lasers,
             window=shot.window,
         )
-        self.due, self.at = max(self.due, time.monotonic() - 1.0) + 1.0 / self.rate_hz, self.at + 1
+        self.due = max(self.due, time.monotonic()) + 1.0 / self.rate_hz
+        self.at += 1
         return frame
 
     def samples(self, timeout_s: float) -> tuple[ArmSample, ...]:

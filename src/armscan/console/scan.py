@@ -291,8 +291,8 @@ class LiveScan:
 
     def start(self) -> None:
         """Begin, or go on after a pause, with a new pass."""
-        self.bench.hold(False)
         self.session.start()
+        self.bench.hold(False)
 
     def pause(self) -> None:
         """Record nothing until `start`."""

@@ -25,7 +25,7 @@ from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 
 from armscan.console.journey import StepName
-from armscan.console.pages import open_console
+from armscan.console.pages import ConsolePage, open_console
 from armscan.errors import OutputError
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -34,7 +34,7 @@ DRIVER = shutil.which("chromedriver")
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
     *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"),
-    *("--disable-component-update", "--window-size=1400,1000"),
+    *("--disable-component-update", "--window-size=800,600"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
 )
 RIG = "twin:thesis-single?seed=1&scene=plate&views=24&rate=50"
@@ -109,7 +109,9 @@ def operator(folder: Path, address: str) -> Iterator[Operator]:
         one.browser.quit()
 
 
-def test_a_new_user_gets_from_an_empty_folder_to_a_report(tmp_path: Path) -> None:
+def test_a_step_by_its_buttons_alone_and_a_browser_closed_and_a_job_killed(
+    tmp_path: Path,
+) -> None:
     folder = tmp_path / "first"
     with open_console(folder, RIG, port=0) as (page, address):
         with operator(tmp_path / "browser1", address) as one:
@@ -119,74 +121,69 @@ def test_a_new_user_gets_from_an_empty_folder_to_a_report(tmp_path: Path) -> Non
             one.sees("Placement 2 of 15")
             one.press("Take all that is left")
             one.sees("All 15 are taken")
-            one.press("Calculate")
-            one.sees("Go on with 'Light sheets'.")
             assert one.hosts() == {urlsplit(address).netloc}, "something came from elsewhere"
         # the browser is closed, and another one opened: the session goes on where it was
         with operator(tmp_path / "browser2", address) as one:
-            one.sees("Camera\ngood")
-            one.press("Go on")
-            one.sees("Placement 1 of 8")
-            one.press("Take all that is left")
-            one.sees("All 8 are taken")
+            one.sees("All 15 are taken")
             one.press("Calculate")
-            one.waited(lambda: page.worker.is_busy)
+            one.waited(lambda: page.worker.is_busy and one.text.count("Cancel"))
             os.kill(page.worker.pid, signal.SIGKILL)
             one.sees("came to an end, and nothing was written")
-            assert not (folder / "sensor.json").exists()
-            one.press("Calculate")
-            one.sees("Go on with 'Touch the plate'.")
-            one.press("Go on")
-            one.sees("Touch 1 of 24")
-            one.press("Take all that is left")
-            one.sees("All 24 are taken")
-            one.press("Calculate")
-            one.sees("Go on with 'Hand-eye'.")
-            one.press("Go on")
-            one.sees("Placement 1 of 12")
-            one.press("Take all that is left")
-            one.sees("All 12 are taken")
-            one.press("Calculate")
-            one.sees("Go on with 'Daily check'.")
+            assert not (folder / "camera.json").exists()
             # another console on the same session is told, and this one goes on
             with pytest.raises(OutputError, match="another console"), open_console(folder, port=0):
                 pass
+            one.press("Calculate")
+            one.sees("Go on with 'Light sheets'.")
+    assert page.journey.state(StepName.CAMERA).status == "good"
+
+
+@pytest.mark.skipif(
+    "ARMSCAN_JOURNEY" not in os.environ, reason="minutes long, the whole journey: make journey"
+)
+def test_a_new_user_gets_from_an_empty_folder_to_a_report(tmp_path: Path) -> None:
+    with (
+        open_console(tmp_path / "first", RIG, port=0) as (page, address),
+        operator(tmp_path / "browser", address) as one,
+    ):
+        for n, kind, follows in (
+            (15, "Placement", "Light sheets"),
+            (8, "Placement", "Touch the plate"),
+            (24, "Touch", "Hand-eye"),
+            (12, "Placement", "Daily check"),
+        ):
+            one.sees(f"{kind} 1 of {n}")
+            one.press("Take all that is left")
+            one.sees(f"All {n} are taken")
+            one.press("Calculate")
+            one.sees(f"Go on with '{follows}'.")
             one.press("Go on")
-            scanned(one, page)
-            one.waited(lambda: page.journey.state(StepName.CHECK).result is not None)
-            one.sees("o on with 'Scan'.")
-            one.press("Go on")
-            scanned(one, page)
-            one.sees("Go on with 'Inspect'.")
-            one.press("Go on")
-            one.sees("Compare with")
-            one.press("Inspect (K)")
-            one.sees("The report is ready.")
-            report = one.browser.find_element(By.LINK_TEXT, "Report of the session")
-            one.browser.get(report.get_attribute("href"))
-            one.sees("scan-01")
-            assert "SIMULATED" in one.text.upper()
-            one.browser.find_element(By.LINK_TEXT, "All about it").click()
-            assert one.hosts() == {urlsplit(address).netloc}
+        scanned(one, page)
+        one.sees("o on with 'Scan'.")
+        one.press("Go on")
+        scanned(one, page)
+        one.sees("Go on with 'Inspect'.")
+        one.press("Go on")
+        one.sees("Compare with")
+        one.press("Inspect (K)")
+        one.sees("The report is ready.")
+        report = one.browser.find_element(By.LINK_TEXT, "Report of the session")
+        one.browser.get(report.get_attribute("href"))
+        one.sees("scan-01")
+        assert "SIMULATED" in one.text.upper()
+        assert one.hosts() == {urlsplit(address).netloc}
+    scans = {StepName.SCAN, StepName.INSPECT}
     states = {
-        step.name: page.journey.state(
-            step.name, "scan-01" if step.name in ("scan", "inspect") else ""
-        )
+        step.name: page.journey.state(step.name, "scan-01" if step.name in scans else "").status
         for step in page.journey.steps
+        if step.name is not StepName.CHECK
     }
-    assert {name.value: one.status for name, one in states.items()} | {"check": "any"} == {
-        "camera": "good",
-        "laser": "good",
-        "probing": "good",
-        "hand-eye": "good",
-        "check": "any",
-        "scan": "good",
-        "inspect": "good",
-    }
+    # 24 of the ball's 70 exposures leave the check inconclusive as often as not
+    assert set(states.values()) == {"good"}
 
 
-def scanned(one: Operator, page) -> None:
-    """Start, pause and go on by key, wait for the hand's end, finish."""
+def scanned(one: Operator, page: ConsolePage) -> None:
+    """Start, wait for the hand's end, finish."""
     one.press("Start")
     one.waited(lambda: page.live is not None and page.live.n_recorded > 4)
     one.sees("Pause (S)")

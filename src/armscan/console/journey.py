@@ -452,15 +452,7 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
             of_rig = {"rig": settings.rig, "needs_latency": settings.needs_latency}
             journey.change(**{**asdict(settings), **known, **of_rig})
         return journey
-    if folder.exists() and not folder.is_dir():
-        raise OutputError("this is a file", where=path_text(folder), remedy="name a folder")
-    held = [one.name for one in folder.iterdir()] if folder.is_dir() else []
-    if foreign := sorted(name for name in held if name != LOCK_FILE):
-        raise OutputError(
-            f"the folder holds other files than a session's ({', '.join(foreign[:3])})",
-            where=path_text(folder),
-            remedy="name a new or an empty folder",
-        )
+    _check_own(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -470,6 +462,20 @@ def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journ
     journey = Journey(folder, settings or SessionSettings())
     journey.change()
     return journey
+
+
+def _check_own(folder: Path) -> None:
+    """Raise `OutputError` for a file, and for a folder of something else."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("this is a file", where=path_text(folder), remedy="name a folder")
+    held = [one.name for one in folder.iterdir()] if folder.is_dir() else []
+    foreign = sorted(name for name in held if name != LOCK_FILE)
+    if foreign and SETTINGS_FILE not in held:
+        raise OutputError(
+            f"the folder holds other files than a session's ({', '.join(foreign[:3])})",
+            where=path_text(folder),
+            remedy="name a new or an empty folder",
+        )
 
 
 def read_settings(path: Path) -> SessionSettings:
@@ -491,20 +497,26 @@ def read_settings(path: Path) -> SessionSettings:
 
 @contextmanager
 def held_session(folder: Path) -> Iterator[None]:
-    """Keep other consoles out of a session folder.
+    """Keep other consoles out of a session folder, which is made if need be.
 
     Raises
     ------
     OutputError
-        If another one has it open.
+        If another one has it open, it is of something else, or cannot be written.
     """
-    if fcntl is None:
-        yield
-        return
-    folder.mkdir(parents=True, exist_ok=True)
+    _check_own(folder)
     path = folder / LOCK_FILE
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be written ({error.strerror})", where=path_text(folder)
+        ) from error
+    try:
+        if fcntl is None:
+            yield
+            return
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -519,6 +531,11 @@ def held_session(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+        # a folder that became no session is left as it was
+        with suppress(OSError):
+            if [one.name for one in folder.iterdir()] == [LOCK_FILE]:
+                path.unlink()
+                folder.rmdir()
 
 
 def sessions_in(folder: Path) -> tuple[Path, ...]:

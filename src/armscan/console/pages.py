@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from html import escape
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -47,7 +47,7 @@ from armscan.console.scene import (
     shown_points,
     taken_image,
 )
-from armscan.console.server import LOOPBACK, PAGES, open_server
+from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
 from armscan.console.work import Worker, run_step, told
 from armscan.errors import ArmscanError
 from armscan.models.calibration import ScannerCalibration
@@ -720,7 +720,8 @@ def run_console(
     """
     with open_console(folder, rig, host=host, port=port) as (page, address):
         tell(f"{page.journey.folder}: open {address} in a browser; Ctrl-C ends the console")
-        threading.Event().wait()
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
 
 
 @contextmanager
@@ -738,7 +739,7 @@ def open_console(
         server, address = open_server(
             lambda: pages[0].journey.folder if pages else folder, host, port
         )
-        opened.callback(server.stop)
+        opened.callback(close_server, server)
         pages.append(ConsolePage(server, folder, bench))
         opened.callback(pages[0].close)
         yield pages[0], address

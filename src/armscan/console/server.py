@@ -203,6 +203,13 @@ def open_server(
     return server, shown if is_loopback(host) else f"{shown}?token={token}"
 
 
+def close_server(server: viser.ViserServer) -> None:
+    """Close the port; browsers that have the page say so."""
+    # viser tells the terminal
+    with redirect_stdout(StringIO()):
+        server.stop()
+
+
 def _free_port(host: str, port: int, *, is_asked: bool) -> int:
     for candidate in (port,) if is_asked else (port, 0):
         family = socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -4,10 +4,10 @@ from .clocks import ClockFit as ClockFit
 from .clocks import ClockModel as ClockModel
 from .clocks import ElementStatus as ElementStatus
 from .clocks import StreamMonitor as StreamMonitor
+from .inbox import Inbox as Inbox
 from .matching import InstantMatcher as InstantMatcher
 from .matching import MatchedInstant as MatchedInstant
 from .matching import TimedSample as TimedSample
-from .inbox import Inbox as Inbox
 from .protocols import Arm as Arm
 from .protocols import ArmFlag as ArmFlag
 from .protocols import ArmSample as ArmSample

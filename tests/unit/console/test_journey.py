@@ -120,7 +120,12 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(OutputError, match=r"letter\.txt"):
         open_journey(tmp_path, SETTINGS)
+    with pytest.raises(OutputError, match=r"letter\.txt"), held_session(tmp_path):
+        pass
     assert [one.name for one in tmp_path.iterdir()] == ["letter.txt"]
+    with held_session(tmp_path / "new"):
+        pass
+    assert not (tmp_path / "new").exists(), "nothing became of it"
 
 
 def test_a_damaged_result_counts_as_none(tmp_path: Path) -> None:
@@ -134,13 +139,13 @@ def test_a_damaged_result_counts_as_none(tmp_path: Path) -> None:
 
 def test_the_second_console_is_told_which_one_is_first(tmp_path: Path) -> None:
     with (
-        held_session(tmp_path),
+        held_session(tmp_path / "s"),
         pytest.raises(OutputError, match=f"process {os.getpid()}"),
-        held_session(tmp_path),
+        held_session(tmp_path / "s"),
     ):
         pass
-    with held_session(tmp_path):
-        assert (tmp_path / LOCK_FILE).is_file()
+    with held_session(tmp_path / "again"):
+        assert (tmp_path / "again" / LOCK_FILE).is_file()
 
 
 def test_a_growing_recording_is_whole_after_every_take(tmp_path: Path) -> None:

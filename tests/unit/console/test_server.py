@@ -17,9 +17,12 @@ from websockets.datastructures import Headers
 from websockets.exceptions import InvalidStatus
 from websockets.http11 import Request
 from websockets.sync.client import connect
+from websockets.typing import Subprotocol
 
-from armscan.console.server import COOKIE, Door, is_loopback, open_server
+from armscan.console.server import COOKIE, Door, close_server, is_loopback, open_server
 from armscan.errors import DeviceError, OptionError
+
+VISER = Subprotocol("viser-v0")
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +34,7 @@ def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     server, address = open_server(lambda: folder, port=0)
     assert address == f"http://localhost:{server.get_port()}/"
     yield server.get_port()
-    server.stop()
+    close_server(server)
 
 
 def ask(port: int, path: str, **headers: str) -> tuple[int, str, http.client.HTTPMessage]:
@@ -63,12 +66,12 @@ def test_another_name_of_this_computer_is_refused(port: int) -> None:
 
 def test_a_page_of_another_host_cannot_press_buttons(port: int) -> None:
     with pytest.raises(InvalidStatus) as refused:
-        connect(f"ws://127.0.0.1:{port}", origin="http://evil.example", subprotocols=["viser-v0"])
+        connect(f"ws://127.0.0.1:{port}", origin="http://evil.example", subprotocols=[VISER])
     assert refused.value.response.status_code == 403
     own = f"http://127.0.0.1:{port}"
-    with connect(f"ws://127.0.0.1:{port}", origin=own, subprotocols=["viser-v0"]) as link:
+    with connect(f"ws://127.0.0.1:{port}", origin=own, subprotocols=[VISER]) as link:
         # let in; viser then ends it, for its own page is of another version
-        assert link.subprotocol == "viser-v0"
+        assert link.subprotocol == VISER
 
 
 def request(path: str, **headers: str) -> Request:

@@ -34,7 +34,8 @@ FINE_POINTS = 400_000
 COVERED_MM, WELL_COVERED = 2.0, 8
 """A cell of this size is well covered by so many points."""
 GROWN = 1.6
-"""The view follows points that have spread by more than this since it was turned to them."""
+"""The view follows points that have spread by more than this since it was turned to them, or
+whose middle has gone half as far aside."""
 IMAGE_WIDTH = 640
 STEEP_DEG = 60.0
 """Lines seen at a steeper angle scatter; colours of incidence end here."""
@@ -143,7 +144,7 @@ class SceneView:
         self._cloud: viser.PointCloudHandle | None = None
         self._head: list[Any] = []
         self._has_view = False
-        self._seen_mm = 0.0
+        self._seen_mm, self._looked_at_mm = 0.0, np.zeros(3)
         server.scene.set_up_direction("+z")
         self._scene.world_axes.visible = False
 
@@ -167,18 +168,21 @@ class SceneView:
             precision="float32" if len(points) <= FINE_POINTS else "float16",
             position=tuple((middle / UNIT_MM).tolist()),
         )
-        if not self._has_view or size > GROWN * self._seen_mm:
+        moved = float(np.linalg.norm(middle - self._looked_at_mm))
+        if not self._has_view or max(size, 3.0 * moved) > GROWN * self._seen_mm:
             self.look_at(middle, size)
         return f"{len(points):,} of {len(shown.points_mm):,} points; {text}"
 
     def look_at(self, middle_mm: FloatArray, size_mm: float) -> None:
         """Turn the view of every browser, also of those to come, to a place."""
         middle = middle_mm / UNIT_MM
-        self._seen_mm = max(size_mm, 60.0)
+        self._seen_mm, self._looked_at_mm = max(size_mm, 60.0), middle_mm
         eye = middle + self._seen_mm / UNIT_MM * np.array([0.36, -0.66, 0.5])
         self._camera.look_at, self._camera.position = middle, eye
         for client in self._server.get_clients().values():
-            client.camera.look_at, client.camera.position = middle, eye
+            # in this order: what is looked at follows a new position
+            client.camera.position = eye
+            client.camera.look_at = middle
         self._has_view = True
 
     def clear(self) -> None:

@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test check unit net cov test-uncompiled test-oldest clean
+.PHONY: demo test check unit net cov test-uncompiled test-oldest journey clean
 demo: $(STAMP)
 	$(BIN)/armscan demo single -o demo
 
@@ -31,6 +31,10 @@ cov: $(STAMP)
 KERNEL_TESTS := tests/unit/stripe/test_kernels.py tests/unit/test_jpeg_format.py
 test-uncompiled: $(STAMP)
 	NUMBA_DISABLE_JIT=1 $(BIN)/pytest -n 2 $(KERNEL_TESTS)
+
+# from an empty folder to a report in the console's page, by its buttons alone, in Chromium
+journey: $(STAMP)
+	ARMSCAN_JOURNEY=1 $(BIN)/pytest tests/system/test_console_in_browser.py
 
 # the oldest series of each dependency that pyproject.toml allows
 OLDEST := .venv-oldest

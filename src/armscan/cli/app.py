@@ -22,12 +22,14 @@ from armscan.cli import (
     twin,
 )
 from armscan.cli import reconstruct as reconstruct_command
+from armscan.cli.live.console import CONSOLE_EXAMPLE, console
 
 EXIT_INPUT = 2
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HELP_ORDER = (
     *("demo", "simulate", "probe", "calibrate", "reconstruct", "fuse", "markers", "register"),
     *("clean", "inspect", "verify", "mesh"),
+    "console",
     *("convert", "recover", "info", "devices", "doctor"),
 )
 """The chain, then what looks at files; left to itself the library lists groups last."""
@@ -107,6 +109,7 @@ app.command("register", epilog=points.REGISTER_EXAMPLE)(points.register)
 app.command("clean", epilog=clean.CLEAN_EXAMPLE)(clean.clean)
 app.command("verify", epilog=inspect.VERIFY_EXAMPLE)(inspect.verify)
 app.command("mesh", epilog=surface.MESH_EXAMPLE)(surface.mesh)
+app.command("console", epilog=CONSOLE_EXAMPLE)(console)
 app.command("convert", epilog=files.CONVERT_EXAMPLE)(files.convert)
 app.command("recover", epilog=files.RECOVER_EXAMPLE)(files.recover)
 app.command("info", epilog=files.INFO_EXAMPLE)(files.info)

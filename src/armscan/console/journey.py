@@ -1,0 +1,546 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way from an empty folder to a report: its steps as data, their state as it lies on disk.
+
+A session can be closed and opened again at any step. Every step fills a recording, runs one job on
+it, and keeps what came out with what it rests on, so that an older result is known as old.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Literal
+
+from armscan.console.placements import CAMERA, HAND_EYE, LASER, TOUCHES, Placement
+from armscan.errors import ArmscanError, FileFormatError, OutputError
+from armscan.storage.arm import ARM_FILE
+from armscan.storage.codec import MismatchError, RecordCodec, parse_toml, toml_bytes
+from armscan.storage.files import path_text, read_bytes, write_files
+from armscan.storage.recording_session import EXPOSURES_FILE, exposure_rows
+from armscan.storage.tables import read_csv
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover - Windows has none
+    fcntl = None  # type: ignore[assignment]
+
+SETTINGS_FILE, LOCK_FILE, REPORT_FILE = "console.toml", ".console.lock", "report.html"
+RECORDINGS, RESULTS = "recordings", "results"
+
+
+class StepName(StrEnum):
+    """The steps in their order."""
+
+    CAMERA = "camera"
+    LASER = "laser"
+    PROBING = "probing"
+    HAND_EYE = "hand-eye"
+    LATENCY = "latency"
+    CHECK = "check"
+    SCAN = "scan"
+    INSPECT = "inspect"
+
+
+Filling = Literal["placements", "touches", "motion", "nothing"]
+"""How a step's recording comes about: one by one, touch by touch, or while the hand moves."""
+Verdict = Literal["good", "doubtful", "not good"]
+Status = Literal["waiting", "open", "ready", "good", "doubtful", "not good", "old"]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the journey.
+
+    Parameters
+    ----------
+    name, title
+        What it is called.
+    to_do
+        What the operator does, in plain words.
+    filling
+        How its recording is filled.
+    placements
+        What is to be taken, one after the other; empty where the hand moves freely.
+    least
+        With fewer of them the job is not worth a try.
+    needs
+        Steps whose documents it rests on.
+    is_optional
+        The journey goes on without it.
+    """
+
+    name: StepName
+    title: str
+    to_do: str
+    filling: Filling
+    placements: tuple[Placement, ...] = ()
+    least: int = 1
+    needs: tuple[StepName, ...] = ()
+    is_optional: bool = False
+
+
+STEPS: tuple[Step, ...] = (
+    Step(
+        StepName.CAMERA,
+        "Camera",
+        "Lock focus and aperture. Hold the target before the camera as drawn, keep it still, and "
+        "take a photograph. It should be sharp, without reflections, and wholly in the image.",
+        "placements",
+        CAMERA,
+        least=8,
+    ),
+    Step(
+        StepName.LASER,
+        "Light sheets",
+        "Put the target where you will scan, as drawn, so that the laser line crosses it. Each "
+        "take makes one image with the laser and one without: nothing may move between them.",
+        "placements",
+        LASER,
+        least=6,
+        needs=(StepName.CAMERA,),
+    ),
+    Step(
+        StepName.PROBING,
+        "Touch the plate",
+        "Fix the plate to the table. Touch it with the arm's probe where drawn, always from above. "
+        "Leave the scanner mounted, and do not reference the arm anew until the hand-eye is done.",
+        "touches",
+        TOUCHES,
+        least=8,
+    ),
+    Step(
+        StepName.HAND_EYE,
+        "Hand-eye",
+        "Point the head at the plate as drawn, with the laser line on the plate from end to end. "
+        "Hold the arm still and take. The plate and the arm's base must not move.",
+        "placements",
+        HAND_EYE,
+        least=6,
+        needs=(StepName.LASER, StepName.PROBING),
+    ),
+    Step(
+        StepName.LATENCY,
+        "Latency",
+        "Only where camera and arm have no trigger in common. Over the plate, move the head nearer "
+        "and away by 10 mm or more, about once a second and unevenly, for ten seconds, and "
+        "slowly sideways meanwhile.",
+        "motion",
+        needs=(StepName.HAND_EYE,),
+        is_optional=True,
+    ),
+    Step(
+        StepName.CHECK,
+        "Daily check",
+        "Put the reference ball on the table and scan it from above and from four sides. This "
+        "says whether the scanner is still what its calibration says: do it every day, and after "
+        "a knock.",
+        "motion",
+        needs=(StepName.HAND_EYE,),
+    ),
+    Step(
+        StepName.SCAN,
+        "Scan",
+        "Scan the part: start, move the line over it in even passes, and keep the range bar in the "
+        "green. Pause to put the arm elsewhere. A pass that went wrong can be taken back.",
+        "motion",
+        needs=(StepName.HAND_EYE,),
+    ),
+    Step(
+        StepName.INSPECT,
+        "Inspect",
+        "Choose a scan and what it is compared with.",
+        "nothing",
+        needs=(StepName.SCAN,),
+    ),
+)
+BY_NAME: Mapping[StepName, Step] = {step.name: step for step in STEPS}
+
+
+@dataclass(frozen=True, slots=True)
+class SessionSettings:
+    """What is known of a session besides its recordings; the keys of ``console.toml``.
+
+    Parameters
+    ----------
+    rig
+        The rig that fills it: path of ``rig.toml``, or ``twin:HEAD?seed=1``; empty for none.
+    target
+        Specification of the calibration target.
+    n_cameras
+        Cameras of the head.
+    ball_mm
+        Certified diameter of the reference ball.
+    part
+        Model of the part that scans are compared with; empty for none.
+    tolerance
+        As of ``armscan inspect cad``; empty for none.
+    needs_latency
+        Camera and arm have no trigger in common.
+    """
+
+    rig: str = ""
+    target: str = ""
+    n_cameras: int = 1
+    ball_mm: float = 0.0
+    part: str = ""
+    tolerance: str = ""
+    needs_latency: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What a step's job said.
+
+    Parameters
+    ----------
+    verdict
+        Whether to go on with it.
+    reasons
+        Why it is not good, or what to look at, as sentences.
+    values
+        (label, value and meaning) as the report shows them.
+    written
+        Files, relative to the session.
+    rests_on
+        SHA-256 of every input, by its path relative to the session.
+    next_step
+        What to do now.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...] = ()
+    values: tuple[tuple[str, str], ...] = ()
+    written: tuple[str, ...] = ()
+    rests_on: Mapping[str, str] | None = None
+    next_step: str = ""
+
+    @property
+    def page(self) -> str:
+        """Its page, relative to the session; empty for none."""
+        return next((name for name in self.written if name.endswith(".html")), "")
+
+
+@dataclass(frozen=True, slots=True)
+class StepState:
+    """Where a step stands.
+
+    Parameters
+    ----------
+    status
+        ``waiting`` for an earlier step, ``open`` to be filled, ``ready`` to be calculated, the
+        result's verdict, or ``old``: what it rests on has changed.
+    n_taken
+        Placements or touches that are taken.
+    result
+        The latest result, also an old one.
+    why
+        What it waits for, or why it is old.
+    """
+
+    status: Status
+    n_taken: int
+    result: StepResult | None = None
+    why: str = ""
+
+
+INSPECTIONS = ("CAD model", "plate", "ball")
+"""What a scan can be compared with."""
+
+
+class Journey:
+    """A session folder.
+
+    Parameters
+    ----------
+    folder
+        Where it lies; see `open_journey`.
+    settings
+        As written there.
+    """
+
+    def __init__(self, folder: Path, settings: SessionSettings) -> None:
+        self.folder = folder
+        self.settings = settings
+
+    def change(self, **settings: Any) -> None:
+        """Write other settings.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written.
+        """
+        self.settings = replace(self.settings, **settings)
+        content = toml_bytes(RecordCodec({}).write(self.settings))
+        write_files({self.folder / SETTINGS_FILE: content}, is_overwriting=True)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps that this session has."""
+        return tuple(step for step in STEPS if not step.is_optional or self.settings.needs_latency)
+
+    def recording(self, step: StepName, scan: str = "") -> Path:
+        """Folder that a step fills; of a scan by its name."""
+        return self.folder / RECORDINGS / (scan or step.value)
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Names of the scans, in their order."""
+        place = self.folder / RECORDINGS
+        found = place.glob("scan-*") if place.is_dir() else []
+        return tuple(sorted(one.name for one in found if (one / EXPOSURES_FILE).is_file()))
+
+    def new_scan(self) -> str:
+        """A name that no scan has."""
+        place = self.folder / RECORDINGS
+        used = {one.name for one in place.glob("scan-*")} if place.is_dir() else set()
+        return next(name for k in range(1, 10_000) if (name := f"scan-{k:02d}") not in used)
+
+    @property
+    def camera_file(self) -> Path:
+        """Calibration of the camera or cameras."""
+        return self.folder / ("stereo.json" if self.settings.n_cameras > 1 else "camera.json")
+
+    @property
+    def scanner_file(self) -> Path:
+        """The calibrated scanner: with latency where that was found."""
+        timed = self.folder / "scanner-timed.json"
+        return timed if timed.is_file() else self.folder / "scanner.json"
+
+    def cloud_file(self, scan: str) -> Path:
+        """Points of a scan."""
+        return self.folder / f"{scan}.ply"
+
+    def n_taken(self, step: StepName, scan: str = "") -> int:
+        """Placements, touches or exposures that are on disk."""
+        place = self.recording(step, scan)
+        try:
+            if BY_NAME[step].filling == "touches":
+                return len(read_csv(place / ARM_FILE))
+            rows, _ = exposure_rows(read_csv(place / EXPOSURES_FILE))
+        except ArmscanError:
+            return 0
+        views = {str(row.t_ns) if row.view is None else f"view {row.view}" for row in rows}
+        return len(views)
+
+    def state(self, step: StepName, scan: str = "") -> StepState:
+        """Where a step stands; of scan and inspection for one scan."""
+        known, n_taken = BY_NAME[step], self.n_taken(step, scan)
+        result = self.result(step, scan)
+        for needed in known.needs:
+            if not self._document(needed, scan).is_file():
+                what = f"'{BY_NAME[needed].title}' comes first"
+                return StepState("waiting", n_taken, result, what)
+        if result is not None:
+            changed = self._changed(result)
+            if not changed:
+                return StepState(result.verdict, n_taken, result)
+            return StepState("old", n_taken, result, f"{changed} has changed since")
+        if known.filling == "nothing" or n_taken >= known.least:
+            return StepState("ready", n_taken)
+        return StepState("open", n_taken)
+
+    def result(self, step: StepName, scan: str = "") -> StepResult | None:
+        """What was found last; None where nothing was, or the file is not to be read."""
+        path = self.folder / RESULTS / f"{result_key(step, scan)}.json"
+        try:
+            content = json.loads(path.read_text("utf-8"))
+            found = StepResult(**content)
+            pairs = tuple((str(label), str(text)) for label, text in found.values)
+        except (OSError, ValueError, TypeError):
+            return None
+        return replace(
+            found, reasons=tuple(found.reasons), values=pairs, written=tuple(found.written)
+        )
+
+    def next_step(self) -> StepName:
+        """The first step that has no good result."""
+        for step in self.steps:
+            scan = self.scans[-1] if self.scans and step.name in OF_A_SCAN else ""
+            if self.state(step.name, scan).status not in ("good", "doubtful"):
+                return step.name
+        return self.steps[-1].name
+
+    def start_over(self, step: StepName, scan: str = "") -> None:
+        """Remove what a step has taken, and its result; documents stay until they are replaced.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be removed.
+        """
+        place = self.recording(step, scan)
+        gone = place.with_name(f".{place.name}.old")
+        try:
+            if place.is_dir():
+                place.rename(gone)
+                shutil.rmtree(gone)
+            (self.folder / RESULTS / f"{result_key(step, scan)}.json").unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"what was taken cannot be removed ({error.strerror})",
+                where=path_text(place),
+                remedy="check the rights of the folder",
+            ) from error
+
+    def _document(self, step: StepName, scan: str) -> Path:
+        if step is StepName.SCAN:
+            return self.cloud_file(scan) if scan else self.folder / "no scan"
+        names = {
+            StepName.CAMERA: self.camera_file,
+            StepName.LASER: self.folder / "sensor.json",
+            StepName.PROBING: self.folder / "plate.csv",
+            StepName.HAND_EYE: self.folder / "scanner.json",
+            StepName.LATENCY: self.folder / "scanner-timed.json",
+        }
+        return names[step]
+
+    def _changed(self, result: StepResult) -> str:
+        """Name of the first input that is not what the result rests on; empty if none is."""
+        for name, digest in (result.rests_on or {}).items():
+            if digest_of(self.folder / name) != digest:
+                return name
+        return ""
+
+
+def result_key(step: StepName, scan: str) -> str:
+    """Name under which a step's result is kept."""
+    return f"{step.value}-{scan}" if scan else step.value
+
+
+OF_A_SCAN = (StepName.SCAN, StepName.INSPECT)
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a file; empty where it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+def open_journey(folder: Path, settings: SessionSettings | None = None) -> Journey:
+    """Open a session folder, made if need be.
+
+    Parameters
+    ----------
+    folder
+        Empty, new, or a session.
+    settings
+        Of a new session; what an existing one says of its rig is replaced by them, the rest of it
+        stays, and what it does not know they tell. None to take those of the folder.
+
+    Raises
+    ------
+    OutputError
+        If it holds other files than a session's, or cannot be written.
+    FileFormatError
+        If its settings are damaged.
+    """
+    path = folder / SETTINGS_FILE
+    if path.is_file():
+        journey = Journey(folder, read_settings(path))
+        if settings is not None:
+            known = {key: value for key, value in asdict(journey.settings).items() if value}
+            of_rig = {"rig": settings.rig, "needs_latency": settings.needs_latency}
+            journey.change(**{**asdict(settings), **known, **of_rig})
+        return journey
+    _check_own(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be made ({error.strerror})", where=path_text(folder)
+        ) from error
+    journey = Journey(folder, settings or SessionSettings())
+    journey.change()
+    return journey
+
+
+def _check_own(folder: Path) -> None:
+    """Raise `OutputError` for a file, and for a folder of something else."""
+    if folder.exists() and not folder.is_dir():
+        raise OutputError("this is a file", where=path_text(folder), remedy="name a folder")
+    held = [one.name for one in folder.iterdir()] if folder.is_dir() else []
+    foreign = sorted(name for name in held if name != LOCK_FILE)
+    if foreign and SETTINGS_FILE not in held:
+        raise OutputError(
+            f"the folder holds other files than a session's ({', '.join(foreign[:3])})",
+            where=path_text(folder),
+            remedy="name a new or an empty folder",
+        )
+
+
+def read_settings(path: Path) -> SessionSettings:
+    """Read ``console.toml``.
+
+    Raises
+    ------
+    FileFormatError
+        If it is no TOML, or a value is of a wrong type.
+    """
+    where, unknown = path_text(path), list[str]()
+    remedy = "remove the file: the session asks for its settings again"
+    try:
+        content = parse_toml(read_bytes(path), where, "write lines as ball_mm = 30.0")
+        return RecordCodec({}, unknown).read(SessionSettings, content)
+    except MismatchError as error:
+        raise FileFormatError(str(error), where=where, remedy=remedy) from error
+
+
+@contextmanager
+def held_session(folder: Path) -> Iterator[None]:
+    """Keep other consoles out of a session folder, which is made if need be.
+
+    Raises
+    ------
+    OutputError
+        If another one has it open, it is of something else, or cannot be written.
+    """
+    _check_own(folder)
+    path = folder / LOCK_FILE
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+    except OSError as error:
+        raise OutputError(
+            f"the folder cannot be written ({error.strerror})", where=path_text(folder)
+        ) from error
+    try:
+        if fcntl is None:
+            yield
+            return
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            whose = os.read(handle, 100).decode("ascii", "replace").strip()
+            raise OutputError(
+                f"another console has this session open (process {whose or 'not known'})",
+                where=path_text(folder),
+                remedy="go on in that one, or close it first",
+            ) from error
+        os.ftruncate(handle, 0)
+        os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
+        yield
+    finally:
+        os.close(handle)
+        # a folder that became no session is left as it was
+        with suppress(OSError):
+            if [one.name for one in folder.iterdir()] == [LOCK_FILE]:
+                path.unlink()
+                folder.rmdir()
+
+
+def sessions_in(folder: Path) -> tuple[Path, ...]:
+    """Session folders that lie in a folder, sorted by name."""
+    found: Sequence[Path] = ()
+    with suppress(OSError):
+        found = sorted(one for one in folder.iterdir() if (one / SETTINGS_FILE).is_file())
+    return tuple(found)

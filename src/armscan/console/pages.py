@@ -1,0 +1,745 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of the console: one column that leads through the steps, beside the space with points.
+
+Everything that it does is a call that a script can make: `Journey`, `Bench`, `LiveScan` and
+`run_step`.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from html import escape
+from pathlib import Path
+from typing import Any, Literal, cast
+from urllib.parse import quote
+
+import numpy as np
+import viser
+
+from armscan.console.journey import (
+    BY_NAME,
+    INSPECTIONS,
+    OF_A_SCAN,
+    REPORT_FILE,
+    Journey,
+    StepName,
+    StepResult,
+    StepState,
+    held_session,
+    open_journey,
+    sessions_in,
+)
+from armscan.console.placements import Placement, drawing
+from armscan.console.rig import open_bench
+from armscan.console.scan import Bench, LiveScan
+from armscan.console.scene import (
+    COLOURED_BY,
+    MOST_POINTS,
+    SceneView,
+    ShownPoints,
+    depths_mm,
+    live_image,
+    paragraph,
+    range_bar,
+    shown_points,
+    taken_image,
+)
+from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
+from armscan.console.work import Worker, run_step, told
+from armscan.errors import ArmscanError
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
+from armscan.pipeline.progress import ProgressEvent
+from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
+from armscan.storage.clouds import read_cloud
+from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.files import read_bytes
+from armscan.storage.formats.ply import parse_ply
+
+REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
+GOOD = "#3f7d2b"
+TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": "#b3261e", "old": "#b07d12"}
+WORDS = {
+    "waiting": "waits",
+    "open": "to do",
+    "ready": "can be calculated",
+    "good": "good",
+    "doubtful": "with remarks",
+    "not good": "not good",
+    "old": "out of date",
+}
+DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
+DETAIL = "up to 500,000"
+"""Shown at first: a computer without graphics processor draws two million points once a second."""
+START_BUTTON, UNDO_BUTTON = "0", "1"
+"""Buttons of the arm: start or pause, and take the last pass back."""
+
+
+class ConsolePage:
+    """The page of one session.
+
+    Parameters
+    ----------
+    server
+        From `armscan.console.server.open_server`.
+    folder
+        The session, made if need be.
+    bench
+        What fills it; None to look at what is there.
+
+    Raises
+    ------
+    ArmscanError
+        If the folder is no session, or another console has it open.
+    """
+
+    def __init__(self, server: viser.ViserServer, folder: Path, bench: Bench | None) -> None:
+        self.server, self.bench = server, bench
+        self.worker = Worker()
+        self.view = SceneView(server)
+        self.live: LiveScan | None = None
+        self._held = ExitStack()
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._scanner: ScannerCalibration | None = None
+        self._shown: ShownPoints | None = None
+        self._version = -1
+        self._drawn_at = 0.0
+        self._problem = ""
+        self.journey = self._opened(folder)
+        self.step = self.journey.next_step()
+        self.scan = self.journey.scans[-1] if self.journey.scans else ""
+        self._build()
+        self.refresh()
+        self._show_stored()
+        self._thread = threading.Thread(target=self._keep_fresh, daemon=True)
+        self._thread.start()
+        threading.Thread(target=self.worker.prepare, daemon=True).start()
+
+    def close(self) -> None:
+        """End a scan and the work under way, and let others open the session."""
+        self._closing.set()
+        if self.live is not None:
+            self.live.stop()
+        self._thread.join(5.0)
+        self.worker.close()
+        self._held.close()
+
+    def _opened(self, folder: Path) -> Journey:
+        held = ExitStack()
+        held.enter_context(held_session(folder))
+        try:
+            settings = None if self.bench is None else self.bench.settings
+            journey = open_journey(folder, settings)
+        except BaseException:
+            held.close()
+            raise
+        self._held.close()
+        self._held = held
+        return journey
+
+    # the column, from top to bottom
+
+    def _build(self) -> None:
+        gui = self.server.gui
+        gui.configure_theme(
+            control_width="large",
+            show_logo=False,
+            show_share_button=False,
+            brand_color=(11, 110, 135),
+        )
+        gui.main_panel.dock_right()
+        gui.set_panel_label("armscan")
+        self._head = gui.add_html("")
+        titles = [step.title for step in self.journey.steps]
+        self._choice = gui.add_dropdown("Step", titles, initial_value=BY_NAME[self.step].title)
+        self._choice.on_update(lambda _: self._choose_title(self._choice.value))
+        self._guide = gui.add_html("")
+        self._settings()
+        self._take = self._button("Take", self.take, "T", "Record this placement", "teal")
+        self._take_all = self._button(
+            "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
+        )
+        self._start_over = self._button("Start over", self.start_over, "", "Remove what was taken")
+        self._scanning()
+        self._inspecting()
+        self._picture = gui.add_image(
+            np.full((8, 640, 3), 245, dtype=np.uint8), label=None, visible=False
+        )
+        self._second = gui.add_image(
+            np.full((8, 640, 3), 245, dtype=np.uint8), label=None, visible=False
+        )
+        self._calculate = self._button(
+            "Calculate", self.calculate, "K", "Run this step's job", "teal"
+        )
+        self._working = gui.add_html("", visible=False)
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._cancel = self._button("Cancel", self.worker.cancel, "", "End the calculation", "red")
+        self._cancel.visible = False
+        self._note = gui.add_html("")
+        self._next = self._button("Go on", self.go_on, "N", "To the next step", "teal")
+        with gui.add_folder("What is shown"):
+            self._colour = gui.add_dropdown("Colour by", COLOURED_BY)
+            self._colour.on_update(lambda _: self._redraw())
+            self._detail = gui.add_dropdown("Points", tuple(DETAILS), initial_value=DETAIL)
+            self._detail.on_update(lambda _: self._redraw())
+            self._legend = gui.add_html("")
+        with gui.add_folder("Sessions", expand_by_default=False):
+            self._session_list = gui.add_dropdown("Session", (self._name(),))
+            self._open = self._button("Open", self._open_chosen, "", "Close this one, open that")
+
+    def _settings(self) -> None:
+        gui = self.server.gui
+        self._target = gui.add_text("Target", self.journey.settings.target)
+        self._target.on_update(lambda _: self._set(target=self._target.value.strip()))
+        self._ball = gui.add_number("Ball, mm", self.journey.settings.ball_mm, step=0.0001)
+        self._ball.on_update(lambda _: self._set(ball_mm=float(self._ball.value)))
+
+    def _scanning(self) -> None:
+        gui = self.server.gui
+        self._range = gui.add_html("", visible=False)
+        self._start = self._button("Start", self.start_or_pause, "S", "Begin, pause, go on", "teal")
+        self._undo = self._button("Undo last pass", self.undo, "U", "Take the last pass out")
+        self._clear = self._button("Clear", self.clear, "", "Take all passes out")
+        self._finish = self._button(
+            "Finish", self.finish, "F", "End the scan and calculate", "teal"
+        )
+        self._facts = gui.add_html("", visible=False)
+
+    def _inspecting(self) -> None:
+        gui = self.server.gui
+        self._scan_choice = gui.add_dropdown("Scan", ("none",))
+        self._scan_choice.on_update(lambda _: self._choose_scan(self._scan_choice.value))
+        first = INSPECTIONS[0 if self.journey.settings.part else 1]
+        self._compare = gui.add_dropdown("Compare with", INSPECTIONS, initial_value=first)
+        self._compare.on_update(lambda _: self.refresh())
+        self._part = gui.add_text("Model (STL, STEP)", self.journey.settings.part)
+        self._part.on_update(lambda _: self._set(part=self._part.value.strip()))
+        self._tolerance = gui.add_text("Tolerance, mm", self.journey.settings.tolerance)
+        self._tolerance.on_update(lambda _: self._set(tolerance=self._tolerance.value.strip()))
+
+    def _button(
+        self,
+        label: str,
+        work: Callable[[], object],
+        key: str,
+        hint: str,
+        colour: Literal["teal", "gray", "red"] = "gray",
+    ) -> viser.GuiButtonHandle:
+        """A button, and a key for it, that tell a failure as its sentence."""
+        named = f"{label} ({key})" if key else label
+        button = self.server.gui.add_button(named, hint=hint, color=colour)
+        button.on_click(lambda _: self._tried(work))
+        if key:
+            command = self.server.gui.add_command(label, hotkey=cast(Any, key), description=hint)
+            command.on_trigger(lambda _: self._tried(work) if _is_usable(button) else None)
+        return button
+
+    def _tried(self, work: Callable[[], object]) -> None:
+        try:
+            self._problem = ""
+            work()
+        except Exception as error:  # every failure ends as a sentence on the page
+            self._problem = told(error)
+        self.refresh()
+
+    def _set(self, **settings: Any) -> None:
+        now = self.journey.settings
+        if any(getattr(now, key) != value for key, value in settings.items()):
+            self._tried(lambda: self.journey.change(**settings))
+
+    def _name(self) -> str:
+        return self.journey.folder.resolve().name
+
+    # what the operator does
+
+    def choose(self, step: StepName) -> None:
+        """Show a step."""
+        if self.live is not None:
+            self._problem = "Finish the scan first."
+            self.refresh()
+            return
+        self.step = step
+        self._picture.visible = self._second.visible = False
+        self.refresh()
+        self._show_stored()
+
+    def _choose_title(self, title: str) -> None:
+        chosen = next((one.name for one in self.journey.steps if one.title == title), self.step)
+        if chosen is not self.step:
+            self._problem = ""
+            self.choose(chosen)
+
+    def _choose_scan(self, scan: str) -> None:
+        if scan in self.journey.scans and scan != self.scan:
+            self.scan = scan
+            self.refresh()
+            self._show_stored()
+
+    def go_on(self) -> None:
+        """Show the step that comes next."""
+        order = [one.name for one in self.journey.steps]
+        place = order.index(self.step)
+        self.choose(order[min(place + 1, len(order) - 1)])
+
+    def take(self) -> None:
+        """Record the placement or touch that is drawn."""
+        with self._lock:
+            bench, step = self._bench(), self.step
+            k, place = self.journey.n_taken(step), self.journey.recording(step)
+            if BY_NAME[step].filling == "touches":
+                bench.touch(place, k)
+                return
+            shown = bench.take(step, place, k)
+            if shown is not None:
+                self._picture.image = taken_image(shown)
+                self._picture.visible = True
+
+    def take_all(self) -> None:
+        """Record all that is left, as the twin shows it."""
+        with self._lock:
+            while self.journey.n_taken(self.step) < self._n_wanted():
+                self.take()
+                self.refresh()
+
+    def start_over(self) -> None:
+        """Remove what this step has taken."""
+        with self._lock:
+            self._picture.visible = self._second.visible = False
+            self.journey.start_over(self.step, self._scan_of(self.step))
+
+    def start_or_pause(self) -> None:
+        """Begin a scan, pause it, or go on."""
+        with self._lock:
+            if self.live is None:
+                self._begin()
+            elif self.live.snapshot.state == "scanning":
+                self.live.pause()
+            else:
+                self.live.start()
+
+    def _begin(self) -> None:
+        step = self.step
+        self._scanner = read_scanner_calibration(self.journey.scanner_file)
+        if step is StepName.SCAN:
+            self.scan = self.journey.new_scan()
+        else:
+            self.journey.start_over(step)
+        folder = self.journey.recording(step, self._scan_of(step))
+        self.live = LiveScan(self._bench(), step, folder, self._scanner)
+        self._version = -1
+        self.view.clear()
+        self.view.forget_view()
+        self.live.start()
+
+    def undo(self) -> None:
+        """Take the last pass back."""
+        if self.live is not None:
+            self.live.undo_pass()
+
+    def clear(self) -> None:
+        """Take all passes back."""
+        if self.live is not None:
+            self.live.clear()
+
+    def finish(self) -> None:
+        """End the scan, and run its job."""
+        with self._lock:
+            live, self.live = self.live, None
+            if live is None:
+                return
+            live.stop()
+            self.view.show_head(None, None)
+            n = live.n_recorded
+        self.refresh()
+        if n:
+            self.calculate()
+
+    def calculate(self) -> None:
+        """Run this step's job in its process, and show what it says."""
+        step, scan = self.step, self._scan_of(self.step)
+        _put(self._bar, 0.0)
+        self._busy(f"{BY_NAME[step].title}: calculating ...")
+        try:
+            self.worker.run(
+                run_step, self.journey.folder, step, scan, self._compare.value,
+                progress=self._tell,
+            )  # fmt: skip
+        finally:
+            self._busy("")
+            self.refresh()
+        self._show_stored()
+
+    def _tell(self, event: ProgressEvent) -> None:
+        _put(self._bar, 100.0 * event.done / max(event.total, 1))
+        words = f"{event.stage.capitalize()}: {event.done} of {event.total}"
+        self._working.content = _padded(paragraph(words, MUTED))
+
+    def _busy(self, words: str) -> None:
+        self._working.content = _padded(paragraph(words, MUTED))
+        for handle in (self._working, self._bar, self._cancel):
+            handle.visible = bool(words)
+        self._calculate.disabled = bool(words)
+
+    def _open_chosen(self) -> None:
+        chosen = self._session_list.value
+        if self.live is not None or self.worker.is_busy:
+            self._problem = "Finish the scan or the calculation first."
+            return
+        if chosen != self._name():
+            self.journey = self._opened(self.journey.folder.resolve().parent / chosen)
+            self.scan = self.journey.scans[-1] if self.journey.scans else ""
+            self.choose(self.journey.next_step())
+
+    # what is shown
+
+    def _bench(self) -> Bench:
+        if self.bench is None:
+            raise ArmscanError(
+                "no rig is connected", remedy="open the console with --rig to take and scan"
+            )
+        return self.bench
+
+    def _scan_of(self, step: StepName) -> str:
+        return self.scan if step in OF_A_SCAN else ""
+
+    def _n_wanted(self) -> int:
+        wanted = {} if self.bench is None else self.bench.n_placements
+        return wanted.get(self.step, len(BY_NAME[self.step].placements))
+
+    def refresh(self) -> None:
+        """Show what lies on disk now."""
+        step = BY_NAME[self.step]
+        state = self.journey.state(self.step, self._scan_of(self.step))
+        with self.server.atomic():
+            self._head.content = _padded(self._overview())
+            if self._choice.value != step.title:
+                _put(self._choice, step.title)
+            self._guide.content = _padded(self._instruction(state))
+            self._arrange(state)
+            self._note.content = _padded(self._told(state))
+            known = tuple(one.name for one in sessions_in(self.journey.folder.resolve().parent))
+            self._session_list.options = known or (self._name(),)
+
+    def _arrange(self, state: StepState) -> None:
+        """Which controls this step has."""
+        step, is_live = BY_NAME[self.step], self.live is not None
+        is_taken = step.filling in ("placements", "touches")
+        has_rig, is_motion = self.bench is not None, step.filling == "motion"
+        is_blocked = state.status == "waiting"
+        is_full = is_taken and state.n_taken >= self._n_wanted()
+        self._take.visible = is_taken and has_rig and not is_full and not is_blocked
+        is_twin = self.bench is not None and self.bench.is_simulated
+        self._take_all.visible = self._take.visible and is_twin
+        self._start_over.visible = is_taken and state.n_taken > 0
+        self._start.visible = is_motion and has_rig and not is_blocked
+        self._start.label = self._start_label()
+        for handle in (self._undo, self._clear, self._finish, self._range, self._facts):
+            handle.visible = is_motion and is_live
+        is_inspection = self.step is StepName.INSPECT
+        self._compare.visible = is_inspection
+        is_cad = is_inspection and self._compare.value == INSPECTIONS[0]
+        self._part.visible = self._tolerance.visible = is_cad
+        self._scan_choice.visible = self.step in OF_A_SCAN and bool(self.journey.scans)
+        self._scan_choice.visible = self._scan_choice.visible and not is_live
+        if self.journey.scans:
+            self._scan_choice.options = self.journey.scans
+            if self.scan in self.journey.scans:
+                _put(self._scan_choice, self.scan)
+        now = self.journey.settings
+        known: tuple[tuple[Any, object], ...] = (
+            (self._target, now.target),
+            (self._ball, now.ball_mm),
+            (self._part, now.part),
+            (self._tolerance, now.tolerance),
+        )
+        for field, value in known:
+            if field.value != value:
+                _put(field, value)
+        self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
+        uses_ball = is_inspection and self._compare.value == "ball"
+        self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
+        can_run = state.n_taken >= step.least or (is_inspection and not is_blocked)
+        self._calculate.visible = can_run and not is_live
+        verb = "Inspect" if is_inspection else "Calculate"
+        self._calculate.label = f"{verb} again (K)" if state.result else f"{verb} (K)"
+        is_settled = state.status in ("good", "doubtful")
+        self._calculate.color = "gray" if is_settled else "teal"
+        self._next.visible = is_settled and not is_live and self.step is not StepName.INSPECT
+
+    def _start_label(self) -> str:
+        if self.live is None:
+            again = self.step is StepName.SCAN and self.journey.scans
+            return "Start a new scan (S)" if again else "Start (S)"
+        return "Pause (S)" if self.live.snapshot.state == "scanning" else "Go on (S)"
+
+    def _overview(self) -> str:
+        rows = []
+        for step in self.journey.steps:
+            state = self.journey.state(step.name, self._scan_of(step.name))
+            tint = TINTS.get(state.status, MUTED if state.status != "ready" else ACCENT)
+            weight = "600" if step.name is self.step else "400"
+            hollow = state.status in ("waiting", "open")
+            dot = (
+                f'<span style="display:inline-block;width:10px;height:10px;border-radius:50%;'
+                f"border:2px solid {tint};box-sizing:border-box;margin-right:8px;"
+                f'background:{"transparent" if hollow else tint}"></span>'
+            )
+            rows.append(
+                f'<div style="display:flex;align-items:center;font-weight:{weight};'
+                f'padding:1px 0">{dot}<span>{escape(step.title)}</span>'
+                f'<span style="margin-left:auto;color:{tint}">{WORDS[state.status]}</span></div>'
+            )
+        rig = self.journey.settings.rig if self.bench is not None else "no rig: looking only"
+        what = "Simulated rig: " if self.bench is not None and self.bench.is_simulated else "Rig: "
+        return (
+            f'<div style="font-size:14px;color:{INK};line-height:1.45">'
+            f'<div style="font-size:16px;font-weight:700">{escape(self._name())}</div>'
+            f'<div style="font-size:11px;color:{MUTED};overflow-wrap:anywhere;margin-bottom:6px">'
+            f"{escape(what + rig if self.bench is not None else rig)}</div>{''.join(rows)}"
+            f'<div style="margin-top:6px">{self._link(REPORT_FILE, "Report of the session")}</div>'
+            "</div>"
+        )
+
+    def _link(self, page: str, words: str) -> str:
+        if not page or not (self.journey.folder / page).is_file():
+            return ""
+        return (
+            f'<a href="{PAGES}{quote(page)}" target="_blank" rel="noopener" '
+            f'style="color:{ACCENT}">{escape(words)}</a>'
+        )
+
+    def _instruction(self, state: StepState) -> str:
+        step = BY_NAME[self.step]
+        body = paragraph(step.to_do)
+        if state.status == "waiting":
+            return body + paragraph(f"{state.why}.", ALERT)
+        if step.filling not in ("placements", "touches"):
+            return body
+        wanted = self._n_wanted()
+        n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
+        if n >= wanted:
+            return body + paragraph(f"All {wanted} are taken.", GOOD)
+        shown = self._placement(n)
+        enough = f" At least {step.least} are needed." if n < step.least else ""
+        is_twin = self.bench is not None and self.bench.is_simulated
+        own = "The simulated operator follows a list of its own." if is_twin else ""
+        return (
+            body + f'<p style="margin:6px 0 2px;font-size:14px;color:{INK}"><b>{kind} {n + 1} of '
+            f"{wanted}:</b> {escape(shown.words)}.{enough}</p>"
+            + drawing(shown)
+            + paragraph(own, MUTED, 12)
+        )
+
+    def _placement(self, k: int) -> Placement:
+        known = BY_NAME[self.step].placements
+        return known[k % len(known)]
+
+    def _told(self, state: StepState) -> str:
+        problem = paragraph(self._problem, "#b3261e") if self._problem else ""
+        if state.result is None or self.live is not None:
+            return problem
+        return problem + result_card(state, self._link(state.result.page, "All about it"))
+
+    def _redraw(self) -> None:
+        self._version = -1
+        if self._shown is not None:
+            by = self._colour.value
+            self._legend.content = _padded(
+                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
+            )
+
+    def _show_stored(self) -> None:
+        """The points that belong to this step."""
+        self._shown = None
+        if self.step in OF_A_SCAN and self.scan:
+            try:
+                self._shown = self._stored_points()
+            except ArmscanError as error:
+                self._problem = str(error)
+        self.view.forget_view()
+        if self._shown is not None and self._shown.deviation_mm is not None:
+            _put(self._colour, "deviation")
+        if self._shown is None:
+            self.view.clear()
+            self._legend.content = _padded(paragraph("no points yet", MUTED, 12))
+        self._redraw()
+
+    def _stored_points(self) -> ShownPoints | None:
+        compared = self.journey.folder / f"{self.scan}-cad.ply"
+        if self.step is StepName.INSPECT and compared.is_file():
+            table = parse_ply(read_bytes(compared), str(compared)).table
+            points = np.column_stack([table[name] for name in "xyz"]).astype(np.float64)
+            deviation = np.asarray(table["deviation_mm"], dtype=np.float64)
+            limit = float(np.quantile(np.abs(deviation), 0.95)) if len(deviation) else 0.1
+            sheet = np.asarray(table["sheet"], dtype=np.int64)
+            return ShownPoints(
+                points, sheet, np.zeros(len(points)), None, deviation, float(f"{limit:.1g}")
+            )
+        path = self.journey.cloud_file(self.scan)
+        return shown_points(read_cloud(path)) if path.is_file() else None
+
+    # while scanning
+
+    def _keep_fresh(self) -> None:
+        while not self._closing.wait(REFRESH_S):
+            live = self.live
+            if live is not None:
+                try:
+                    self._show_live(live)
+                except Exception as error:  # the page goes on showing what it can
+                    self._problem = told(error)
+
+    def _show_live(self, live: LiveScan) -> None:
+        shown = live.snapshot
+        self._hear(live)
+        sensor = None if self._scanner is None else self._scanner.sensor
+        if sensor is not None:
+            names = tuple(one.name for one in sensor.sheets)
+            handles = (self._picture, self._second)
+            for handle, view, camera in zip(handles, shown.cameras, live.rig.cameras, strict=False):
+                handle.image = live_image(view, names, camera.setup.window)
+                handle.visible = True
+            self._range.content = _padded(range_bar(shown.range_mm, *depths_mm(sensor)))
+        self._facts.content = _padded(self._live_facts(live, shown))
+        self._start.label = self._start_label()
+        is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
+        if shown.cloud_version != self._version and is_due:
+            self._version, self._drawn_at = shown.cloud_version, time.monotonic()
+            cloud = live.session.cloud()
+            self._shown = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm)
+            by = self._colour.value
+            self._legend.content = _padded(
+                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
+            )
+            self.view.show_head(shown.base_from_tool, self._scanner)
+
+    def _hear(self, live: LiveScan) -> None:
+        while live.events:
+            event = live.events.popleft()
+            if event.kind == "button" and event.text == START_BUTTON:
+                self._tried(self.start_or_pause)
+            elif event.kind == "button" and event.text == UNDO_BUTTON:
+                self._tried(self.undo)
+            elif event.kind in ("fault", "warning"):
+                self._problem = event.text
+                self.refresh()
+            elif event.kind == "recovered":
+                self._problem = ""
+                self.refresh()
+
+    def _live_facts(self, live: LiveScan, shown: LiveSnapshot) -> str:
+        drift = live.drift_mm()
+        late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
+        lines = [
+            f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
+            f"{shown.n_passes} passes, {shown.n_points:,} points",
+            "passes do not meet yet"
+            if drift is None
+            else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
+        ]
+        still = shown.counts.get(LiveStatus.STILL, 0)
+        lines += [f"{still} dropped while the hand was still"] if still else []
+        lost = [
+            f"{n} {status.value}"
+            for status, n in shown.counts.items()
+            if status not in (LiveStatus.PLACED, LiveStatus.STILL)
+        ]
+        lines += [", ".join(lost)] if lost else []
+        if live.bench.is_over:
+            lines.append("the simulated hand has come to its end: finish")
+        return "".join(paragraph(line, INK, 13) for line in lines)
+
+
+def _padded(content: str) -> str:
+    """HTML as far from the column's edges as the controls."""
+    return f'<div style="padding:2px 10px">{content}</div>'
+
+
+def _put(handle: Any, value: object) -> None:
+    """Show a value; typed anew, for the library types values as what a person changes."""
+    handle.value = value
+
+
+def _is_usable(button: viser.GuiButtonHandle) -> bool:
+    return bool(button.visible) and not button.disabled
+
+
+def result_card(state: StepState, link: str) -> str:
+    """HTML of what a step's job said."""
+    result = cast(StepResult, state.result)
+    tint = TINTS[state.status if state.status in TINTS else result.verdict]
+    title = WORDS[state.status] if state.status in TINTS else WORDS[result.verdict]
+    rows = "".join(
+        f'<tr><td style="color:{MUTED};padding:2px 8px 2px 0;vertical-align:top">'
+        f'{escape(label.strip())}</td><td style="padding:2px 0;white-space:pre-line">'
+        f"{escape(text)}</td></tr>"
+        for label, text in result.values
+    )
+    reasons = "".join(paragraph(text, INK, 13) for text in result.reasons)
+    old = paragraph(f"{state.why}: calculate again.", ALERT, 13) if state.status == "old" else ""
+    return (
+        f'<div style="border:1px solid {LINE};border-left:5px solid {tint};border-radius:4px;'
+        f'padding:8px 10px;margin:6px 0;color:{INK};font-size:13px">'
+        f'<div style="font-size:15px;font-weight:700;color:{tint}">{title.capitalize()}</div>'
+        f"{old}{reasons}{paragraph(result.next_step, INK, 13)}"
+        f'<details open><summary style="cursor:pointer;color:{MUTED}">Figures</summary>'
+        f'<table style="font-size:12px;border-collapse:collapse">{rows}</table></details>'
+        f"{link}</div>"
+    )
+
+
+def run_console(
+    folder: Path,
+    rig: str = "",
+    *,
+    host: str = LOOPBACK,
+    port: int | None = None,
+    tell: Callable[[str], object] = print,
+) -> None:
+    """Open a session's page and serve it until an interrupt.
+
+    Parameters
+    ----------
+    folder
+        The session, made if need be.
+    rig
+        As of `armscan.console.rig.open_bench`; empty for none.
+    host, port
+        As of `armscan.console.server.open_server`.
+    tell
+        Told the page's address.
+
+    Raises
+    ------
+    ArmscanError
+        If rig, session or port cannot be opened.
+    """
+    with open_console(folder, rig, host=host, port=port) as (page, address):
+        tell(f"{page.journey.folder}: open {address} in a browser; Ctrl-C ends the console")
+        with suppress(KeyboardInterrupt):
+            threading.Event().wait()
+
+
+@contextmanager
+def open_console(
+    folder: Path, rig: str = "", *, host: str = LOOPBACK, port: int | None = None
+) -> Iterator[tuple[ConsolePage, str]]:
+    """A session's page and its address, closed at the end; parameters as of `run_console`."""
+    with ExitStack() as opened:
+        # before devices are opened and a port is taken: two consoles do not fight for them
+        with held_session(folder):
+            bench = open_bench(rig) if rig else None
+        if bench is not None:
+            opened.callback(bench.close)
+        pages: list[ConsolePage] = []
+        server, address = open_server(
+            lambda: pages[0].journey.folder if pages else folder, host, port
+        )
+        opened.callback(close_server, server)
+        pages.append(ConsolePage(server, folder, bench))
+        opened.callback(pages[0].close)
+        yield pages[0], address

@@ -1,0 +1,502 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What fills a session's recordings: the twin or real devices, one placement or touch at a time,
+or a scan while the hand moves.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from armscan.console.journey import SessionSettings, StepName
+from armscan.console.scan import ArmReading, Bench, GrowingRecording, samples_of
+from armscan.devices.clocks import ElementStatus
+from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
+from armscan.devices.protocols import (
+    Arm,
+    ArmSample,
+    Camera,
+    CameraSettings,
+    Frame,
+    LaserEvent,
+    TriggerMode,
+)
+from armscan.devices.registry import open_device
+from armscan.devices.sources import Preset, ScanSource, TwinScene
+from armscan.errors import DeviceError, FileFormatError, OptionError
+from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
+from armscan.pipeline.live.session import LiveSession, exposure_of
+from armscan.pipeline.simulate import TwinName, fewer_views
+from armscan.records.exposure import Exposure
+from armscan.records.recording import NO_TRIGGER, CameraSetup, ExposureRow, PoseForm, Session
+from armscan.storage.arm import (
+    ARM_FILE,
+    PROBE_FILE,
+    ProbeTip,
+    arm_columns,
+    probe_tip_toml,
+    read_probe_tip,
+)
+from armscan.storage.files import write_files
+from armscan.storage.recording import read_arm_track
+from armscan.storage.recording_session import SESSION_FILE, session_toml
+from armscan.storage.tables import csv_bytes
+
+TWIN = "twin:"
+WAIT_S = 5.0
+"""A take waits so long for an image and a pose."""
+
+
+TAKEN_SCENES: dict[StepName, TwinScene] = {
+    StepName.CAMERA: "camera",
+    StepName.LASER: "laser",
+    StepName.HAND_EYE: "hand-eye",
+}
+
+
+@dataclass(slots=True)
+class _Hand:
+    """Goes through a scan at a pace, exposure by exposure, and waits where it is held."""
+
+    source: ScanSource
+    rate_hz: float
+    is_held: bool = True
+    at: int = 0
+    due: float = 0.0
+    _sample: int = 0
+
+    @property
+    def is_over(self) -> bool:
+        return self.at >= len(self.source.rows)
+
+    def frame(self, camera: int, timeout_s: float) -> Frame | None:
+        """The next exposure, rendered when it is due; None while the hand is held."""
+        wait = min(max(self.due - time.monotonic(), 0.0), timeout_s)
+        if self.is_held or self.is_over or wait >= timeout_s:
+            time.sleep(timeout_s if wait == 0.0 else wait)
+            return None
+        time.sleep(wait)
+        row = self.source.rows[self.at]
+        if row.camera != camera:
+            time.sleep(0.002)
+            return None
+        shot = self.source.exposure(self.at)
+        frame = Frame(
+            shot.image,
+            self.at // len(self.source.session.cameras),
+            row.t_ns,
+            time.monotonic_ns(),
+            trigger_id=row.trigger_id,
+            lasers=row.lasers,
+            window=shot.window,
+        )
+        self.due = max(self.due, time.monotonic()) + 1.0 / self.rate_hz
+        self.at += 1
+        return frame
+
+    def samples(self, timeout_s: float) -> tuple[ArmSample, ...]:
+        """Samples of the arm up to the latest exposure."""
+        arm = self.source.arm
+        if arm is None or self.at == 0:
+            time.sleep(timeout_s)
+            return ()
+        until = self.source.rows[self.at - 1].t_ns if not self.is_over else arm.t_ns[-1]
+        stop = int(np.searchsorted(arm.t_ns, until, side="right"))
+        found, now = [], time.monotonic_ns()
+        for k in range(self._sample, stop):
+            ids = arm.trigger_ids
+            trigger = None if ids is None or ids[k] == NO_TRIGGER else int(ids[k])
+            pose = arm.pose(k) if arm.is_known[k] else None
+            found.append(ArmSample(k, int(arm.t_ns[k]), now, pose, trigger_id=trigger))
+        self._sample = max(stop, self._sample)
+        if not found:
+            time.sleep(min(timeout_s, 0.01))
+        return tuple(found)
+
+
+@dataclass(slots=True)
+class _HandCamera:
+    """See `armscan.devices.protocols.Camera`; what the hand's exposures show."""
+
+    hand: _Hand
+    camera: int
+    settings: CameraSettings = field(default_factory=CameraSettings)
+
+    @property
+    def name(self) -> str:
+        return f"simulated camera {self.camera}"
+
+    @property
+    def setup(self) -> CameraSetup:
+        return self.hand.source.session.cameras[self.camera]
+
+    def configure(self, settings: CameraSettings) -> CameraSettings:
+        return self.settings
+
+    def start(self, trigger: TriggerMode = "free") -> None:
+        """Deliver."""
+
+    def read(self, timeout_s: float) -> Frame | None:
+        return self.hand.frame(self.camera, timeout_s)
+
+    def stop(self) -> None:
+        """Deliver no more."""
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+@dataclass(slots=True)
+class _HandArm:
+    """See `armscan.devices.protocols.Arm`."""
+
+    hand: _Hand
+    name: str = "simulated arm"
+    pose_form: PoseForm = "quaternion"
+
+    def start(self) -> None:
+        """Deliver."""
+
+    def read(self, timeout_s: float) -> tuple[ArmSample, ...]:
+        return self.hand.samples(timeout_s)
+
+    def stop(self) -> None:
+        """Deliver no more."""
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+class TwinBench:
+    """The twin with its hand that holds targets and the head as a session's steps ask for.
+
+    Parameters
+    ----------
+    address
+        ``twin:HEAD?seed=1&preset=thesis&scene=workpiece&views=24&rate=10``; ``scene`` is what is
+        scanned, ``views`` how many exposures of a scan are taken, 0 for all.
+
+    Raises
+    ------
+    OptionError
+        If the address is wrong.
+    """
+
+    def __init__(self, address: str) -> None:
+        head, values = _parsed(address)
+        seed, self.views = _whole(values, "seed", 1), _whole(values, "views", 0)
+        self.rate_hz = float(max(_whole(values, "rate", 10), 1))
+        self.scene = cast(TwinScene, values.get("scene", "workpiece"))
+        preset = cast(Preset, values.get("preset", "thesis"))
+        self.twin = TwinName(head or "thesis-single", preset, seed).build()
+        self.address, self.is_simulated = address, True
+        self._n_cameras = len(self.twin.scan("camera").session.cameras)
+        self._sources: dict[str, ScanSource] = {}
+        self._hand: _Hand | None = None
+        self.scan_source(self.scene)
+
+    @property
+    def settings(self) -> SessionSettings:
+        """As of `Bench`."""
+        place = files("armscan.simulation") / "workpiece" / "workpiece.stl"
+        with as_file(place) as path:
+            part = str(path) if self.scene == "workpiece" else ""
+        return SessionSettings(
+            rig=self.address,
+            target=self.twin.target,
+            n_cameras=self._n_cameras,
+            ball_mm=self.twin.truth.ball_diameter_mm,
+            part=part,
+            tolerance="0.1" if part else "",
+        )
+
+    @property
+    def n_placements(self) -> dict[StepName, int]:
+        """As of `Bench`."""
+        found = {step: len(self._views(scene)) for step, scene in TAKEN_SCENES.items()}
+        return {**found, StepName.PROBING: len(self.twin.probe_plate().arm)}
+
+    def scan_source(self, scene: TwinScene) -> ScanSource:
+        """The exposures of a scene, as many as are wanted."""
+        if scene not in self._sources:
+            whole = self.twin.scan(scene)
+            is_thinned = self.views > 0 and scene not in TAKEN_SCENES.values()
+            self._sources[scene] = fewer_views(whole, self.views) if is_thinned else whole
+        return self._sources[scene]
+
+    def _views(self, scene: TwinScene) -> list[list[int]]:
+        groups: dict[object, list[int]] = {}
+        for k, row in enumerate(self.scan_source(scene).rows):
+            groups.setdefault(row.t_ns if row.view is None else row.view, []).append(k)
+        return list(groups.values())
+
+    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
+        """As of `Bench`."""
+        source = self.scan_source(TAKEN_SCENES[step])
+        views = self._views(TAKEN_SCENES[step])
+        if k >= len(views):
+            raise DeviceError(
+                "the simulated operator has shown all placements", remedy="calculate now"
+            )
+        grown = GrowingRecording.of(folder, _session(source))
+        shown = None
+        for row in views[k]:
+            shot = source.exposure(row)
+            shown = shot if shown is None or shot.lasers else shown
+            grown.add(source.rows[row], shot)
+        if source.arm is not None:
+            last = source.rows[views[k][-1]].t_ns
+            for t_ns, pose, trigger in samples_of(source.arm):
+                if t_ns <= last:
+                    grown.add_sample(t_ns, pose, trigger)
+        grown.flush()
+        return shown
+
+    def touch(self, folder: Path, k: int) -> None:
+        """As of `Bench`."""
+        probing = self.twin.probe_plate()
+        if k >= len(probing.arm):
+            raise DeviceError("the simulated operator has touched all places")
+        tip = ProbeTip(probing.tool_from_probe_mm, probing.tip_diameter_mm)
+        samples = list(samples_of(probing.arm))[: k + 1]
+        _write_touches(folder, samples, tip, is_simulated=True)
+
+    def scan_rig(self, step: StepName) -> Rig:
+        """As of `Bench`."""
+        scenes: dict[StepName, TwinScene] = {StepName.CHECK: "ball", StepName.LATENCY: "latency"}
+        source = self.scan_source(scenes.get(step, self.scene))
+        hand = self._hand = _Hand(source, self.rate_hz)
+        ids = source.arm is not None and source.arm.trigger_ids is not None
+        description = RigDescription((self.address,), is_common_trigger=ids)
+        cameras: list[Camera] = [_HandCamera(hand, k) for k in range(self._n_cameras)]
+        arm: Arm = _HandArm(hand)
+        return Rig(cameras, arm, None, description)
+
+    def hold(self, is_held: bool) -> None:
+        """As of `Bench`."""
+        if self._hand is not None:
+            self._hand.is_held = is_held
+
+    @property
+    def is_over(self) -> bool:
+        """As of `Bench`."""
+        return self._hand is not None and self._hand.is_over
+
+    def close(self) -> None:
+        """As of `Bench`."""
+
+
+def _session(source: ScanSource) -> Session:
+    return replace(source.session, is_simulated=source.is_simulated)
+
+
+def _write_touches(
+    folder: Path,
+    samples: Sequence[ArmReading],
+    tip: ProbeTip,
+    *,
+    is_simulated: bool,
+) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    track = arm_track([one[0] for one in samples], [one[1] for one in samples])
+    session = Session(cameras=(), is_simulated=is_simulated)
+    contents = {
+        folder / ARM_FILE: csv_bytes(arm_columns(track, session.pose_form, session.rotation, {})),
+        folder / PROBE_FILE: probe_tip_toml(tip),
+        folder / SESSION_FILE: session_toml(session),
+    }
+    write_files(contents, is_overwriting=True)
+
+
+def _parsed(address: str) -> tuple[str, dict[str, str]]:
+    head, _, options = address.removeprefix(TWIN).partition("?")
+    pairs = [word.partition("=") for word in options.split("&") if word]
+    values = {key: value for key, _, value in pairs}
+    if unknown := sorted(set(values) - {"seed", "preset", "scene", "views", "rate"}):
+        raise OptionError(
+            f"the address has no '{unknown[0]}'",
+            where=address,
+            remedy="write for example twin:thesis-single?seed=1&scene=workpiece",
+        )
+    return head, values
+
+
+def _whole(values: dict[str, str], key: str, default: int) -> int:
+    text = values.get(key, str(default))
+    if not text.isdigit():
+        raise OptionError(f"{key} is '{text}'", remedy="give a whole number, 0 or more")
+    return int(text)
+
+
+class _Latest:
+    """Keeps the latest instant; see `armscan.pipeline.live.acquire.Recorder`."""
+
+    def __init__(self) -> None:
+        self.instants: deque[MatchedInstant] = deque(maxlen=64)
+        self.samples: deque[TimedSample] = deque(maxlen=4096)
+
+    def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
+        """Instants hold the frames."""
+
+    def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
+        """Keep them."""
+        self.samples.extend(samples)
+
+    def add_events(self, events: tuple[LaserEvent, ...]) -> None:
+        """Instants know what was on."""
+
+    def add_instant(self, instant: MatchedInstant) -> None:
+        """Keep it."""
+        self.instants.append(instant)
+
+
+class DeviceBench:
+    """Real devices, or any that were opened.
+
+    Parameters
+    ----------
+    rig
+        Opened; `close` closes it.
+    name
+        What the session calls it.
+    """
+
+    def __init__(self, rig: Rig, name: str) -> None:
+        self.rig, self.name = rig, name
+        self.n_placements: dict[StepName, int] = {}
+        self.is_over = self.is_simulated = False
+
+    @property
+    def settings(self) -> SessionSettings:
+        """As of `Bench`."""
+        return SessionSettings(
+            rig=self.name,
+            n_cameras=len(self.rig.cameras),
+            needs_latency=not self.rig.description.is_common_trigger,
+        )
+
+    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
+        """As of `Bench`: one image in the light of the room, one of each laser, or both."""
+        sources = () if self.rig.lasers is None else self.rig.lasers.sources
+        states: list[tuple[str, ...]] = [()]
+        if step is StepName.LASER:
+            states = [*((source,) for source in sources), ()]
+        elif step is StepName.HAND_EYE:
+            states = [sources, sources]
+        setups = [camera.setup for camera in self.rig.cameras]
+        grown = GrowingRecording.of(folder, Session("calibration", tuple(setups)))
+        shown = None
+        view = f"{k + 1:02d}"
+        for state, instant in zip(states, self._instants(states, step), strict=True):
+            t_ns = _later(grown, instant)
+            for camera, frame in enumerate(instant.frames):
+                if frame is None:
+                    continue
+                index = 1 + max((row.index for row in grown.rows), default=-1)
+                row = ExposureRow(index, t_ns, camera, f"images/{index:04d}.png", state, None, view)
+                shot = exposure_of(frame, setups[camera], replace(instant, lasers=state), camera)
+                grown.add(row, shot)
+                shown = shot if shown is None or state else shown
+            if step is StepName.HAND_EYE:
+                grown.add_sample(t_ns, instant.pose, None)
+        grown.flush()
+        return shown
+
+    def touch(self, folder: Path, k: int) -> None:
+        """As of `Bench`; the tip is that of ``probe.toml`` in the session's folder."""
+        tip = read_probe_tip(folder.parents[1] / PROBE_FILE)
+        if self.rig.arm is None:
+            raise DeviceError("the rig has no arm", remedy="name it in rig.toml")
+        self.rig.arm.start()
+        try:
+            end = time.monotonic() + WAIT_S
+            found: tuple[ArmSample, ...] = ()
+            while not found and time.monotonic() < end:
+                found = tuple(one for one in self.rig.arm.read(0.1) if one.pose is not None)
+        finally:
+            self.rig.arm.stop()
+        if not found:
+            raise DeviceError("the arm gives no pose", remedy="reference it")
+        before: list[ArmReading] = []
+        with suppress(FileFormatError):
+            before = list(samples_of(read_arm_track(folder)[0]))
+        t_ns = max(found[-1].t_host_ns, before[-1][0] + 1 if before else 0)
+        _write_touches(folder, [*before, (t_ns, found[-1].pose, -1)], tip, is_simulated=False)
+
+    def _instants(
+        self, states: Sequence[tuple[str, ...]], step: StepName
+    ) -> Iterator[MatchedInstant]:
+        """One complete instant of each state of the lasers."""
+        latest = _Latest()
+        session = LiveSession(self.rig, recorder=latest)
+        session.start()
+        try:
+            for state in states:
+                if self.rig.lasers is not None:
+                    self.rig.lasers.set_next(state)
+                latest.instants.clear()
+                end = time.monotonic() + WAIT_S
+                while (one := self._complete(latest, state, step)) is None:
+                    if time.monotonic() > end:
+                        raise DeviceError(
+                            f"no complete image came within {WAIT_S:g} s",
+                            remedy="check camera, trigger and arm in the list of devices",
+                        )
+                    time.sleep(0.01)
+                yield one
+        finally:
+            session.stop()
+
+    def _complete(
+        self, latest: _Latest, state: tuple[str, ...], step: StepName
+    ) -> MatchedInstant | None:
+        has_pose = step is not StepName.HAND_EYE
+        for one in tuple(latest.instants):
+            is_whole = all(frame is not None and frame.is_complete for frame in one.frames)
+            is_state = self.rig.lasers is None or one.lasers == state
+            if is_whole and is_state and (has_pose or one.pose is not None):
+                return one
+        return None
+
+    def scan_rig(self, step: StepName) -> Rig:
+        """As of `Bench`."""
+        return self.rig
+
+    def hold(self, is_held: bool) -> None:
+        """As of `Bench`."""
+
+    def close(self) -> None:
+        """As of `Bench`."""
+        self.rig.close()
+
+
+def _later(grown: GrowingRecording, instant: MatchedInstant) -> int:
+    first = next(frame for frame in instant.frames if frame is not None)
+    t_ns = first.t_host_ns if instant.t_ns is None else instant.t_ns
+    return max(t_ns, 1 + max((row.t_ns for row in grown.rows), default=0))
+
+
+def open_bench(rig: str) -> Bench:
+    """Open what fills a session.
+
+    Parameters
+    ----------
+    rig
+        Path of ``rig.toml``, or ``twin:HEAD?seed=1`` for the simulator.
+
+    Raises
+    ------
+    ArmscanError
+        If it is not there, or a device does not open.
+    """
+    if rig.startswith(TWIN):
+        return TwinBench(rig)
+    return DeviceBench(Rig.open(read_rig(Path(rig)), open_device), rig)

@@ -1,0 +1,389 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan of a session while it is taken: its live chain, and its recording, which grows on disk and
+is whole again and again.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from armscan.console.journey import SessionSettings, StepName
+from armscan.devices.clocks import ElementStatus
+from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
+from armscan.devices.protocols import Frame, LaserEvent
+from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.live.acquire import LiveEvent
+from armscan.pipeline.live.rig import Rig
+from armscan.pipeline.live.session import LiveSession, LiveSnapshot, ShownCloud, exposure_of
+from armscan.records.cloud import PointCloud
+from armscan.records.exposure import Exposure
+from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
+from armscan.storage.arm import ARM_FILE, arm_columns
+from armscan.storage.files import write_files
+from armscan.storage.recording import encoded_png, read_recording
+from armscan.storage.recording_session import (
+    EXPOSURES_FILE,
+    SESSION_FILE,
+    exposure_columns,
+    session_toml,
+)
+from armscan.storage.tables import csv_bytes
+
+TABLES_EVERY_S = 1.0
+"""A scan's tables are written so often: a kill loses no more."""
+ArmReading = tuple[int, Pose[Base, Tool] | None, int]
+"""Time in ns, ``base_from_tool`` or None, and number of the trigger."""
+
+
+@dataclass(slots=True)
+class GrowingRecording:
+    """A folder recording that is whole after every `flush`.
+
+    Parameters
+    ----------
+    folder
+        What it holds already is kept.
+    session
+        Its facts; pixels as exposures deliver them.
+    rows
+        The exposures that are listed.
+    samples
+        Time, pose and trigger id of samples of the arm.
+    left_out
+        Exposures whose images are there and which are not listed.
+    """
+
+    folder: Path
+    session: Session
+    rows: list[ExposureRow] = field(default_factory=list)
+    samples: list[ArmReading] = field(default_factory=list)
+    left_out: list[ExposureRow] = field(default_factory=list)
+
+    @staticmethod
+    def of(folder: Path, session: Session) -> GrowingRecording:
+        """That of a folder, empty if there is none.
+
+        Raises
+        ------
+        FileFormatError
+            If what is there is damaged.
+        """
+        cameras = tuple(replace(one, align="low") for one in session.cameras)
+        grown = GrowingRecording(folder, replace(session, cameras=cameras))
+        if (folder / EXPOSURES_FILE).is_file():
+            found = read_recording(folder)
+            grown.rows = list(found.rows)
+            if found.arm is not None:
+                grown.samples = list(samples_of(found.arm))
+        return grown
+
+    def add(self, row: ExposureRow, exposure: Exposure) -> None:
+        """Write an image; `flush` lists it."""
+        content = encoded_png(exposure, self.session.cameras[row.camera])
+        path = self.folder / row.source
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_files({path: content}, is_overwriting=True)
+        self.rows.append(row)
+
+    def add_sample(self, t_ns: int, pose: Pose[Base, Tool] | None, trigger_id: int | None) -> None:
+        """Keep a sample of the arm; one that is not later than the last is passed over."""
+        if not self.samples or t_ns > self.samples[-1][0]:
+            self.samples.append((t_ns, pose, NO_TRIGGER if trigger_id is None else trigger_id))
+
+    def leave_out(self, chosen: Sequence[ExposureRow]) -> None:
+        """Take rows out of the list; their images stay."""
+        self.left_out += chosen
+        self.rows = [row for row in self.rows if row not in chosen]
+
+    def flush(self) -> None:
+        """Write the tables, all or none."""
+        if not self.rows:
+            (self.folder / EXPOSURES_FILE).unlink(missing_ok=True)
+            return
+        contents = {self.folder / EXPOSURES_FILE: csv_bytes(exposure_columns(self.rows, {}))}
+        if self.samples:
+            columns = arm_columns(self._track(), "quaternion", self.session.rotation, {})
+            contents[self.folder / ARM_FILE] = csv_bytes(columns)
+        facts = replace(self.session, pose_form="quaternion")
+        contents[self.folder / SESSION_FILE] = session_toml(facts)
+        write_files(contents, is_overwriting=True)
+
+    def _track(self) -> ArmTrack:
+        times, poses, triggers = zip(*self.samples, strict=True)
+        ids = np.array(triggers, dtype=np.int64)
+        has_ids = bool((ids != NO_TRIGGER).any())
+        return replace(arm_track(list(times), list(poses)), trigger_ids=ids if has_ids else None)
+
+
+def samples_of(arm: ArmTrack) -> Iterator[ArmReading]:
+    """The samples of a track one by one."""
+    for k, t_ns in enumerate(arm.t_ns.tolist()):
+        trigger = NO_TRIGGER if arm.trigger_ids is None else int(arm.trigger_ids[k])
+        yield t_ns, arm.pose(k) if arm.is_known[k] else None, trigger
+
+
+class Bench(Protocol):
+    """A rig and what stands before it, as the console uses them."""
+
+    @property
+    def settings(self) -> SessionSettings:
+        """What a new session knows of it."""
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether images are rendered."""
+
+    @property
+    def n_placements(self) -> dict[StepName, int]:
+        """Placements or touches of a step, where the rig knows them better than the list."""
+
+    def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
+        """Record placement ``k`` of a step into a folder; returns an image to show.
+
+        Raises
+        ------
+        ArmscanError
+            If a device does not deliver, or the disk refuses.
+        """
+
+    def touch(self, folder: Path, k: int) -> None:
+        """Record touch ``k``; raises as `take`."""
+
+    def scan_rig(self, step: StepName) -> Rig:
+        """Opened devices for a scan, with the thing that the step is about before them."""
+
+    def hold(self, is_held: bool) -> None:
+        """Keep a simulated hand where it is; a person's stays by itself."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a simulated hand has come to its end."""
+
+    def close(self) -> None:
+        """Give the devices back."""
+
+
+class ScanRecorder:
+    """Records a live scan as a folder; see `armscan.pipeline.live.acquire.Recorder`.
+
+    Parameters
+    ----------
+    folder
+        Of the recording.
+    rig
+        Whose instants come.
+    is_simulated
+        Whether images are rendered.
+    """
+
+    def __init__(self, folder: Path, rig: Rig, *, is_simulated: bool) -> None:
+        self.is_triggered = rig.description.is_common_trigger
+        self.setups = [camera.setup for camera in rig.cameras]
+        # one clock for all where ids decide nothing: the times are then this computer's
+        session = Session("scan", tuple(self.setups), is_simulated=is_simulated)
+        self.grown = GrowingRecording.of(folder, session)
+        self._rows_of: dict[int, list[ExposureRow]] = {}
+        self._lock = threading.Lock()
+        self._written = time.monotonic()
+
+    def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
+        """Instants hold the frames."""
+
+    def add_events(self, events: tuple[LaserEvent, ...]) -> None:
+        """Instants know what was on."""
+
+    def add_samples(self, samples: tuple[TimedSample, ...]) -> None:
+        """Keep those that have a time."""
+        with self._lock:
+            for one in samples:
+                t_ns = one.sample.t_device_ns if self.is_triggered else one.t_ns
+                if t_ns is not None:
+                    self.grown.add_sample(t_ns, one.pose, one.sample.trigger_id)
+
+    def add_instant(self, instant: MatchedInstant) -> None:
+        """Write its images; one without a time cannot be placed and is passed over."""
+        with self._lock:
+            for camera, frame in enumerate(instant.frames):
+                if frame is None or not frame.is_complete:
+                    continue
+                t_ns = frame.t_device_ns if self.is_triggered else instant.t_ns
+                if t_ns is None:
+                    continue
+                index = len(self.grown.rows) + len(self.grown.left_out)
+                row = ExposureRow(
+                    index,
+                    t_ns,
+                    camera,
+                    f"images/{index:05d}.png",
+                    instant.lasers or (),
+                    frame.trigger_id if self.is_triggered else None,
+                )
+                shot = exposure_of(frame, self.setups[camera], instant, camera)
+                self.grown.add(row, shot)
+                self._rows_of.setdefault(frame.number, []).append(row)
+            if time.monotonic() - self._written > TABLES_EVERY_S:
+                self._written = time.monotonic()
+                self.grown.flush()
+
+    def leave_out(self, first: int, last: int) -> None:
+        """Take the exposures between two frame numbers, both included, out of the list."""
+        with self._lock:
+            chosen = [
+                row
+                for number, rows in self._rows_of.items()
+                if first <= number <= last
+                for row in rows
+            ]
+            self.grown.leave_out(chosen)
+            self.grown.flush()
+
+    def finish(self) -> None:
+        """Write the tables."""
+        with self._lock:
+            self.grown.flush()
+
+
+DRIFT_MM = 1.5
+"""Points of an earlier pass within this distance carry the comparison of passes."""
+LEAST_SHARED = 60
+
+
+class LiveScan:
+    """One scan of a session: the live session, its recording, and what a page shows of them.
+
+    Parameters
+    ----------
+    bench
+        What is scanned with.
+    step
+        Scan, daily check or latency.
+    folder
+        Of the recording.
+    scanner
+        Places points; None only to show images and record.
+    """
+
+    def __init__(
+        self, bench: Bench, step: StepName, folder: Path, scanner: ScannerCalibration | None
+    ) -> None:
+        self.bench, self.step, self.folder = bench, step, folder
+        self.rig = bench.scan_rig(step)
+        is_simulated = bench.is_simulated
+        self.recorder = ScanRecorder(folder, self.rig, is_simulated=is_simulated)
+        self.events: deque[LiveEvent] = deque(maxlen=50)
+        self._frame_of: dict[int, int] = {}
+        self._starts: list[int] = []
+        self.session = LiveSession(
+            self.rig, scanner, recorder=self.recorder, keep_cloud=self._remember
+        )
+        self.session.add_listener(self._hear)
+
+    def start(self) -> None:
+        """Begin, or go on after a pause, with a new pass."""
+        self.session.start()
+        self.bench.hold(False)
+
+    def pause(self) -> None:
+        """Record nothing until `start`."""
+        self.bench.hold(True)
+        self.session.pause()
+        self.recorder.finish()
+
+    def undo_pass(self) -> None:
+        """Take the last pass out of the cloud and out of the recording's list."""
+        if self._starts:
+            start = self._starts.pop()
+            self.session.undo_pass()
+            self._leave_out({number for number in self._frame_of if number >= start})
+
+    def clear(self) -> None:
+        """Take all passes out."""
+        self.session.clear()
+        self._starts.clear()
+        self._leave_out(set(self._frame_of))
+
+    def stop(self) -> None:
+        """End the scan; the recording is whole."""
+        self.bench.hold(True)
+        self.session.stop()
+        self.recorder.finish()
+
+    @property
+    def snapshot(self) -> LiveSnapshot:
+        """What there is to show now."""
+        return self.session.snapshot()
+
+    @property
+    def n_recorded(self) -> int:
+        """Exposures in the recording."""
+        return len(self.recorder.grown.rows)
+
+    def drift_mm(self) -> float | None:
+        """Median distance of the last pass from the surface of the earlier ones, where they meet.
+
+        None where they do not.
+        """
+        cloud = self.session.cloud()
+        last = self._is_of_last_pass(cloud)
+        return passes_apart_mm(cloud.points_mm[~last], cloud.points_mm[last])
+
+    def _is_of_last_pass(self, cloud: ShownCloud) -> BoolArray:
+        return np.asarray(cloud.exposure >= (self._starts[-1] if self._starts else 0))
+
+    def _remember(self, number: int, cloud: PointCloud) -> None:
+        """Which frame an instant is, and with which instant a pass begins."""
+        n_passes = self.session.snapshot().n_passes
+        if n_passes != len(self._starts):
+            self._starts = [*self._starts[: n_passes - 1], number]
+        for source in cloud.exposure_sources:
+            self._frame_of[number] = int(source.rpartition(" ")[2])
+
+    def _leave_out(self, numbers: set[int]) -> None:
+        known = [self._frame_of[one] for one in numbers if one in self._frame_of]
+        if known:
+            self.recorder.leave_out(min(known), max(known))
+
+    def _hear(self, event: LiveEvent) -> None:
+        is_end = event.kind in ("fault", "recovered") and (
+            self.bench.is_over or self.session.snapshot().state != "scanning"
+        )
+        if not is_end:
+            self.events.append(event)
+
+
+def passes_apart_mm(earlier_mm: FloatArray, latest_mm: FloatArray) -> float | None:
+    """Median signed distance of points (M, 3) from planes through their neighbours of (N, 3).
+
+    None where too few of them lie near each other. A pass that lies apart from an earlier one by
+    more than both scatter shows that arm, plate or scanner moved meanwhile.
+    """
+    if len(earlier_mm) < LEAST_SHARED or len(latest_mm) < LEAST_SHARED:
+        return None
+    step = max(1, len(latest_mm) // 2000)
+    chosen = latest_mm[::step]
+    distance, near = cKDTree(earlier_mm).query(chosen, k=12)
+    met: BoolArray = np.asarray(distance)[:, 7] < DRIFT_MM
+    if met.sum() < LEAST_SHARED // 4:
+        return None
+    neighbours = earlier_mm[np.asarray(near)[met]]
+    middle = neighbours.mean(axis=1)
+    spread = np.einsum("nki,nkj->nij", neighbours - middle[:, None], neighbours - middle[:, None])
+    values, vectors = np.linalg.eigh(spread)
+    is_flat = values[:, 1] > 25.0 * np.maximum(values[:, 0], 1e-9)
+    if is_flat.sum() < LEAST_SHARED // 4:
+        return None
+    normals = vectors[is_flat, :, 0]
+    apart = np.einsum("ni,ni->n", chosen[met][is_flat] - middle[is_flat], normals)
+    # normals have no common side on an open surface: what counts is how far, not where to
+    return float(np.median(np.abs(apart)))

@@ -1,0 +1,411 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The jobs of a session's steps, and a process of its own that runs them and can be killed.
+
+Jobs write all or nothing, so that whoever ends the process leaves a whole session behind.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from armscan.console.journey import (
+    BY_NAME,
+    INSPECTIONS,
+    OF_A_SCAN,
+    REPORT_FILE,
+    RESULTS,
+    SETTINGS_FILE,
+    STEPS,
+    Journey,
+    StepName,
+    StepResult,
+    Verdict,
+    digest_of,
+    read_settings,
+    result_key,
+)
+from armscan.errors import ArmscanError, EstimationError, OptionError
+from armscan.jobs.camera import calibrate_camera
+from armscan.jobs.hand_eye import Artefact, StripeSource, calibrate_hand_eye, calibrate_latency
+from armscan.jobs.inspection.cad import inspect_cad
+from armscan.jobs.inspection.shapes import inspect_plane, inspect_sphere
+from armscan.jobs.job import Job
+from armscan.jobs.probe import probe
+from armscan.jobs.reconstruct import StillPaths, reconstruct
+from armscan.jobs.sheets import SheetImages, calibrate_sheets
+from armscan.jobs.stereo import calibrate_stereo
+from armscan.jobs.verify import Standard, verify
+from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.report.page import Block, Facts, Links, Page, Section, footer, render_page
+from armscan.report.quantity import Summary, fact, sentence
+from armscan.storage.arm import ARM_FILE
+from armscan.storage.documents import new_provenance
+from armscan.storage.files import write_files
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.recording_session import EXPOSURES_FILE
+
+Result = TypeVar("Result")
+LEAST_APART_S = 0.05
+
+
+class WorkCancelledError(ArmscanError):
+    """A person ended the work; nothing was written."""
+
+
+class Worker:
+    """One process that runs one piece of work after the other; started when it is first needed.
+
+    It stays, so that only the first work waits for its imports.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._link: Connection | None = None
+        self._is_cancelled = False
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process; None while there is none."""
+        return None if self._process is None else self._process.pid
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether work is under way."""
+        return self._lock.locked()
+
+    def prepare(self) -> None:
+        """Start the process ahead of its first work."""
+        if self._process is None or not self._process.is_alive():
+            context = get_context("spawn")
+            self._link, theirs = context.Pipe()
+            self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+            self._process.start()
+            theirs.close()
+
+    def run(self, work: Callable[..., Result], *given: Any, progress: Progress = silent) -> Result:
+        """Run a function of a module with ``progress`` as its keyword, and wait for its result.
+
+        Raises
+        ------
+        WorkCancelledError
+            If `cancel` was called meanwhile.
+        EstimationError
+            If the process came to an end, or the work failed by a bug.
+        ArmscanError
+            What the work raised, or that other work is under way.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise EstimationError("other work is under way", remedy="wait for it or cancel it")
+        try:
+            self._is_cancelled = False
+            self.prepare()
+            return cast(Result, self._wait(work, given, progress))
+        except (EOFError, OSError) as error:
+            self.close()
+            if self._is_cancelled:
+                raise WorkCancelledError("the work was cancelled; nothing was written") from error
+            raise EstimationError(
+                "the process that calculated came to an end, and nothing was written",
+                remedy="start it once more; if it happens again, free some memory",
+            ) from error
+        finally:
+            self._lock.release()
+
+    def cancel(self) -> None:
+        """End the work that is under way, at once."""
+        if self.is_busy and self._process is not None:
+            self._is_cancelled = True
+            self._process.kill()
+
+    def close(self) -> None:
+        """End the process."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join(5.0)
+        if self._link is not None:
+            self._link.close()
+        self._process = self._link = None
+
+    def _wait(self, work: Callable[..., Any], given: tuple[Any, ...], progress: Progress) -> object:
+        if self._link is None:
+            raise EOFError
+        self._link.send((work, given))
+        while True:
+            kind, content = self._link.recv()
+            if kind == "progress":
+                progress(content)
+            elif kind == "error":
+                raise content
+            elif kind == "bug":
+                raise EstimationError(
+                    f"this is a bug in armscan ({content})", remedy="report it with the session"
+                )
+            else:
+                return content
+
+
+def _serve(link: Connection) -> None:
+    """Do what is asked for until the other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    asked: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+    ready = threading.Semaphore(0)
+
+    def listen() -> None:
+        while True:
+            try:
+                asked.append(link.recv())
+            except (EOFError, OSError):
+                # the console is gone: what is under way would write behind the next one's back
+                os._exit(1)
+            ready.release()
+
+    threading.Thread(target=listen, daemon=True).start()
+    while True:
+        ready.acquire()
+        link.send(_done(*asked.pop(), link))
+
+
+def _done(work: Callable[..., Any], given: tuple[Any, ...], link: Connection) -> tuple[str, object]:
+    def tell(event: ProgressEvent) -> None:
+        link.send(("progress", event))
+
+    try:
+        return "done", work(*given, progress=tell)
+    except ArmscanError as error:
+        return "error", error
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        return "error", EstimationError(f"{place}{error.strerror or error}")
+    except Exception as error:
+        return "bug", f"{type(error).__name__}: {error}"
+
+
+def run_step(
+    folder: Path,
+    step: StepName,
+    scan: str = "",
+    compare: str = INSPECTIONS[0],
+    progress: Progress = silent,
+) -> StepResult:
+    """Run a step's job on what was taken, and keep what it says in the session.
+
+    Parameters
+    ----------
+    folder
+        The session.
+    step, scan
+        Which job, and on which scan.
+    compare
+        What an inspection compares with, one of `INSPECTIONS`.
+    progress
+        Told of every step of the job.
+
+    Returns
+    -------
+    StepResult
+        Also where the job refused: a refusal is a result with its sentence.
+
+    Raises
+    ------
+    ArmscanError
+        If the session cannot be read or written.
+    """
+    journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
+    known = BY_NAME[step]
+    if known.filling == "placements" and (n := journey.n_taken(step)) < known.least:
+        raise OptionError(
+            f"{n} of {len(known.placements)} placements are taken",
+            where=known.title,
+            remedy=f"take at least {known.least}, better all",
+        )
+    inputs = [path for path in _inputs(journey, step, scan) if path.is_file()]
+    rests_on = {path.relative_to(folder).as_posix(): digest_of(path) for path in inputs}
+    try:
+        result = _judged(step, _work(journey, step, scan, compare, progress))
+    except ArmscanError as error:
+        result = StepResult("not good", (sentence(str(error)),))
+        result = replace(result, written=_refusal(journey, step, scan))
+    written = tuple(
+        Path(name).relative_to(folder).as_posix() if Path(name).is_absolute() else name
+        for name in result.written
+    )
+    result = replace(
+        result, written=written, rests_on=rests_on, next_step=_advice(journey, step, result)
+    )
+    place = folder / RESULTS / f"{result_key(step, scan)}.json"
+    place.parent.mkdir(exist_ok=True)
+    write_files({place: json.dumps(asdict(result), indent=1).encode()}, is_overwriting=True)
+    write_report(journey)
+    return result
+
+
+def _inputs(journey: Journey, step: StepName, scan: str) -> list[Path]:
+    place = journey.recording(step, scan)
+    own = [place / EXPOSURES_FILE, place / ARM_FILE]
+    folder = journey.folder
+    rest: dict[StepName, list[Path]] = {
+        StepName.LASER: [journey.camera_file],
+        StepName.HAND_EYE: [folder / "sensor.json", folder / "plate.csv"],
+        StepName.LATENCY: [folder / "scanner.json"],
+        StepName.CHECK: [journey.scanner_file],
+        StepName.SCAN: [journey.scanner_file],
+        StepName.INSPECT: [journey.cloud_file(scan)],
+    }
+    return [*([] if step is StepName.INSPECT else own), *rest.get(step, [])]
+
+
+def _work(journey: Journey, step: StepName, scan: str, compare: str, progress: Progress) -> Summary:
+    """Run the job of a step."""
+    folder, settings, place = journey.folder, journey.settings, journey.recording(step, scan)
+
+    def job(name: str) -> Job:
+        command = ("armscan", "console", step.value, *((scan,) if scan else ()))
+        return Job(folder / name, is_overwriting=True, command=command, progress=progress)
+
+    def scanned() -> Summary:
+        paths = StillPaths((str(place),))
+        return reconstruct(job(f"{scan}.ply"), journey.scanner_file, paths)
+
+    def camera() -> Summary:
+        if settings.n_cameras > 1:
+            return calibrate_stereo(job("stereo.json"), settings.target, scan=place)
+        return calibrate_camera(job("camera.json"), settings.target, scan=place)
+
+    def laser() -> Summary:
+        images = SheetImages(scan=place)
+        return calibrate_sheets(job("sensor.json"), journey.camera_file, settings.target, images)
+
+    def hand_eye() -> Summary:
+        source = StripeSource(scans=(place,), sensor=folder / "sensor.json")
+        return calibrate_hand_eye(job("scanner.json"), source, Artefact(plate=folder / "plate.csv"))
+
+    works: dict[StepName, Callable[[], Summary]] = {
+        StepName.CAMERA: camera,
+        StepName.LASER: laser,
+        StepName.PROBING: lambda: probe(job("plate.csv"), place),
+        StepName.HAND_EYE: hand_eye,
+        StepName.LATENCY: lambda: calibrate_latency(
+            job("scanner-timed.json"), place, folder / "scanner.json"
+        ),
+        StepName.CHECK: lambda: verify(
+            job("check.html"), place, journey.scanner_file, Standard(ball_mm=settings.ball_mm)
+        ),
+        StepName.SCAN: scanned,
+        StepName.INSPECT: lambda: _inspected(journey, scan, compare, job),
+    }
+    return works[step]()
+
+
+def _inspected(journey: Journey, scan: str, compare: str, job: Callable[[str], Job]) -> Summary:
+    cloud, settings = journey.cloud_file(scan), journey.settings
+    if compare == "plate":
+        return inspect_plane(job(f"{scan}-plate.html"), cloud, plate=journey.folder / "plate.csv")
+    if compare == "ball":
+        return inspect_sphere(job(f"{scan}-ball.html"), cloud, settings.ball_mm)
+    if not settings.part:
+        raise OptionError("no model of the part is named", remedy="give its STL or STEP file")
+    part = journey.folder / settings.part
+    return inspect_cad(job(f"{scan}-cad.html"), cloud, part, tolerance=settings.tolerance)
+
+
+def _judged(step: StepName, summary: Summary) -> StepResult:
+    verdict: Verdict = "doubtful" if summary.warnings or summary.forced else "good"
+    said = summary.data.get("verdict")
+    if step is StepName.CHECK and isinstance(said, str):
+        verdict = {"still valid": verdict, "not valid": "not good"}.get(said, "doubtful")
+    reasons = (*summary.forced, *summary.warnings)
+    if step is StepName.CHECK and verdict != "good":
+        reasons = (sentence(f"the check says: {said}"), *reasons)
+    if step is StepName.INSPECT and said in ("fail", "undecided"):
+        verdict = "not good" if said == "fail" else "doubtful"
+        reasons = (sentence(f"the part's verdict is {said}"), *reasons)
+    values = tuple((item.label, item.line) for item in summary.quantities if item.label)
+    written = tuple(path.as_posix() for path in summary.written)
+    return StepResult(verdict, tuple(reasons), values, written)
+
+
+def _refusal(journey: Journey, step: StepName, scan: str) -> tuple[str, ...]:
+    """The page of a run that was refused, if it wrote one."""
+    names = {
+        StepName.CAMERA: journey.camera_file.stem,
+        StepName.LASER: "sensor",
+        StepName.HAND_EYE: "scanner",
+    }
+    page = journey.folder / f"{names.get(step, scan)}.refused.html"
+    return (page.as_posix(),) if page.is_file() else ()
+
+
+def _advice(journey: Journey, step: StepName, result: StepResult) -> str:
+    if result.verdict == "not good":
+        if step is StepName.CHECK:
+            return "Clean the ball and the lenses and scan it once more; then calibrate anew."
+        if step is StepName.INSPECT:
+            return "Open the report to see where."
+        return "Take again what the sentence above names, or start over."
+    order = [one.name for one in journey.steps]
+    place = order.index(step) + 1
+    following = f"Go on with '{BY_NAME[order[place]].title}'." if place < len(order) else ""
+    if result.verdict == "doubtful":
+        rest = f" If they do not matter: {following[0].lower()}{following[1:]}" if following else ""
+        return f"Read the remarks above.{rest}"
+    return following or "The report is ready."
+
+
+def write_report(journey: Journey) -> Path:
+    """Write the session's page: every step, its verdict and values, and links to its own page.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written.
+    """
+    sections = []
+    for step in journey.steps:
+        for scan in journey.scans if step.name in OF_A_SCAN else ("",):
+            state = journey.state(step.name, scan)
+            result = state.result
+            if result is None:
+                continue
+            title = f"{step.title} {scan}".strip()
+            heading = fact("Result", "old" if state.status == "old" else result.verdict, state.why)
+            facts = (heading, *(fact(label, text) for label, text in result.values))
+            why = tuple(fact("Remark", text) for text in result.reasons)
+            blocks: list[Block] = [Facts((*facts, *why))]
+            if result.page:
+                blocks.append(Links(((result.page, "All about it"),)))
+            sections.append(Section(title, tuple(blocks)))
+    files = [journey.folder / SETTINGS_FILE]
+    tables = [journey.recording(step.name) / EXPOSURES_FILE for step in STEPS]
+    provenance = new_provenance(files, command=("armscan", "console", journey.folder.name))
+    page = Page(
+        title=f"Session {journey.folder.resolve().name}",
+        subtitle="From calibration to inspection, step by step",
+        cards=(),
+        warnings=(),
+        sections=tuple(sections),
+        is_simulated=are_simulated([path for path in tables if path.is_file()]),
+        footer=footer(provenance),
+    )
+    path = journey.folder / REPORT_FILE
+    write_files({path: render_page(page)}, is_overwriting=True)
+    return path
+
+
+def told(error: BaseException) -> str:
+    """The one sentence about a failure."""
+    if isinstance(error, ArmscanError):
+        return str(error)
+    if isinstance(error, OSError):
+        return f"{error.filename or 'the disk'}: {error.strerror or error}."
+    return f"this is a bug in armscan ({type(error).__name__}: {error})."

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A session is what lies on disk: its state, results that grow old, refusals, two consoles."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from armscan.console.journey import (
+    LOCK_FILE,
+    SETTINGS_FILE,
+    Journey,
+    SessionSettings,
+    StepName,
+    held_session,
+    open_journey,
+    sessions_in,
+)
+from armscan.console.rig import open_bench
+from armscan.console.scan import GrowingRecording
+from armscan.console.work import run_step
+from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
+from armscan.geometry.poses import Pose
+from armscan.records.exposure import Exposure
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.arm import ProbeTip, write_probing
+from armscan.storage.recording import read_recording
+
+SETTINGS = SessionSettings(rig="twin:thesis-single?seed=1", target="chessboard:9x6:10", ball_mm=30)
+
+
+def touch_plate(journey: Journey, n: int, height_mm: float = 5.0) -> None:
+    """Touches of Z = height with a tip of 6 mm, as an arm reports them."""
+    rng = np.random.default_rng(3)
+    spots = np.column_stack([rng.uniform(-80, 80, (n, 2)), np.full(n, height_mm + 3.0)])
+    spots[:, 2] += rng.normal(0.0, 0.01, n)
+    tip = np.array([0.0, 0.0, 200.0])
+    down = np.diag([1.0, -1.0, -1.0])
+    track = ArmTrack(
+        t_ns=np.arange(n) * 10**9,
+        rotations=np.tile(down, (n, 1, 1)),
+        translations_mm=spots - down @ tip,
+        is_known=np.ones(n, dtype=bool),
+    )
+    place = journey.recording(StepName.PROBING)
+    place.parent.mkdir(exist_ok=True)
+    write_probing(place, track, ProbeTip(tip, 6.0))
+
+
+def test_an_empty_session_begins_with_the_camera_and_names_what_the_rest_waits_for(
+    tmp_path: Path,
+) -> None:
+    journey = open_journey(tmp_path / "new", SETTINGS)
+    assert journey.next_step() is StepName.CAMERA
+    states = {step.name: journey.state(step.name) for step in journey.steps}
+    assert states[StepName.CAMERA].status == states[StepName.PROBING].status == "open"
+    assert states[StepName.LASER].why == "'Camera' comes first"
+    assert states[StepName.HAND_EYE].why == "'Light sheets' comes first"
+    assert StepName.LATENCY not in states, "one trigger for camera and arm leaves no latency"
+    assert sessions_in(tmp_path) == (tmp_path / "new",)
+
+
+def test_a_plate_is_probed_and_the_result_grows_old_with_another_touch(tmp_path: Path) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 12)
+    assert journey.state(StepName.PROBING).status == "ready"
+    result = run_step(journey.folder, StepName.PROBING)
+    assert (result.verdict, result.reasons) == ("good", ())
+    assert result.next_step == "Go on with 'Hand-eye'."
+    plane = dict(result.values)["A B C D"].split("(")[0].split()
+    # 12 touches that scatter by 0.01 mm tell the height to 0.003 mm
+    assert -float(plane[3]) == pytest.approx(5.0, abs=0.02)
+    again = open_journey(journey.folder)
+    assert again.state(StepName.PROBING).status == "good"
+    for file in journey.recording(StepName.PROBING).iterdir():
+        file.unlink()
+    journey.recording(StepName.PROBING).rmdir()
+    touch_plate(journey, 13)
+    state = again.state(StepName.PROBING)
+    assert (state.status, state.why) == ("old", "recordings/probing/arm.csv has changed since")
+    assert "old" in (journey.folder / "report.html").read_text() or run_step(
+        journey.folder, StepName.PROBING
+    )
+
+
+def test_a_refusal_is_a_result_with_its_sentence(tmp_path: Path) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 2)
+    result = run_step(journey.folder, StepName.PROBING)
+    assert result.verdict == "not good"
+    assert len(result.reasons) == 1 and "2" in result.reasons[0]
+    assert open_journey(journey.folder).state(StepName.PROBING).status == "not good"
+    assert not (journey.folder / "plate.csv").exists()
+    with pytest.raises(OptionError, match="0 of 15 placements"):
+        run_step(journey.folder, StepName.CAMERA)
+
+
+def test_settings_stay_and_a_rig_tells_what_they_lack(tmp_path: Path) -> None:
+    folder = tmp_path / "s"
+    open_journey(folder, SETTINGS).change(ball_mm=25.0)
+    other = SessionSettings(rig="rig.toml", ball_mm=30.0, part="part.stl", needs_latency=True)
+    journey = open_journey(folder, other)
+    assert journey.settings.ball_mm == 25.0 and journey.settings.target == SETTINGS.target
+    assert journey.settings.rig == "rig.toml" and journey.settings.part == "part.stl"
+    assert StepName.LATENCY in [step.name for step in journey.steps]
+
+
+@pytest.mark.parametrize("content", ["", "ball_mm = [", 'ball_mm = "large"', "ball_mm = nan\n["])
+def test_damaged_settings_are_one_sentence(tmp_path: Path, content: str) -> None:
+    (tmp_path / SETTINGS_FILE).write_text(content)
+    with pytest.raises(FileFormatError):
+        open_journey(tmp_path)
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match=r"letter\.txt"):
+        open_journey(tmp_path, SETTINGS)
+    with pytest.raises(OutputError, match=r"letter\.txt"), held_session(tmp_path):
+        pass
+    assert [one.name for one in tmp_path.iterdir()] == ["letter.txt"]
+    with held_session(tmp_path / "new"):
+        pass
+    assert not (tmp_path / "new").exists(), "nothing became of it"
+
+
+def test_a_damaged_result_counts_as_none(tmp_path: Path) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    place = journey.folder / "results" / "camera.json"
+    place.parent.mkdir()
+    for content in ("", "{", json.dumps({"verdict": "good", "more": 1}), "[]"):
+        place.write_text(content)
+        assert journey.result(StepName.CAMERA) is None
+
+
+def test_the_second_console_is_told_which_one_is_first(tmp_path: Path) -> None:
+    with (
+        held_session(tmp_path / "s"),
+        pytest.raises(OutputError, match=f"process {os.getpid()}"),
+        held_session(tmp_path / "s"),
+    ):
+        pass
+    with held_session(tmp_path / "again"):
+        assert (tmp_path / "again" / LOCK_FILE).is_file()
+
+
+def test_a_growing_recording_is_whole_after_every_take(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    session = Session("calibration", (CameraSetup(6, 4),))
+    images = [rng.integers(0, 255, (4, 6)).astype(np.uint8) for _ in range(5)]
+    for k, image in enumerate(images):
+        # opened anew every time, as after a restart
+        grown = GrowingRecording.of(tmp_path / "r", session)
+        row = ExposureRow(k, k * 10**9, 0, f"images/{k}.png", ("A",), k, f"{k // 2}")
+        grown.add(row, Exposure(image, row.source))
+        grown.add_sample(k * 10**9, Pose(np.eye(3), np.array([k, 0.0, 0.0])), k)
+        grown.flush()
+        found = read_recording(tmp_path / "r")
+        assert len(found.rows) == k + 1 == len(found.arm.t_ns)
+        np.testing.assert_array_equal(found.exposure(k).image, image)
+    assert found.rows[3].lasers == ("A",) and found.arm.trigger_ids.tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_allclose(found.arm.translations_mm[:, 0], range(5), atol=1e-12)
+    grown.leave_out(grown.rows[1:3])
+    grown.flush()
+    assert [row.index for row in read_recording(tmp_path / "r").rows] == [0, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "address",
+    ["twin:thesis-single?colour=red", "twin:thesis-single?seed=x", "twin:other", "no/rig.toml"],
+)
+def test_a_wrong_rig_is_one_sentence(address: str) -> None:
+    with pytest.raises(ArmscanError):
+        open_bench(address)

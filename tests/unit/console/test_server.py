@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who may come in at the console's port, what it serves, and what it forbids the browser."""
+
+from __future__ import annotations
+
+import http.client
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("viser")
+
+from websockets.datastructures import Headers
+from websockets.exceptions import InvalidStatus
+from websockets.http11 import Request
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from armscan.console.server import COOKIE, Door, close_server, is_loopback, open_server
+from armscan.errors import DeviceError, OptionError
+
+VISER = Subprotocol("viser-v0")
+
+
+@pytest.fixture(scope="module")
+def port(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    folder = tmp_path_factory.mktemp("session")
+    (folder / "report.html").write_text("<p>all of it</p>")
+    (folder / "scanner.json").write_text("{}")
+    (folder.parent / "other.html").write_text("not yours")
+    server, address = open_server(lambda: folder, port=0)
+    assert address == f"http://localhost:{server.get_port()}/"
+    yield server.get_port()
+    close_server(server)
+
+
+def ask(port: int, path: str, **headers: str) -> tuple[int, str, http.client.HTTPMessage]:
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)) as link:
+        link.request("GET", path, headers=headers)
+        with link.getresponse() as answer:
+            return answer.status, answer.read().decode("utf-8", "replace"), answer.headers
+
+
+def test_the_page_comes_with_a_rule_against_other_hosts(port: int) -> None:
+    status, text, headers = ask(port, "/")
+    assert status == 200 and "<html" in text
+    rule = headers["Content-Security-Policy"]
+    assert rule.startswith("default-src 'self'") and "http" not in rule and "*" not in rule
+
+
+def test_pages_of_the_session_alone_are_served(port: int) -> None:
+    assert ask(port, "/pages/report.html")[:2] == (200, "<p>all of it</p>")
+    for path in ("scanner.json", "other.html", "../other.html", "%2e%2e/other.html", "", "a/"):
+        assert ask(port, f"/pages/{path}")[0] == 404, path
+
+
+def test_another_name_of_this_computer_is_refused(port: int) -> None:
+    # a name that an attacker's name server leads to 127.0.0.1
+    status, text, _ = ask(port, "/", Host=f"evil.example:{port}")
+    assert status == 403 and "token" in text
+    assert ask(port, "/pages/report.html", Host="evil.example")[0] == 403
+
+
+def test_a_page_of_another_host_cannot_press_buttons(port: int) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        connect(f"ws://127.0.0.1:{port}", origin="http://evil.example", subprotocols=[VISER])
+    assert refused.value.response.status_code == 403
+    own = f"http://127.0.0.1:{port}"
+    with connect(f"ws://127.0.0.1:{port}", origin=own, subprotocols=[VISER]) as link:
+        # let in; viser then ends it, for its own page is of another version
+        assert link.subprotocol == VISER
+
+
+def request(path: str, **headers: str) -> Request:
+    return Request(path, Headers({"Host": "192.168.1.5:80", **headers}))
+
+
+def test_a_token_lets_in_whoever_is_not_here(tmp_path: Path) -> None:
+    door = Door("secret", lambda: tmp_path)
+    assert door.refusal("192.168.1.9", request("/"))
+    assert door.refusal("192.168.1.9", request("/?token=Secret"))
+    assert door.refusal("127.0.0.1", request("/")), "a forwarded name is not this computer"
+    assert not door.refusal("192.168.1.9", request("/?token=secret"))
+    assert not door.refusal("192.168.1.9", request("/", Cookie=f"a=b; {COOKIE}=secret"))
+    # the token does not help a page of another host
+    assert door.refusal("192.168.1.9", request("/?token=secret", Origin="http://evil.example"))
+
+
+@pytest.mark.parametrize(
+    ("name", "is_here"),
+    [
+        ("localhost", True),
+        ("127.0.0.1", True),
+        ("::1", True),
+        ("127.0.0.1.evil.example", False),
+        ("10.0.0.1", False),
+        ("", False),
+    ],
+)
+def test_loopback(name: str, is_here: bool) -> None:
+    assert is_loopback(name) is is_here
+
+
+def test_a_taken_port_is_one_sentence(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(DeviceError, match="nothing can listen"):
+            open_server(lambda: tmp_path, port=taken.getsockname()[1])
+    with pytest.raises(OptionError):
+        open_server(lambda: tmp_path, port=70_000)

@@ -82,10 +82,11 @@ def test_plays_what_is_recorded_at_its_times(folder: Path) -> None:
 def test_plays_a_recording_of_one_file_alike(folder: Path, tmp_path: Path) -> None:
     record_folder(folder, tmp_path / "scan.mcap")
     frames, samples, events = played(str(tmp_path / "scan.mcap"), 3)
-    wanted = played(str(folder), 3)
-    for came, known in zip((frames, samples, events), wanted, strict=True):
-        assert [one.t_device_ns for one in came] == [one.t_device_ns for one in known]
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(frames, wanted[0], strict=True))
+    images, poses, switched = played(str(folder), 3)
+    assert [one.t_device_ns for one in frames] == [one.t_device_ns for one in images]
+    assert [one.t_device_ns for one in samples] == [one.t_device_ns for one in poses]
+    assert [one.t_device_ns for one in events] == [one.t_device_ns for one in switched]
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(frames, images, strict=True))
     (tmp_path / "cut.mcap").write_bytes((tmp_path / "scan.mcap").read_bytes()[:500])
     with pytest.raises(DeviceError):
         open_device("camera", f"replay:{tmp_path / 'cut.mcap'}")

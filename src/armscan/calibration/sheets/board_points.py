@@ -14,7 +14,7 @@ import numpy as np
 
 from armscan.calibration.cameras.adjustment import State, gather, linearise
 from armscan.calibration.cameras.result import MAX_STEPS
-from armscan.calibration.cameras.robust import solve_robustly, with_significant_bow
+from armscan.calibration.cameras.robust import BowTest, solve_robustly, with_board_warp
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.result import BoardStripes, PlacedBoard
 from armscan.errors import InputError
@@ -36,6 +36,9 @@ GRAZING = 1e-6
 
 LEAST_BOW_VIEWS = 3
 """Of fewer views, the poses take up a bow."""
+LIKELY_BOARD_BOW = 3e-4
+"""Bow of a board that is called flat, in parts of half its size: of a print on a plate of 300 mm,
+0.05 mm. It only limits what views that hardly show a bow leave open."""
 BOW_STEPS = 3
 
 SeenBoard = tuple[int, TargetView, Estimate[Pose[Sensor, Board]]]
@@ -306,14 +309,15 @@ def _step(a: Pose[Sensor, Board], b: Pose[Sensor, Board]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardBow:
-    """The common bow of a target, as its views show it where that is significant.
+    """The common bow of a target, as its views show it.
 
     Parameters
     ----------
     bow_mm
-        (2,) as of `armscan.calibration.cameras.result.BoardWarp`.
+        (2,) as of `armscan.calibration.cameras.result.BoardWarp`; zero where it is not significant.
     covariance_mm2
-        (2, 2) by the noise of the target's points, the cameras being held.
+        (2, 2) by the noise of the target's points, the cameras being held; where the bow is held at
+        zero, with the square of what is likely of it.
     by_cameras
         (2, P) derivative by the cameras' parameters.
     low_mm, high_mm
@@ -398,7 +402,8 @@ def find_bow(
 def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBow | None:
     """Bow of the target that camera 0 saw in several views, the camera being held.
 
-    None where fewer than `LEAST_BOW_VIEWS` views show it, or none is significant.
+    One that is not significant is held at zero, with the mean square of what the views leave likely
+    of it. None where fewer than `LEAST_BOW_VIEWS` views show it.
     """
     if len(views) < LEAST_BOW_VIEWS:
         return None
@@ -413,10 +418,9 @@ def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBo
     flat = solve_robustly(observations, start, held, trusted, MAX_STEPS)
     if isinstance(flat, FitFailure):
         return None
-    found = with_significant_bow(flat, MAX_STEPS)
-    if isinstance(found, FitFailure) or found[1] is None:
+    bowed = with_board_warp(flat, MAX_STEPS)
+    if isinstance(bowed, FitFailure):
         return None
-    bowed = found[0]
     equations = linearise(bowed.observations, bowed.state, np.eye(N_CAMERA + 2), bowed.weights)
     if equations is None:
         return None
@@ -427,10 +431,11 @@ def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBo
     by_cameras = np.zeros((2, cameras.n_parameters))
     by_cameras[:, :N_CAMERA] = -of_bow @ reduced[N_CAMERA:, :N_CAMERA]
     board = np.concatenate([view.points_board_mm[:, :2] for view in views])
-    return BoardBow(
-        bowed.state.shared[N_CAMERA:],
-        bowed.variance_factor * of_bow,
-        by_cameras,
-        board.min(axis=0),
-        board.max(axis=0),
-    )
+    bow_mm, covariance = bowed.state.shared[N_CAMERA:], bowed.variance_factor * of_bow
+    if not BowTest.of(flat, bowed).is_significant:
+        likely_mm = LIKELY_BOARD_BOW * 0.5 * float(np.ptp(board, axis=0).max())
+        left = np.linalg.inv(np.linalg.inv(covariance) + np.eye(2) / likely_mm**2)
+        mean_mm = left @ np.linalg.solve(covariance, bow_mm)
+        by_cameras = left @ np.linalg.solve(covariance, by_cameras)
+        bow_mm, covariance = np.zeros(2), left + np.outer(mean_mm, mean_mm)
+    return BoardBow(bow_mm, covariance, by_cameras, board.min(axis=0), board.max(axis=0))

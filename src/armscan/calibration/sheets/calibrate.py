@@ -145,7 +145,7 @@ def calibrate_sheets(
 
 
 def _about_bow(bow: BoardBow | None) -> tuple[str, ...]:
-    if bow is None:
+    if bow is None or not bow.bow_mm.any():
         return ()
     along = ", ".join(f"{value:+.3f}" for value in bow.bow_mm)
     return (f"the board is bowed by {along} mm (along x, along y); stripes were placed so",)

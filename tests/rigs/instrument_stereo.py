@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -16,7 +17,7 @@ from armscan.errors import ArmscanError
 from armscan.geometry.arrays import FloatArray
 from armscan.geometry.estimate import FitFailure
 from armscan.vision.targets.target import Chessboard, CircleGrid, Target
-from rigs.instrument_bounds import bound, camera_information
+from rigs.instrument_bounds import SeenPoints, bound, camera_information, moved_head
 from rigs.instrument_stages import HOPELESS_FOCAL, Outcome, judged, views_of
 from rigs.instruments import DEGENERATE, Instrument, board_placements
 
@@ -49,7 +50,8 @@ def run_stereo(made: Instrument) -> Outcome:
     except ArmscanError as error:
         fit = FitFailure(str(error))
     seconds = time.process_time() - begun
-    best = bound(camera_information(made, [*left.seen, *right.seen], 24), 24)
+    seen = [*left.seen, *right.seen]
+    best = bound(camera_information(made, seen, 24), 24)
     sigma = np.sqrt(np.diag(best))
     focal = max(
         float((sigma[:2] / made.left.focal).max()),
@@ -63,7 +65,7 @@ def run_stereo(made: Instrument) -> Outcome:
         return Outcome("stereo", result, reasons[0], seconds=seconds)
     error = stereo_error(made, fit)
     free = np.flatnonzero(np.diag(fit.covariance) > 0.0)
-    covariance = fit.covariance[np.ix_(free, free)]
+    covariance = between(made, error, fit.covariance, seen)[np.ix_(free, free)]
     groups = {
         name: [list(free).index(k) for k in rows if k in free] for name, rows in GROUPS.items()
     }
@@ -77,6 +79,24 @@ def run_stereo(made: Instrument) -> Outcome:
         warnings=fit.warnings,
         seconds=seconds,
     )
+
+
+def between(
+    made: Instrument, error: FloatArray, covariance: FloatArray, seen: Sequence[SeenPoints]
+) -> FloatArray:
+    """(24, 24) covariance that is stated at the estimate, carried halfway to the truth.
+
+    Which shifts of both images one sees best, to a thousandth of what each centre is known to,
+    turns with centres and turn themselves: across an error of two sigmas of these by more than that
+    thousandth. Linear in the middle, the chord is exact to the third order. Cramer-Rao bounds at
+    both places tell how the covariance changes: ``L2 L1^-1 C L1^-T L2'`` of their roots.
+    """
+    roots = [
+        np.linalg.cholesky(bound(camera_information(moved_head(made, part * error), seen, 24), 24))
+        for part in (1.0, 0.5)
+    ]
+    change = roots[1] @ np.linalg.inv(roots[0])
+    return np.asarray(change @ covariance @ change.T)
 
 
 def stereo_error(made: Instrument, fit: StereoFit) -> FloatArray:

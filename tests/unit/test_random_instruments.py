@@ -64,6 +64,21 @@ def test_degenerate_cameras_are_refused(fault: str) -> None:
         assert run_camera(replace(made, fault=fault), OPTIONS).outcome.result == "rightly refused"
 
 
+@pytest.mark.parametrize("seed", [520090, 510012, 510030])
+def test_a_board_that_bows_less_than_its_views_show_is_in_what_sheets_state(seed: int) -> None:
+    """Bowed by 2 to 11 um: beside a board taken as flat, bows of the sheets were 6 to 13 sigmas off."""
+    made = draw_instrument(seed)
+    camera = run_camera(made)
+    found = run_sheets(made, camera.calibration, camera.information).outcome
+    assert found.result == "right"
+    assert found.groups["bow"] < 4.0
+
+
+def test_stereo_pairs_are_judged_along_the_curve_of_their_errors() -> None:
+    """The best known shift of both images: across two sigmas of the centres it turns."""
+    assert run_stereo(draw_instrument(520241)).result == "right"
+
+
 @pytest.mark.parametrize("seed", [520331, 520442, 520443, 510005])
 def test_postures_that_only_scatter_stay_in_a_hand_eye(seed: int) -> None:
     """Few postures of an arm that scatters by 0.1 mm: their median tells little of the scatter.

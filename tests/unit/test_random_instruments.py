@@ -66,7 +66,7 @@ def test_degenerate_cameras_are_refused(fault: str) -> None:
 
 @pytest.mark.parametrize("seed", [520090, 510012, 510030])
 def test_a_board_that_bows_less_than_its_views_show_is_in_what_sheets_state(seed: int) -> None:
-    """Bowed by 2 to 11 um: beside a board taken as flat, bows of the sheets were 6 to 13 sigmas off."""
+    """Bowed by 2 to 11 um: beside boards taken as flat, sheets bowed by 6 to 13 sigmas too much."""
     made = draw_instrument(seed)
     camera = run_camera(made)
     found = run_sheets(made, camera.calibration, camera.information).outcome

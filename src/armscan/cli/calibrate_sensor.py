@@ -95,6 +95,13 @@ LeaveOut = Annotated[
         help="Image, or view of a recording, not to use, by name or quoted pattern; repeatable."
     ),
 ]
+TargetBow = Annotated[
+    float | None,
+    typer.Option(
+        help="What the target may be bowed by where its views show none (mm); 0 if known flat.",
+        show_default="3e-4 of half its size",
+    ),
+]
 TargetMargin = Annotated[
     float | None,
     typer.Option(
@@ -152,6 +159,7 @@ def laser(
     plane_only: Annotated[
         bool, typer.Option("--plane-only", help="Hold every sheet to a plane, without a bow.")
     ] = False,
+    target_bow: TargetBow = None,
     margin_mm: TargetMargin = None,
     stripe_method: StripeMethodOption = None,
     laser_colour: LaserColourOption = None,
@@ -178,6 +186,7 @@ def laser(
         "n_sheets": sheets,
         "sheet_names": tuple(name) if name else None,
         "is_bow_allowed": False if plane_only else None,
+        "target_bow_mm": target_bow,
     }
     if again is not None:
         refuse_given(

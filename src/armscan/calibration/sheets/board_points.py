@@ -14,7 +14,7 @@ import numpy as np
 
 from armscan.calibration.cameras.adjustment import State, gather, linearise
 from armscan.calibration.cameras.result import MAX_STEPS
-from armscan.calibration.cameras.robust import BowTest, solve_robustly, with_board_warp
+from armscan.calibration.cameras.robust import BowTest, Solution, solve_robustly, with_board_warp
 from armscan.calibration.cameras.start import estimate_board_pose
 from armscan.calibration.sheets.result import BoardStripes, PlacedBoard
 from armscan.errors import InputError
@@ -364,12 +364,13 @@ class BoardBow:
 
 
 def find_bow(
-    boards: Sequence[BoardStripes], cameras: HeadCameras
+    boards: Sequence[BoardStripes], cameras: HeadCameras, likely_mm: float | None
 ) -> tuple[BoardBow | None, Sequence[BoardStripes]]:
-    """The target's bow, and the boards with their poses estimated anew with it."""
+    """The target's bow, and the boards placed with it; where it is not zero, estimated anew."""
     bow = find_board_bow(
         list({board.view.source: board.view for board in boards if board.camera == 0}.values()),
         cameras,
+        likely_mm,
     )
     if bow is None:
         return None, boards
@@ -377,7 +378,9 @@ def find_bow(
     placements: dict[str, dict[int, SeenBoard]] = {}
     for board in boards:
         key = board.camera, board.view.source
-        if key not in found:
+        if key not in found and not bow.bow_mm.any():
+            found[key] = board.camera, board.view, board.sensor_from_board
+        elif key not in found:
             view = bow.bent(board.view)
             pose = estimate_board_pose(view, cameras.model(board.camera), allow_ambiguous=True)
             if isinstance(pose, FitFailure):
@@ -399,24 +402,17 @@ def find_bow(
     ]
 
 
-def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBow | None:
+def find_board_bow(
+    views: Sequence[TargetView], cameras: HeadCameras, likely_mm: float | None = None
+) -> BoardBow | None:
     """Bow of the target that camera 0 saw in several views, the camera being held.
 
     One that is not significant is held at zero, with the mean square of what the views leave likely
-    of it. None where fewer than `LEAST_BOW_VIEWS` views show it.
+    of it where ``likely_mm`` is known beforehand (None: `LIKELY_BOARD_BOW`). None where fewer than
+    `LEAST_BOW_VIEWS` views show it, and where it is known to be zero and they do not contradict.
     """
-    if len(views) < LEAST_BOW_VIEWS:
-        return None
-    model, observations = cameras.model(0), gather(views)
-    poses = [estimate_board_pose(view, model, allow_ambiguous=True) for view in views]
-    known = [pose.value for pose in poses if not isinstance(pose, FitFailure)]
-    if len(known) < len(views):
-        return None
-    start = State.from_poses(np.append(model.parameters, np.zeros(2)), known)
-    trusted = np.ones(len(views), dtype=np.bool_)
-    held = np.zeros((N_CAMERA + 2, 0))
-    flat = solve_robustly(observations, start, held, trusted, MAX_STEPS)
-    if isinstance(flat, FitFailure):
+    flat = _held_camera(views, cameras.model(0)) if len(views) >= LEAST_BOW_VIEWS else None
+    if flat is None:
         return None
     bowed = with_board_warp(flat, MAX_STEPS)
     if isinstance(bowed, FitFailure):
@@ -433,9 +429,25 @@ def find_board_bow(views: Sequence[TargetView], cameras: HeadCameras) -> BoardBo
     board = np.concatenate([view.points_board_mm[:, :2] for view in views])
     bow_mm, covariance = bowed.state.shared[N_CAMERA:], bowed.variance_factor * of_bow
     if not BowTest.of(flat, bowed).is_significant:
-        likely_mm = LIKELY_BOARD_BOW * 0.5 * float(np.ptp(board, axis=0).max())
+        if likely_mm is None:
+            likely_mm = LIKELY_BOARD_BOW * 0.5 * float(np.ptp(board, axis=0).max())
+        if likely_mm == 0.0:
+            return None
         left = np.linalg.inv(np.linalg.inv(covariance) + np.eye(2) / likely_mm**2)
         mean_mm = left @ np.linalg.solve(covariance, bow_mm)
         by_cameras = left @ np.linalg.solve(covariance, by_cameras)
         bow_mm, covariance = np.zeros(2), left + np.outer(mean_mm, mean_mm)
     return BoardBow(bow_mm, covariance, by_cameras, board.min(axis=0), board.max(axis=0))
+
+
+def _held_camera(views: Sequence[TargetView], model: CameraModel) -> Solution | None:
+    """The flat board's poses under a camera that is held; None where one has no solution."""
+    poses = [estimate_board_pose(view, model, allow_ambiguous=True) for view in views]
+    known = [pose.value for pose in poses if not isinstance(pose, FitFailure)]
+    if len(known) < len(views):
+        return None
+    start = State.from_poses(np.append(model.parameters, np.zeros(2)), known)
+    trusted = np.ones(len(views), dtype=np.bool_)
+    held = np.zeros((N_CAMERA + 2, 0))
+    flat = solve_robustly(gather(views), start, held, trusted, MAX_STEPS)
+    return None if isinstance(flat, FitFailure) else flat

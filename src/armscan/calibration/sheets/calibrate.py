@@ -119,7 +119,7 @@ def calibrate_sheets(
     """
     options = options or SheetOptions()
     cameras = HeadCameras.of(camera)
-    bow, bent = find_bow(boards, cameras)
+    bow, bent = find_bow(boards, cameras, options.target_bow_mm)
     vote = observe_boards(bent, cameras, options, bow)
     if not any(image.stripes for image in vote.images):
         return FitFailure(

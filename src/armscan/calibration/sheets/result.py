@@ -58,12 +58,17 @@ class SheetOptions:
         to bottom where stripes lie flatter than 45 degrees); empty gives A, B, C, ...
     is_bow_allowed
         False holds every sheet to a plane.
+    target_bow_mm
+        What the target may be bowed by (one standard deviation of the height of its middle over its
+        edges) where its views show no bow; 0 for one that is known to be flat. None takes 3e-4 of
+        half its size.
     """
 
     margin_mm: float | None = None
     n_sheets: int = 0
     sheet_names: tuple[str, ...] = ()
     is_bow_allowed: bool = True
+    target_bow_mm: float | None = None
 
     def __post_init__(self) -> None:
         n = len(self.sheet_names)
@@ -83,6 +88,11 @@ class SheetOptions:
                 not n or self.n_sheets in (0, n),
                 f"{n} names for {self.n_sheets} sheets",
                 "give one name a sheet",
+            ),
+            (
+                self.target_bow_mm is None or 0.0 <= self.target_bow_mm < math.inf,
+                f"target bowed by {self.target_bow_mm} mm",
+                "give a height of 0 or more",
             ),
         ):
             if not holds:

@@ -6,6 +6,8 @@ from __future__ import annotations
 import json
 import math
 import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -287,3 +289,27 @@ def test_interrupt_leaves_no_result(
     # the targets that were found before are whole, and the next run takes them
     assert [path.name for path in tmp_path.iterdir()] == ["armscan-cache"]
     assert not list(tmp_path.rglob("*.part"))
+
+
+SLOW_DISK = (
+    "import os, sys, time\n"
+    "from armscan.cli import main\n"
+    "os.fsync = lambda handle: (print('writing', flush=True), time.sleep(60))\n"
+    "sys.exit(main(sys.argv[1:]))\n"
+)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows ends a process without a signal")
+def test_a_process_that_is_told_to_end_leaves_no_result(tmp_path: Path) -> None:
+    (tmp_path / "cloud.xyz").write_text("1 2 3\n4 5 6\n7 8 9.5\n")
+    words = [sys.executable, "-c", SLOW_DISK, "convert", "cloud.xyz", "cloud.ply"]
+    with subprocess.Popen(
+        words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline() == "writing\n"
+        assert [path.suffix for path in sorted(tmp_path.iterdir())] == [".part", ".xyz"]
+        process.terminate()
+        assert process.wait(30) == 143
+        assert process.stderr.read() == "ended; no file is left half-written\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.xyz"]

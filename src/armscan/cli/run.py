@@ -5,11 +5,16 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import stat
 import sys
 import tempfile
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import cast
 
 import typer
@@ -67,36 +72,74 @@ USAGE_ERROR = cast(type[Exception], typer.BadParameter.__bases__[0])
 EXIT_INPUT = 2
 EXIT_BUG = 70
 EXIT_INTERRUPTED = 130
+EXIT_ENDED = 128 + signal.SIGTERM
+
+
+@dataclass(slots=True)
+class Ending:
+    """Whether another program asked this one to end."""
+
+    is_asked: bool = False
+
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Unwind as on Ctrl-C, so that what is half-written goes."""
+        self.is_asked = True
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def ended_in_order() -> Iterator[Ending]:
+    """While the block runs, SIGTERM (of kill, of a service, of a shutdown) is as Ctrl-C."""
+    ending = Ending()
+    if threading.current_thread() is not threading.main_thread():
+        # Python takes handlers from the main thread only
+        yield ending
+        return
+    before = signal.signal(signal.SIGTERM, ending.interrupt)
+    try:
+        yield ending
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``armscan`` and return its exit code.
 
     0 means done, 1 that a check was made and not passed, 2 that the input or the disk stood in the
-    way (one sentence on standard error says what to do), 130 that a person interrupted, 70 a bug.
+    way (one sentence on standard error says what to do), 130 that a person interrupted, 143 that
+    another program asked it to end, 70 a bug.
 
     Parameters
     ----------
     arguments
         Words after ``armscan``; those of the process if None.
     """
-    from armscan.cli.app import command
-
     os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
     give_kernels_a_folder(Path(__file__).parents[1])
     if isinstance(sys.stdout, io.TextIOWrapper):
         # a terminal that has no sign for ± or ° shows a question mark instead of failing
         sys.stdout.reconfigure(errors="replace")
+    with ended_in_order() as ending:
+        code = _run(arguments)
+    if code != EXIT_INTERRUPTED:
+        return code
+    word = "ended" if ending.is_asked else "interrupted"
+    code = EXIT_ENDED if ending.is_asked else EXIT_INTERRUPTED
+    return _fail(f"{word}; no file is left half-written", code, prefix="")
+
+
+def _run(arguments: Sequence[str] | None) -> int:
+    from armscan.cli.app import command
+
     try:
         result = command()(
             args=None if arguments is None else list(arguments),
             prog_name="armscan",
             standalone_mode=False,
         )
-        code = result if isinstance(result, int) else 0
-        return _interrupted() if code == EXIT_INTERRUPTED else code
+        return result if isinstance(result, int) else 0
     except (KeyboardInterrupt, typer.Abort):
-        return _interrupted()
+        return EXIT_INTERRUPTED
     except (ArmscanError, OSError, MemoryError, USAGE_ERROR) as error:
         return _fail(_sentence(error), EXIT_INPUT)
     except Exception as error:
@@ -121,10 +164,6 @@ def _sentence(error: BaseException) -> str:
     message = message.replace(": Value error, ", ": ")
     hint = "Put quotes around patterns" if "unexpected extra arg" in message else "Add -h for help"
     return f"{message.replace(chr(10), ' ').rstrip('.')}. {hint}."
-
-
-def _interrupted() -> int:
-    return _fail("interrupted; no file is left half-written", EXIT_INTERRUPTED, prefix="")
 
 
 def _fail(sentence: str, code: int, prefix: str = "error: ") -> int:

@@ -20,7 +20,6 @@ from armscan.report.fuse import FusedCloud, fused_page, fused_quantities
 from armscan.report.quantity import Summary, sentences
 from armscan.storage.clouds import (
     CLOUD_SUFFIXES,
-    N_POINTS,
     CloudPiece,
     cloud_losses,
     cloud_parts,
@@ -115,9 +114,7 @@ def _written(
     )
     content = cloud_parts(places[0], marks, n_points, pieces, is_fused=True)
     written = job.write({places[0]: content, places[1]: fused_page(result, provenance, warnings)})
-    # how many points each stands for is in PLY files alone
-    dropped = () if places[0].suffix.lower() == ".ply" else (N_POINTS,)
-    losses = cloud_losses(marks, places[0], dropped)
+    losses = cloud_losses(marks, places[0])
     kind = places[0].suffix.lstrip(".").upper()
     lost = (f"the {kind} file does not hold {', '.join(losses)}",) if losses else ()
     return Summary(

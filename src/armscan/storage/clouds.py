@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
+from armscan.geometry.arrays import IntArray
 from armscan.models.calibration import SensorCalibration
 from armscan.models.camera import CameraModel
 from armscan.records.cloud import PointCloud
@@ -76,7 +77,7 @@ class CloudFormat:
     name: str
     suffixes: tuple[str, ...]
     read: Callable[[bytes, Path], CloudColumns]
-    write: Callable[[PointCloud], bytes] | None
+    write: Callable[[CloudPiece], bytes] | None
     losses: Callable[[PointCloud], tuple[str, ...]]
 
 
@@ -84,12 +85,12 @@ def _lost(*words: str) -> Callable[[PointCloud], tuple[str, ...]]:
     return lambda _: words
 
 
-def _las(cloud: PointCloud) -> bytes:
-    return las.las_bytes(cloud, is_packed=False)
+def _las(piece: CloudPiece) -> bytes:
+    return las.las_bytes(piece, is_packed=False)
 
 
-def _laz(cloud: PointCloud) -> bytes:
-    return las.las_bytes(cloud, is_packed=True)
+def _laz(piece: CloudPiece) -> bytes:
+    return las.las_bytes(piece, is_packed=True)
 
 
 FORMATS = (
@@ -138,11 +139,14 @@ class CloudFile:
         What a person should know of how it was read, in words.
     dropped
         Names of the file's columns that the cloud does not carry.
+    n_points
+        (N,) measured points that each of a fused cloud stands for; None where the file has none.
     """
 
     cloud: PointCloud
     remarks: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
+    n_points: IntArray | None = None
 
 
 def read_cloud_file(path: Path) -> CloudFile:
@@ -163,10 +167,11 @@ def read_cloud_file(path: Path) -> CloudFile:
             remedy=f"give a file {', '.join(BY_SUFFIX)} with x y z in mm",
         )
     found = known.read(data, path)
-    return CloudFile(cloud_of_columns(found, path), found.remarks, dropped_columns(found))
+    counts = found.columns.get(N_POINTS) if found.is_own else None
+    return CloudFile(cloud_of_columns(found, path), found.remarks, dropped_columns(found), counts)
 
 
-def cloud_bytes(cloud: PointCloud, path: Path) -> bytes:
+def cloud_bytes(points: PointCloud | CloudPiece, path: Path) -> bytes:
     """Content of a file that holds a cloud in the format of the path's suffix.
 
     Raises
@@ -180,7 +185,7 @@ def cloud_bytes(cloud: PointCloud, path: Path) -> bytes:
         if known is not None:
             fact = f"{known.name} files hold triangles, and a cloud has none"
         raise OptionError(fact, where=str(path), remedy=f"end it in {', '.join(CLOUD_SUFFIXES)}")
-    return known.write(cloud)
+    return known.write(points if isinstance(points, CloudPiece) else CloudPiece(points))
 
 
 def cloud_parts(
@@ -200,7 +205,7 @@ def cloud_parts(
     path
         Where it goes.
     marks, n_points, pieces, is_fused
-        As of `ply_parts`; how many points each stands for is in PLY files alone.
+        As of `ply_parts`.
     """
     suffix = path.suffix.lower()
     if suffix == ".ply":
@@ -208,10 +213,9 @@ def cloud_parts(
     elif suffix in (".xyz", ".asc", ".txt"):
         yield from text.xyz_parts(marks, pieces)
     else:
-        whole = PointCloud.concat([piece.cloud for piece in pieces])
-        yield cloud_bytes(
-            replace(whole, is_simulated=marks.is_simulated, forced=marks.forced), path
-        )
+        whole = CloudPiece.joined(list(pieces))
+        marked = replace(whole.cloud, is_simulated=marks.is_simulated, forced=marks.forced)
+        yield cloud_bytes(replace(whole, cloud=marked), path)
 
 
 MOST_NAMED = 12
@@ -313,9 +317,10 @@ def convert_file(source: Path, output: Path, *, is_overwriting: bool = False) ->
     if is_cloud:
         found = read_cloud_file(source)
         cloud = found.cloud
-        content = cloud_bytes(cloud, output)
+        content = cloud_bytes(CloudPiece(cloud, n_points=found.n_points), output)
+        kept = tuple(name for name in found.dropped if name != N_POINTS)
         what = f"cloud to {BY_SUFFIX[suffix].name}"
-        losses = cloud_losses(cloud, output, found.dropped)
+        losses = cloud_losses(cloud, output, kept)
         holds_sigma = SIGMA_LOSS not in losses
         without = (NO_SIGMA,) if holds_sigma and not cloud.covariance_mm2.any() else ()
         conversion = Conversion(what, losses, (*found.remarks, *without), cloud.forced)

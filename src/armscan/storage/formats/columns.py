@@ -102,10 +102,19 @@ class CloudPiece:
     sigma_mm: FloatArray | None = None
     n_points: IntArray | None = None
 
+    @staticmethod
+    def joined(pieces: Sequence[CloudPiece]) -> CloudPiece:
+        """One or more pieces as one; sigmas are those of the points."""
+        counts = [piece.n_points for piece in pieces]
+        known = [n for n in counts if n is not None]
+        return CloudPiece(
+            PointCloud.concat([piece.cloud for piece in pieces]),
+            n_points=np.concatenate(known) if len(known) == len(counts) else None,
+        )
 
-def cloud_columns(piece: PointCloud | CloudPiece) -> CloudColumns:
+
+def cloud_columns(piece: CloudPiece) -> CloudColumns:
     """All that a cloud carries."""
-    piece = piece if isinstance(piece, CloudPiece) else CloudPiece(piece)
     return CloudColumns(point_columns(piece), cloud_notes(piece.cloud))
 
 

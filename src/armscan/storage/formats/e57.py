@@ -16,13 +16,13 @@ import numpy as np
 
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
-from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
-    INDICES,
     POINT,
+    WHOLE,
     CloudColumns,
+    CloudPiece,
     Column,
     cloud_columns,
     missing_package,
@@ -41,7 +41,7 @@ SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
-def e57_bytes(cloud: PointCloud) -> bytes:
+def e57_bytes(piece: CloudPiece) -> bytes:
     """Content of an E57 file of one scan that holds all of a cloud.
 
     Raises
@@ -50,7 +50,7 @@ def e57_bytes(cloud: PointCloud) -> bytes:
         If the package is not installed.
     """
     pye57 = _pye57()
-    found = cloud_columns(cloud)
+    found = cloud_columns(piece)
     values = {
         FIELDS.get(name, f"{OWN}:{name}"): np.array(column, np.float64)
         for name, column in found.columns.items()
@@ -80,7 +80,7 @@ def _write_scan(file: Any, lib: Any, values: dict[str, FloatArray], notes: str) 
     buffers = lib.VectorSourceDestBuffer()
     for name, column in values.items():
         low, high = (float(column.min()), float(column.max())) if len(column) else (0.0, 0.0)
-        if name.removeprefix(f"{OWN}:") in INDICES:
+        if name.removeprefix(f"{OWN}:") in WHOLE:
             node = lib.IntegerNode(image, int(low), int(low), int(high))
         else:
             node = lib.FloatNode(image, low, lib.E57_DOUBLE, low, high)

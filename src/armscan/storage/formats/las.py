@@ -19,9 +19,10 @@ from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
-    INDICES,
     POINT,
+    WHOLE,
     CloudColumns,
+    CloudPiece,
     Column,
     cloud_columns,
     missing_package,
@@ -56,7 +57,7 @@ def las_losses(cloud: PointCloud) -> tuple[str, ...]:
     return (lost,)
 
 
-def las_bytes(cloud: PointCloud, *, is_packed: bool) -> bytes:
+def las_bytes(piece: CloudPiece, *, is_packed: bool) -> bytes:
     """Content of a LAS 1.4 file, packed as LAZ.
 
     Raises
@@ -65,7 +66,7 @@ def las_bytes(cloud: PointCloud, *, is_packed: bool) -> bytes:
         If the packages are not installed.
     """
     laspy = _laspy()
-    found = cloud_columns(cloud)
+    found, cloud = cloud_columns(piece), piece.cloud
     header = laspy.LasHeader(point_format=6, version="1.4")
     middle = (
         (cloud.points_mm.min(axis=0) + cloud.points_mm.max(axis=0)) / 2.0
@@ -77,7 +78,7 @@ def las_bytes(cloud: PointCloud, *, is_packed: bool) -> bytes:
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams(
-                name=_theirs(name), type=np.dtype("i4" if name in INDICES else "f8")
+                name=_theirs(name), type=np.dtype("i4" if name in WHOLE else "f8")
             )
             for name in extra
         ]

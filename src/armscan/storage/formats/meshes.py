@@ -11,7 +11,6 @@ import numpy as np
 
 from armscan.errors import FileFormatError
 from armscan.geometry.arrays import FloatArray
-from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
@@ -20,6 +19,7 @@ from armscan.storage.formats.columns import (
     POINT,
     SIMULATED,
     CloudColumns,
+    CloudPiece,
 )
 from armscan.storage.formats.ply import vertices_remark
 from armscan.storage.formats.stl import stl_corners
@@ -89,8 +89,9 @@ def _numbers(lines: list[str], word: str, path: Path) -> FloatArray:
         ) from error
 
 
-def obj_bytes(cloud: PointCloud) -> bytes:
+def obj_bytes(piece: CloudPiece) -> bytes:
     """Content of an OBJ file of points without faces; it lacks `OBJ_LOSES`."""
+    cloud = piece.cloud
     buffer = io.StringIO()
     buffer.write(f"# frame {cloud.frame}\n")
     if cloud.is_simulated:

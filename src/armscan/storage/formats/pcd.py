@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from armscan.errors import FileFormatError
-from armscan.records.cloud import PointCloud
 from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     DAMAGED,
     MOST_HEADER_BYTES,
     POINT,
     CloudColumns,
+    CloudPiece,
     cloud_columns,
     columns_of,
     header_bytes,
@@ -54,9 +54,9 @@ class _Header:
         return self.width * self.height
 
 
-def pcd_bytes(cloud: PointCloud) -> bytes:
+def pcd_bytes(piece: CloudPiece) -> bytes:
     """Content of a binary PCD file that holds all of a cloud, in float64 and int32."""
-    found = cloud_columns(cloud)
+    found = cloud_columns(piece)
     table = structured(found.columns)
     renamed = {own: theirs for theirs, own in RENAMED.items()}
     kinds = [table.dtype[name] for name in table.dtype.names or ()]

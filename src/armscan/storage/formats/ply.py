@@ -159,7 +159,7 @@ def _ascii_table(body: bytes, kind: np.dtype[Any], count: int, where: str) -> ND
         ) from error
 
 
-def ply_bytes(cloud: PointCloud) -> bytes:
+def ply_bytes(points: PointCloud | CloudPiece) -> bytes:
     """Content of a binary little-endian PLY file that holds all of a cloud, in float64 and int32.
 
     Names stand in the header: ``comment frame Sensor``, ``comment sheet 0 "A"``,
@@ -167,7 +167,9 @@ def ply_bytes(cloud: PointCloud) -> bytes:
     ``comment simulated``, of those of a calibration that was refused and forced
     ``comment forced 0 "why"``.
     """
-    return b"".join(ply_parts(cloud, len(cloud), [CloudPiece(cloud)]))
+    piece = points if isinstance(points, CloudPiece) else CloudPiece(points)
+    has_counts = piece.n_points is not None
+    return b"".join(ply_parts(piece.cloud, len(piece.cloud), [piece], is_fused=has_counts))
 
 
 def ply_parts(

@@ -21,11 +21,11 @@ from armscan.storage.files import path_text
 from armscan.storage.formats.columns import (
     COVARIANCE,
     FORCED,
-    INDICES,
     NOISE_LENGTH,
     NORMAL,
     POINT,
     SIMULATED,
+    WHOLE,
     CloudColumns,
     CloudPiece,
     cloud_columns,
@@ -46,7 +46,7 @@ XYZ_LOSES = (
 CSV_LOSES = ("digits beyond 0.1 nm of a position, and beyond nine of anything else",)
 
 KNOWN = {
-    **{name: name for name in (*POINT, *NORMAL, *COVARIANCE, *INDICES, NOISE_LENGTH)},
+    **{name: name for name in (*POINT, *NORMAL, *COVARIANCE, *WHOLE, NOISE_LENGTH)},
     **{name: name for name in ("sigma_noise_mm", "intensity")},
     **{f"{name}_mm": name for name in POINT},
 }
@@ -58,9 +58,10 @@ EMPTY_FIELD = re.compile(r"(^|[,;])[ \t]*(?=[,;])", re.MULTILINE)
 OWN_HEADER = "x_mm y_mm z_mm in frame "
 
 
-def xyz_bytes(cloud: PointCloud) -> bytes:
+def xyz_bytes(points: PointCloud | CloudPiece) -> bytes:
     """Content of an XYZ text file; it lacks `XYZ_LOSES`."""
-    return b"".join(xyz_parts(cloud, [CloudPiece(cloud)]))
+    piece = points if isinstance(points, CloudPiece) else CloudPiece(points)
+    return b"".join(xyz_parts(piece.cloud, [piece]))
 
 
 def xyz_parts(marks: PointCloud, pieces: Iterable[CloudPiece]) -> Iterator[bytes]:
@@ -74,11 +75,11 @@ def xyz_parts(marks: PointCloud, pieces: Iterable[CloudPiece]) -> Iterator[bytes
         yield buffer.getvalue().encode()
 
 
-def csv_bytes(cloud: PointCloud) -> bytes:
+def csv_bytes(piece: CloudPiece) -> bytes:
     """Content of a table with a heading, notes in ``#`` lines below it, and all columns."""
-    found = cloud_columns(cloud)
+    found = cloud_columns(piece)
     heading = ",".join(f"{name}_mm" if name in POINT else name for name in found.columns)
-    formats = {**dict.fromkeys(POINT, "%.7f"), **dict.fromkeys(INDICES, "%d")}
+    formats = {**dict.fromkeys(POINT, "%.7f"), **dict.fromkeys(WHOLE, "%d")}
     notes = "".join(f"# {note}\n" for note in found.notes)
     buffer = io.StringIO()
     row = ",".join(formats.get(name, "%.9g") for name in found.columns)

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import os
 import time
+import tty
 from collections.abc import Iterator
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 from armscan.devices.protocols import LaserController, LaserEvent
 from armscan.devices.registry import open_device
+from armscan.drivers.arm_stream import SerialLink
 from armscan.drivers.laser_serial import framed, unframed
 from armscan.errors import DeviceError, DeviceTakenError, OptionError
 from rigs.laser_controller import ReferenceController
@@ -65,7 +68,9 @@ def test_a_schedule_runs_and_what_was_on_is_told(firmware: ReferenceController) 
     lasers.read(0.0)
     assert {one.lasers for one in events(lasers, 3)} == {("B",)}
     lasers.stop()
-    assert not firmware.is_on and lasers.read(0.1) == ()
+    assert not firmware.is_on
+    while lasers.read(0.1):
+        """Told before the stop."""
     lasers.start(None)
     assert lasers.read(0.05) == ()
     firmware.trigger()
@@ -110,6 +115,43 @@ def test_lasers_stay_on_while_the_host_lives_and_go_off_where_it_is_silent(
     lasers.start(20.0)
     assert events(lasers, 2)
     lasers.close()
+
+
+def test_a_silence_that_is_over_is_no_fault_any_more(firmware: ReferenceController) -> None:
+    lasers = open_device("lasers", firmware.address)
+    lasers.set_schedule([("A",)])
+    lasers.start(20.0)
+    # the controller hears all and its answers are lost: it goes on
+    firmware.is_mute = True
+    with pytest.raises(DeviceError, match="no answer to PING"):
+        while True:
+            lasers.read(0.1)
+    firmware.is_mute = False
+    end = time.monotonic() + 5.0
+    found: tuple[LaserEvent, ...] = ()
+    while not found and time.monotonic() < end:
+        try:
+            found = lasers.read(0.1)
+        except DeviceError:
+            time.sleep(0.01)
+    assert found
+    time.sleep(0.6)
+    for _ in range(50):
+        # a fault that stays is raised wherever nothing waits
+        lasers.read(0.0)
+    lasers.close()
+
+
+def test_a_port_that_takes_nothing_keeps_nobody_waiting(firmware: ReferenceController) -> None:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    link = SerialLink(f"{os.ttyname(slave)}:115200")
+    with pytest.raises(OSError, match=r"[Tt]imeout"):
+        # nobody reads the other end of the line, whose buffer holds some kilobytes
+        link.write(bytes(1_000_000))
+    link.close()
+    os.close(master)
+    os.close(slave)
 
 
 def test_what_is_no_controller_is_refused(firmware: ReferenceController) -> None:

@@ -79,6 +79,53 @@ def of_tables(instants, timed):
     return listed, exposure_poses(rows, track, latency_ns=LATENCY_NS)
 
 
+def counts_anew(restarts, kinds, *, n=60):
+    """A triggered rig whose streams count from 0 again, half a second after ``restarts`` triggers.
+
+    Streams that are not among ``kinds`` go on counting. Each pose tells its time in x.
+    """
+    items = []
+    for k in range(restarts + n):
+        t_ns = 10**9 + round(1e9 * (k / 80 + (0.5 if k >= restarts else 0.0)))
+        number = {kind: k - restarts * (kind in kinds and k >= restarts) for kind in KINDS}
+        pose = Pose(np.eye(3), np.array([k, 0.0, 0.0]))
+        lasers = ("A",) if k % 2 else ("B",)
+        items += [
+            (t_ns + 3_000_000, LaserEvent(number["event"], t_ns, t_ns + 3_000_000, lasers), k),
+            (t_ns + 5_000_000, ArmSample(k, t_ns, t_ns + 5_000_000, pose=pose,
+                                         trigger_id=number["sample"]), k),
+            (t_ns + 4_000_000, Frame(IMAGE, k, t_ns, t_ns + 4_000_000,
+                                     trigger_id=number["frame"]), k),
+        ]  # fmt: skip
+    return sorted(items, key=lambda item: item[0])
+
+
+KINDS = ("frame", "sample", "event")
+
+
+@pytest.mark.parametrize("kinds", [KINDS, ("frame",), ("sample",), ("frame", "event")])
+@pytest.mark.parametrize("restarts", [30, 90])
+def test_an_id_of_an_earlier_count_belongs_to_nothing_taken_later(restarts, kinds):
+    matcher = InstantMatcher(is_triggered=True)
+    instants = []
+    for host, element, _ in counts_anew(restarts, kinds):
+        if isinstance(element, Frame):
+            matcher.add_frame(element)
+        elif isinstance(element, ArmSample):
+            matcher.add_samples((element,))
+        else:
+            matcher.add_events((element,))
+        instants += matcher.take(host)
+    instants += matcher.take(host + 10**9)
+    assert [one.frames[0].number for one in instants] == list(range(restarts + 60))
+    for k, one in enumerate(instants):
+        assert one.pose is None or one.pose.translation_mm[0] == k
+        assert one.lasers in (None, ("A",) if k % 2 else ("B",))
+    n_placed = sum(one.pose is not None for one in instants)
+    # where all count anew alike nothing is lost; else all before
+    assert n_placed == (restarts + 60 if kinds == KINDS else restarts)
+
+
 def hole(kind, element):
     """Samples lost for 0.2 s; a sample here and there; unreferenced for a while."""
     return kind == "sample" and (400 <= element.number < 448 or element.number % 97 == 5)

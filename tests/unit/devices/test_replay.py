@@ -33,7 +33,9 @@ def folder(tmp_path: Path) -> Path:
     return lab_folder(tmp_path / "scan", exposures=EXPOSURES, arm=ARM)
 
 
-def played(place: str, n: int) -> tuple[list[Frame], list[ArmSample], list[LaserEvent]]:
+def played(
+    place: str, n: int, n_samples: int = 0, n_events: int = 0
+) -> tuple[list[Frame], list[ArmSample], list[LaserEvent]]:
     devices: list[Any] = [
         open_device(kind, f"replay:{place}") for kind in ("camera", "arm", "lasers")
     ]
@@ -44,13 +46,14 @@ def played(place: str, n: int) -> tuple[list[Frame], list[ArmSample], list[Laser
     arm.start()
     camera.start("external")
     lasers.start(None)
-    end = time.monotonic() + 5.0
-    while len(frames) < n and time.monotonic() < end:
+    end = time.monotonic() + 20.0
+    while time.monotonic() < end:
+        if len(frames) >= n and len(samples) >= n_samples and len(events) >= n_events:
+            break
         frame = camera.read(0.02)
         frames += [frame] if frame else []
-    time.sleep(0.05)
-    samples += arm.read(0.0)
-    events += lasers.read(0.0)
+        samples += arm.read(0.0)
+        events += lasers.read(0.0)
     for device in devices:
         device.close()
         device.close()
@@ -59,7 +62,7 @@ def played(place: str, n: int) -> tuple[list[Frame], list[ArmSample], list[Laser
 
 def test_plays_what_is_recorded_at_its_times(folder: Path) -> None:
     source = read_recording(folder)
-    frames, samples, events = played(str(folder), 3)
+    frames, samples, events = played(str(folder), 3, 7, 3)
     assert [frame.t_device_ns for frame in frames] == list(TIMES)
     assert [frame.trigger_id for frame in frames] == [5, 6, 7]
     assert [frame.lasers for frame in frames] == [event.lasers for event in events]
@@ -74,15 +77,14 @@ def test_plays_what_is_recorded_at_its_times(folder: Path) -> None:
         assert (one.pose is not None) == known
         if one.pose is not None:
             assert one.pose.translation_mm.tolist() == place.tolist()
-    # arrivals keep the recorded pace, to what a busy computer adds
-    steps = np.diff([frame.t_host_ns for frame in frames])
-    assert np.abs(steps - 20_000_000).max() < 5_000_000
+    # the pace is the recorded one, whatever else this computer does
+    assert np.diff([frame.t_host_ns for frame in frames]).tolist() == [20_000_000] * 2
 
 
 def test_plays_a_recording_of_one_file_alike(folder: Path, tmp_path: Path) -> None:
     record_folder(folder, tmp_path / "scan.mcap")
-    frames, samples, events = played(str(tmp_path / "scan.mcap"), 3)
-    images, poses, switched = played(str(folder), 3)
+    frames, samples, events = played(str(tmp_path / "scan.mcap"), 3, 7, 3)
+    images, poses, switched = played(str(folder), 3, 7, 3)
     assert [one.t_device_ns for one in frames] == [one.t_device_ns for one in images]
     assert [one.t_device_ns for one in samples] == [one.t_device_ns for one in poses]
     assert [one.t_device_ns for one in events] == [one.t_device_ns for one in switched]
@@ -109,14 +111,18 @@ def test_waits_while_everything_is_stopped(folder: Path) -> None:
     camera.start()
     first = camera.read(2.0)
     camera.stop()
+    last = first
+    while (taken := camera.read(0.1)) is not None:
+        last = taken
     time.sleep(0.3)
     assert camera.read(0.0) is None
     camera.start()
-    following = camera.read(2.0)
+    following = camera.read(5.0)
     camera.close()
-    assert first is not None and following is not None
-    assert following.number <= first.number + 2
-    assert following.t_device_ns - first.t_device_ns > 250_000_000
+    assert last is not None and following is not None
+    # one may have been under way to a camera that was stopped
+    assert following.number <= last.number + 2
+    assert following.t_device_ns - last.t_device_ns > 250_000_000
 
 
 def test_a_lost_packet_and_a_missing_image(folder: Path) -> None:

@@ -3,20 +3,32 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from armscan.devices.protocols import ArmSample, CameraSettings, Frame
-from armscan.errors import DeviceError, OutputError
-from armscan.pipeline.live.rig import Rig, RigDescription
-from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus
+from armscan.devices.matching import MatchedInstant
+from armscan.devices.protocols import ArmSample, CameraSettings, Frame, LaserEvent
+from armscan.errors import DeviceError, InputError, OutputError
+from armscan.models.arm import forward, thesis_arm
+from armscan.pipeline.live.rig import Rig, RigDescription, read_rig
+from armscan.pipeline.live.session import LiveOptions, LiveSession, LiveStatus, exposure_of
+from armscan.pipeline.measure import measure_instants
 from armscan.pipeline.scan import ScanOptions, measure_scan
+from armscan.reconstruction.labels import SingleLabeller
+from armscan.reconstruction.sync import PoseStatus
 from armscan.records.cloud import PointCloud
-from armscan.records.recording import ArmTrack, CameraSetup
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow
+from armscan.storage.arm import arm_model_toml
+from armscan.storage.recording import read_recorded
 from rigs.scan_fake import CAMERA, FakeScan, as_source, fake_scan, scanner
 
 
@@ -28,6 +40,9 @@ class Device:
     elements: list[Any]
     calls: list[str] = field(default_factory=list)
     setup: CameraSetup = field(default_factory=lambda: CameraSetup(CAMERA.width_px))
+    pose_form: str = "quaternion"
+    on_its_way: list[Any] = field(default_factory=list)
+    """What it has taken when it is stopped and can be read from then on alone."""
 
     def start(self, *_: object) -> None:
         self.calls.append("start")
@@ -53,6 +68,7 @@ class Device:
 
     def stop(self) -> None:
         self.calls.append("stop")
+        self.elements, self.on_its_way = [*self.elements, *self.on_its_way], []
 
     def close(self) -> None:
         self.calls.append("close")
@@ -71,7 +87,7 @@ def triggered_scan(n: int) -> FakeScan:
     return replace(scan, rows=rows, arm=track)
 
 
-def rig_of(scan: FakeScan, frames: list[Any] | None = None) -> Rig:
+def rig_of(scan: FakeScan, frames: list[Any] | None = None) -> Any:
     samples = [
         (ArmSample(k, row.t_ns, row.t_ns, pose=scan.truth[k], trigger_id=k),)
         for k, row in enumerate(scan.rows)
@@ -87,10 +103,23 @@ def frame(scan: FakeScan, k: int, **changes: Any) -> Frame:
     return replace(Frame(image, k, t_ns, t_ns, trigger_id=k, lasers=("A",)), **changes)
 
 
+ALL = LiveOptions(latest_ms=math.inf)
+MEASURE = "armscan.pipeline.live.session.measure_instants"
+
+
+def waited(is_done: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20.0
+    while not is_done():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
 def run(rig: Rig, n: int, **given: Any) -> tuple[LiveSession, dict[int, PointCloud], list[Any]]:
     clouds: dict[int, PointCloud] = {}
     told: list[Any] = []
-    session = LiveSession(rig, scanner(), keep_cloud=clouds.__setitem__, **given)
+    session = LiveSession(
+        rig, scanner(), **{"keep_cloud": clouds.__setitem__, "options": ALL, **given}
+    )
     session.add_listener(told.append)
     devices = [*rig.cameras, rig.arm]
     held = [device.elements for device in devices]
@@ -145,7 +174,7 @@ def test_a_camera_that_is_unplugged_is_told_of_and_goes_on() -> None:
 
 def test_shows_one_point_a_voxel_and_takes_a_pass_back() -> None:
     scan = triggered_scan(6)
-    session, clouds, _ = run(rig_of(scan), 6, options=LiveOptions(voxel_mm=2.0))
+    session, clouds, _ = run(rig_of(scan), 6, options=replace(ALL, voxel_mm=2.0))
     shown = session.cloud()
     cells = {tuple(cell) for cell in np.floor(shown.points_mm / 2.0).astype(int).tolist()}
     every = np.concatenate([cloud.points_mm for cloud in clouds.values()])
@@ -193,6 +222,252 @@ class FaultyRecorder:
 
     def add_instant(self, instant: object) -> None:
         """Keeps none."""
+
+
+class Kept(FaultyRecorder):
+    """Keeps which images came in which order, by their numbers."""
+
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+        self.instants: list[int] = []
+
+    def add_frame(self, camera: int, frame: Frame, status: object) -> None:
+        self.frames.append(frame.number)
+
+    def add_instant(self, instant: Any) -> None:
+        self.instants.append(instant.frames[0].number)
+
+
+def test_what_devices_have_taken_when_they_are_stopped_is_recorded_and_placed() -> None:
+    scan, kept = triggered_scan(8), Kept()
+    rig = rig_of(scan)
+    for device in (rig.cameras[0], rig.arm):
+        device.on_its_way, device.elements = device.elements[3:], device.elements[:3]
+    session, clouds, _ = run(rig, 3, recorder=kept)
+    assert kept.frames == kept.instants == list(range(8))
+    assert session.snapshot().counts == {LiveStatus.PLACED: 8} and len(clouds) == 8
+
+
+def test_a_device_that_does_not_obey_the_stop_keeps_nobody_waiting() -> None:
+    scan = triggered_scan(2)
+    rig = rig_of(scan)
+    endless = rig.cameras[0]
+    number = iter(range(2, 10**9))
+    late_ns = time.monotonic_ns() + 3_600_000_000_000
+    given = endless.read
+    endless.read = lambda timeout_s: (
+        given(timeout_s)
+        or (
+            replace(frame(scan, 1), number=next(number), trigger_id=None, t_host_ns=late_ns)
+            if "stop" in endless.calls
+            else None
+        )
+    )
+    session, _, _ = run(rig, 2)
+    assert session.snapshot().counts[LiveStatus.PLACED] == 2
+
+
+@pytest.mark.parametrize("error", [ValueError("a fault of its own"), ZeroDivisionError()])
+def test_whatever_a_driver_raises_is_its_device_s_fault(error: Exception) -> None:
+    scan = triggered_scan(4)
+    frames = [frame(scan, k) for k in range(4)]
+    rig = rig_of(scan, [*frames[:2], error, *frames[2:]])
+    calls = rig.cameras[0].calls
+
+    def stop() -> None:
+        calls.append("stop")
+        raise error
+
+    rig.cameras[0].stop = stop
+    session, _, told = run(rig, 4)
+    assert session.snapshot().counts == {LiveStatus.PLACED: 4}
+    faults = [event for event in told if event.kind == "fault"]
+    assert [event.device for event in faults] == ["camera 0", ""]
+    assert all(f"camera 0: its driver failed ({type(error).__name__}" in e.text for e in faults)
+    assert rig.arm.calls == ["start", "stop"]
+
+
+def test_a_driver_that_fails_at_the_start_stops_the_rig() -> None:
+    rig = rig_of(triggered_scan(2))
+
+    def start(*_: object) -> None:
+        raise KeyError("firmware")
+
+    rig.cameras[0].start = start
+    session = LiveSession(rig, scanner())
+    with pytest.raises(DeviceError, match="camera 0: its driver failed"):
+        session.start()
+    assert rig.arm.calls == ["start", "stop"]
+
+
+def test_a_fault_in_measuring_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, n_calls = measure_instants, iter(range(100))
+
+    def failing(instants: Any, *given: Any, **named: Any) -> Any:
+        if next(n_calls) == 0:
+            next(iter(instants))
+            raise RuntimeError("a kernel failed")
+        return real(instants, *given, **named)
+
+    monkeypatch.setattr(MEASURE, failing)
+    session, _, told = run(rig_of(triggered_scan(4)), 4)
+    assert session.snapshot().counts == {LiveStatus.PLACED: 3, LiveStatus.FAILED: 1}
+    text = "an image could not be measured: RuntimeError: a kernel failed"
+    assert [event.text for event in told if event.kind == "warning"] == [text]
+
+
+def test_faults_of_those_who_listen_are_theirs() -> None:
+    rig, told = rig_of(triggered_scan(4)), []
+
+    def keep(number: int, cloud: PointCloud) -> None:
+        raise OSError("no room")
+
+    session = LiveSession(rig, scanner(), options=ALL, keep_cloud=keep)
+    session.add_listener(lambda event: 1 // 0)
+    session.add_listener(told.append)
+    devices = [rig.cameras[0], rig.arm]
+    held = [device.elements for device in devices]
+    rig.cameras[0].elements, rig.arm.elements = [], []
+    session.start()
+    rig.cameras[0].elements, rig.arm.elements = held
+    waited(lambda: sum(session.snapshot().counts.values()) == 4)
+    session.stop()
+    assert session.snapshot().counts == {LiveStatus.PLACED: 4}
+    texts = [event.text for event in told]
+    assert texts.count("a cloud was not kept: OSError: no room") == 4
+    assert [text for text in texts if "listener" in text] == [
+        "a listener failed and is told no more: ZeroDivisionError: "
+        "integer division or modulo by zero"
+    ]
+
+
+def test_a_session_that_is_over_does_not_say_that_it_scans() -> None:
+    session, _, _ = run(rig_of(triggered_scan(2)), 2)
+    for begin in (session.start, session.resume):
+        with pytest.raises(DeviceError, match="is over"):
+            begin()
+    session.pause()
+    session.stop()
+    assert session.snapshot().state == "stopped"
+    with pytest.raises(DeviceError, match="not open"):
+        LiveSession(rig_of(triggered_scan(2)), scanner()).resume()
+
+
+def test_an_arm_of_joints_alone_places_by_its_document(tmp_path: Path) -> None:
+    scan = triggered_scan(4)
+    model = thesis_arm((300.0, 600.0, 500.0, 200.0), (40.0, 40.0, 40.0))
+    rng = np.random.default_rng(3)
+    joints = rng.uniform(-0.5, 0.5, 7) + np.linspace(0, 0.1, 4)[:, None]
+    rotations, places = forward(model, joints)
+    (tmp_path / "arm.toml").write_bytes(arm_model_toml(model))
+    description = 'cameras = ["c"]\narm = "a"\nis_common_trigger = true\narm_model = "arm.toml"\n'
+    (tmp_path / "rig.toml").write_text(description)
+    samples = [
+        (ArmSample(k, row.t_ns, row.t_ns, joints_rad=joints[k], trigger_id=k),)
+        for k, row in enumerate(scan.rows)
+    ]
+    devices = {
+        "c": Device("camera 0", [frame(scan, k) for k in range(4)]),
+        "a": Device("arm", samples, pose_form="joints"),
+    }
+    rig = Rig.open(read_rig(tmp_path / "rig.toml"), lambda _, address: devices[address])
+    seen: list[Any] = []
+    kept: Any = Kept()
+    kept.add_instant = seen.append
+    run(rig, 4, recorder=kept)
+    assert len(seen) == 4
+    for k, instant in enumerate(seen):
+        np.testing.assert_array_equal(instant.pose.rotation, rotations[k])
+        np.testing.assert_array_equal(instant.pose.translation_mm, places[k])
+    with pytest.raises(InputError, match=r"arm_model = .arm\.toml"):
+        LiveSession(replace_rig(rig), scanner())
+
+
+def replace_rig(rig: Rig) -> Rig:
+    """The same devices without the arm's document."""
+    return Rig(rig.cameras, rig.arm, None, rig.description)
+
+
+def test_a_bayer_pattern_is_measured_as_its_recording_is(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    mosaic = rng.integers(0, 1024, (12, 16)).astype(np.uint16)
+    setup = CameraSetup(16, 12, bits_used=10, colour="bayer_rggb")
+    (tmp_path / "0.png").write_bytes(cv2.imencode(".png", mosaic)[1].tobytes())
+    row = ExposureRow(0, 5, 0, "0.png", ("A",), 7)
+    recorded = read_recorded(tmp_path, row, setup)
+    taken = Frame(mosaic, 0, 5, 5, trigger_id=7)
+    instant = MatchedInstant((taken,), 5, ("A",), 7, None, PoseStatus.UNKNOWN_TRIGGER)
+    live = exposure_of(taken, setup, instant)
+    np.testing.assert_array_equal(live.image, recorded.image)
+    assert (live.bits_used, live.t_ns, live.lasers) == (10, 5, ("A",))
+    assert live.image.shape == (12, 16, 3)
+
+
+def test_a_cloud_of_two_cameras_is_kept_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = measure_instants
+
+    def twice(*given: Any, **named: Any) -> Any:
+        for one in real(*given, **named):
+            yield replace(one, profiles=one.profiles * 2)
+
+    monkeypatch.setattr(MEASURE, twice)
+    kept: list[tuple[int, PointCloud]] = []
+    run(rig_of(triggered_scan(3)), 3, keep_cloud=lambda *given: kept.append(given))
+    assert [number for number, _ in kept] == [0, 1, 2]
+    for _, cloud in kept:
+        half = len(cloud) // 2
+        np.testing.assert_array_equal(cloud.points_mm[:half], cloud.points_mm[half:])
+        assert len(cloud.exposure_sources) == 2 and set(cloud.exposure.tolist()) == {0, 1}
+
+
+def test_what_waits_too_long_is_recorded_and_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, is_held = measure_instants, threading.Event()
+
+    def held(instants: Any, *given: Any, **named: Any) -> Any:
+        is_held.wait(10.0)
+        return real(instants, *given, **named)
+
+    monkeypatch.setattr(MEASURE, held)
+    scan, kept = triggered_scan(8), Kept()
+    rig = rig_of(scan)
+    camera = rig.cameras[0]
+    every, camera.elements = camera.elements, []
+    samples, rig.arm.elements = rig.arm.elements, []
+    session = LiveSession(rig, scanner(), options=LiveOptions(latest_ms=20.0), recorder=kept)
+    session.start()
+    camera.elements, rig.arm.elements = every[:1], samples[:1]
+    waited(lambda: kept.instants == [0])
+    time.sleep(0.05)
+    camera.elements, rig.arm.elements = every[1:], samples[1:]
+    waited(lambda: len(kept.instants) == 8)
+    is_held.set()
+    session.stop()
+    counts = session.snapshot().counts
+    assert counts == {LiveStatus.PLACED: 1, LiveStatus.NOT_SHOWN: 7}
+    assert kept.instants == list(range(8))
+
+
+class Lasers(Device):
+    """Switches; what it was asked for is kept."""
+
+    sources = ("A", "B")
+
+    def set_next(self, lasers: tuple[str, ...]) -> None:
+        self.calls.append("+".join(lasers))
+
+
+def test_the_head_s_rule_chooses_the_lasers(monkeypatch: pytest.MonkeyPatch) -> None:
+    wanted = iter([("A",), ("A",), ("A", "B"), ("B",), ("B",)])
+    monkeypatch.setattr(SingleLabeller, "next_lasers", lambda _: next(wanted))
+    scan = triggered_scan(4)
+    rig = rig_of(scan)
+    events = [(LaserEvent(k, row.t_ns, row.t_ns, ("A",)),) for k, row in enumerate(scan.rows)]
+    lasers = Lasers("lasers", events)
+    description = replace(rig.description, chooses_lasers=True)
+    session, _, _ = run(Rig(rig.cameras, rig.arm, lasers, description), 4)
+    assert session.snapshot().counts == {LiveStatus.PLACED: 4}
+    # before the first image, then after the images that changed the rule's mind
+    assert lasers.calls == ["start", "A", "A+B", "B", "stop"]
 
 
 def test_a_full_disk_ends_the_recording_and_not_the_scan() -> None:

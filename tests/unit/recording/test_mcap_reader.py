@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from armscan.errors import ArmscanError, FileFormatError
+from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.jobs.live.recordings import recover_recording
 from armscan.records.recording import CameraSetup, PixelColour, Session
 from armscan.storage.recording import read_recording
@@ -208,3 +210,16 @@ def test_recovered_raw_pixels_are_those_recorded(
     assert kept.session.cameras == session.cameras
     extract_recording(again, tmp_path / "third")
     np.testing.assert_array_equal(read_recording(tmp_path / "third").exposure(0).image, wanted)
+
+
+def test_a_full_disk_leaves_nothing_of_a_conversion(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(os, "writev", full)
+    with pytest.raises(OutputError, match=r"scan.mcap: nothing was written \(No space"):
+        record_folder(folder, tmp_path / "scan.mcap")
+    assert sorted(tmp_path.iterdir()) == before

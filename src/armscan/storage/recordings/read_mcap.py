@@ -6,6 +6,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,32 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap import records
 from numpy.typing import NDArray
 
-from armscan.errors import ArmscanError, FileFormatError
+from armscan.devices.sources import ScanSource
+from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.records.exposure import Exposure
-from armscan.records.recording import CameraSetup, ExposureRow
-from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE
-from armscan.storage.files import new_folder, path_text, read_bytes, scratch_folder
-from armscan.storage.recording import encoded_png, read_recording, written_session
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, arm_columns
+from armscan.storage.files import (
+    check_outputs,
+    is_file,
+    new_folder,
+    path_text,
+    read_bytes,
+    scratch_folder,
+    write_files,
+)
+from armscan.storage.recording import (
+    Report,
+    encoded_png,
+    image_files,
+    named_rows,
+    read_recording,
+    written_session,
+)
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
     SESSION_FILE,
+    exposure_columns,
     is_inside,
     session_toml,
 )
@@ -279,27 +297,128 @@ def record_folder(folder: Path, output: Path) -> WriterStatus:
     recording = read_recording(folder)
     session = written_session(recording)
     names = [SESSION_FILE, ARM_MODEL_FILE, EVENTS_FILE, *([session.head] if session.head else [])]
-    documents = {name: read_bytes(folder / name) for name in names if (folder / name).is_file()}
+    documents = {name: read_bytes(folder / name) for name in names if is_file(folder / name)}
     if session.is_simulated != recording.session.is_simulated:
         documents[SESSION_FILE] = session_toml(session)
     table = read_csv(folder / EXPOSURES_FILE)
     by_index = {row.index: row for row in recording.rows}
+    rows = [by_index[index] for index in table.ints("index").tolist()]
+    arm_cells = {} if recording.arm is None else read_csv(folder / ARM_FILE).columns
+    return _record(
+        output,
+        _Content(session, documents, rows, table.columns, recording.arm, arm_cells),
+        (read_bytes(folder / row.source) for row in rows),
+    )
+
+
+def record_source(
+    output: Path,
+    source: ScanSource,
+    progress: Report | None = None,
+    *,
+    encoded: Iterable[bytes] | None = None,
+    beside: Mapping[Path, bytes] | None = None,
+) -> WriterStatus:
+    """Write a scan as an MCAP file: what `write_recording` writes into a folder.
+
+    Parameters
+    ----------
+    output
+        Must not exist.
+    source
+        What to write.
+    progress
+        Called with images written, images in all, and the name of the latest.
+    encoded
+        (N,) the images' PNG files, where they were made already.
+    beside
+        Files that appear with it; they must not exist.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written; nothing is left then.
+    """
+    check_new_file(output)
+    session, rows = written_session(source), named_rows(source)
+    columns, arm = exposure_columns(rows, {}), source.arm
+    of_arm = {} if arm is None else arm_columns(arm, session.pose_form, session.rotation, {})
+    content = _Content(session, {SESSION_FILE: session_toml(session)}, rows, columns, arm, of_arm)
+    files = image_files(source, session) if encoded is None else encoded
+    return _record(output, content, files, progress, beside)
+
+
+def check_new_file(output: Path) -> None:
+    """Raise before long work if a new file could not be written afterwards.
+
+    Raises
+    ------
+    OutputError
+        If it exists, or its folder does not or may not be written.
+    """
+    if output.exists():
+        raise OutputError("the file exists", where=path_text(output), remedy="name another file")
+    check_outputs((output,))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Content:
+    """What a file holds beside its images, which come in the order of ``rows``."""
+
+    session: Session
+    documents: Mapping[str, bytes]
+    rows: Sequence[ExposureRow]
+    columns: Mapping[str, Sequence[str]]
+    arm: ArmTrack | None
+    arm_cells: Mapping[str, Sequence[str]]
+
+
+def _record(
+    output: Path,
+    content: _Content,
+    images: Iterable[bytes],
+    progress: Report | None = None,
+    beside: Mapping[Path, bytes] | None = None,
+) -> WriterStatus:
     with scratch_folder(output) as scratch:
         part = scratch / "recording.mcap"
-        with RecordingWriter(part) as writer:
-            writer.begin(session, documents)
-            for k, index in enumerate(table.ints("index").tolist()):
-                row: ExposureRow = by_index[index]
-                cells = {name: column[k] for name, column in table.columns.items()}
-                writer.add_exposure(row, read_bytes(folder / row.source), cells=cells)
-            if recording.arm is not None:
-                arm_cells = read_csv(folder / ARM_FILE).columns
-                for first in range(0, len(recording.arm), ARM_BATCH):
-                    span = slice(first, first + ARM_BATCH)
-                    writer.add_arm_samples(
-                        recording.arm.select(span),
-                        cells={name: cells[span] for name, cells in arm_cells.items()},
-                    )
-        status = writer.status()
-        part.replace(output)
+        try:
+            status = _write_all(part, content, images, progress)
+            write_files(beside or {})
+            _give_name(part, output, beside or {})
+        except OutputError as error:
+            cause = error.__cause__
+            why = (isinstance(cause, OSError) and cause.strerror) or error.what
+            raise OutputError(
+                f"nothing was written ({why})",
+                where=path_text(output),
+                remedy="free some space or choose another folder",
+            ) from error
     return status
+
+
+def _write_all(
+    part: Path, content: _Content, images: Iterable[bytes], progress: Report | None
+) -> WriterStatus:
+    with RecordingWriter(part) as writer:
+        writer.begin(content.session, content.documents)
+        for k, (row, image) in enumerate(zip(content.rows, images, strict=True)):
+            cells = {name: column[k] for name, column in content.columns.items()}
+            writer.add_exposure(row, image, cells=cells)
+            if progress is not None:
+                progress(k + 1, len(content.rows), row.source)
+        for first in range(0, 0 if content.arm is None else len(content.arm), ARM_BATCH):
+            span = slice(first, first + ARM_BATCH)
+            cells_of = {name: cells[span] for name, cells in content.arm_cells.items()}
+            if content.arm is not None:
+                writer.add_arm_samples(content.arm.select(span), cells=cells_of)
+    return writer.status()
+
+
+def _give_name(part: Path, output: Path, beside: Mapping[Path, bytes]) -> None:
+    try:
+        part.replace(output)
+    except OSError as error:
+        for path in beside:
+            path.unlink(missing_ok=True)
+        raise OutputError("the file cannot get its name", where=path_text(output)) from error

@@ -25,6 +25,39 @@ def test_the_real_twin_probes_its_plate(tmp_path: Path, capsys: pytest.CaptureFi
     assert "not empty" in capsys.readouterr().err
 
 
+def contents(folder: Path) -> dict[str, bytes]:
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in found}
+
+
+def test_a_simulated_file_is_the_simulated_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["simulate", "thesis-single", "still-step", "--seed", "3"]
+    for place in ("a/scan", "b/scan.mcap"):
+        (tmp_path / place).parent.mkdir()
+        assert main([*words, "-o", str(tmp_path / place)]) == 0
+    assert sorted(path.name for path in (tmp_path / "b").iterdir()) == [
+        "scan.mcap",
+        "scan.truth.json",
+    ]
+    truth = (tmp_path / "b/scan.truth.json").read_bytes()
+    assert truth == (tmp_path / "a/scan.truth.json").read_bytes()
+    assert main(["convert", str(tmp_path / "b/scan.mcap"), str(tmp_path / "back")]) == 0
+    there = contents(tmp_path / "a/scan")
+    assert contents(tmp_path / "back") == there
+    assert not any("truth" in name for name in there)
+    capsys.readouterr()
+    assert main(["info", str(tmp_path / "b/scan.mcap"), "--json"]) == 0
+    (item,) = json.loads(capsys.readouterr().out)["items"]
+    assert item["simulated"] is True
+    assert main([*words, "-o", str(tmp_path / "b/scan.mcap")]) == 2
+    assert "the file exists" in capsys.readouterr().err
+    assert main(["simulate", "thesis-single", "probing", "-o", str(tmp_path / "touches.mcap")]) == 2
+    assert "name a folder" in capsys.readouterr().err
+    assert not (tmp_path / "touches.mcap").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

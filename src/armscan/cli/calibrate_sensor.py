@@ -111,7 +111,7 @@ TargetMargin = Annotated[
 Scans = Annotated[
     list[Path] | None,
     typer.Argument(
-        help="Folders of recordings; several are calibrated one by one and together.",
+        help="Recordings, folders or .mcap; several are calibrated one by one and together.",
         show_default=False,
     ),
 ]

@@ -156,7 +156,7 @@ def verify(
     scan: Annotated[
         Path,
         typer.Argument(
-            help="A recording of a ball or plate (folder), or a cloud of one in Base.",
+            help="A recording of a ball or plate (folder or .mcap), or a cloud of one in Base.",
             show_default=False,
         ),
     ],

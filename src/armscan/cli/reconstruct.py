@@ -62,7 +62,7 @@ ProfilePoses = Annotated[
 Images = Annotated[
     list[str],
     typer.Argument(
-        help="A recording's folder; or images with the laser on: files, folders, patterns.",
+        help="A recording, folder or .mcap; or images with the laser on: files, folders, patterns.",
         show_default=False,
     ),
 ]

@@ -113,7 +113,10 @@ def simulate(
     output: Annotated[
         Path,
         typer.Option(
-            "-o", "--output", help="Folder of the recording; new or empty.", show_default=False
+            "-o",
+            "--output",
+            help="Folder of the recording, new or empty; or a new .mcap.",
+            show_default=False,
         ),
     ],
     preset: Annotated[

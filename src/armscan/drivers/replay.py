@@ -8,7 +8,6 @@ alike, so that what lies between them keeps its place.
 from __future__ import annotations
 
 import queue
-import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -134,7 +133,6 @@ class Playback:
         self._clock = clock
         self.started: set[str] = set()
         self.lock = threading.Condition()
-        self.scratch: tempfile.TemporaryDirectory[str] | None = None
         self._is_closed = False
         self._is_playing = False
         self._images: queue.Queue[Exposure | ArmscanError] = queue.Queue(_READ_AHEAD)
@@ -186,8 +184,6 @@ class Playback:
             self.lock.notify_all()
         for thread in self._threads:
             thread.join()
-        if self.scratch is not None:
-            self.scratch.cleanup()
 
     def _first_ns(self) -> int:
         first = self.source.rows[0].t_ns
@@ -516,21 +512,11 @@ class ReplayDriver:
 
 
 def _playback(plan: _Plan) -> Playback:
-    path, scratch = Path(plan.path), None
     try:
-        if path.is_file():
-            from armscan.storage.recordings.read_mcap import extract_recording
-
-            scratch = tempfile.TemporaryDirectory(prefix="armscan-replay-")
-            path = Path(scratch.name) / path.stem
-            extract_recording(Path(plan.path), path)
-        source = read_recording(path)
+        source = read_recording(Path(plan.path))
         rig = Playback(source, rate_hz=plan.rate_hz, is_loop=plan.is_loop, is_ahead=plan.is_ahead)
     except ArmscanError as error:
-        if scratch is not None:
-            scratch.cleanup()
         raise DeviceError(error.what, where=error.where, remedy=error.remedy) from error
-    rig.scratch = scratch
     return rig
 
 

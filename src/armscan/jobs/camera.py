@@ -25,6 +25,7 @@ from armscan.records.exposure import Exposure
 from armscan.report.camera import CAMERA_TITLE, camera_page, camera_quantities
 from armscan.report.photographs import refused_page, tried_targets
 from armscan.report.quantity import Quantity, Summary, Table, sentences, significant, without_source
+from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import (
     camera_document,
     observations_of,
@@ -34,8 +35,7 @@ from armscan.storage.documents import (
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, check_same_size, read_exposures
 from armscan.storage.observations import pack_observations, read_observations
-from armscan.storage.recording import read_recording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recording import read_recording, recording_tables
 from armscan.thesis.ellipse import with_printed_centres
 from armscan.vision.targets.target import (
     Charuco,
@@ -244,12 +244,11 @@ def _camera_scan(folder: Path) -> _Images:
         )
     dark = [k for k, row in enumerate(recording.rows) if not row.lasers]
     chosen = dark or list(range(len(recording.rows)))
-    tables = (folder / EXPOSURES_FILE, folder / SESSION_FILE)
     return _Images(
         tuple(recording.exposure(k) for k in chosen),
         tuple(folder / recording.rows[k].source for k in chosen),
         recording.is_simulated,
-        tuple(path for path in tables if path.is_file()),
+        tuple(path for path in recording_tables(folder) if path.name != ARM_FILE),
         (*recording.warnings, *recording.session.assumed),
     )
 

@@ -68,12 +68,14 @@ from armscan.storage.points import (
     read_profiles,
     read_robot_poses,
 )
-from armscan.storage.recording import FolderRecording, read_recording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recording import (
+    FolderRecording,
+    read_recording,
+    recording_name,
+    recording_tables,
+)
 from armscan.thesis.hand_eye import PrintedHandEye, as_printed
 from armscan.vision.stripe.image import StripeOptions
-
-TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -372,9 +374,8 @@ def calibrate_latency(
     if not is_shared:
         odd += ("the clocks are separate: the time holds for this recording, nothing is written",)
     is_simulated = recording.is_simulated or are_simulated([scanner])
-    files = [path for path in (*(scan / name for name in TABLES), scanner, arm) if path]
     provenance = job.provenance(
-        [path for path in files if path.exists()],
+        [path for path in (*recording_tables(scan), scanner, arm) if path],
         (stripe_options,),
         parents=(before.provenance,),
         warnings=odd,
@@ -456,7 +457,7 @@ def read_hand_eye_inputs(
     for recording in recordings:
         seen = observe_stripes(recording, sensor, measure, progress=progress)
         groups.append((recording.name, _named(seen, _prefix(recording, len(recordings)))))
-    tables = [folder / name for folder in source.scans for name in TABLES]
+    tables = [path for folder in source.scans for path in recording_tables(folder)]
     files = [path for path in (*tables, source.sensor, artefact.plate, source.arm) if path]
     odd = [text for r in recordings for text in (*r.warnings, *r.session.assumed)]
     of_groups = [text for _, seen in groups for text in seen.warnings]
@@ -464,7 +465,7 @@ def read_hand_eye_inputs(
         groups=tuple(groups),
         sensor=sensor,
         plate=plate,
-        files=tuple(path for path in files if path.exists()),
+        files=tuple(files),
         warnings=(*notes, *odd, *of_groups),
         is_simulated=any(r.is_simulated for r in recordings) or are_simulated([source.sensor]),
         recordings=recordings,
@@ -473,7 +474,7 @@ def read_hand_eye_inputs(
 
 def _refuse_repeated(folders: Sequence[Path]) -> None:
     """Names of postures begin with those of their recordings, so these must differ."""
-    names = [folder.resolve().name for folder in folders]
+    names = [recording_name(folder) for folder in folders]
     for name in names:
         if names.count(name) > 1:
             raise OptionError(

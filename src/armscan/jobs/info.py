@@ -52,7 +52,7 @@ from armscan.storage.documents import (
     read_scanner_calibration,
     read_stereo_calibration,
 )
-from armscan.storage.files import read_bytes
+from armscan.storage.files import files_in, holds_files, is_file, read_bytes
 from armscan.storage.image_paths import expand_paths
 from armscan.storage.images import image_format, read_exposure
 from armscan.storage.observations import read_observations
@@ -134,9 +134,9 @@ def describe_touches(folder: Path) -> dict[str, Any]:
     """Describe a folder of the arm's samples without images, as a probing is."""
     track, notes = read_arm_track(folder)
     tip = folder / "probe.toml"
-    what = "touches of a probe" if tip.is_file() else "an arm's samples"
+    what = "touches of a probe" if is_file(tip) else "an arm's samples"
     content = {"what": f"{what}, {len(track)} samples", **_track(track)}
-    if tip.is_file():
+    if is_file(tip):
         content |= {key: value for key, value in describe_probe(tip).items() if key != "what"}
     return content | _notes((), notes)
 
@@ -313,9 +313,9 @@ def describe_files(names: Sequence[str]) -> Summary:
     facts: Facts = []
     data: list[dict[str, Any]] = []
     for name in names:
-        paths = [Path(name)] if Path(name).is_dir() else expand_paths([name])
+        paths = [Path(name)] if holds_files(Path(name)) else expand_paths([name])
         for path in paths:
-            described = _folder(path) if path.is_dir() else _file(path)
+            described = _folder(path) if holds_files(path) else _file(path)
             facts += [(str(path), "\n".join(_line(key, value) for key, value in described.items()))]
             data.append({"path": path.as_posix(), **described})
     count = f"{len(data)} item" + ("s" if len(data) != 1 else "")
@@ -532,12 +532,12 @@ def _origin(provenance: Provenance) -> dict[str, Any]:
 def _folder(path: Path) -> dict[str, Any]:
     if is_recording(path):
         return describe_recording(path)
-    if (path / ARM_FILE).is_file():
+    if is_file(path / ARM_FILE):
         return describe_touches(path)
-    items = sorted(item for item in path.iterdir() if not item.name.startswith("."))
+    items = sorted(item for item in files_in(path) if not item.name.startswith("."))
     if not items:
         raise FileFormatError("the folder is empty", where=str(path), remedy="name another folder")
-    kinds = Counter(item.suffix.lower() or "other" for item in items if item.is_file())
+    kinds = Counter(item.suffix.lower() or "other" for item in items if is_file(item))
     n_folders = sum(item.is_dir() for item in items)
     content: dict[str, Any] = {
         "what": f"folder with {sum(kinds.values())} files and {n_folders} folders"

@@ -16,7 +16,7 @@ from armscan.models.arm import tip_centres, tool_from_probe
 from armscan.records.points import ProbedPoints
 from armscan.report.quantity import Quantity, Summary, Table, sentences, significant
 from armscan.storage.arm import ARM_FILE, PROBE_FILE, read_probe_tip
-from armscan.storage.files import path_text
+from armscan.storage.files import holds_files, path_text
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.points import probed_points_csv, read_probed_points
 from armscan.storage.recording import read_arm_track
@@ -65,7 +65,7 @@ def probe(
             is_compensated=True,
         )
         written = job.write({job.output: probed_points_csv(surface)})
-    is_simulated = are_simulated((source / ARM_FILE if source.is_dir() else source,))
+    is_simulated = are_simulated((source / ARM_FILE if holds_files(source) else source,))
     next_step = f"armscan calibrate hand-eye SCAN --sensor sensor.json --plate {job.output}"
     return Summary(
         title="Plate probed" + (" (simulated)." if is_simulated else "."),
@@ -86,7 +86,7 @@ def read_touches(source: Path, tip: Path | None = None) -> Touches:
     ArmscanError
         If a file is missing or damaged, the arm gave no pose, or a tip is given for a table.
     """
-    if not source.is_dir():
+    if not holds_files(source):
         if tip is not None:
             raise OptionError(
                 "a table of points says itself how large the tip was",

@@ -44,7 +44,7 @@ from armscan.report.cloud import (
 )
 from armscan.report.page import Page, render_page
 from armscan.report.quantity import Summary, sentences
-from armscan.storage.arm import ARM_FILE, read_arm_model
+from armscan.storage.arm import read_arm_model
 from armscan.storage.clouds import CLOUD_SUFFIXES, CloudPiece, cloud_losses, cloud_parts
 from armscan.storage.documents import (
     is_scanner_document,
@@ -55,8 +55,12 @@ from armscan.storage.files import scratch_folder
 from armscan.storage.image_paths import are_simulated, expand_paths
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.points import profile_files, read_profiles, read_robot_poses
-from armscan.storage.recording import FolderRecording, is_recording, read_recording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recording import (
+    FolderRecording,
+    is_recording,
+    read_recording,
+    recording_tables,
+)
 
 LISTED = 4
 
@@ -180,8 +184,7 @@ def reconstruct(
     box = Box.parse(volume, "--volume") if volume else None
     if poses is not None:
         return _delivered(job, calibration, paths.images, poses, box)
-    folders = [Path(name) for name in paths.images if Path(name).is_dir()]
-    recordings = [folder for folder in folders if is_recording(folder)]
+    recordings = [Path(name) for name in paths.images if is_recording(Path(name))]
     if recordings and not (paths.background or paths.right):
         image_options.check_unused()
     if recordings and is_scanner_document(calibration):
@@ -329,10 +332,9 @@ def _scan(
             progress=job.progress, cache=job.cache, clock=clock, reader=reader,
         )  # fmt: skip
         warnings = (*recording.warnings, *recording.session.assumed, *scan.warnings)
-        tables = [folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)]
-        inputs = [path for path in (*tables, calibration, arm) if path is not None]
+        inputs = (*recording_tables(folder), calibration, arm)
         provenance = job.provenance(
-            [path for path in inputs if path.exists()],
+            [path for path in inputs if path is not None],
             (options,),
             parents=(scanner.provenance,),
             warnings=warnings,

@@ -42,7 +42,6 @@ from armscan.report.quantity import (
     without_source,
 )
 from armscan.report.sheets import TITLE, laser_page, sheet_quantities, sheet_warnings
-from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import (
     STEREO_SCHEMA,
     document_schema,
@@ -56,8 +55,7 @@ from armscan.storage.documents import (
 from armscan.storage.image_paths import are_simulated, expand_paths, named_by
 from armscan.storage.images import ImageOptions, read_exposures
 from armscan.storage.observations import pack_board_stripes, read_observations
-from armscan.storage.recording import read_recording
-from armscan.storage.recording_session import EXPOSURES_FILE, SESSION_FILE
+from armscan.storage.recording import read_recording, recording_tables
 from armscan.vision.targets.target import Target, parse_target
 
 REQUESTED = "left out by request"
@@ -65,7 +63,6 @@ STRIPES = "StripeOptions."
 """Entries of a document's record that say how stripes were found."""
 COUNTS = ("columns", "rows")
 SIZES = ("square_mm", "pitch_mm")
-SCAN_TABLES = (EXPOSURES_FILE, ARM_FILE, SESSION_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,7 +317,7 @@ def _read_scan(folder: Path, leave_out: Sequence[str], *, is_stereo: bool) -> _I
         tuple(folder / recording.rows[k].source for k in rows),
         pair_by_view([one for one in exposures if one.source not in gone]),
         _skipped([one for one in exposures if one.lasers], gone),
-        tuple(folder / name for name in SCAN_TABLES if (folder / name).is_file()),
+        recording_tables(folder),
         (*recording.warnings, *recording.session.assumed),
     )
 

@@ -46,6 +46,7 @@ from armscan.report.quantity import (
 )
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
+from armscan.storage.files import holds_files
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
@@ -129,10 +130,10 @@ def verify(
     """
     options, inspection = options or VerifyOptions(), inspection or InspectionOptions()
     box = region_of(region)
-    if scan.is_dir() and scanner is None:
+    if holds_files(scan) and scanner is None:
         raise OptionError("a recording needs the scanner's calibration", remedy="give --scanner")
     job.places(".html")
-    table = scan / EXPOSURES_FILE if scan.is_dir() else scan
+    table = scan / EXPOSURES_FILE if holds_files(scan) else scan
     inputs = [path for path in (table, scanner, standard.plate) if path is not None]
     measured, is_simulated = _measured(scan, scanner, job.progress)
     is_simulated = is_simulated or are_simulated(inputs)
@@ -174,7 +175,7 @@ def verify(
 
 def _measured(scan: Path, scanner: Path | None, progress: Progress) -> tuple[Measured, bool]:
     """The points, and whether they are of rendered images."""
-    if not scan.is_dir() or scanner is None:
+    if not holds_files(scan) or scanner is None:
         cloud = read_cloud(scan)
         if cloud.frame == "Sensor":
             raise OptionError(

@@ -37,8 +37,9 @@ from armscan.pipeline.progress import Progress, ProgressEvent, silent
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, ExposureRow, Session
 from armscan.storage.arm import ProbeTip, write_probing
-from armscan.storage.files import check_new_folder, check_outputs
+from armscan.storage.files import RECORDING_SUFFIX, check_new_folder, check_outputs, path_text
 from armscan.storage.recording import encoded_png, write_recording, written_session
+from armscan.storage.recordings.read_mcap import check_new_file, record_source
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -239,14 +240,14 @@ def record_scenes(
     beside: Mapping[Path, bytes] | None = None,
     progress: Progress = silent,
 ) -> dict[TwinScene, ScanSource]:
-    """Render scenes of a twin and write each as a folder recording.
+    """Render scenes of a twin and write each as a recording: a folder, or one file ``NAME.mcap``.
 
     Each recording is there complete or not at all.
 
     Parameters
     ----------
     folders
-        The scenes, with the folder of each, which must not exist or be empty.
+        The scenes, with the place of each, which must not exist or be an empty folder.
     name
         The twin.
     most_views
@@ -283,7 +284,8 @@ def record_scenes(
         for scene, scan in scans.items():
             own = islice(images, len(scan.rows))
             files = beside if before == 0 else None
-            write_recording(folders[scene], scan, report, encoded=own, beside=files)
+            write = record_source if _is_one_file(folders[scene]) else write_recording
+            write(folders[scene], scan, report, encoded=own, beside=files)
             before += len(scan.rows)
     return scans
 
@@ -363,7 +365,7 @@ class SimulatedScene:
 
 
 def truth_path(folder: Path) -> Path:
-    """``NAME.truth.json`` beside the folder ``NAME``: truth never travels inside a recording.
+    """``NAME.truth.json`` beside ``NAME`` or ``NAME.mcap``: truth never travels in a recording.
 
     Raises
     ------
@@ -374,7 +376,12 @@ def truth_path(folder: Path) -> Path:
     named = folder if folder.name not in ("", "..") else folder.resolve()
     if not named.name:
         raise OutputError("a root has no name", where=str(folder), remedy="name a new folder")
-    return named.with_name(f"{named.name}.truth.json")
+    name = named.stem if _is_one_file(named) else named.name
+    return named.with_name(f"{name}.truth.json")
+
+
+def _is_one_file(place: Path) -> bool:
+    return place.suffix.lower() == RECORDING_SUFFIX
 
 
 def simulate_scene(
@@ -384,12 +391,12 @@ def simulate_scene(
     options: SimulateOptions | None = None,
     progress: Progress = silent,
 ) -> SimulatedScene:
-    """Write a scene of the twin as a folder recording, and its truth beside it.
+    """Write a scene of the twin as a recording, and its truth beside it.
 
     Parameters
     ----------
     folder
-        Must not exist, or be empty.
+        Must not exist, or be an empty folder; one file if its name ends in ``.mcap``.
     head
         Name of the head.
     scene
@@ -410,7 +417,13 @@ def simulate_scene(
     """
     settings = SimulateOptions() if options is None else options
     truth = truth_path(folder)
-    check_new_folder(folder)
+    if _is_one_file(folder) and scene == "probing":
+        raise OptionError(
+            "touches have no images, which a recording in one file is of",
+            where=path_text(folder),
+            remedy="name a folder",
+        )
+    (check_new_file if _is_one_file(folder) else check_new_folder)(folder)
     if truth.is_file():
         raise OutputError(
             "the truth of an earlier recording is there",

@@ -51,12 +51,67 @@ def path_text(path: Path | str) -> str:
     return os.fsencode(text).decode("utf-8", "backslashreplace")
 
 
+RECORDING_SUFFIX = ".mcap"
+
+
+def packed_place(path: Path) -> tuple[Path, str] | None:
+    """The file that is read as a folder and that a path leads into, and the path inside of it.
+
+    A recording in one file is read as the folder that it holds: ``scan.mcap/exposures.csv`` is its
+    list of exposures. None for all other paths.
+    """
+    for place in (path, *path.parents):
+        if place.suffix.lower() == RECORDING_SUFFIX:
+            try:
+                is_packed = place.is_file()
+            except (OSError, ValueError):
+                return None
+            if is_packed:
+                return place, "" if place == path else path.relative_to(place).as_posix()
+    return None
+
+
 def is_file(path: Path) -> bool:
-    """True for a file; False also for a path that no system takes."""
+    """True for a file, also in a recording of one file; False also for a path no system takes."""
     try:
+        packed = packed_place(path)
+        if packed is not None and packed[1]:
+            return packed[1] in _packed_names(packed[0])
         return path.is_file()
-    except (OSError, ValueError):
+    except (OSError, ValueError, FileFormatError):
         return False
+
+
+def holds_files(path: Path) -> bool:
+    """True for a folder, and for a recording in one file or a folder in it."""
+    packed = packed_place(path)
+    if packed is None:
+        return is_folder(path)
+    return not packed[1] or bool(files_in(path))
+
+
+def files_in(path: Path) -> tuple[Path, ...]:
+    """What lies in a folder, as `holds_files` says; of a recording in one file only files.
+
+    Raises
+    ------
+    FileFormatError
+        If the recording is unfinished or damaged.
+    """
+    packed = packed_place(path)
+    if packed is None:
+        return tuple(path.iterdir())
+    start = f"{packed[1]}/" if packed[1] else ""
+    names = (
+        name.removeprefix(start) for name in _packed_names(packed[0]) if name.startswith(start)
+    )
+    return tuple(path / name for name in names if "/" not in name)
+
+
+def _packed_names(path: Path) -> tuple[str, ...]:
+    from armscan.storage.recordings.mcap_folder import folder_in  # it reads files itself
+
+    return folder_in(path).names
 
 
 def is_folder(path: Path) -> bool:
@@ -76,6 +131,11 @@ def read_bytes(path: Path) -> bytes:
         If there is no such file, it is a folder or a pipe, it is empty or it may not be read.
     """
     where = path_text(path)
+    packed = packed_place(path)
+    if packed is not None and packed[1]:
+        from armscan.storage.recordings.mcap_folder import folder_in  # it reads files itself
+
+        return folder_in(packed[0]).read(packed[1])
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

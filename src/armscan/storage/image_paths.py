@@ -13,7 +13,14 @@ from pathlib import Path
 
 from armscan.errors import FileFormatError, OptionError
 from armscan.storage.codec import parse_json, parse_toml
-from armscan.storage.files import present_path, read_bytes
+from armscan.storage.files import (
+    files_in,
+    holds_files,
+    is_file,
+    packed_place,
+    present_path,
+    read_bytes,
+)
 
 IMAGE_SUFFIXES = frozenset({".png", ".bmp", ".jpg", ".jpeg", ".tif", ".tiff", ".pgm", ".ppm"})
 
@@ -103,8 +110,8 @@ def _expand(pattern: str) -> list[Path]:
 
 def _found(pattern: str) -> list[Path]:
     path = Path(pattern)
-    if path.is_dir():
-        images = [item for item in path.iterdir() if item.suffix.lower() in IMAGE_SUFFIXES]
+    if holds_files(path):
+        images = [item for item in files_in(path) if item.suffix.lower() in IMAGE_SUFFIXES]
         if not images:
             raise FileFormatError(
                 "the folder holds no image",
@@ -112,12 +119,15 @@ def _found(pattern: str) -> list[Path]:
                 remedy="name the folder that holds the PNG, BMP, JPEG, TIFF or PGM files",
             )
         return sorted(images, key=lambda item: natural_key(item.as_posix()))
-    if path.exists():
+    if path.exists() or is_file(path):
         return [path]
     if not MAGIC.search(pattern):
         raise FileFormatError("there is no such file", where=pattern, remedy="check the path")
     root = Path(path.anchor)
-    files = [match for match in root.glob(str(path.relative_to(root))) if match.is_file()]
+    if packed_place(path.parent) is not None:
+        files = [one for one in files_in(path.parent) if fnmatchcase(one.name, path.name)]
+    else:
+        files = [match for match in root.glob(str(path.relative_to(root))) if match.is_file()]
     if not files:
         raise FileFormatError(
             "no file matches the pattern",

@@ -37,7 +37,14 @@ from armscan.storage.arm import (
     read_arm_model,
     read_arm_table,
 )
-from armscan.storage.files import is_file, new_folder, read_bytes
+from armscan.storage.files import (
+    files_in,
+    holds_files,
+    is_file,
+    new_folder,
+    packed_place,
+    read_bytes,
+)
 from armscan.storage.image_paths import are_simulated
 from armscan.storage.images import ImageOptions, read_exposure
 from armscan.storage.recording_session import (
@@ -351,8 +358,8 @@ class FolderRecording:
 
     @property
     def name(self) -> str:
-        """The folder's name."""
-        return self.folder.resolve().name
+        """As `recording_name`."""
+        return recording_name(self.folder)
 
     def exposure(self, row: int) -> Exposure:
         """Read the exposure of ``rows[row]`` with its pixels.
@@ -366,13 +373,26 @@ class FolderRecording:
         return read_recorded(self.folder, chosen, self.session.cameras[chosen.camera])
 
 
+def recording_name(folder: Path) -> str:
+    """The folder's name; of a recording in one file that of the file without its suffix."""
+    path = folder.resolve()
+    return path.name if packed_place(path) is None else path.stem
+
+
 def is_recording(folder: Path) -> bool:
-    """True for a folder that holds the list of a recording's exposures."""
-    return is_file(folder / EXPOSURES_FILE)
+    """True for a folder that holds the list of a recording's exposures, and for one in one file."""
+    packed = packed_place(folder)
+    return is_file(folder / EXPOSURES_FILE) if packed is None else not packed[1]
+
+
+def recording_tables(folder: Path) -> tuple[Path, ...]:
+    """Its list of exposures, its arm's samples and its session, those that there are."""
+    places = (folder / name for name in (EXPOSURES_FILE, ARM_FILE, SESSION_FILE))
+    return tuple(path for path in places if is_file(path))
 
 
 def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording:
-    """Read a folder recording; images are read later, one by one.
+    """Read a folder recording, or the one in an MCAP file; images are read later, one by one.
 
     Parameters
     ----------
@@ -394,7 +414,7 @@ def read_recording(folder: Path, arm: ArmModel | None = None) -> FolderRecording
     warnings = [*said.warnings, *_odd(table, unknown)]
     warnings += [f"{table.where}: {name} is listed again" for name in repeated_files(rows)]
     track, form, arm_model, arm_unknown = None, said.session.pose_form, None, {}
-    if (folder / ARM_FILE).exists():
+    if is_file(folder / ARM_FILE):
         arm_csv = read_csv(folder / ARM_FILE)
         arm_model = arm if arm is not None else _own_arm_model(folder)
         found = _arm_table(arm_csv, said, arm_model)
@@ -452,17 +472,19 @@ def read_arm_track(folder: Path, arm: ArmModel | None = None) -> tuple[ArmTrack,
 def _said(folder: Path) -> tuple[SessionFile, list[str]]:
     """The session, and that there is none if there is none."""
     path = folder / SESSION_FILE
-    if path.exists():
+    if is_file(path):
         return read_session_file(path), []
     return SessionFile(Session(cameras=())), [f"there is no {SESSION_FILE}"]
 
 
 def _check_folder(folder: Path) -> None:
-    if not folder.is_dir():
+    if not holds_files(folder):
         raise FileFormatError(
             "there is no such folder", where=str(folder), remedy="name a recording's folder"
         )
-    if not is_recording(folder):
+    if packed_place(folder) is not None:
+        files_in(folder)
+    if not is_file(folder / EXPOSURES_FILE):
         raise FileFormatError(
             f"the folder holds no {EXPOSURES_FILE}, so it is no recording",
             where=str(folder),
@@ -472,7 +494,7 @@ def _check_folder(folder: Path) -> None:
 
 def _own_arm_model(folder: Path) -> ArmModel | None:
     path = folder / ARM_MODEL_FILE
-    return read_arm_model(path) if path.exists() else None
+    return read_arm_model(path) if is_file(path) else None
 
 
 def _arm_table(table: CsvTable, said: SessionFile, arm: ArmModel | None) -> ArmTable:
@@ -591,8 +613,8 @@ def write_recording(
         If an exposure is not what its session says.
     """
     session = written_session(source)
-    rows = _named(source, names)
-    contents = _contents(source, session) if encoded is None else encoded
+    rows = named_rows(source, names)
+    contents = image_files(source, session) if encoded is None else encoded
     with new_folder(folder, beside) as partial:
         for done, (row, content) in enumerate(zip(rows, contents, strict=True), start=1):
             path = partial / row.source
@@ -619,7 +641,8 @@ def _delivered(setup: CameraSetup) -> CameraSetup:
     return replace(setup, align="low", colour=colour)
 
 
-def _contents(source: ScanSource, session: Session) -> Iterator[bytes]:
+def image_files(source: ScanSource, session: Session) -> Iterator[bytes]:
+    """The image files of a scan as it is written, in the order of its rows."""
     for k, row in enumerate(source.rows):
         if isinstance(source, FolderRecording):
             yield read_bytes(source.folder / row.source)
@@ -627,8 +650,8 @@ def _contents(source: ScanSource, session: Session) -> Iterator[bytes]:
             yield encoded_png(source.exposure(k), session.cameras[row.camera])
 
 
-def _named(source: ScanSource, names: Sequence[str] | None) -> tuple[ExposureRow, ...]:
-    """Rows with the names under which their images are written."""
+def named_rows(source: ScanSource, names: Sequence[str] | None = None) -> tuple[ExposureRow, ...]:
+    """Rows with the names under which their images are written; see `write_recording`."""
     if isinstance(source, FolderRecording) and names is None:
         return source.rows
     chosen = [_png_name(row) for row in source.rows] if names is None else names
@@ -665,5 +688,5 @@ def _write_tables(
         head = source.folder / session.head
         if is_file(head):
             (folder / session.head).parent.mkdir(parents=True, exist_ok=True)
-            (folder / session.head).write_bytes(head.read_bytes())
+            (folder / session.head).write_bytes(read_bytes(head))
     (folder / SESSION_FILE).write_bytes(session_toml(session))

@@ -3,15 +3,23 @@
 
 from __future__ import annotations
 
+import errno
+import json
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from armscan.errors import ArmscanError, FileFormatError
+from armscan.errors import ArmscanError, FileFormatError, OutputError
+from armscan.jobs.live.recordings import recover_recording
+from armscan.records.recording import CameraSetup, PixelColour, Session
+from armscan.storage.recording import read_recording
+from armscan.storage.recordings import write_mcap
+from armscan.storage.recordings.mcap_folder import read_summary
 from armscan.storage.recordings.read_mcap import extract_recording, record_folder
-from armscan.storage.recordings.write_mcap import RecordingWriter
+from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 from armscan.storage.tables import read_csv
 from unit.recording.test_mcap_writer import SESSION, image, row
 
@@ -104,3 +112,114 @@ def test_an_unfinished_file_is_told_to_be_recovered(tmp_path: Path) -> None:
     for k in range(3):
         pixels = cv2.imread(str(tmp_path / "saved" / row(k).source), cv2.IMREAD_UNCHANGED)
         np.testing.assert_array_equal(pixels, image(k))
+
+
+def recorded(path: Path, monkeypatch: pytest.MonkeyPatch, n: int = 12) -> list[tuple[int, int]]:
+    """A recording of ``n`` exposures, three a chunk; where the chunks of images begin and end."""
+    monkeypatch.setattr(write_mcap, "CHUNK_BYTES", 4000)
+    with RecordingWriter(path, WriterOptions("raw")) as writer:
+        writer.begin(SESSION, {"arm.toml": b"name = 'x'\n"})
+        for k in range(n):
+            writer.add_exposure(row(k), image(k))
+    chunks = read_summary(path).chunks
+    spans = [(c.chunk_start_offset, c.chunk_start_offset + c.chunk_length) for c in chunks]
+    return [span for span in spans if span[1] - span[0] > 3000]
+
+
+@pytest.mark.parametrize("place", [0, 2, 5, 30, 900])
+def test_recovery_goes_on_after_a_damaged_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    path, saved = tmp_path / "scan.mcap", tmp_path / "saved"
+    start, _ = recorded(path, monkeypatch)[1]
+    data = bytearray(path.read_bytes())
+    data[start + place] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(FileFormatError, match="damaged"):
+        extract_recording(path, tmp_path / "strict")
+    found = extract_recording(path, saved, is_recovering=True)
+    assert (found.n_exposures, found.n_lost) == (9, 3)
+    assert found.lost[0] == "3 of 12 exposures"
+    assert read_csv(saved / "exposures.csv").columns["index"] == tuple(
+        map(str, (0, 1, 2, *range(6, 12)))
+    )
+    for k in (0, 1, 2, *range(6, 12)):
+        pixels = cv2.imread(str(saved / row(k).source), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(pixels, image(k))
+
+
+def test_what_is_left_without_its_beginning_has_its_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, saved = tmp_path / "scan.mcap", tmp_path / "saved"
+    spans = recorded(path, monkeypatch)
+    data = bytearray(path.read_bytes())
+    data[8 : spans[0][0]] = bytes(spans[0][0] - 8)
+    path.write_bytes(data)
+    found = extract_recording(path, saved, is_recovering=True)
+    assert (found.n_exposures, found.n_lost, found.warnings) == (12, 0, ())
+    assert read_recording(saved).session.cameras == SESSION.cameras
+    assert (saved / "arm.toml").read_bytes() == b"name = 'x'\n"
+
+
+def test_any_prefix_that_holds_a_chunk_is_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "scan.mcap"
+    spans = recorded(path, monkeypatch)
+    data = path.read_bytes()
+    for k, (_, end) in enumerate(spans[1:]):
+        path.write_bytes(data[: end + 10])
+        found = extract_recording(path, tmp_path / f"saved{k}", is_recovering=True)
+        assert found.n_exposures == 3 * (k + 1)
+        assert found.lost and not found.warnings
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype", "colour"),
+    [
+        ((30, 40), np.uint8, "bayer_rggb"),
+        ((30, 40), np.uint16, "mono"),
+        ((30, 40, 3), np.uint8, "rgb"),
+    ],
+)
+def test_recovered_raw_pixels_are_those_recorded(
+    tmp_path: Path, shape: tuple[int, ...], dtype: type, colour: PixelColour
+) -> None:
+    path, again = tmp_path / "scan.mcap", tmp_path / "again.mcap"
+    bits = 8 * np.dtype(dtype).itemsize
+    session = Session(cameras=(CameraSetup(40, 30, bits_used=bits, colour=colour),))
+    pixels = np.random.default_rng(1).integers(0, 2**bits, shape).astype(dtype)
+    writer = RecordingWriter(path)
+    writer.begin(session)
+    writer.add_exposure(row(0), pixels)
+    writer.add_event(77, "button")
+    writer.close()
+    path.write_bytes(path.read_bytes()[:-40])
+    recover_recording(path, again)
+    recover_recording(path, tmp_path / "saved")
+    events = [
+        json.loads(line)
+        for line in (tmp_path / "saved/events.jsonl").read_bytes().split(b"\n")[:-1]
+    ]
+    assert events == [{"t_ns": 77, "kind": "button", "facts": {}}]
+    kept = read_recording(tmp_path / "saved")
+    shown = kept.exposure(0).image
+    wanted = cv2.cvtColor(pixels, cv2.COLOR_BayerRGGB2RGB) if colour == "bayer_rggb" else pixels
+    np.testing.assert_array_equal(shown, wanted)
+    assert kept.session.cameras == session.cameras
+    extract_recording(again, tmp_path / "third")
+    np.testing.assert_array_equal(read_recording(tmp_path / "third").exposure(0).image, wanted)
+
+
+def test_a_full_disk_leaves_nothing_of_a_conversion(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.setattr(os, "writev", full)
+    with pytest.raises(OutputError, match=r"scan.mcap: nothing was written \(No space"):
+        record_folder(folder, tmp_path / "scan.mcap")
+    assert sorted(tmp_path.iterdir()) == before

@@ -17,10 +17,13 @@ import numpy as np
 import pytest
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_protobuf.decoder import DecoderFactory
 
-from armscan.errors import OutputError
+from armscan.errors import InputError, OutputError
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.recordings import write_mcap
 from armscan.storage.recordings.read_mcap import extract_recording
 from armscan.storage.recordings.write_mcap import RecordingWriter, WriterOptions
 
@@ -60,7 +63,7 @@ def test_another_reader_finds_all_that_was_recorded(tmp_path: Path, compression:
         names = {one.name for one in reader.iter_attachments()}
         summary = reader.get_summary()
     assert summary is not None and summary.statistics is not None
-    assert summary.statistics.message_count == 44
+    assert summary.statistics.message_count == 46
     assert names == {"session.toml", "arm.toml"}
     assert [len(one["rows"]) for one in arm] == [3]
     assert [pose.translation.x for pose in poses] == [0.25, 0.25]
@@ -159,3 +162,81 @@ def test_a_file_that_exists_is_left_as_it_is(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be begun"):
         RecordingWriter(path).begin(SESSION)
     assert path.read_bytes() == b"mine"
+
+
+def writing_fails(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    def refuse(*_: object) -> int:
+        raise error
+
+    monkeypatch.setattr(os, "writev", refuse)
+
+
+FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("error", [FULL, MemoryError("no memory"), ValueError("a bug")])
+def test_whatever_ends_the_writing_thread_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    writer = RecordingWriter(tmp_path / "scan.mcap", WriterOptions("raw", queue_bytes=3000))
+    writer.begin(SESSION)
+    writing_fails(monkeypatch, error)
+    writer.add_exposure(row(0), image(0))
+    with pytest.raises(OutputError, match="0 exposures of 1 are safe"):
+        writer.close()
+    with pytest.raises(OutputError, match=r"the recording stopped \((No space|MemoryError|Value)"):
+        writer.add_exposure(row(1), image(1))
+
+
+def test_a_file_that_cannot_even_be_cut_is_told_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    writer = RecordingWriter(tmp_path / "scan.mcap")
+    writer.begin(SESSION)
+    writing_fails(monkeypatch, FULL)
+    monkeypatch.setattr(os, "ftruncate", refuse)
+    writer.add_exposure(row(0), image(0))
+    with pytest.raises(OutputError, match=r"No space.*armscan recover"):
+        writer.close()
+
+
+def test_a_recording_that_cannot_be_begun_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, closed = tmp_path / "scan.mcap", []
+    monkeypatch.setattr(os, "close", lambda handle, real=os.close: closed.append(real(handle)))
+    writer = RecordingWriter(path)
+    with monkeypatch.context() as patch:
+        writing_fails(patch, FULL)
+        with pytest.raises(OutputError, match=r"cannot be begun \(No space"):
+            writer.begin(SESSION)
+    assert not path.exists()
+    assert len(closed) == 1
+    with pytest.raises(InputError, match="begun before"):
+        writer.begin(SESSION)
+    writer.close()
+
+
+def test_each_chunk_declares_what_it_holds_and_facts_follow_their_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(write_mcap, "CHUNK_BYTES", 4000)
+    path = tmp_path / "scan.mcap"
+    with RecordingWriter(path) as writer:
+        writer.begin(SESSION)
+        for k in range(12):
+            writer.add_exposure(row(k), image(k))
+    stored = StreamReader(io.BytesIO(path.read_bytes()), emit_chunks=True).records
+    chunks = [breakup_chunk(one, validate_crc=True) for one in stored if isinstance(one, Chunk)]
+    n_images = n_facts = 0
+    for listed in chunks:
+        topics = {one.id: one.topic for one in listed if isinstance(one, Channel)}
+        found = [topics[one.channel_id] for one in listed if isinstance(one, Message)]
+        n_images += found.count("/camera/0/raw")
+        n_facts += found.count("/exposures")
+        assert n_images - n_facts in (0, 3)
+    assert len(chunks) == 8
+    assert n_images == n_facts == 12

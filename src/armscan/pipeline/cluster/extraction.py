@@ -28,6 +28,7 @@ from armscan.records.exposure import Exposure
 from armscan.records.profile import Profile
 from armscan.records.recording import CameraSetup, ExposureRow
 from armscan.storage.detection_cache import DetectionCache, code_version
+from armscan.storage.files import is_file
 from armscan.storage.recording import FolderRecording, read_recorded
 from armscan.storage.recording_session import EXPOSURES_FILE
 from armscan.vision.stripe.image import StripeOptions
@@ -143,7 +144,7 @@ def extract_chunk(chunk: Chunk) -> list[Found]:
             where=WHERE,
             remedy="install the same ones everywhere",
         )
-    if not (chunk.folder / EXPOSURES_FILE).is_file():
+    if not is_file(chunk.folder / EXPOSURES_FILE):
         raise InputError(
             f"the worker on {platform.node()} does not see the recording",
             where=str(chunk.folder),

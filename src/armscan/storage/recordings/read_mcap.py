@@ -3,61 +3,79 @@
 
 from __future__ import annotations
 
+import base64
 import json
-import struct
-import zlib
-from collections import defaultdict, deque
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-import zstandard
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
 from mcap import records
-from mcap.data_stream import RecordBuilder
-from mcap.exceptions import McapError
-from mcap.stream_reader import StreamReader, breakup_chunk
 from numpy.typing import NDArray
 
-from armscan.errors import ArmscanError, FileFormatError
+from armscan.devices.sources import ScanSource
+from armscan.errors import ArmscanError, FileFormatError, OutputError
 from armscan.records.exposure import Exposure
-from armscan.records.recording import CameraSetup, ExposureRow
-from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE
-from armscan.storage.files import new_folder, path_text, read_bytes, scratch_folder
-from armscan.storage.recording import encoded_png, read_recording, written_session
+from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
+from armscan.storage.arm import ARM_FILE, ARM_MODEL_FILE, arm_columns
+from armscan.storage.files import (
+    check_outputs,
+    is_file,
+    new_folder,
+    path_text,
+    read_bytes,
+    scratch_folder,
+    write_files,
+)
+from armscan.storage.recording import (
+    Report,
+    encoded_png,
+    image_files,
+    named_rows,
+    read_recording,
+    written_session,
+)
 from armscan.storage.recording_session import (
     EXPOSURES_FILE,
-    MOST_CAMERAS,
     SESSION_FILE,
+    exposure_columns,
     is_inside,
     session_toml,
 )
+from armscan.storage.recordings.mcap_folder import (
+    CAMERA_TOPICS,
+    DAMAGE,
+    EVENTS_FILE,
+    RECOVER_REMEDY,
+    TABLES,
+    Damage,
+    FileSummary,
+    RecordedTables,
+    StoredMessage,
+    opened,
+    pieces_of,
+    raw_pixels,
+    read_summary,
+    stored_image,
+)
 from armscan.storage.recordings.write_mcap import (
     ARM_TOPIC,
+    DOCUMENT_TOPIC,
     EVENT_TOPIC,
     EXPOSURE_TOPIC,
-    MAGIC,
-    TRANSFORM_TOPIC,
     RecordingWriter,
     WriterStatus,
 )
-from armscan.storage.tables import csv_bytes, read_csv
+from armscan.storage.tables import read_csv
 
-EVENTS_FILE = "events.jsonl"
-TABLES = {EXPOSURES_FILE, ARM_FILE}
-FOOTER = struct.Struct("<BQQQI")
 ARM_BATCH = 1000
 """Samples in one message: a second of a quick arm."""
-RECOVER_REMEDY = "run `armscan recover` on it first"
-DAMAGE = (
-    *(McapError, DecodeError, zstandard.ZstdError, struct.error),
-    *(ValueError, KeyError, IndexError, TypeError, EOFError, OverflowError, MemoryError),
-)
-"""What readers of bytes raise where the bytes are not what they should be."""
+LISTED = 5
+"""Damages told one by one; of more, the count."""
 
 
 @dataclass
@@ -71,6 +89,8 @@ class ReadBack:
     n_aside
         Exposures and samples that a table cannot hold: repeated or backward times or ids, names
         outside of the recording.
+    n_lost
+        Exposures that were recorded and are not whole.
     seconds
         From the first exposure to the last.
     lost
@@ -83,6 +103,7 @@ class ReadBack:
     n_samples: int = 0
     n_events: int = 0
     n_aside: int = 0
+    n_lost: int = 0
     seconds: float = 0.0
     lost: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -93,109 +114,89 @@ class _Folder:
     """A recording as it grows in its folder."""
 
     path: Path
-    found: ReadBack = field(default_factory=ReadBack)
-    topics: dict[int, str] = field(default_factory=dict)
-    pending: dict[str, deque[bytes]] = field(default_factory=lambda: defaultdict(deque))
-    exposures: list[dict[str, str]] = field(default_factory=list)
-    samples: list[dict[str, str]] = field(default_factory=list)
-    events: list[bytes] = field(default_factory=list)
-    times: list[int] = field(default_factory=list)
-    latest: dict[str, int] = field(default_factory=dict)
-    ids: set[tuple[str, str]] = field(default_factory=set)
-    checksums: dict[str, int] = field(default_factory=dict)
-    n_messages: int = 0
+    tables: RecordedTables = field(default_factory=RecordedTables)
+    pending: dict[int, StoredMessage] = field(default_factory=dict)
+    damages: list[Damage] = field(default_factory=list)
+    n_seen: Counter[str] = field(default_factory=Counter)
+    n_said: defaultdict[str, int] = field(default_factory=lambda: defaultdict(int))
 
-    def take(self, record: records.McapRecord) -> None:
-        if isinstance(record, records.Channel):
-            self.topics[record.id] = record.topic
-        elif isinstance(record, records.Attachment):
-            if is_inside(record.name) and record.name not in TABLES:
-                self._write(record.name, record.data)
-        elif isinstance(record, records.Message):
-            self.n_messages += 1
-            self._take_message(self.topics[record.channel_id], record.data)
-
-    def _take_message(self, topic: str, data: bytes) -> None:
-        if topic.startswith("/camera/"):
-            self.pending[topic].append(data)
-        elif topic == EXPOSURE_TOPIC:
-            self._exposure(json.loads(data))
-        elif topic == ARM_TOPIC:
-            said = json.loads(data)
-            for row in said["rows"]:
-                self._sample(dict(zip(said["columns"], row, strict=True)))
-        elif topic == EVENT_TOPIC:
-            self.events.append(data)
-        elif topic != TRANSFORM_TOPIC:
-            raise ValueError("a topic is not one of armscan")
-
-    def _exposure(self, said: dict[str, Any]) -> None:
-        facts, cells = said["image"], dict(said["cells"])
-        content = self.pending[facts["topic"]].popleft()
-        shown = CompressedImage() if facts["stored"] == "file" else RawImage()
-        shown.ParseFromString(content)
-        if zlib.crc32(shown.data) != facts["crc32"]:
-            raise ValueError("an image is not the one that was recorded")
-        name = str(said["file"])
-        if isinstance(shown, RawImage):
-            name = name if name.lower().endswith(".png") else f"{name}.png"
-            cells["file"] = name
-        keys = [("index", cells["index"])]
-        if cells.get("trigger_id"):
-            keys.append((f"trigger of camera {said['camera']}", cells["trigger_id"]))
-        is_usable = (
-            is_inside(name)
-            and name not in TABLES
-            and 0 <= said["camera"] < MOST_CAMERAS
-            and self.checksums.get(name, facts["crc32"]) == facts["crc32"]
-        )
-        if not (is_usable and self._is_next(f"camera {said['camera']}", said["t_ns"], keys)):
-            self.found.n_aside += 1
-            return
-        self._write(name, shown.data if isinstance(shown, CompressedImage) else _png(shown))
-        self.checksums[name] = facts["crc32"]
-        if said["flags"]:
-            cells["flags"] = "+".join(said["flags"])
-        self.exposures.append(cells)
-        self.times.append(said["t_ns"])
-
-    def _sample(self, cells: dict[str, str]) -> None:
-        number = cells.get("trigger_id")
-        if self._is_next("arm", int(cells["t_ns"]), [("arm", number)] if number else []):
-            self.samples.append(cells)
+    def take(self, message: StoredMessage) -> None:
+        kind = EXPOSURE_TOPIC if message.topic.startswith(CAMERA_TOPICS) else message.topic
+        self.n_said[kind] = max(self.n_said[kind], message.number + 1)
+        self.n_seen[message.topic] += 1
+        if kind != message.topic:
+            self.pending[message.number] = message
+        elif kind == EXPOSURE_TOPIC:
+            self._take_exposure(message)
+        elif kind == DOCUMENT_TOPIC:
+            said = json.loads(message.data)
+            self.take_document(said["name"], base64.b64decode(said["base64"]))
         else:
-            self.found.n_aside += 1
+            self.tables.take(message)
 
-    def _is_next(self, source: str, t_ns: int, ids: list[tuple[str, str]]) -> bool:
-        """False for what the tables' parsers refuse."""
-        if t_ns <= self.latest.get(source, t_ns - 1) or not self.ids.isdisjoint(ids):
-            return False
-        self.latest[source] = t_ns
-        self.ids.update(ids)
-        return True
+    def take_document(self, name: str, content: bytes) -> None:
+        if is_inside(name) and name not in TABLES:
+            self._write(name, content)
+
+    def _take_exposure(self, message: StoredMessage) -> None:
+        said = json.loads(message.data)
+        image = self.pending.pop(message.number, None)
+        # facts come in the order of their images: what is older has lost its own
+        self.pending = {n: one for n, one in self.pending.items() if n > message.number}
+        if image is None:
+            return
+        shown = stored_image(image, said)
+        self.n_seen["whole"] += 1
+        name = self.tables.take_exposure(said)
+        if name is not None:
+            self._write(name, shown.data if isinstance(shown, CompressedImage) else _png(shown))
 
     def _write(self, name: str, content: bytes) -> None:
         path = self.path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
 
-    def finish(self) -> None:
-        """Write the tables, and say what became of it."""
-        for name, rows in ((EXPOSURES_FILE, self.exposures), (ARM_FILE, self.samples)):
-            heads = dict.fromkeys(head for row in rows for head in row)
-            if rows:
-                columns = {head: tuple(row.get(head, "") for row in rows) for head in heads}
-                self._write(name, csv_bytes(columns))
-        if self.events:
-            self._write(EVENTS_FILE, b"".join(line + b"\n" for line in self.events))
-        found = self.found
-        found.n_exposures, found.n_samples = len(self.exposures), len(self.samples)
-        found.n_events = len(self.events)
-        found.seconds = 1e-9 * (max(self.times) - min(self.times)) if self.times else 0.0
+    def finish(self, n_stated: int) -> ReadBack:
+        """Write the tables, and say what became of it; ``n_stated`` exposures were recorded."""
+        tables = self.tables
+        for name, content in tables.contents().items():
+            self._write(name, content)
+        times = tables.times
+        found = ReadBack(
+            n_exposures=len(tables.exposures),
+            n_samples=len(tables.samples),
+            n_events=len(tables.events),
+            n_aside=tables.n_aside,
+            n_lost=self.n_lost(n_stated),
+            seconds=1e-9 * (max(times) - min(times)) if times else 0.0,
+            lost=self._lost(n_stated),
+        )
         try:
             read_recording(self.path)
         except ArmscanError as error:
             found.warnings = (f"the folder is no whole recording: {error.what}",)
+        return found
+
+    def n_lost(self, n_stated: int) -> int:
+        """Exposures that were recorded and did not come whole."""
+        n_whole = self.n_seen["whole"]
+        return max(self.n_said[EXPOSURE_TOPIC], n_stated) - n_whole
+
+    def _lost(self, n_stated: int) -> tuple[str, ...]:
+        said = []
+        n = max(self.n_said[EXPOSURE_TOPIC], n_stated)
+        if self.n_lost(n_stated):
+            said.append(f"{self.n_lost(n_stated)} of {n} exposures")
+        for topic, what in ((ARM_TOPIC, "packets of the arm's samples"), (EVENT_TOPIC, "events")):
+            if self.n_seen[topic] < self.n_said[topic]:
+                n_gone = self.n_said[topic] - self.n_seen[topic]
+                said.append(f"{n_gone} of {self.n_said[topic]} {what}")
+        for one in self.damages[:LISTED]:
+            said.append(f"{one.n_bytes} bytes from byte {one.place} on ({one.reason})")
+        if len(self.damages) > LISTED:
+            rest = self.damages[LISTED:]
+            said.append(f"{sum(one.n_bytes for one in rest)} bytes in {len(rest)} further places")
+        return tuple(said)
 
 
 def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) -> ReadBack:
@@ -211,7 +212,7 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
     folder
         Must not exist, or be empty.
     is_recovering
-        Take a file without its end, or a damaged one, up to the damage.
+        Take a file without its end, or a damaged one: all that is whole before and after a damage.
 
     Raises
     ------
@@ -222,115 +223,61 @@ def extract_recording(path: Path, folder: Path, *, is_recovering: bool = False) 
         If the folder holds something, or cannot be written.
     """
     where = path_text(path)
-    n_stated = None if is_recovering else _stated_messages(path)
-    with new_folder(folder) as partial, _opened(path) as file:
+    stated = _stated(path, is_recovering=is_recovering)
+    with new_folder(folder) as partial, opened(path) as file:
         grown = _Folder(partial)
-        size = path.stat().st_size
-        damage, place = "", 0
-        try:
-            for record in _records(file, size):
-                grown.take(record)
-                place = file.tell()
-        except DAMAGE as error:
-            damage = f"{error}" or type(error).__name__
-        if not is_recovering and (damage or grown.n_messages != n_stated):
-            fact = damage or f"{grown.n_messages} messages of {n_stated} are there"
-            raise FileFormatError(f"the file is damaged ({fact})", where=where,
-                                  remedy=RECOVER_REMEDY)  # fmt: skip
-        if not grown.exposures:
+        for piece in pieces_of(file, path.stat().st_size):
+            _take(grown, piece)
+        n_stated = 0 if stated is None else stated.n_exposures
+        if not is_recovering:
+            _refuse_lost(grown, stated, where)
+        if not grown.tables.exposures:
             raise FileFormatError("no exposure in the file is whole", where=where,
                                   remedy="record again, or look for a copy")  # fmt: skip
-        grown.finish()
-        grown.found.lost = _lost(grown, damage, size - place)
-        return grown.found
+        return grown.finish(n_stated)
 
 
-def _lost(grown: _Folder, damage: str, n_bytes: int) -> tuple[str, ...]:
-    said = []
-    if damage:
-        said.append(f"the last {n_bytes} bytes, from the damage on ({damage})")
-    n_images = sum(map(len, grown.pending.values()))
-    if n_images:
-        said.append(f"{n_images} images whose facts were not written any more")
-    return tuple(said)
-
-
-def _opened(path: Path) -> BinaryIO:
+def _stated(path: Path, *, is_recovering: bool) -> FileSummary | None:
     try:
-        with path.open("rb") as file:
-            head = file.read(len(MAGIC))
-        if head == MAGIC:
-            return path.open("rb")
-    except (OSError, ValueError):
-        read_bytes(path)
-    raise FileFormatError(
-        "this is no MCAP file" if head else "the file is empty (0 bytes)",
-        where=path_text(path),
-        remedy="name a recording that armscan wrote",
-    )
+        return read_summary(path)
+    except FileFormatError as error:
+        if not is_recovering or error.remedy != RECOVER_REMEDY:
+            raise
+        return None
 
 
-def _records(file: BinaryIO, size: int) -> Iterator[records.McapRecord]:
-    """Records of the data, chunks broken up; each is whole, its checksum right."""
-    reader = StreamReader(
-        file, emit_chunks=True, validate_crcs=True, record_size_limit=max(size, 1)
-    )
-    for record in reader.records:
-        if isinstance(record, records.DataEnd):
-            return
-        if isinstance(record, records.Chunk):
-            yield from breakup_chunk(record, validate_crc=True)
-        else:
-            if isinstance(record, records.Attachment):
-                _check_attachment(record, file)
-            yield record
-    raise EOFError("the file has no end")
+def _take(grown: _Folder, piece: list[StoredMessage] | records.Attachment | Damage) -> None:
+    if isinstance(piece, Damage):
+        grown.damages.append(piece)
+    elif isinstance(piece, records.Attachment):
+        grown.take_document(piece.name, piece.data)
+    else:
+        for message in piece:
+            try:
+                grown.take(message)
+            except DAMAGE as error:
+                reason = f"a message cannot be read: {error or type(error).__name__}"
+                grown.damages.append(Damage(0, len(message.data), reason))
 
 
-def _check_attachment(record: records.Attachment, file: BinaryIO) -> None:
-    """The library reads an attachment's checksum and does not compare it."""
-    file.seek(-4, 1)
-    builder = RecordBuilder()
-    record.write(builder)
-    if bytes(builder.end())[-4:] != file.read(4):
-        raise ValueError("an attachment's checksum is wrong")
-
-
-def _stated_messages(path: Path) -> int:
-    """Messages that the summary of a finished file counts."""
-    with _opened(path) as file:
-        size = path.stat().st_size
-        length = FOOTER.size + len(MAGIC)
-        file.seek(max(size - length, 0))
-        tail = file.read()
-        try:
-            _, _, start, _, crc = FOOTER.unpack_from(tail)
-            if not tail.endswith(MAGIC) or not 0 < start <= size - length:
-                raise ValueError
-            file.seek(start)
-            body = file.read(size - length - start)
-            if zlib.crc32(tail[: FOOTER.size - 4], zlib.crc32(body)) != crc:
-                raise ValueError
-            file.seek(start)
-            for record in StreamReader(file, skip_magic=True).records:
-                if isinstance(record, records.Statistics):
-                    return record.message_count
-        except DAMAGE:
-            pass
-    raise FileFormatError(
-        "the recording is unfinished: it has no whole summary",
-        where=path_text(path),
-        remedy=RECOVER_REMEDY,
-    )
+def _refuse_lost(grown: _Folder, stated: FileSummary | None, where: str) -> None:
+    n_stated = 0 if stated is None else stated.n_messages
+    n_found = sum(n for topic, n in grown.n_seen.items() if topic != "whole")
+    fact = ""
+    if grown.damages:
+        fact = grown.damages[0].reason
+    elif n_found != n_stated:
+        fact = f"{n_found} messages of {n_stated} are there"
+    elif grown.n_lost(0):
+        fact = f"{grown.n_lost(0)} exposures have no image"
+    if fact:
+        raise FileFormatError(f"the file is damaged ({fact})", where=where, remedy=RECOVER_REMEDY)
 
 
 def _png(shown: RawImage) -> bytes:
-    channels = 3 if shown.encoding == "rgb8" else 1
-    dtype = "<u2" if shown.encoding == "mono16" else "u1"
-    shape = (shown.height, shown.width, 3) if channels == 3 else (shown.height, shown.width)
-    pixels = np.frombuffer(shown.data, dtype).reshape(shape)
-    bits = 16 if dtype == "<u2" else 8
-    setup = CameraSetup(bits_used=bits, colour="rgb" if channels == 3 else "mono")
+    pixels = raw_pixels(shown)
+    bits = 8 * pixels.dtype.itemsize
+    setup = CameraSetup(bits_used=bits, colour="rgb" if pixels.ndim == 3 else "mono")
     native: NDArray[Any] = pixels.astype(np.uint16 if bits == 16 else np.uint8)
     return encoded_png(Exposure(native, "image", bits_used=bits), setup)
 
@@ -350,27 +297,128 @@ def record_folder(folder: Path, output: Path) -> WriterStatus:
     recording = read_recording(folder)
     session = written_session(recording)
     names = [SESSION_FILE, ARM_MODEL_FILE, EVENTS_FILE, *([session.head] if session.head else [])]
-    documents = {name: read_bytes(folder / name) for name in names if (folder / name).is_file()}
+    documents = {name: read_bytes(folder / name) for name in names if is_file(folder / name)}
     if session.is_simulated != recording.session.is_simulated:
         documents[SESSION_FILE] = session_toml(session)
     table = read_csv(folder / EXPOSURES_FILE)
     by_index = {row.index: row for row in recording.rows}
+    rows = [by_index[index] for index in table.ints("index").tolist()]
+    arm_cells = {} if recording.arm is None else read_csv(folder / ARM_FILE).columns
+    return _record(
+        output,
+        _Content(session, documents, rows, table.columns, recording.arm, arm_cells),
+        (read_bytes(folder / row.source) for row in rows),
+    )
+
+
+def record_source(
+    output: Path,
+    source: ScanSource,
+    progress: Report | None = None,
+    *,
+    encoded: Iterable[bytes] | None = None,
+    beside: Mapping[Path, bytes] | None = None,
+) -> WriterStatus:
+    """Write a scan as an MCAP file: what `write_recording` writes into a folder.
+
+    Parameters
+    ----------
+    output
+        Must not exist.
+    source
+        What to write.
+    progress
+        Called with images written, images in all, and the name of the latest.
+    encoded
+        (N,) the images' PNG files, where they were made already.
+    beside
+        Files that appear with it; they must not exist.
+
+    Raises
+    ------
+    OutputError
+        If the file exists or cannot be written; nothing is left then.
+    """
+    check_new_file(output)
+    session, rows = written_session(source), named_rows(source)
+    columns, arm = exposure_columns(rows, {}), source.arm
+    of_arm = {} if arm is None else arm_columns(arm, session.pose_form, session.rotation, {})
+    content = _Content(session, {SESSION_FILE: session_toml(session)}, rows, columns, arm, of_arm)
+    files = image_files(source, session) if encoded is None else encoded
+    return _record(output, content, files, progress, beside)
+
+
+def check_new_file(output: Path) -> None:
+    """Raise before long work if a new file could not be written afterwards.
+
+    Raises
+    ------
+    OutputError
+        If it exists, or its folder does not or may not be written.
+    """
+    if output.exists():
+        raise OutputError("the file exists", where=path_text(output), remedy="name another file")
+    check_outputs((output,))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Content:
+    """What a file holds beside its images, which come in the order of ``rows``."""
+
+    session: Session
+    documents: Mapping[str, bytes]
+    rows: Sequence[ExposureRow]
+    columns: Mapping[str, Sequence[str]]
+    arm: ArmTrack | None
+    arm_cells: Mapping[str, Sequence[str]]
+
+
+def _record(
+    output: Path,
+    content: _Content,
+    images: Iterable[bytes],
+    progress: Report | None = None,
+    beside: Mapping[Path, bytes] | None = None,
+) -> WriterStatus:
     with scratch_folder(output) as scratch:
         part = scratch / "recording.mcap"
-        with RecordingWriter(part) as writer:
-            writer.begin(session, documents)
-            for k, index in enumerate(table.ints("index").tolist()):
-                row: ExposureRow = by_index[index]
-                cells = {name: column[k] for name, column in table.columns.items()}
-                writer.add_exposure(row, read_bytes(folder / row.source), cells=cells)
-            if recording.arm is not None:
-                arm_cells = read_csv(folder / ARM_FILE).columns
-                for first in range(0, len(recording.arm), ARM_BATCH):
-                    span = slice(first, first + ARM_BATCH)
-                    writer.add_arm_samples(
-                        recording.arm.select(span),
-                        cells={name: cells[span] for name, cells in arm_cells.items()},
-                    )
-        status = writer.status()
-        part.replace(output)
+        try:
+            status = _write_all(part, content, images, progress)
+            write_files(beside or {})
+            _give_name(part, output, beside or {})
+        except OutputError as error:
+            cause = error.__cause__
+            why = (isinstance(cause, OSError) and cause.strerror) or error.what
+            raise OutputError(
+                f"nothing was written ({why})",
+                where=path_text(output),
+                remedy="free some space or choose another folder",
+            ) from error
     return status
+
+
+def _write_all(
+    part: Path, content: _Content, images: Iterable[bytes], progress: Report | None
+) -> WriterStatus:
+    with RecordingWriter(part) as writer:
+        writer.begin(content.session, content.documents)
+        for k, (row, image) in enumerate(zip(content.rows, images, strict=True)):
+            cells = {name: column[k] for name, column in content.columns.items()}
+            writer.add_exposure(row, image, cells=cells)
+            if progress is not None:
+                progress(k + 1, len(content.rows), row.source)
+        for first in range(0, 0 if content.arm is None else len(content.arm), ARM_BATCH):
+            span = slice(first, first + ARM_BATCH)
+            cells_of = {name: cells[span] for name, cells in content.arm_cells.items()}
+            if content.arm is not None:
+                writer.add_arm_samples(content.arm.select(span), cells=cells_of)
+    return writer.status()
+
+
+def _give_name(part: Path, output: Path, beside: Mapping[Path, bytes]) -> None:
+    try:
+        part.replace(output)
+    except OSError as error:
+        for path in beside:
+            path.unlink(missing_ok=True)
+        raise OutputError("the file cannot get its name", where=path_text(output)) from error

@@ -6,14 +6,17 @@ was still waiting and the open chunks.
 from __future__ import annotations
 
 import json
+import math
 import os
 import struct
 import threading
 import time
 import zlib
+from base64 import b64encode
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -42,13 +45,18 @@ CHUNK_BYTES = 4 << 20
 """Of images in one chunk: reading one exposure unpacks no more than this and one image."""
 CHUNK_SECONDS = 0.5
 """After so long a chunk is closed and handed to the system; a killed process loses no more."""
+DOCUMENTS_SECONDS = 5.0
+"""So often the documents are written again: what is left of a broken file can be read without its
+beginning."""
+MOST_REPEATED_BYTES = 1 << 16
+"""Larger documents are written once, at the beginning."""
 SYNC_SECONDS = 1.0
 """So often the system is asked to put all on the disk: a power cut loses about as much."""
 NS_PER_S = 1_000_000_000
 NEW_FILE = os.O_CREAT | os.O_EXCL | os.O_WRONLY | getattr(os, "O_BINARY", 0)
 
 EXPOSURE_TOPIC, ARM_TOPIC, EVENT_TOPIC = "/exposures", "/arm/samples", "/events"
-TRANSFORM_TOPIC = "/tf"
+TRANSFORM_TOPIC, DOCUMENT_TOPIC = "/tf", "/documents"
 Compression = Literal["auto", "raw", "zstd"]
 
 
@@ -99,6 +107,8 @@ class _Message:
     t_ns: int
     pieces: tuple[bytes, ...]
     n_exposures: int = 0
+    number: int | None = None
+    """Of an exposure: what its image and its facts have in common."""
 
     @property
     def n_bytes(self) -> int:
@@ -107,7 +117,10 @@ class _Message:
 
 @dataclass
 class _Chunk:
-    """An open chunk: messages whose bytes are not joined before they are written."""
+    """An open chunk: messages whose bytes are not joined before they are written.
+
+    It begins with what it needs of schemas and channels, so that it can be read alone.
+    """
 
     pieces: list[bytes] = field(default_factory=list)
     n_bytes: int = 0
@@ -115,7 +128,10 @@ class _Chunk:
     index: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
     n_exposures: int = 0
 
-    def add(self, message: _Message, sequence: int) -> None:
+    def add(self, message: _Message, sequence: int, declared: Sequence[bytes]) -> None:
+        if message.channel not in self.index:
+            self.pieces += declared
+            self.n_bytes += sum(map(len, declared))
         time_ns = max(message.t_ns, 0)
         length = 22 + message.n_bytes
         head = struct.pack(
@@ -134,7 +150,8 @@ class RecordingWriter:
     Exposures, samples of the arm and events may be added from several threads. Times may be in any
     order: what is recorded is what was delivered. A file whose `close` never came has no summary;
     its chunks are whole and checksummed, and a reader that goes through a file from its beginning
-    finds them.
+    finds them. Each chunk of images is followed by the facts of its exposures, and declares itself
+    what it holds.
 
     Parameters
     ----------
@@ -150,7 +167,8 @@ class RecordingWriter:
         self._queue: deque[_Message] = deque()
         self._queued_bytes = 0
         self._is_closing = False
-        self._failure: OSError | None = None
+        self._failure: BaseException | None = None
+        self._has_summary = False
         self._n_accepted = self._n_written = self._n_waits = 0
         self._handle = -1
         self._size = 0
@@ -161,6 +179,9 @@ class RecordingWriter:
         self._sequence: Counter[int] = Counter()
         self._counts: Counter[int] = Counter()
         self._synced = 0.0
+        self._documented = -math.inf
+        self._documents: tuple[_Message, ...] = ()
+        self._declared: dict[int, tuple[bytes, ...]] = {}
         self._session = Session()
         self._of_topic: dict[str, int] = {}
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
@@ -178,22 +199,47 @@ class RecordingWriter:
         Raises
         ------
         OutputError
-            If the file exists or cannot be made.
+            If the file exists or cannot be made; nothing is left of it then.
+        InputError
+            If the recording was begun before.
         """
+        if self._thread.ident is not None or self._is_closing:
+            raise InputError("the recording was begun before", remedy="make a new writer")
         self._session = session
         try:
             self._handle = os.open(self._path, NEW_FILE, 0o666)
-            self._write((MAGIC, _record(records.Header("", "armscan"))))
-            self._declare(len(session.cameras))
-            for name, data in {SESSION_FILE: session_toml(session), **(documents or {})}.items():
-                self._attach(name, data)
-        except OSError as error:
+            self._write_head({SESSION_FILE: session_toml(session), **(documents or {})})
+            self._thread.start()
+        except BaseException as error:
+            if self._handle >= 0:
+                self._leave_nothing()
+            if not isinstance(error, OSError):
+                raise
             raise OutputError(
                 f"the recording cannot be begun ({error.strerror})",
                 where=path_text(self._path),
                 remedy="choose another name or folder",
             ) from error
-        self._thread.start()
+
+    def _leave_nothing(self) -> None:
+        """Remove the file that this writer made and could not begin."""
+        with suppress(OSError):
+            os.close(self._handle)
+        self._handle = -1
+        self._is_closing = True
+        with suppress(OSError):
+            self._path.unlink()
+
+    def _write_head(self, documents: Mapping[str, bytes]) -> None:
+        self._write((MAGIC, _record(records.Header("", "armscan"))))
+        self._declare(len(self._session.cameras))
+        for name, data in documents.items():
+            self._attach(name, data)
+        self._documents = tuple(
+            self._json(DOCUMENT_TOPIC, 0, {"name": name, "base64": b64encode(data).decode()})
+            for name, data in documents.items()
+            if len(data) <= MOST_REPEATED_BYTES
+        )
 
     def add_exposure(
         self,
@@ -285,7 +331,8 @@ class RecordingWriter:
 
     def add_event(self, t_ns: int, kind: str, facts: Mapping[str, Any] | None = None) -> float:
         """Record what happened, as a button or a lost packet; returns as `add_exposure`."""
-        return self._put(self._json(EVENT_TOPIC, t_ns, {"kind": kind, "facts": dict(facts or {})}))
+        said = {"t_ns": t_ns, "kind": kind, "facts": dict(facts or {})}
+        return self._put(self._json(EVENT_TOPIC, t_ns, said))
 
     def status(self) -> WriterStatus:
         """How far the recording is."""
@@ -307,8 +354,11 @@ class RecordingWriter:
         if self._thread.is_alive():
             self._thread.join()
         if self._handle >= 0:
-            os.close(self._handle)
-            self._handle = -1
+            handle, self._handle = self._handle, -1
+            try:
+                os.close(handle)
+            except OSError as error:
+                self._failure = self._failure or error
         self._refuse_failed()
         return self.status()
 
@@ -324,13 +374,17 @@ class RecordingWriter:
         self.close()
 
     def _refuse_failed(self) -> None:
-        if self._failure is not None:
-            raise OutputError(
-                f"the recording stopped ({self._failure.strerror}): {self._n_written} exposures of "
-                f"{self._n_accepted} are safe",
-                where=path_text(self._path),
-                remedy="free some space, and record the rest into a new file",
-            ) from self._failure
+        if self._failure is None:
+            return
+        cause = self._failure
+        why = getattr(cause, "strerror", None) or f"{type(cause).__name__}: {cause}"
+        first = "" if self._has_summary else "run `armscan recover` on the file, "
+        raise OutputError(
+            f"the recording stopped ({why}): {self._n_written} exposures of "
+            f"{self._n_accepted} are safe",
+            where=path_text(self._path),
+            remedy=f"{first}free some space, and record the rest into a new file",
+        ) from cause
 
     def _put(self, *messages: _Message) -> float:
         n_bytes = sum(message.n_bytes for message in messages)
@@ -343,39 +397,56 @@ class RecordingWriter:
             self._refuse_failed()
             if self._is_closing or self._handle < 0:
                 raise InputError("the recording is not open", remedy="call begin first")
+            n_exposures = sum(message.n_exposures for message in messages)
+            if n_exposures:
+                for message in messages:
+                    message.number = self._n_accepted
             self._queue += messages
             self._queued_bytes += n_bytes
-            self._n_accepted += sum(message.n_exposures for message in messages)
+            self._n_accepted += n_exposures
             self._ready.notify_all()
             return min(1.0, self._queued_bytes / most)
 
     def _run(self) -> None:
-        """The thread: fill chunks, close them when they are full or old, write them."""
+        """The thread: whatever ends it is kept for the callers."""
+        try:
+            self._fill_chunks()
+        except BaseException as error:  # nobody else sees what a thread raises
+            self._stop(error)
+
+    def _fill_chunks(self) -> None:
+        """Fill chunks, close them when they are full or old, write them."""
         chunks = {kind: _Chunk() for kind in ("images", "views", "tables")}
         begun = time.monotonic()
-        try:
-            while True:
-                messages, is_last = self._take(begun + CHUNK_SECONDS)
-                for message in messages:
-                    chunk = chunks[message.kind]
-                    chunk.add(message, self._sequence[message.channel])
-                    self._sequence[message.channel] += 1
-                    if message.kind == "images" and chunk.n_bytes >= CHUNK_BYTES:
-                        self._close_chunk(chunks, "images")
-                    with self._ready:
-                        self._queued_bytes -= message.n_bytes
-                        self._ready.notify_all()
-                if is_last or time.monotonic() >= begun + CHUNK_SECONDS:
-                    # facts last: an exposure that is listed has its image
-                    for kind in chunks:
-                        self._close_chunk(chunks, kind)
-                    begun = time.monotonic()
-                if is_last:
-                    self._write(self._summary())
-                    os.fsync(self._handle)
-                    return
-        except OSError as error:
-            self._stop(error)
+        while True:
+            messages, is_last = self._take(begun + CHUNK_SECONDS)
+            for message in messages:
+                self._add(chunks, message)
+                # facts last: an exposure that is listed has its image
+                if message.n_exposures and chunks["images"].n_bytes >= CHUNK_BYTES:
+                    self._close_chunk(chunks, "images")
+                    self._close_chunk(chunks, "tables")
+                with self._ready:
+                    self._queued_bytes -= message.n_bytes
+                    self._ready.notify_all()
+            if is_last or time.monotonic() >= begun + CHUNK_SECONDS:
+                for kind in chunks:
+                    self._close_chunk(chunks, kind)
+                begun = time.monotonic()
+            if is_last:
+                self._write(self._summary())
+                os.fsync(self._handle)
+                self._has_summary = True
+                return
+
+    def _add(self, chunks: dict[str, _Chunk], message: _Message) -> None:
+        if message.kind == "tables" and time.monotonic() > self._documented + DOCUMENTS_SECONDS:
+            self._documented = time.monotonic()
+            for document in self._documents:
+                self._add(chunks, replace(document, t_ns=message.t_ns))
+        sequence = self._sequence[message.channel] if message.number is None else message.number
+        self._sequence[message.channel] += 1
+        chunks[message.kind].add(message, sequence, self._declared[message.channel])
 
     def _take(self, until: float) -> tuple[list[_Message], bool]:
         with self._ready:
@@ -388,20 +459,27 @@ class RecordingWriter:
             taken = [self._queue.popleft()] if self._queue else []
             return taken, self._is_closing and not self._queue
 
-    def _stop(self, error: OSError) -> None:
+    def _stop(self, error: BaseException) -> None:
         """Cut what was begun off, and close what is whole as well as the disk allows."""
         try:
-            os.ftruncate(self._handle, self._size)
-            os.lseek(self._handle, self._size, os.SEEK_SET)
+            self._cut_off()
             self._write(self._summary())
             os.fsync(self._handle)
-        except OSError:
-            os.ftruncate(self._handle, self._size)
-        with self._ready:
-            self._failure = error
-            self._queue.clear()
-            self._queued_bytes = 0
-            self._ready.notify_all()
+            self._has_summary = True
+        except Exception:
+            # a summary that is cut is none: without it the file is an unfinished one
+            with suppress(OSError):
+                self._cut_off()
+        finally:
+            with self._ready:
+                self._failure = error
+                self._queue.clear()
+                self._queued_bytes = 0
+                self._ready.notify_all()
+
+    def _cut_off(self) -> None:
+        os.ftruncate(self._handle, self._size)
+        os.lseek(self._handle, self._size, os.SEEK_SET)
 
     def _close_chunk(self, chunks: dict[str, _Chunk], kind: str) -> None:
         chunk, chunks[kind] = chunks[kind], _Chunk()
@@ -469,7 +547,7 @@ class RecordingWriter:
         for kind in (RawImage, CompressedImage, FrameTransform):
             data = build_file_descriptor_set(kind).SerializeToString()
             self._schema(kind.DESCRIPTOR.full_name, "protobuf", data)
-        for name in ("Exposure", "ArmSamples", "Event"):
+        for name in ("Exposure", "ArmSamples", "Event", "Document"):
             self._schema(f"armscan.{name}", "jsonschema", b'{"type": "object"}')
         for camera in range(n_cameras):
             self._channel(f"/camera/{camera}/raw", "protobuf", 1)
@@ -478,6 +556,7 @@ class RecordingWriter:
         self._channel(EXPOSURE_TOPIC, "json", 4)
         self._channel(ARM_TOPIC, "json", 5)
         self._channel(EVENT_TOPIC, "json", 6)
+        self._channel(DOCUMENT_TOPIC, "json", 7)
 
     def _schema(self, name: str, encoding: str, data: bytes) -> None:
         schema = records.Schema(len(self._schemas) + 1, data, encoding, name)
@@ -489,6 +568,7 @@ class RecordingWriter:
         self._channels.append(channel)
         self._of_topic[topic] = channel.id
         self._write((_record(channel),))
+        self._declared[channel.id] = (_record(self._schemas[schema - 1]), _record(channel))
 
     def _attach(self, name: str, data: bytes) -> None:
         content = _record(records.Attachment(0, 0, name, "application/octet-stream", data))

@@ -34,6 +34,7 @@ from armscan.errors import ArmscanError, DeviceError
 GRACE_S = 0.5
 """A call may take so much longer than its timeout, on a busy computer."""
 _QUIET_S = 0.15
+_STOPPED_S = 3.0
 _RATE_SHARE = 0.5
 _OTHER_LASER = "no such laser"
 
@@ -87,9 +88,12 @@ def check_camera(
             "the image of a frame changed after it was delivered: copy it out of the buffer",
         )
         camera.stop()
-        _check_silence(camera, rule)
+        _check_stopped(camera, rule)
+        since_ns = time.monotonic_ns()
         camera.start(trigger)
-        _check_frames(_frames(camera, n_frames, timeout_s, rule), camera, rule)
+        anew = _frames(camera, n_frames, timeout_s, rule)
+        _check_frames(anew, camera, rule)
+        _check_new(anew, since_ns, rule)
         if is_exclusive:
             _check_taken(open_camera, rule)
         camera.close()
@@ -118,9 +122,12 @@ def check_arm(
         samples = _elements(arm, n_samples, timeout_s, rule)
         _check_samples(samples, arm, rule)
         arm.stop()
-        _check_silence(arm, rule)
+        _check_stopped(arm, rule)
+        since_ns = time.monotonic_ns()
         arm.start()
-        _check_samples(_elements(arm, n_samples, timeout_s, rule), arm, rule)
+        anew = _elements(arm, n_samples, timeout_s, rule)
+        _check_samples(anew, arm, rule)
+        _check_new(anew, since_ns, rule)
         if is_exclusive:
             _check_taken(open_arm, rule)
         arm.close()
@@ -174,9 +181,12 @@ def check_lasers(
                 f"after set_next(('{sources[0]}',)) {last.lasers} were on",
             )
         lasers.stop()
-        _check_silence(lasers, rule)
+        _check_stopped(lasers, rule)
+        since_ns = time.monotonic_ns()
         lasers.start(rate_hz)
-        _check_events(_elements(lasers, 3, timeout_s, rule), lasers, rule)
+        anew = _elements(lasers, 3, timeout_s, rule)
+        _check_events(anew, lasers, rule)
+        _check_new(anew, since_ns, rule)
         if is_exclusive:
             _check_taken(open_lasers, rule)
         lasers.close()
@@ -231,6 +241,21 @@ def _check_silence(device: Any, rule: _Rules) -> None:
     rule(found is None or isinstance(found, tuple), f"read gives {found!r} where nothing came")
     rule(
         taken_s < _QUIET_S + GRACE_S, f"read({_QUIET_S}) took {taken_s:.2f} s: keep to the timeout"
+    )
+
+
+def _check_stopped(device: Any, rule: _Rules) -> None:
+    """What was taken before the stop can be read, and then nothing comes any more."""
+    end_s = time.monotonic() + _STOPPED_S
+    while device.read(_QUIET_S) and time.monotonic() < end_s:
+        """Taken before."""
+    _check_silence(device, rule)
+
+
+def _check_new(came: Sequence[Any], since_ns: int, rule: _Rules) -> None:
+    rule(
+        came[0].t_host_ns >= since_ns,
+        "after a start it delivers what it had taken before the stop",
     )
 
 

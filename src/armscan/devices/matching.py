@@ -11,7 +11,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -33,6 +33,9 @@ USUAL_STEPS = 256
 LASER_BOUND_NS = 50_000_000
 """Without trigger ids a frame may be so much later than its laser event: transport delays differ.
 Its lasers are known only if all events that near agree."""
+SAME_TRIGGER_NS = 100_000_000
+"""What bears one trigger id was taken within this, by clocks that are known: another count, before
+a device began to count anew, has the same ids."""
 SAME_INSTANT = 0.25
 """Frames of two cameras without ids are of one instant within this part of the usual step."""
 
@@ -101,6 +104,21 @@ class _Open:
         return max(frame.t_host_ns for frame in self.frames if frame is not None)
 
 
+@dataclass(frozen=True, slots=True)
+class _Told(Generic[T]):
+    """What was told of a trigger, and when it was taken and arrived."""
+
+    value: T
+    t_ns: int | None
+    t_host_ns: int
+
+    def is_of(self, t_ns: int | None, t_host_ns: int) -> bool:
+        """Whether it was taken together with something else of the same id."""
+        if t_ns is not None and self.t_ns is not None:
+            return abs(t_ns - self.t_ns) <= SAME_TRIGGER_NS
+        return abs(t_host_ns - self.t_host_ns) <= PATIENCE_NS
+
+
 class InstantMatcher:
     """Brings the streams of a rig together while they come in; called from one thread.
 
@@ -145,8 +163,8 @@ class InstantMatcher:
         self._times: list[int] = []
         self._poses: list[Pose[Base, Tool] | None] = []
         self._steps: deque[int] = deque(maxlen=USUAL_STEPS)
-        self._pose_of: dict[int, Pose[Base, Tool] | None] = {}
-        self._lasers_of: dict[int, tuple[str, ...]] = {}
+        self._pose_of: dict[int, _Told[Pose[Base, Tool] | None]] = {}
+        self._lasers_of: dict[int, _Told[tuple[str, ...]]] = {}
         self._events: deque[tuple[int, tuple[str, ...]]] = deque(maxlen=USUAL_STEPS)
         self._frame_step_ns = 0.0
         self._last_ns: list[int | None] = [None] * n_cameras
@@ -161,8 +179,8 @@ class InstantMatcher:
             times = (event.t_device_ns, event.t_host_ns)
             if self.controller.check(event.trigger_id, *times) in _SEEN_BEFORE:
                 continue
-            _remember(self._lasers_of, event.trigger_id, event.lasers)
             t_ns = _common_ns(self.controller, event.t_device_ns)
+            _remember(self._lasers_of, event.trigger_id, _Told(event.lasers, t_ns, event.t_host_ns))
             if t_ns is not None:
                 self._events.append((t_ns, event.lasers))
 
@@ -224,11 +242,11 @@ class InstantMatcher:
         pose = self._valid_pose(sample)
         if status in _SEEN_BEFORE:
             return TimedSample(sample, None, status, pose)
-        if sample.trigger_id is not None:
-            _remember(self._pose_of, sample.trigger_id, pose)
         t_ns = None
         if status == ElementStatus.USABLE:
             t_ns = _common_ns(self.arm, sample.t_device_ns)
+        if sample.trigger_id is not None:
+            _remember(self._pose_of, sample.trigger_id, _Told(pose, t_ns, sample.t_host_ns))
         if t_ns is None or (self._times and t_ns <= self._times[-1]):
             return TimedSample(sample, None, status, pose)
         if self._times:
@@ -261,7 +279,9 @@ class InstantMatcher:
             if one.frames[camera] is not None:
                 continue
             if frame.trigger_id is not None and one.trigger_id is not None:
+                told = _Told(None, t_ns, frame.t_host_ns)
                 is_same = frame.trigger_id == one.trigger_id
+                is_same = is_same and told.is_of(one.t_ns, one.newest_host_ns)
             elif t_ns is not None and one.t_ns is not None:
                 is_same = abs(t_ns - one.t_ns) <= SAME_INSTANT * self._frame_step_ns
             else:
@@ -277,10 +297,10 @@ class InstantMatcher:
         return self._has_lasers(one) and self._has_track(one)
 
     def _has_lasers(self, one: _Open) -> bool:
-        if not self._has_controller or one.trigger_id in self._lasers_of:
+        if not self._has_controller:
             return True
         if one.trigger_id is not None:
-            return bool(self._lasers_of) and max(self._lasers_of) > one.trigger_id
+            return _is_told(self._lasers_of, one)
         if one.t_ns is None:
             return True
         return bool(self._events) and self._events[-1][0] > one.t_ns + LASER_BOUND_NS
@@ -289,8 +309,7 @@ class InstantMatcher:
         if not self._has_arm:
             return True
         if self._is_triggered:
-            wanted = one.trigger_id
-            return wanted is None or (bool(self._pose_of) and max(self._pose_of) >= wanted)
+            return one.trigger_id is None or _is_told(self._pose_of, one)
         if one.t_ns is None:
             return True
         return bool(self._times) and self._times[-1] >= one.t_ns + self.latency_ns
@@ -300,7 +319,8 @@ class InstantMatcher:
         if len(told) == 1:
             return told.pop()
         if one.trigger_id is not None and self._has_controller:
-            return self._lasers_of.get(one.trigger_id)
+            switched = _told(self._lasers_of, one)
+            return None if switched is None else switched.value
         if one.t_ns is None:
             return None
         near = {on for t_ns, on in self._events if abs(t_ns - one.t_ns) <= LASER_BOUND_NS}
@@ -310,9 +330,10 @@ class InstantMatcher:
         if self._is_triggered:
             if one.trigger_id is None:
                 return None, PoseStatus.NO_TRIGGER
-            if one.trigger_id not in self._pose_of:
+            latched = _told(self._pose_of, one)
+            if latched is None:
                 return None, PoseStatus.UNKNOWN_TRIGGER
-            pose = self._pose_of[one.trigger_id]
+            pose = latched.value
             return pose, PoseStatus.UNKNOWN_SAMPLE if pose is None else PoseStatus.FOUND
         if one.t_ns is None:
             return None, PoseStatus.NO_TIME
@@ -353,7 +374,25 @@ def _common_ns(monitor: StreamMonitor, t_device_ns: int) -> int | None:
     return monitor.clock.to_other_ns(t_device_ns)
 
 
-def _remember(of_trigger: dict[int, T], trigger_id: int, value: T) -> None:
+def _told(of_trigger: dict[int, _Told[T]], one: _Open) -> _Told[T] | None:
+    """What was told of an instant's trigger; None for what bears its id from another count."""
+    found = None if one.trigger_id is None else of_trigger.get(one.trigger_id)
+    return found if found is not None and found.is_of(one.t_ns, one.newest_host_ns) else None
+
+
+def _is_told(of_trigger: dict[int, _Told[T]], one: _Open) -> bool:
+    """Whether an instant's trigger, or one after it, was told of: nothing more is to come."""
+    if _told(of_trigger, one) is not None:
+        return True
+    if not of_trigger or one.trigger_id is None:
+        return False
+    last = next(reversed(of_trigger))
+    # what arrived long before belongs to another count
+    is_current = of_trigger[last].t_host_ns >= one.newest_host_ns - PATIENCE_NS
+    return last > one.trigger_id and is_current
+
+
+def _remember(of_trigger: dict[int, _Told[T]], trigger_id: int, value: _Told[T]) -> None:
     """Keep the last triggers only; a count that began anew forgets the old ones."""
     if of_trigger and trigger_id < next(reversed(of_trigger)):
         of_trigger.clear()

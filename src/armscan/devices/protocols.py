@@ -118,13 +118,13 @@ class Camera(Protocol):
         """Set what is not None and return what the camera took, which may be near it only."""
 
     def start(self, trigger: TriggerMode = "free") -> None:
-        """Begin to deliver frames."""
+        """Begin to deliver frames; those of before the last stop are forgotten."""
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame, in the order of delivery; None if none came in time."""
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read. May be started again."""
 
     def close(self) -> None:
         """Give the camera back. Does nothing the second time."""
@@ -186,13 +186,13 @@ class Arm(Protocol):
         """``joints`` where it delivers joint angles alone, else how its poses are kept."""
 
     def start(self) -> None:
-        """Begin to deliver samples."""
+        """Begin to deliver samples; those of before the last stop are forgotten."""
 
     def read(self, timeout_s: float) -> tuple[ArmSample, ...]:
         """All samples that came since the last call; waits for the first, empty if none came."""
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read. May be started again."""
 
     def close(self) -> None:
         """Give the arm back. Does nothing the second time."""
@@ -239,13 +239,16 @@ class LaserController(Protocol):
         """Sources of the next trigger alone, and of those after it until the next call."""
 
     def start(self, rate_hz: float | None) -> None:
-        """Trigger at this rate; None waits for triggers from elsewhere."""
+        """Trigger at this rate; None waits for triggers from elsewhere.
+
+        Events of before the last stop are forgotten.
+        """
 
     def read(self, timeout_s: float) -> tuple[LaserEvent, ...]:
         """All events since the last call; waits for the first, empty if none came."""
 
     def stop(self) -> None:
-        """All lasers off, no more triggers."""
+        """All lasers off, no more triggers; events that were told can still be read."""
 
     def close(self) -> None:
         """Lasers off, and give the controller back. Does nothing the second time."""

@@ -42,6 +42,8 @@ _LARGEST_MM, _LARGEST_RAD = 1e5, 1e3
 _MOST_SAMPLES = 20_000
 _FIRST_S, _AGAIN_S, _CONNECT_S = 2.0, 0.5, 3.0
 _READ_S, _READ_BYTES = 0.05, 65_536
+_WRITE_S = 1.0
+"""A device that takes no byte for so long hangs: who writes to it must not."""
 
 
 def encode_sample(sample: ArmSample) -> bytes:
@@ -274,7 +276,9 @@ class SerialLink:
                 f"'{place}' is no serial port", remedy="write PORT:BAUD, as /dev/ttyUSB0:921600"
             )
         try:
-            self._port = serial.Serial(port, int(baud), timeout=_READ_S, exclusive=True)
+            self._port = serial.Serial(
+                port, int(baud), timeout=_READ_S, write_timeout=_WRITE_S, exclusive=True
+            )
         except (OSError, ValueError) as error:
             code = getattr(error, "errno", None)
             text = str(error).lower()
@@ -293,7 +297,7 @@ class SerialLink:
         return bytes(self._port.read(max(1, self._port.in_waiting)))
 
     def write(self, sent: bytes) -> None:
-        """Send; raises `OSError` where the port is gone."""
+        """Send; raises `OSError` where the port is gone, or takes nothing any more."""
         self._port.write(sent)
 
     def close(self) -> None:
@@ -338,6 +342,8 @@ class StreamedArm:
     def start(self) -> None:
         """Begin to deliver samples."""
         self._check_open()
+        if not self._is_started:
+            self._inbox.clear()
         self._is_started = True
 
     def read(self, timeout_s: float) -> tuple[ArmSample, ...]:
@@ -345,10 +351,9 @@ class StreamedArm:
         return self._inbox.take_all(timeout_s)
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read."""
         self._check_open()
         self._is_started = False
-        self._inbox.clear()
 
     def close(self) -> None:
         """Give the arm back. Does nothing the second time."""

@@ -172,7 +172,7 @@ class GenICamCamera:
             self._setup = self._read_setup()
             self._settings = self._read_settings()
             if running is not None and is_resized:
-                self.start(running)
+                self._begin(running)
         return self._settings
 
     def start(self, trigger: TriggerMode = "free") -> None:
@@ -183,23 +183,19 @@ class GenICamCamera:
         with self._lock:
             if self._trigger is not None:
                 self._halt()
-            self._call(lambda: self._set_trigger(trigger))
-            self._numbers.begin_anew(self._camera.has_short_ids)
-            self._call(self._camera.begin)
-            self._trigger = trigger
-            self._thread = threading.Thread(target=self._run, daemon=True)
-            self._thread.start()
+            else:
+                self._inbox.clear()
+            self._begin(trigger)
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame; None if none came in time."""
         return self._inbox.take(timeout_s)
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read."""
         self._check_open()
         with self._lock:
             self._halt()
-        self._inbox.clear()
 
     def close(self) -> None:
         """Give the camera back. Does nothing the second time."""
@@ -231,6 +227,14 @@ class GenICamCamera:
                 where=self.name,
                 remedy="check cable, power and whether another program uses it",
             ) from error
+
+    def _begin(self, trigger: TriggerMode) -> None:
+        self._call(lambda: self._set_trigger(trigger))
+        self._numbers.begin_anew(self._camera.has_short_ids)
+        self._call(self._camera.begin)
+        self._trigger = trigger
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
     def _halt(self) -> None:
         thread, self._thread, self._trigger = self._thread, None, None

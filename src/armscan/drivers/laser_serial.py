@@ -134,10 +134,12 @@ class SerialLasers:
         return self._inbox.take_all(timeout_s)
 
     def stop(self) -> None:
-        """All lasers off, no more triggers."""
-        self._is_started = False
-        self._ask("STOP")
-        self._inbox.clear()
+        """All lasers off, no more triggers; events that were told can still be read."""
+        try:
+            # events that were sent before the answer still count
+            self._ask("STOP")
+        finally:
+            self._is_started = False
 
     def close(self) -> None:
         """Lasers off, and give the port back. Does nothing the second time."""
@@ -197,13 +199,22 @@ class SerialLasers:
 
     def _ping(self) -> None:
         """Keep the lasers on while the host is alive: that is, while this thread runs."""
+        is_silent = False
         while not self._is_closed:
             time.sleep(PING_S)
-            if self._is_started and not self._is_closed:
-                try:
-                    self._ask("PING")
-                except DeviceError as error:
+            if not self._is_started or self._is_closed:
+                is_silent = False
+                continue
+            try:
+                self._ask("PING")
+            except DeviceError as error:
+                is_silent = True
+                if self._is_started:
                     self._inbox.fail(error)
+            else:
+                if is_silent:
+                    self._inbox.fail(None)
+                is_silent = False
 
     def _listen(self) -> None:
         while not self._is_closed:

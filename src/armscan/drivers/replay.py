@@ -147,6 +147,8 @@ class Playback:
     def start(self, device: str) -> None:
         """Let a device deliver; the recording runs once all open ones do."""
         with self.lock:
+            if device not in self.started:
+                self.lines[device].inbox.clear()
             self.started.add(device)
             self.lock.notify_all()
 
@@ -154,7 +156,6 @@ class Playback:
         """Let a device deliver no more; where none does, the recording waits."""
         with self.lock:
             self.started.discard(device)
-            self.lines[device].inbox.clear()
             self.lock.notify_all()
 
     def inject(self, device: str, fault: Fault, amount: float = 1.0) -> None:
@@ -361,7 +362,7 @@ class _Played:
         return self._line.inbox.name
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read."""
         self._line.check_answers()
         self.rig.stop(self._device)
 

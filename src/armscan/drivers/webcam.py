@@ -125,6 +125,7 @@ class Webcam:
                 remedy="set trigger = 'free' for the rig",
             )
         if not self._is_started:
+            self._inbox.clear()
             self._is_started = True
             self._thread = threading.Thread(target=self._run, daemon=True)
             self._thread.start()
@@ -134,10 +135,9 @@ class Webcam:
         return self._inbox.take(timeout_s)
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read."""
         self._check_open()
         self._halt()
-        self._inbox.clear()
 
     def close(self) -> None:
         """Give the camera back. Does nothing the second time."""

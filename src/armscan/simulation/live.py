@@ -60,13 +60,11 @@ _DRAWN = 20
 _LEAST_DELAY_NS = {"camera": 12_000_000, "arm": 5_000_000, "lasers": 3_000_000}
 _DELAY_SPREAD_NS = {"camera": 2_000_000, "arm": 400_000, "lasers": 300_000}
 """Mean of what comes on top by chance, exponentially distributed as on a busy computer."""
-_POLL_S = 0.004
-_FIRST_RENDER_S = 0.3
+_POLL_S, _FIRST_RENDER_S = 0.004, 0.3
 _SLACK = 1.25
 """So much longer than an image takes to be rendered is the hand on its way to the next: it moves on
 steadily, and the image is there when its time has come."""
-_MOST_HZ = 1e4
-_LEAST_PX = 16
+_MOST_HZ, _LEAST_PX = 1e4, 16
 _DRIFT = 20e-6
 """Standard deviation of a quartz clock."""
 _UPTIME_S = 50_000.0
@@ -258,9 +256,8 @@ class TwinRig:
     @property
     def rate_hz(self) -> float:
         """Triggers a second: the controller's, or the first free camera's."""
-        if self.are_lasers_started and self.laser_rate_hz is not None:
-            return self.laser_rate_hz
-        return self.settings[min(self.modes, default=0)].rate_hz or self.plan.rate_hz
+        own = self.laser_rate_hz if self.are_lasers_started else None
+        return own or self.settings[min(self.modes, default=0)].rate_hz or self.plan.rate_hz
 
     @property
     def is_running(self) -> bool:
@@ -372,9 +369,7 @@ class TwinRig:
 
     def _wait_for(self, t_ns: int) -> None:
         """Under the lock; any change ends the wait."""
-        rest_ns = t_ns - time.monotonic_ns()
-        if rest_ns > 0:
-            self.lock.wait(1e-9 * rest_ns)
+        self.lock.wait(1e-9 * max(t_ns - time.monotonic_ns(), 0))
 
     def _render_all(self, stage: SceneStage, cameras: Sequence[int]) -> None:
         """Render what the schedule will want, before the first trigger, into memory."""
@@ -407,9 +402,8 @@ class TwinRig:
         self, stage: SceneStage, k: int, lasers: tuple[str, ...], images: dict[int, ImageArray]
     ) -> None:
         t_ns = self._next_ns
-        self._n_triggers += 1
+        trigger_id = self._n_triggers = self._n_triggers + 1
         self.n_steps += 1
-        trigger_id = self._n_triggers
         self.latches.append((t_ns, trigger_id))
         for camera, image in images.items():
             window = self.setup(camera).window
@@ -470,10 +464,14 @@ class _TwinDevice:
             self.rig.give_back(self._device)
 
     def stop(self) -> None:
-        """Deliver no more; may be started again."""
+        """Take no more; what was taken can still be read."""
         with self.rig.lock:
             self._line.check_answers()
             self._halt()
+
+    def _begin(self, is_started: bool) -> None:
+        self._line.check_answers()
+        if not is_started:
             self._line.inbox.clear()
 
     @property
@@ -537,15 +535,14 @@ class TwinCamera(_TwinDevice):
         if trigger == "software":
             raise DeviceError("it has no software trigger", where=self.name)
         with self.rig.lock:
-            self._line.check_answers()
+            self._begin(self._camera in self.rig.modes)
             self.rig.modes[self._camera] = trigger
             self.rig.run_anew()
 
     def read(self, timeout_s: float) -> Frame | None:
         """The next frame; None if none came in time."""
         self._line.mend()
-        found: Frame | None = self._line.inbox.take(timeout_s)
-        return found
+        return cast(Frame | None, self._line.inbox.take(timeout_s))
 
     def _halt(self) -> None:
         with self.rig.lock:
@@ -569,7 +566,7 @@ class TwinArm(_TwinDevice):
     def start(self) -> None:
         """Begin to deliver samples."""
         with self.rig.lock:
-            self._line.check_answers()
+            self._begin(self._is_started)
             if not self._is_started:
                 self._start_ns = self._until_ns = time.monotonic_ns()
             self._is_started = True
@@ -587,6 +584,10 @@ class TwinArm(_TwinDevice):
                 return found
 
     def _halt(self) -> None:
+        if self._is_started:
+            # what it took last becomes known a little later
+            time.sleep(1e-9 * _KNOWN_NS)
+            self._until_ns = self.rig.samples(self._until_ns, self._start_ns)
         self._is_started = False
 
 
@@ -621,15 +622,14 @@ class TwinLasers(_TwinDevice):
         if rate_hz is not None and not 0.0 < rate_hz <= _MOST_HZ:
             raise OptionError(f"{rate_hz} triggers a second", where=self.name)
         with self.rig.lock:
-            self._line.check_answers()
+            self._begin(self.rig.are_lasers_started)
             self.rig.laser_rate_hz, self.rig.are_lasers_started = rate_hz, True
             self.rig.run_anew()
 
     def read(self, timeout_s: float) -> tuple[LaserEvent, ...]:
         """All events since the last call; waits for the first."""
         self._line.mend()
-        found: tuple[LaserEvent, ...] = self._line.inbox.take_all(timeout_s)
-        return found
+        return cast(tuple[LaserEvent, ...], self._line.inbox.take_all(timeout_s))
 
     def _check(self, lasers: tuple[str, ...]) -> None:
         unknown = sorted(set(lasers) - set(self.sources))
@@ -670,8 +670,8 @@ class TwinDriver:
 
     def discover(self) -> tuple[DeviceInfo, ...]:
         """The devices of the head with one line: simulated ones are always there."""
-        place = "twin:thesis-single"
-        return tuple(DeviceInfo(place, kind, f"simulated {kind}") for kind in self.kinds)
+        kinds = self.kinds
+        return tuple(DeviceInfo("twin:thesis-single", one, f"simulated {one}") for one in kinds)
 
     def open(self, kind: DeviceKind, place: str) -> Camera | Arm | LaserController:
         """Open one device of the instrument at an address.

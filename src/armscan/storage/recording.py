@@ -204,7 +204,7 @@ def read_recorded(folder: Path, row: ExposureRow, setup: CameraSetup) -> Exposur
     image = read_exposure(path, options, source=row.source)
     _check_layout(image, setup, path)
     _check_size(image, setup, path)
-    pixels = image.image if setup.colour != "bayer_rggb" else _demosaiced(image.image)
+    pixels = image.image if setup.colour != "bayer_rggb" else demosaiced(image.image)
     return Exposure(
         pixels,
         row.source,
@@ -279,7 +279,8 @@ def encoded_png(exposure: Exposure, setup: CameraSetup) -> bytes:
     return bytes(content.tobytes())
 
 
-def _demosaiced(mosaic: ImageArray) -> ImageArray:
+def demosaiced(mosaic: ImageArray) -> ImageArray:
+    """Red, green and blue (H, W, 3) of a Bayer pattern (H, W) that begins with red."""
     colour: NDArray[Any] = cv2.cvtColor(mosaic, cv2.COLOR_BayerRGGB2RGB)
     return colour.astype(np.uint8) if mosaic.dtype == np.uint8 else colour.astype(np.uint16)
 

@@ -13,18 +13,20 @@ from typing import Any, Literal, Protocol
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import InstantMatcher, MatchedInstant, TimedSample
 from armscan.devices.protocols import ArmSample, Frame, LaserEvent
-from armscan.errors import ArmscanError, DeviceError
-from armscan.pipeline.live.rig import Rig
+from armscan.errors import ArmscanError
+from armscan.pipeline.live.rig import Rig, told_as_fault_of
 
 READ_S = 0.1
 """A device is asked again after so long, so that a stop is obeyed at once."""
+LATE_NS = 1_000_000_000
+"""What arrives so long after the stop was not on its way then: a device did not obey."""
 SILENT_S = 2.0
 """A device that delivers nothing for so long is pointed out."""
 MOST_WAITING = 512
 """Elements that wait to be matched and recorded; more, and this computer cannot keep up."""
 BEHIND = "this computer cannot keep up with the recording; the devices' own buffers must hold"
 
-EventKind = Literal["state", "pass", "fault", "recovered", "button", "warning"]
+EventKind = Literal["state", "pass", "fault", "recovered", "button", "warning", "setting"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +94,14 @@ class Acquisition:
             has_arm=rig.arm is not None,
             has_controller=rig.lasers is not None,
             latency_ns=latency_ns,
+            arm=rig.arm_model,
         )
         self.recorder: Recorder | None = None
         """Set while what arrives is to be recorded."""
         self._deliver, self._tell = deliver, tell
         self._arrived: queue.Queue[tuple[str, int, Any]] = queue.Queue(MOST_WAITING)
         self._stopping = threading.Event()
+        self._stopped_ns = 0
         self._is_broken = threading.Event()
         self._threads: list[threading.Thread] = []
         self._buttons = 0
@@ -110,11 +114,7 @@ class Acquisition:
         DeviceError
             If a device does not answer; all are stopped then.
         """
-        try:
-            self.rig.start()
-        except DeviceError:
-            self.rig.stop()
-            raise
+        self.rig.start()
         for k, camera in enumerate(self.rig.cameras):
             self._run(self._read, "frame", k, camera)
         if self.rig.arm is not None:
@@ -124,10 +124,11 @@ class Acquisition:
         self._run(self._match)
 
     def stop(self) -> None:
-        """Lasers off, all read to the end and matched; does nothing the second time."""
-        self._stopping.set()
+        """Lasers off, all that was taken read and matched; does nothing the second time."""
         for text in self.rig.stop():
             self._tell(LiveEvent("fault", text))
+        self._stopped_ns = time.monotonic_ns()
+        self._stopping.set()
         for thread in self._threads:
             if thread is not threading.current_thread():
                 thread.join()
@@ -144,15 +145,24 @@ class Acquisition:
         thread.start()
 
     def _read(self, what: str, k: int, device: Any) -> None:
-        """Read one device until the stop; a silent one is told of and asked again."""
-        last, is_silent = time.monotonic(), False
-        while not self._stopping.is_set():
-            fault = ""
+        """Read one device until it is stopped and empty; a silent one is told of and asked again.
+
+        Drivers are other people's: whatever one of them raises is its device's fault.
+        """
+        last, is_silent, n_faults = time.monotonic(), False, 0
+        while True:
+            # asked before reading: what came before the stop is then read by this very read
+            is_stopped, fault, found = self._stopping.is_set(), "", None
             try:
-                found = device.read(READ_S)
-            except DeviceError as error:
-                found, fault = None, str(error)
+                with told_as_fault_of(device.name):
+                    found = device.read(READ_S)
+            except ArmscanError as error:
+                fault = str(error)
                 self._stopping.wait(READ_S)
+            # a fault may stand between what came before and after it, and is raised once then
+            n_faults = n_faults + 1 if fault else 0
+            if is_stopped and (self._is_late(found) if found else n_faults != 1):
+                return
             if found:
                 if is_silent:
                     self._tell(LiveEvent("recovered", f"{device.name} answers again", device.name))
@@ -162,6 +172,10 @@ class Acquisition:
                 is_silent = True
                 since = f"{device.name} has delivered nothing for {time.monotonic() - last:.1f} s"
                 self._tell(LiveEvent("fault", fault or since, device.name))
+
+    def _is_late(self, found: Any) -> bool:
+        first = found[0] if isinstance(found, tuple) else found
+        return bool(first.t_host_ns > self._stopped_ns + LATE_NS)
 
     def _put(self, what: str, k: int, found: Any) -> None:
         """Hand on what arrived; while there is no room the device's own buffer must hold."""

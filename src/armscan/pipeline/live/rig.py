@@ -3,22 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, cast
 
 from armscan.devices.protocols import (
     Arm,
     Camera,
+    CameraSettings,
     DeviceKind,
     LaserController,
     TriggerMode,
 )
-from armscan.errors import DeviceError, FileFormatError
+from armscan.errors import ArmscanError, DeviceError, FileFormatError, InputError, OptionError
+from armscan.models.arm import ArmModel
+from armscan.pipeline.live.exposure import ExposureSettings
+from armscan.records.exposure import SensorWindow
+from armscan.storage.arm import read_arm_model
 from armscan.storage.codec import MismatchError, RecordCodec, parse_toml
 from armscan.storage.files import path_text, read_bytes
+from armscan.vision.stripe.image import StripeOptions
 
 OpenDevice = Callable[[DeviceKind, str], Any]
 """Opens the device of a kind at an address, or raises `DeviceError`."""
@@ -44,8 +50,24 @@ class RigDescription:
         Lasers of one trigger after the other, joined by ``+``; empty leaves the controller's own.
     is_common_trigger
         Frames and arm samples bear ids of the same triggers.
+    chooses_lasers
+        The head's own rule says after each exposure which lasers come next; there is no schedule.
+    arm_model
+        Path of ``arm.toml``, for an arm that gives joint angles; empty for none.
     scanner
         Path of ``scanner.json``; empty for none.
+    windows
+        Part of the sensor that each camera reads while it scans, left first: corner x and y, width
+        and height in px; none for what the cameras are set to.
+    exposure
+        How long the cameras expose while they scan.
+    stripes
+        Thresholds of the stripe extraction.
+
+    Raises
+    ------
+    InputError
+        If both a schedule and the head's rule say what is on, or windows do not fit the cameras.
     """
 
     cameras: tuple[str, ...]
@@ -54,8 +76,21 @@ class RigDescription:
     trigger: TriggerMode = "external"
     rate_hz: float = 80.0
     schedule: tuple[str, ...] = ()
+    chooses_lasers: bool = False
     is_common_trigger: bool = False
+    arm_model: str = ""
     scanner: str = ""
+    windows: tuple[tuple[int, int, int, int], ...] = ()
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
+    stripes: StripeOptions = field(default_factory=StripeOptions)
+
+    def __post_init__(self) -> None:
+        if self.chooses_lasers and self.schedule:
+            raise InputError("schedule and chooses_lasers both say which lasers are on")
+        if self.windows and len(self.windows) != len(self.cameras):
+            raise InputError(f"{len(self.windows)} windows for {len(self.cameras)} cameras")
+        if any(min(x, y) < 0 or min(w, h) < 1 for x, y, w, h in self.windows):
+            raise InputError(f"windows are {list(map(list, self.windows))}: x, y, width, height")
 
     @property
     def steps(self) -> tuple[tuple[str, ...], ...]:
@@ -64,7 +99,7 @@ class RigDescription:
 
 
 def read_rig(path: Path) -> RigDescription:
-    """Read ``rig.toml``.
+    """Read ``rig.toml``; paths in it are relative to it.
 
     Raises
     ------
@@ -76,7 +111,7 @@ def read_rig(path: Path) -> RigDescription:
     unknown: list[str] = []
     try:
         rig = RecordCodec({}, unknown).read(RigDescription, content)
-    except MismatchError as error:
+    except (MismatchError, OptionError) as error:
         raise FileFormatError(
             str(error), where=where, remedy='write lines as cameras = ["webcam:0"], rate_hz = 40.0'
         ) from error
@@ -86,7 +121,11 @@ def read_rig(path: Path) -> RigDescription:
         fault = fault or f"rate_hz is {rig.rate_hz:g}"
     if fault:
         raise FileFormatError(fault, where=where, remedy="correct the description of the rig")
-    return rig
+
+    def beside(name: str) -> str:
+        return str(path.parent / name) if name else ""
+
+    return replace(rig, arm_model=beside(rig.arm_model), scanner=beside(rig.scanner))
 
 
 class ShowsScenes(Protocol):
@@ -107,6 +146,8 @@ class Rig:
         None for none.
     description
         How they are run.
+    arm_model
+        Turns joint angles into poses, for an arm that gives those alone.
     """
 
     def __init__(
@@ -115,11 +156,13 @@ class Rig:
         arm: Arm | None = None,
         lasers: LaserController | None = None,
         description: RigDescription | None = None,
+        arm_model: ArmModel | None = None,
     ) -> None:
         self.cameras = tuple(cameras)
         self.arm = arm
         self.lasers = lasers
         self.description = description or RigDescription(tuple(one.name for one in cameras))
+        self.arm_model = arm_model
 
     @staticmethod
     def open(description: RigDescription, open_device: OpenDevice) -> Rig:
@@ -129,19 +172,50 @@ class Rig:
         ------
         DeviceError
             If one cannot be opened; those opened before it are closed.
+        FileFormatError
+            If the arm's document cannot be read.
         """
+        place = description.arm_model
+        model = read_arm_model(Path(place)) if place else None
         opened: list[Any] = []
         addresses: list[tuple[DeviceKind, str]] = [("camera", one) for one in description.cameras]
+        if description.arm:
+            addresses.append(("arm", description.arm))
+        if description.lasers:
+            addresses.append(("lasers", description.lasers))
         try:
-            opened += [open_device(kind, address) for kind, address in addresses]
-            arm = open_device("arm", description.arm) if description.arm else None
-            opened += [arm] if arm else []
-            lasers = open_device("lasers", description.lasers) if description.lasers else None
+            for kind, address in addresses:
+                with told_as_fault_of(address):
+                    opened.append(open_device(kind, address))
         except BaseException:
             _close(opened)
             raise
+        found = dict(zip((kind for kind, _ in addresses), opened, strict=True))
         cameras = opened[: len(description.cameras)]
-        return Rig(cameras, arm, lasers, description)
+        return Rig(cameras, found.get("arm"), found.get("lasers"), description, model)
+
+    def set_windows(self) -> None:
+        """Let each camera read the part of its sensor that the description says; before a start.
+
+        Raises
+        ------
+        DeviceError
+            If a camera does not take it.
+        """
+        for camera, (x, y, width, height) in zip(
+            self.cameras, self.description.windows, strict=False
+        ):
+            wished = CameraSettings(window=SensorWindow(x, y), size_px=(width, height))
+            with told_as_fault_of(camera.name):
+                took = camera.configure(wished)
+            if took.size_px is not None and took.size_px != (width, height):
+                given = took.window or SensorWindow()
+                raise DeviceError(
+                    f"it reads {took.size_px[0]} x {took.size_px[1]} px at {given.x_px}, "
+                    f"{given.y_px}, not {width} x {height} at {x}, {y}",
+                    where=camera.name,
+                    remedy="give a window that the camera can read, for example what it took",
+                )
 
     def start(self) -> None:
         """Begin to deliver: arm and cameras first, then the lasers, which may trigger them.
@@ -153,25 +227,32 @@ class Rig:
         """
         try:
             if self.arm is not None:
-                self.arm.start()
+                with told_as_fault_of(self.arm.name):
+                    self.arm.start()
             for camera in self.cameras:
-                camera.start(self.description.trigger)
+                with told_as_fault_of(camera.name):
+                    camera.start(self.description.trigger)
             if self.lasers is not None:
-                if self.description.steps:
-                    self.lasers.set_schedule(self.description.steps)
-                self.lasers.start(self.description.rate_hz)
+                with told_as_fault_of(self.lasers.name):
+                    if self.description.steps:
+                        self.lasers.set_schedule(self.description.steps)
+                    self.lasers.start(self.description.rate_hz)
         except BaseException:
             self.stop()
             raise
 
     def stop(self) -> tuple[str, ...]:
-        """Lasers off, then no more frames and samples; what did not obey, in words."""
+        """Lasers off, then no more frames and samples; what did not obey, in words.
+
+        What the devices had taken can still be read.
+        """
         silent = []
         for device in (self.lasers, *self.cameras, self.arm):
             if device is not None:
                 try:
-                    device.stop()
-                except DeviceError as error:
+                    with told_as_fault_of(device.name):
+                        device.stop()
+                except ArmscanError as error:
                     silent.append(str(error))
         return tuple(silent)
 
@@ -205,8 +286,20 @@ class Rig:
         cast(ShowsScenes, self.cameras[0]).show(scene)
 
 
+@contextmanager
+def told_as_fault_of(device: str) -> Iterator[None]:
+    """Turn whatever somebody's driver raises into a `DeviceError` that names the device."""
+    try:
+        yield
+    except ArmscanError:
+        raise
+    except Exception as error:
+        raise DeviceError(f"its driver failed ({type(error).__name__}: {error})",
+                          where=device) from error  # fmt: skip
+
+
 def _close(devices: Sequence[Any]) -> None:
     for device in devices:
         if device is not None:
-            with suppress(DeviceError):
+            with suppress(Exception):
                 device.close()

@@ -8,21 +8,26 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
+from armscan.devices.clocks import StreamCounts, StreamMonitor
 from armscan.devices.matching import MatchedInstant
-from armscan.devices.protocols import Frame
+from armscan.devices.protocols import CameraSettings, Frame
 from armscan.errors import ArmscanError, DeviceError, InputError, OptionError
 from armscan.geometry.arrays import FloatArray, ImageArray, IntArray
+from armscan.geometry.estimate import FitFailure
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.instants import Instant, InstantImages
 from armscan.pipeline.live.acquire import Acquisition, LiveEvent, Recorder
-from armscan.pipeline.live.rig import Rig
+from armscan.pipeline.live.exposure import ExposureControl, ExposureSettings
+from armscan.pipeline.live.rig import Rig, RigDescription, told_as_fault_of
 from armscan.pipeline.measure import (
     MeasuredInstant,
     MeasureOptions,
@@ -31,10 +36,11 @@ from armscan.pipeline.measure import (
     measure_instants,
 )
 from armscan.reconstruction.labels import PointStatus, StripeLabeller
-from armscan.reconstruction.place import BaseTransform, propagate_to_base
+from armscan.reconstruction.place import BaseTransform, merge_clouds, propagate_to_base
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.recording import CameraSetup
+from armscan.storage.recording import demosaiced
 
 NEW_PASS_RAD = np.radians(25.0)
 """The head shows another side: a pass of its own, that can be undone by itself."""
@@ -44,6 +50,7 @@ STOP_NS = 500_000_000
 """Standing still for so long ends a pass."""
 MOST_AHEAD = 16
 """Instants that wait to be measured; further ones are recorded and not shown."""
+LOOK_S = 0.1
 LATENCIES = 500
 """Latest instants over which rate and latency are told."""
 
@@ -76,11 +83,17 @@ class LiveOptions:
         One point a voxel and pass is shown.
     measured_every
         Every so many instants is measured live.
+    latest_ms
+        While an instant has waited so long to be measured, those that come are recorded alone.
+    exposure
+        How long the cameras expose.
     """
 
     measure: MeasureOptions = field(default_factory=MeasureOptions)
     voxel_mm: float = 0.5
     measured_every: int = 1
+    latest_ms: float = 100.0
+    exposure: ExposureSettings = field(default_factory=ExposureSettings)
 
     def __post_init__(self) -> None:
         if not 1e-3 <= self.voxel_mm <= 1e3 or self.measured_every < 1:
@@ -88,6 +101,11 @@ class LiveOptions:
                 f"voxels of {self.voxel_mm:g} mm, every {self.measured_every}th instant",
                 remedy="give an edge from 0.001 to 1000 mm and a count from 1",
             )
+
+    @staticmethod
+    def of(rig: RigDescription) -> LiveOptions:
+        """What the description of a rig says of stripes and exposure times."""
+        return LiveOptions(MeasureOptions(stripes=rig.stripes), exposure=rig.exposure)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,6 +217,15 @@ class _Pass:
         self.pieces.append(ShownCloud(kept.points_mm, kept.sheet, kept.sigma_mm, exposure))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Waiting:
+    """An instant that waits to be measured, and since when."""
+
+    number: int
+    instant: MatchedInstant
+    since_ns: int
+
+
 class LiveSession:
     """Drives a rig; every method may be called from any thread.
 
@@ -213,12 +240,14 @@ class LiveSession:
     recorder
         Keeps all that arrives while scanning; None to keep nothing.
     keep_cloud
-        Told of the full points in Base of every instant placed, with its rows' number.
+        Told of the full points in Base of every instant placed, all cameras in one cloud, with
+        the instant's number.
 
     Raises
     ------
     InputError
-        If the rig has not the scanner's cameras, or no arm.
+        If the rig has not the scanner's cameras, no arm, or one whose joint angles need its
+        document.
     """
 
     def __init__(
@@ -239,7 +268,7 @@ class LiveSession:
         self._lock = threading.RLock()
         self._listeners: list[Callable[[LiveEvent], None]] = []
         self._state: SessionState = "closed"
-        self._todo: queue.Queue[tuple[int, MatchedInstant] | None] = queue.Queue(MOST_AHEAD)
+        self._todo: queue.Queue[_Waiting | None] = queue.Queue(MOST_AHEAD)
         self._measuring = threading.Thread(target=self._measure, daemon=True)
         self._passes: list[_Pass] = []
         self._version = self._n_instants = 0
@@ -253,13 +282,24 @@ class LiveSession:
         self._arrivals: deque[int] = deque(maxlen=LATENCIES)
         self._latencies: deque[float] = deque(maxlen=LATENCIES)
         self._wants_pass = True
-        self._now: tuple[int, MatchedInstant] | None = None
+        self._told = ""
+        self._now: _Waiting | None = None
+        self._asked: tuple[str, ...] = ()
+        self._controls = [
+            ExposureControl(one, self.options.exposure, partial(self._tell_set, one.name))
+            for one in rig.cameras
+        ]
 
     def _checked(self, rig: Rig, scanner: ScannerCalibration | None) -> StripeLabeller | None:
         if scanner is None:
             return None
         if scanner.sensor is None or rig.arm is None:
             raise InputError("a live scan needs a scanner with cameras and an arm")
+        if rig.arm.pose_form == "joints" and rig.arm_model is None:
+            raise InputError(
+                "the arm gives joint angles, and nothing says which poses they are",
+                remedy='name its document in rig.toml: arm_model = "arm.toml"',
+            )
         n = len(cameras_of(scanner.sensor))
         if n != len(rig.cameras):
             raise InputError(
@@ -282,24 +322,38 @@ class LiveSession:
         """
         if self._state != "closed":
             raise DeviceError("a session is opened once", remedy="make a new one")
+        for control in self._controls:
+            control.start()
         self._acquisition.start()
         self._measuring.start()
+        self._choose_lasers()
         self._change("ready")
 
     def start(self) -> None:
-        """Begin to scan with a new pass; opens the rig if nobody did."""
+        """Begin to scan with a new pass; opens the rig if nobody did. Raises as `resume`."""
         if self._state == "closed":
             self.open()
         self.resume()
 
     def resume(self) -> None:
-        """Go on with a new pass."""
+        """Go on with a new pass.
+
+        Raises
+        ------
+        DeviceError
+            If the session is not open, or over.
+        """
+        if self._state in ("closed", "stopped"):
+            fact = "is over" if self._state == "stopped" else "is not open"
+            raise DeviceError(f"the session {fact}", remedy="open a new one")
         self._wants_pass = True
         self._acquisition.recorder = self._recorder
         self._change("scanning")
 
     def pause(self) -> None:
         """Show images, and neither record nor place."""
+        if self._state in ("closed", "stopped"):
+            return
         self._acquisition.recorder = None
         self._change("paused")
 
@@ -323,10 +377,36 @@ class LiveSession:
         """Lasers off; what arrived is recorded and measured to its end."""
         if self._state in ("closed", "stopped"):
             return
+        for control in self._controls:
+            control.stop()
         self._acquisition.stop()
-        self._todo.put(None)
-        self._measuring.join()
+        while self._measuring.is_alive():
+            with suppress(queue.Full):
+                self._todo.put(None, timeout=LOOK_S)
+                self._measuring.join()
         self._change("stopped")
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether what arrives is kept now; not any more after the recorder failed."""
+        return self._acquisition.recorder is not None
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether the clocks of all devices are related to this computer's."""
+        clocks = [one.clock.fit for one in self._monitors]
+        return not any(isinstance(fit, FitFailure) for fit in clocks)
+
+    @property
+    def stream_counts(self) -> tuple[StreamCounts, ...]:
+        """What was seen of each camera, the arm and the laser controller, as far as there are."""
+        return tuple(replace(one.counts) for one in self._monitors)
+
+    @property
+    def _monitors(self) -> tuple[StreamMonitor, ...]:
+        matcher = self._acquisition.matcher
+        arm = (matcher.arm,) if self._rig.arm is not None else ()
+        return (*matcher.cameras, *arm, *((matcher.controller,) if self._rig.lasers else ()))
 
     def snapshot(self) -> LiveSnapshot:
         """What there is to show now."""
@@ -378,11 +458,40 @@ class LiveSession:
 
     def _tell(self, event: LiveEvent) -> None:
         for listener in tuple(self._listeners):
-            listener(event)
+            try:
+                listener(event)
+            except Exception as error:  # a listener's fault must not end a device's thread
+                self._listeners.remove(listener)
+                text = f"a listener failed and is told no more: {type(error).__name__}: {error}"
+                self._tell(LiveEvent("warning", text))
+
+    def _tell_set(self, camera: str, what: CameraSettings | DeviceError) -> None:
+        if isinstance(what, DeviceError):
+            self._tell(LiveEvent("warning", f"its exposure is not controlled: {what}", camera))
+        elif what.exposure_us is not None:
+            self._tell(LiveEvent("setting", f"exposure {what.exposure_us:.1f} us", camera))
+
+    def _choose_lasers(self) -> None:
+        """Ask for the lasers that the head's rule wants next, if it is to choose."""
+        lasers, labeller = self._rig.lasers, self._labeller
+        if lasers is None or labeller is None or not self._rig.description.chooses_lasers:
+            return
+        wanted = labeller.next_lasers()
+        if wanted and wanted != self._asked:
+            try:
+                with told_as_fault_of(lasers.name):
+                    lasers.set_next(wanted)
+            except ArmscanError as error:
+                self._tell(LiveEvent("warning", f"the lasers are not chosen: {error}", lasers.name))
+            else:
+                self._asked = wanted
 
     def _take(self, instant: MatchedInstant) -> None:
         """Decide what becomes of an instant; from the matching thread."""
         frames = enumerate(instant.frames)
+        for control, frame in zip(self._controls, instant.frames, strict=True):
+            if frame is not None:
+                control.show(frame, instant.lasers)
         with self._lock:
             self._frames |= {k: (one, instant.lasers) for k, one in frames if one is not None}
             self._arrivals.append(time.monotonic_ns())
@@ -396,9 +505,17 @@ class LiveSession:
                 self._counts[status] += 1
                 return
         try:
-            self._todo.put_nowait((number, instant))
+            if self._is_behind():
+                raise queue.Full
+            self._todo.put_nowait(_Waiting(number, instant, time.monotonic_ns()))
         except queue.Full:
             self._count(LiveStatus.NOT_SHOWN)
+
+    def _is_behind(self) -> bool:
+        with self._todo.mutex:
+            first = self._todo.queue[0] if self._todo.queue else None
+        limit_ns = 1e6 * self.options.latest_ms
+        return first is not None and time.monotonic_ns() - first.since_ns > limit_ns
 
     def _count(self, status: LiveStatus) -> None:
         with self._lock:
@@ -430,7 +547,7 @@ class LiveSession:
     def _feed(self) -> Iterator[InstantImages]:
         while (found := self._todo.get()) is not None:
             self._now = found
-            number, instant = found
+            number, instant = found.number, found.instant
             if self._scanner is None or instant.pose is None:
                 continue
             setups = [camera.setup for camera in self._rig.cameras]
@@ -459,17 +576,25 @@ class LiveSession:
                     self._feed(), self._labeller, self._scanner.sensor, self.options.measure,
                     is_pass=True, reads_ahead=False,
                 ):  # fmt: skip
+                    self._choose_lasers()
                     if self._now is not None:
-                        self._place(one, *self._now, transform)
+                        self._place(one, self._now, transform)
                 return
             except ArmscanError as error:
-                self._count(LiveStatus.FAILED)
-                self._tell(LiveEvent("warning", str(error)))
+                self._fail(str(error))
+            except Exception as error:  # the thread must live: others wait for it
+                self._fail(f"an image could not be measured: {type(error).__name__}: {error}")
 
-    def _place(
-        self, one: MeasuredInstant, number: int, instant: MatchedInstant, transform: BaseTransform
-    ) -> None:
+    def _fail(self, text: str) -> None:
+        """Count one instant and tell; the same words once, until something else happens."""
+        self._count(LiveStatus.FAILED)
+        is_new, self._told = text != self._told, text
+        if is_new:
+            self._tell(LiveEvent("warning", text))
+
+    def _place(self, one: MeasuredInstant, waiting: _Waiting, transform: BaseTransform) -> None:
         """Put the points of an instant into the pass that it belongs to."""
+        number, instant = waiting.number, waiting.instant
         pose = instant.pose
         if pose is None:
             return
@@ -493,9 +618,13 @@ class LiveSession:
             self._version += 1
             start = instant.t_ns or max(one.t_host_ns for one in instant.frames if one)
             self._latencies.append((time.monotonic_ns() - start) / 1e6)
+        self._told = ""
         if self._keep_cloud is not None:
-            for cloud in clouds:
-                self._keep_cloud(number, cloud)
+            try:
+                self._keep_cloud(number, merge_clouds(clouds))
+            except Exception as error:  # not ours; the instant is placed all the same
+                text = f"a cloud was not kept: {type(error).__name__}: {error}"
+                self._tell(LiveEvent("warning", text))
 
     def _has_turned(self, pose: Pose[Base, Tool]) -> bool:
         return bool(_turn_rad(self._passes[-1].first, pose) > NEW_PASS_RAD)
@@ -519,21 +648,12 @@ def _time_ns(instant: MatchedInstant) -> int:
 def exposure_of(
     frame: Frame, setup: CameraSetup, instant: MatchedInstant, camera: int = 0
 ) -> Exposure:
-    """An image as the measuring loop takes it, equal to what a recording of it gives.
-
-    Raises
-    ------
-    DeviceError
-        If the camera delivers a Bayer pattern.
-    """
-    if setup.colour == "bayer_rggb":
-        raise DeviceError(
-            "the camera delivers a Bayer pattern, which is not measured live",
-            remedy="set the camera to mono or RGB, or reconstruct the recording",
-        )
+    """An image as the measuring loop takes it, equal to what a recording of it gives."""
     image = frame.image
     if setup.align == "high":
         image = np.right_shift(image, 8 * image.dtype.itemsize - setup.bits_used)
+    if setup.colour == "bayer_rggb":
+        image = demosaiced(image)
     return Exposure(
         image,
         f"camera {camera} frame {frame.number}",

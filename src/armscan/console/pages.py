@@ -33,21 +33,24 @@ from armscan.console.journey import (
 )
 from armscan.console.panels import Controls, PointsPanel, ScanPanel, padded, put
 from armscan.console.placements import Placement, drawing
-from armscan.console.rig import open_bench
+from armscan.console.quality import ModelWatch
+from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import Bench, LiveScan
 from armscan.console.scene import SceneView, ShownPoints, paragraph, shown_points
 from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
-from armscan.console.work import Worker, run_step
+from armscan.console.work import Worker, run_step, seen_in_take
 from armscan.errors import ArmscanError
 from armscan.pipeline.progress import ProgressEvent
+from armscan.records.exposure import Exposure
 from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
+from armscan.storage.arm import PROBE_FILE
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import read_bytes
 from armscan.storage.formats.ply import parse_ply
 
-GOOD = "#3f7d2b"
-TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": "#b3261e", "old": "#b07d12"}
+GOOD, WRONG = "#3f7d2b", "#b3261e"
+TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
 WORDS = {
     "waiting": "waits",
     "open": "to do",
@@ -82,7 +85,8 @@ class ConsolePage:
         self.worker = Worker()
         self.controls = Controls(server, self.refresh)
         self.points = PointsPanel(SceneView(server))
-        self.scanning = ScanPanel(self.controls, self.points, self.finish)
+        self.scanning = ScanPanel(self.controls, self.points, self.finish, self._look)
+        self._seen: tuple[bool, str] | None = None
         self._held = ExitStack()
         self._lock = threading.RLock()
         self.journey = self._opened(folder)
@@ -135,9 +139,14 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
-        self._take = self.controls.button("Take", self.take, "T", "Record this placement", "teal")
+        self._take = self.controls.button(
+            "Take", self.take_one, "T", "Record this placement", "teal"
+        )
         self._take_all = self.controls.button(
             "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
+        )
+        self._take_back = self.controls.button(
+            "Take back", self.take_back, "B", "Remove what was taken last"
         )
         self._start_over = self.controls.button(
             "Start over", self.start_over, "", "Remove what was taken"
@@ -198,8 +207,8 @@ class ConsolePage:
             self.controls.problem = "Finish the scan first."
             self.refresh()
             return
-        self.step = step
-        self.scanning.show_taken(None)
+        self.step, self._seen = step, None
+        self.scanning.show_image(None)
         self.refresh()
         self._show_stored()
 
@@ -229,19 +238,33 @@ class ConsolePage:
             if BY_NAME[step].filling == "touches":
                 bench.touch(place, k)
                 return
-            self.scanning.show_taken(bench.take(step, place, k))
+            self.scanning.show_image(bench.take(step, place, k))
+
+    def take_one(self) -> None:
+        """Record the placement or touch that is drawn, and say what is seen in it."""
+        self.take()
+        if BY_NAME[self.step].filling == "placements":
+            self._seen = self.worker.run(seen_in_take, self.journey.folder, self.step)
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
+        self._seen = None
         with self._lock:
             while self.journey.n_taken(self.step) < self._n_wanted():
                 self.take()
                 self.refresh()
 
+    def take_back(self) -> None:
+        """Remove the placement or touch that was taken last."""
+        self._seen = None
+        with self._lock:
+            take_back(self.step, self.journey.recording(self.step))
+
     def start_over(self) -> None:
         """Remove what this step has taken."""
+        self._seen = None
         with self._lock:
-            self.scanning.show_taken(None)
+            self.scanning.show_image(None)
             self.journey.start_over(self.step, self._scan_of(self.step))
 
     def start_or_pause(self) -> None:
@@ -262,7 +285,10 @@ class ConsolePage:
         else:
             self.journey.start_over(step)
         folder = self.journey.recording(step, self._scan_of(step))
-        self.scanning.begin(LiveScan(self._bench(), step, folder, scanner), scanner)
+        part, model = self.journey.settings.part, None
+        if step is StepName.SCAN and part:
+            model = ModelWatch(self.worker, self.journey.folder / part)
+        self.scanning.begin(LiveScan(self._bench(), step, folder, scanner), scanner, model)
 
     def finish(self) -> None:
         """End the scan, and run its job."""
@@ -317,6 +343,18 @@ class ConsolePage:
             )
         return self.bench
 
+    def _look(self) -> Exposure | None:
+        """What a camera sees while something is put before it to be taken."""
+        step = BY_NAME[self.step]
+        if self.bench is None or step.filling in ("motion", "nothing"):
+            return None
+        if self.worker.is_busy or not self._take.visible or not self._lock.acquire(blocking=False):
+            return None
+        try:
+            return self.bench.look(self.step, self.journey.n_taken(self.step))
+        finally:
+            self._lock.release()
+
     def _scan_of(self, step: StepName) -> str:
         return self.scan if step in OF_A_SCAN else ""
 
@@ -348,6 +386,7 @@ class ConsolePage:
         self._take.visible = is_taken and has_rig and not is_full and not is_blocked
         is_twin = self.bench is not None and self.bench.is_simulated
         self._take_all.visible = self._take.visible and is_twin
+        self._take_back.visible = is_taken and state.n_taken > 0 and has_rig
         self._start_over.visible = is_taken and state.n_taken > 0
         self.scanning.arrange(
             is_motion=is_motion,
@@ -428,10 +467,13 @@ class ConsolePage:
             return body + paragraph(f"{state.why}.", ALERT)
         if step.filling not in ("placements", "touches"):
             return body
+        body += paragraph(self._lacking(), ALERT)
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
         if n >= wanted:
             return body + paragraph(f"All {wanted} are taken.", GOOD)
+        if self._seen is not None:
+            body += paragraph(self._seen[1], GOOD if self._seen[0] else WRONG)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
         is_twin = self.bench is not None and self.bench.is_simulated
@@ -443,12 +485,27 @@ class ConsolePage:
             + paragraph(own, MUTED, 12)
         )
 
+    def _lacking(self) -> str:
+        """What the operator has to tell before this step makes sense; empty for nothing."""
+        needs_target = self.step in (StepName.CAMERA, StepName.LASER)
+        if needs_target and not self.journey.settings.target:
+            return (
+                "Write into 'Target' which one you hold, for example chessboard:9x6:10 for 9 by 6 "
+                "inner corners 10 mm apart."
+            )
+        is_real = self.bench is not None and not self.bench.is_simulated
+        if self.step is StepName.PROBING and is_real:
+            place = self.journey.folder / PROBE_FILE
+            if not place.is_file():
+                return f"Write first where the tip of the probe is, into {place}: see the how-to."
+        return ""
+
     def _placement(self, k: int) -> Placement:
         known = BY_NAME[self.step].placements
         return known[k % len(known)]
 
     def _told(self, state: StepState) -> str:
-        problem = paragraph(self.controls.problem, "#b3261e") if self.controls.problem else ""
+        problem = paragraph(self.controls.problem, WRONG) if self.controls.problem else ""
         if state.result is None or self.live is not None:
             return problem
         return problem + result_card(state, self._link(state.result.page, "All about it"))

@@ -13,6 +13,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import viser
 
+from armscan.console.quality import ModelWatch
 from armscan.console.scan import LiveScan
 from armscan.console.scene import (
     COLOURED_BY,
@@ -29,12 +30,13 @@ from armscan.console.work import told
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.records.exposure import Exposure
-from armscan.report.drawing import INK, MUTED
+from armscan.report.drawing import ALERT, INK, MUTED
 
 REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
 DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
 DETAIL = "up to 500,000"
 """Shown at first: a computer without graphics processor draws two million points once a second."""
+WINDOW_PX = 420.0
 START_BUTTON, UNDO_BUTTON = "0", "1"
 """Buttons of the arm: start or pause, and take the last pass back."""
 
@@ -104,6 +106,11 @@ class PointsPanel:
             self._detail.on_update(lambda _: self._redraw())
             self._legend = gui.add_html("")
 
+    @property
+    def colour(self) -> str:
+        """By what the points are coloured."""
+        return str(self._colour.value)
+
     def show(self, shown: ShownPoints | None, *, is_new: bool = True) -> None:
         """Show points in place of those before; new ones turn the view to themselves."""
         if is_new:
@@ -133,12 +140,19 @@ class ScanPanel:
         Where the live cloud is shown.
     finish
         What ends a scan.
+    look
+        Gives what a camera sees now while no scan runs; None to leave what is shown.
     """
 
     def __init__(
-        self, controls: Controls, points: PointsPanel, finish: Callable[[], object]
+        self,
+        controls: Controls,
+        points: PointsPanel,
+        finish: Callable[[], object],
+        look: Callable[[], Exposure | None],
     ) -> None:
         self.live: LiveScan | None = None
+        self._look, self._model = look, cast(ModelWatch | None, None)
         self._controls, self._points, self._finish_scan = controls, points, finish
         self._scanner: ScannerCalibration | None = None
         self._version, self._drawn_at = -1, 0.0
@@ -151,7 +165,7 @@ class ScanPanel:
         button = self._controls.button
         self.start_button = button("Start", start, "S", "Begin, pause, go on", "teal")
         self._undo = button("Undo last pass", self.undo, "U", "Take the last pass out")
-        self._clear = button("Clear", self.clear, "", "Take all passes out")
+        self._clear = button("Clear", self.clear, "C", "Take all passes out of the scan")
         self._finish = button(
             "Finish", self._finish_scan, "F", "End the scan and calculate", "teal"
         )
@@ -159,10 +173,13 @@ class ScanPanel:
         self._start = start
 
     def build_pictures(self) -> None:
-        """Add the cameras' images to the column."""
+        """Add the cameras' images, in a window of their own that can be moved."""
         grey = np.full((8, 640, 3), 245, dtype=np.uint8)
-        add = self._controls.gui.add_image
-        self._pictures = [add(grey, label=None, visible=False) for _ in range(2)]
+        gui = self._controls.gui
+        self._window = gui.add_panel(visible=False)
+        with self._window.add_tab("What the camera sees"):
+            self._pictures = [gui.add_image(grey, label=None, visible=False) for _ in range(2)]
+        self._window.float(x=12.0, y=12.0, width=WINDOW_PX)
         self._thread.start()
 
     def close(self) -> None:
@@ -172,9 +189,11 @@ class ScanPanel:
             self.live.stop()
         self._thread.join(5.0)
 
-    def begin(self, live: LiveScan, scanner: ScannerCalibration) -> None:
-        """Start a scan and show it."""
-        self.live, self._scanner = live, scanner
+    def begin(
+        self, live: LiveScan, scanner: ScannerCalibration, model: ModelWatch | None = None
+    ) -> None:
+        """Start a scan and show it, beside its model if there is one."""
+        self.live, self._scanner, self._model = live, scanner, model
         self._version = -1
         self._points.show(None)
         live.start()
@@ -205,11 +224,11 @@ class ScanPanel:
         for handle in (self._undo, self._clear, self._finish, self._range, self._facts):
             handle.visible = is_motion and self.live is not None
 
-    def show_taken(self, exposure: Exposure | None) -> None:
-        """Show what a take has recorded; None to show no image."""
+    def show_image(self, exposure: Exposure | None) -> None:
+        """Show what a camera sees; None to show no image."""
         if exposure is not None:
             self._pictures[0].image = taken_image(exposure)
-        self._pictures[0].visible = exposure is not None
+        self._window.visible = self._pictures[0].visible = exposure is not None
         self._pictures[1].visible = False
 
     def _label(self, *, is_again: bool = False) -> None:
@@ -221,12 +240,18 @@ class ScanPanel:
 
     def _keep_fresh(self) -> None:
         while not self._closing.wait(REFRESH_S):
-            live = self.live
-            if live is not None:
-                try:
+            try:
+                if (live := self.live) is not None:
                     self._show(live)
-                except Exception as error:  # the page goes on showing what it can
-                    self._controls.problem = told(error)
+                elif (seen := self._look()) is not None:
+                    self.show_image(seen)
+            except Exception as error:  # the page goes on showing what it can
+                self._tell(told(error))
+
+    def _tell(self, problem: str) -> None:
+        if problem != self._controls.problem:
+            self._controls.problem = problem
+            self._controls.refresh()
 
     def _show(self, live: LiveScan) -> None:
         shown = live.snapshot
@@ -237,17 +262,34 @@ class ScanPanel:
             views = zip(self._pictures, shown.cameras, live.rig.cameras, strict=False)
             for handle, view, camera in views:
                 handle.image = live_image(view, names, camera.setup.window)
-                handle.visible = True
+                self._window.visible = handle.visible = True
             self._range.content = padded(range_bar(shown.range_mm, *depths_mm(sensor)))
-        self._facts.content = padded(_live_facts(live, shown))
+        self._facts.content = padded(_live_facts(live, shown, self._model))
         self._label()
         is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
         if shown.cloud_version != self._version and is_due:
-            self._version, self._drawn_at = shown.cloud_version, time.monotonic()
-            cloud = live.session.cloud()
-            points = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm)
-            self._points.show(points, is_new=False)
-            self._points.view.show_head(shown.base_from_tool, self._scanner)
+            self._version = shown.cloud_version
+            self._points.show(self._points_of(live), is_new=False)
+            pose = shown.base_from_tool
+            arm_mm = None if pose is None else live.arm_mm(pose)
+            self._points.view.show_head(pose, self._scanner, arm_mm)
+            self._drawn_at = time.monotonic()
+
+    def _points_of(self, live: LiveScan) -> ShownPoints:
+        """The live cloud, with what its colours need."""
+        cloud, by = live.session.cloud(), self._points.colour
+        incidence = live.incidence_deg(cloud) if by == "incidence" else None
+        points = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm, incidence)
+        if by != "deviation" or self._model is None:
+            return points
+        # what was compared is a little older than the cloud
+        found, deviation = self._model.latest(cloud)
+        if not len(deviation):
+            return points
+        limit = float(np.nanquantile(np.abs(deviation), 0.95, method="nearest"))
+        return ShownPoints(
+            found.points_mm, found.sheet, found.sigma_mm, None, deviation, float(f"{limit:.1g}")
+        )
 
     def _hear(self, live: LiveScan) -> None:
         while live.events:
@@ -264,7 +306,7 @@ class ScanPanel:
                 self._controls.refresh()
 
 
-def _live_facts(live: LiveScan, shown: LiveSnapshot) -> str:
+def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -> str:
     drift = live.drift_mm()
     late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
     lines = [
@@ -284,12 +326,18 @@ def _live_facts(live: LiveScan, shown: LiveSnapshot) -> str:
     lines += [", ".join(lost)] if lost else []
     if live.bench.is_over:
         lines.append("the simulated hand has come to its end: finish")
-    return "".join(paragraph(line, INK, 13) for line in lines)
+    alerts = [model.problem] if model is not None and model.problem else []
+    if shown.state == "scanning" and not live.session.is_recording:
+        alerts.append("Nothing is recorded any more: finish, and see to the disk.")
+    return "".join(
+        [paragraph(text, ALERT, 14) for text in alerts]
+        + [paragraph(line, INK, 13) for line in lines]
+    )
 
 
 def padded(content: str) -> str:
     """HTML as far from the column's edges as the controls."""
-    return f'<div style="padding:2px 10px">{content}</div>'
+    return f'<div style="padding:2px 18px 2px 10px">{content}</div>'
 
 
 def put(handle: Any, value: object) -> None:

@@ -8,12 +8,11 @@ Everything that it does is a call that a script can make: `Journey`, `Bench`, `L
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from html import escape
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 from urllib.parse import quote
 
 import numpy as np
@@ -32,36 +31,26 @@ from armscan.console.journey import (
     open_journey,
     sessions_in,
 )
+from armscan.console.panels import Controls, PointsPanel, ScanPanel, padded, put
 from armscan.console.placements import Placement, drawing
-from armscan.console.rig import open_bench
+from armscan.console.quality import ModelWatch
+from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import Bench, LiveScan
-from armscan.console.scene import (
-    COLOURED_BY,
-    MOST_POINTS,
-    SceneView,
-    ShownPoints,
-    depths_mm,
-    live_image,
-    paragraph,
-    range_bar,
-    shown_points,
-    taken_image,
-)
+from armscan.console.scene import SceneView, ShownPoints, paragraph, shown_points
 from armscan.console.server import LOOPBACK, PAGES, close_server, open_server
-from armscan.console.work import Worker, run_step, told
+from armscan.console.work import Worker, run_step, seen_in_take
 from armscan.errors import ArmscanError
-from armscan.models.calibration import ScannerCalibration
-from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
 from armscan.pipeline.progress import ProgressEvent
+from armscan.records.exposure import Exposure
 from armscan.report.drawing import ACCENT, ALERT, INK, LINE, MUTED
+from armscan.storage.arm import PROBE_FILE
 from armscan.storage.clouds import read_cloud
 from armscan.storage.documents import read_scanner_calibration
 from armscan.storage.files import read_bytes
 from armscan.storage.formats.ply import parse_ply
 
-REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
-GOOD = "#3f7d2b"
-TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": "#b3261e", "old": "#b07d12"}
+GOOD, WRONG = "#3f7d2b", "#b3261e"
+TINTS = {"good": GOOD, "doubtful": "#b07d12", "not good": WRONG, "old": "#b07d12"}
 WORDS = {
     "waiting": "waits",
     "open": "to do",
@@ -71,11 +60,6 @@ WORDS = {
     "not good": "not good",
     "old": "out of date",
 }
-DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
-DETAIL = "up to 500,000"
-"""Shown at first: a computer without graphics processor draws two million points once a second."""
-START_BUTTON, UNDO_BUTTON = "0", "1"
-"""Buttons of the arm: start or pause, and take the last pass back."""
 
 
 class ConsolePage:
@@ -99,34 +83,30 @@ class ConsolePage:
     def __init__(self, server: viser.ViserServer, folder: Path, bench: Bench | None) -> None:
         self.server, self.bench = server, bench
         self.worker = Worker()
-        self.view = SceneView(server)
-        self.live: LiveScan | None = None
+        self.controls = Controls(server, self.refresh)
+        self.points = PointsPanel(SceneView(server))
+        self.scanning = ScanPanel(self.controls, self.points, self.finish, self._look)
+        self._seen: tuple[bool, str] | None = None
         self._held = ExitStack()
         self._lock = threading.RLock()
-        self._closing = threading.Event()
-        self._scanner: ScannerCalibration | None = None
-        self._shown: ShownPoints | None = None
-        self._version = -1
-        self._drawn_at = 0.0
-        self._problem = ""
         self.journey = self._opened(folder)
         self.step = self.journey.next_step()
         self.scan = self.journey.scans[-1] if self.journey.scans else ""
         self._build()
         self.refresh()
         self._show_stored()
-        self._thread = threading.Thread(target=self._keep_fresh, daemon=True)
-        self._thread.start()
         threading.Thread(target=self.worker.prepare, daemon=True).start()
 
     def close(self) -> None:
         """End a scan and the work under way, and let others open the session."""
-        self._closing.set()
-        if self.live is not None:
-            self.live.stop()
-        self._thread.join(5.0)
+        self.scanning.close()
         self.worker.close()
         self._held.close()
+
+    @property
+    def live(self) -> LiveScan | None:
+        """The scan that runs."""
+        return self.scanning.live
 
     def _opened(self, folder: Path) -> Journey:
         held = ExitStack()
@@ -159,37 +139,38 @@ class ConsolePage:
         self._choice.on_update(lambda _: self._choose_title(self._choice.value))
         self._guide = gui.add_html("")
         self._settings()
-        self._take = self._button("Take", self.take, "T", "Record this placement", "teal")
-        self._take_all = self._button(
+        self._take = self.controls.button(
+            "Take", self.take_one, "T", "Record this placement", "teal"
+        )
+        self._take_all = self.controls.button(
             "Take all that is left (simulated)", self.take_all, "", "The twin shows them all"
         )
-        self._start_over = self._button("Start over", self.start_over, "", "Remove what was taken")
-        self._scanning()
+        self._take_back = self.controls.button(
+            "Take back", self.take_back, "B", "Remove what was taken last"
+        )
+        self._start_over = self.controls.button(
+            "Start over", self.start_over, "", "Remove what was taken"
+        )
+        self.scanning.build(self.start_or_pause)
         self._inspecting()
-        self._picture = gui.add_image(
-            np.full((8, 640, 3), 245, dtype=np.uint8), label=None, visible=False
-        )
-        self._second = gui.add_image(
-            np.full((8, 640, 3), 245, dtype=np.uint8), label=None, visible=False
-        )
-        self._calculate = self._button(
+        self.scanning.build_pictures()
+        self._calculate = self.controls.button(
             "Calculate", self.calculate, "K", "Run this step's job", "teal"
         )
         self._working = gui.add_html("", visible=False)
         self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._cancel = self._button("Cancel", self.worker.cancel, "", "End the calculation", "red")
+        self._cancel = self.controls.button(
+            "Cancel", self.worker.cancel, "", "End the calculation", "red"
+        )
         self._cancel.visible = False
         self._note = gui.add_html("")
-        self._next = self._button("Go on", self.go_on, "N", "To the next step", "teal")
-        with gui.add_folder("What is shown"):
-            self._colour = gui.add_dropdown("Colour by", COLOURED_BY)
-            self._colour.on_update(lambda _: self._redraw())
-            self._detail = gui.add_dropdown("Points", tuple(DETAILS), initial_value=DETAIL)
-            self._detail.on_update(lambda _: self._redraw())
-            self._legend = gui.add_html("")
+        self._next = self.controls.button("Go on", self.go_on, "N", "To the next step", "teal")
+        self.points.build(gui)
         with gui.add_folder("Sessions", expand_by_default=False):
             self._session_list = gui.add_dropdown("Session", (self._name(),))
-            self._open = self._button("Open", self._open_chosen, "", "Close this one, open that")
+            self._open = self.controls.button(
+                "Open", self._open_chosen, "", "Close this one, open that"
+            )
 
     def _settings(self) -> None:
         gui = self.server.gui
@@ -197,17 +178,6 @@ class ConsolePage:
         self._target.on_update(lambda _: self._set(target=self._target.value.strip()))
         self._ball = gui.add_number("Ball, mm", self.journey.settings.ball_mm, step=0.0001)
         self._ball.on_update(lambda _: self._set(ball_mm=float(self._ball.value)))
-
-    def _scanning(self) -> None:
-        gui = self.server.gui
-        self._range = gui.add_html("", visible=False)
-        self._start = self._button("Start", self.start_or_pause, "S", "Begin, pause, go on", "teal")
-        self._undo = self._button("Undo last pass", self.undo, "U", "Take the last pass out")
-        self._clear = self._button("Clear", self.clear, "", "Take all passes out")
-        self._finish = self._button(
-            "Finish", self.finish, "F", "End the scan and calculate", "teal"
-        )
-        self._facts = gui.add_html("", visible=False)
 
     def _inspecting(self) -> None:
         gui = self.server.gui
@@ -221,35 +191,10 @@ class ConsolePage:
         self._tolerance = gui.add_text("Tolerance, mm", self.journey.settings.tolerance)
         self._tolerance.on_update(lambda _: self._set(tolerance=self._tolerance.value.strip()))
 
-    def _button(
-        self,
-        label: str,
-        work: Callable[[], object],
-        key: str,
-        hint: str,
-        colour: Literal["teal", "gray", "red"] = "gray",
-    ) -> viser.GuiButtonHandle:
-        """A button, and a key for it, that tell a failure as its sentence."""
-        named = f"{label} ({key})" if key else label
-        button = self.server.gui.add_button(named, hint=hint, color=colour)
-        button.on_click(lambda _: self._tried(work))
-        if key:
-            command = self.server.gui.add_command(label, hotkey=cast(Any, key), description=hint)
-            command.on_trigger(lambda _: self._tried(work) if _is_usable(button) else None)
-        return button
-
-    def _tried(self, work: Callable[[], object]) -> None:
-        try:
-            self._problem = ""
-            work()
-        except Exception as error:  # every failure ends as a sentence on the page
-            self._problem = told(error)
-        self.refresh()
-
     def _set(self, **settings: Any) -> None:
         now = self.journey.settings
         if any(getattr(now, key) != value for key, value in settings.items()):
-            self._tried(lambda: self.journey.change(**settings))
+            self.controls.tried(lambda: self.journey.change(**settings))
 
     def _name(self) -> str:
         return self.journey.folder.resolve().name
@@ -259,18 +204,18 @@ class ConsolePage:
     def choose(self, step: StepName) -> None:
         """Show a step."""
         if self.live is not None:
-            self._problem = "Finish the scan first."
+            self.controls.problem = "Finish the scan first."
             self.refresh()
             return
-        self.step = step
-        self._picture.visible = self._second.visible = False
+        self.step, self._seen = step, None
+        self.scanning.show_image(None)
         self.refresh()
         self._show_stored()
 
     def _choose_title(self, title: str) -> None:
         chosen = next((one.name for one in self.journey.steps if one.title == title), self.step)
         if chosen is not self.step:
-            self._problem = ""
+            self.controls.problem = ""
             self.choose(chosen)
 
     def _choose_scan(self, scan: str) -> None:
@@ -293,22 +238,33 @@ class ConsolePage:
             if BY_NAME[step].filling == "touches":
                 bench.touch(place, k)
                 return
-            shown = bench.take(step, place, k)
-            if shown is not None:
-                self._picture.image = taken_image(shown)
-                self._picture.visible = True
+            self.scanning.show_image(bench.take(step, place, k))
+
+    def take_one(self) -> None:
+        """Record the placement or touch that is drawn, and say what is seen in it."""
+        self.take()
+        if BY_NAME[self.step].filling == "placements":
+            self._seen = self.worker.run(seen_in_take, self.journey.folder, self.step)
 
     def take_all(self) -> None:
         """Record all that is left, as the twin shows it."""
+        self._seen = None
         with self._lock:
             while self.journey.n_taken(self.step) < self._n_wanted():
                 self.take()
                 self.refresh()
 
+    def take_back(self) -> None:
+        """Remove the placement or touch that was taken last."""
+        self._seen = None
+        with self._lock:
+            take_back(self.step, self.journey.recording(self.step))
+
     def start_over(self) -> None:
         """Remove what this step has taken."""
+        self._seen = None
         with self._lock:
-            self._picture.visible = self._second.visible = False
+            self.scanning.show_image(None)
             self.journey.start_over(self.step, self._scan_of(self.step))
 
     def start_or_pause(self) -> None:
@@ -323,37 +279,21 @@ class ConsolePage:
 
     def _begin(self) -> None:
         step = self.step
-        self._scanner = read_scanner_calibration(self.journey.scanner_file)
+        scanner = read_scanner_calibration(self.journey.scanner_file)
         if step is StepName.SCAN:
             self.scan = self.journey.new_scan()
         else:
             self.journey.start_over(step)
         folder = self.journey.recording(step, self._scan_of(step))
-        self.live = LiveScan(self._bench(), step, folder, self._scanner)
-        self._version = -1
-        self.view.clear()
-        self.view.forget_view()
-        self.live.start()
-
-    def undo(self) -> None:
-        """Take the last pass back."""
-        if self.live is not None:
-            self.live.undo_pass()
-
-    def clear(self) -> None:
-        """Take all passes back."""
-        if self.live is not None:
-            self.live.clear()
+        part, model = self.journey.settings.part, None
+        if step is StepName.SCAN and part:
+            model = ModelWatch(self.worker, self.journey.folder / part)
+        self.scanning.begin(LiveScan(self._bench(), step, folder, scanner), scanner, model)
 
     def finish(self) -> None:
         """End the scan, and run its job."""
         with self._lock:
-            live, self.live = self.live, None
-            if live is None:
-                return
-            live.stop()
-            self.view.show_head(None, None)
-            n = live.n_recorded
+            n = self.scanning.end()
         self.refresh()
         if n:
             self.calculate()
@@ -361,7 +301,7 @@ class ConsolePage:
     def calculate(self) -> None:
         """Run this step's job in its process, and show what it says."""
         step, scan = self.step, self._scan_of(self.step)
-        _put(self._bar, 0.0)
+        put(self._bar, 0.0)
         self._busy(f"{BY_NAME[step].title}: calculating ...")
         try:
             self.worker.run(
@@ -374,12 +314,12 @@ class ConsolePage:
         self._show_stored()
 
     def _tell(self, event: ProgressEvent) -> None:
-        _put(self._bar, 100.0 * event.done / max(event.total, 1))
+        put(self._bar, 100.0 * event.done / max(event.total, 1))
         words = f"{event.stage.capitalize()}: {event.done} of {event.total}"
-        self._working.content = _padded(paragraph(words, MUTED))
+        self._working.content = padded(paragraph(words, MUTED))
 
     def _busy(self, words: str) -> None:
-        self._working.content = _padded(paragraph(words, MUTED))
+        self._working.content = padded(paragraph(words, MUTED))
         for handle in (self._working, self._bar, self._cancel):
             handle.visible = bool(words)
         self._calculate.disabled = bool(words)
@@ -387,7 +327,7 @@ class ConsolePage:
     def _open_chosen(self) -> None:
         chosen = self._session_list.value
         if self.live is not None or self.worker.is_busy:
-            self._problem = "Finish the scan or the calculation first."
+            self.controls.problem = "Finish the scan or the calculation first."
             return
         if chosen != self._name():
             self.journey = self._opened(self.journey.folder.resolve().parent / chosen)
@@ -403,6 +343,18 @@ class ConsolePage:
             )
         return self.bench
 
+    def _look(self) -> Exposure | None:
+        """What a camera sees while something is put before it to be taken."""
+        step = BY_NAME[self.step]
+        if self.bench is None or step.filling in ("motion", "nothing"):
+            return None
+        if self.worker.is_busy or not self._take.visible or not self._lock.acquire(blocking=False):
+            return None
+        try:
+            return self.bench.look(self.step, self.journey.n_taken(self.step))
+        finally:
+            self._lock.release()
+
     def _scan_of(self, step: StepName) -> str:
         return self.scan if step in OF_A_SCAN else ""
 
@@ -415,12 +367,12 @@ class ConsolePage:
         step = BY_NAME[self.step]
         state = self.journey.state(self.step, self._scan_of(self.step))
         with self.server.atomic():
-            self._head.content = _padded(self._overview())
+            self._head.content = padded(self._overview())
             if self._choice.value != step.title:
-                _put(self._choice, step.title)
-            self._guide.content = _padded(self._instruction(state))
+                put(self._choice, step.title)
+            self._guide.content = padded(self._instruction(state))
             self._arrange(state)
-            self._note.content = _padded(self._told(state))
+            self._note.content = padded(self._told(state))
             known = tuple(one.name for one in sessions_in(self.journey.folder.resolve().parent))
             self._session_list.options = known or (self._name(),)
 
@@ -434,11 +386,13 @@ class ConsolePage:
         self._take.visible = is_taken and has_rig and not is_full and not is_blocked
         is_twin = self.bench is not None and self.bench.is_simulated
         self._take_all.visible = self._take.visible and is_twin
+        self._take_back.visible = is_taken and state.n_taken > 0 and has_rig
         self._start_over.visible = is_taken and state.n_taken > 0
-        self._start.visible = is_motion and has_rig and not is_blocked
-        self._start.label = self._start_label()
-        for handle in (self._undo, self._clear, self._finish, self._range, self._facts):
-            handle.visible = is_motion and is_live
+        self.scanning.arrange(
+            is_motion=is_motion,
+            can_start=is_motion and has_rig and not is_blocked,
+            is_again=self.step is StepName.SCAN and bool(self.journey.scans),
+        )
         is_inspection = self.step is StepName.INSPECT
         self._compare.visible = is_inspection
         is_cad = is_inspection and self._compare.value == INSPECTIONS[0]
@@ -448,7 +402,7 @@ class ConsolePage:
         if self.journey.scans:
             self._scan_choice.options = self.journey.scans
             if self.scan in self.journey.scans:
-                _put(self._scan_choice, self.scan)
+                put(self._scan_choice, self.scan)
         now = self.journey.settings
         known: tuple[tuple[Any, object], ...] = (
             (self._target, now.target),
@@ -458,7 +412,7 @@ class ConsolePage:
         )
         for field, value in known:
             if field.value != value:
-                _put(field, value)
+                put(field, value)
         self._target.visible = self.step in (StepName.CAMERA, StepName.LASER)
         uses_ball = is_inspection and self._compare.value == "ball"
         self._ball.visible = (self.step is StepName.CHECK or uses_ball) and not is_live
@@ -469,12 +423,6 @@ class ConsolePage:
         is_settled = state.status in ("good", "doubtful")
         self._calculate.color = "gray" if is_settled else "teal"
         self._next.visible = is_settled and not is_live and self.step is not StepName.INSPECT
-
-    def _start_label(self) -> str:
-        if self.live is None:
-            again = self.step is StepName.SCAN and self.journey.scans
-            return "Start a new scan (S)" if again else "Start (S)"
-        return "Pause (S)" if self.live.snapshot.state == "scanning" else "Go on (S)"
 
     def _overview(self) -> str:
         rows = []
@@ -519,10 +467,13 @@ class ConsolePage:
             return body + paragraph(f"{state.why}.", ALERT)
         if step.filling not in ("placements", "touches"):
             return body
+        body += paragraph(self._lacking(), ALERT)
         wanted = self._n_wanted()
         n, kind = state.n_taken, "Touch" if step.filling == "touches" else "Placement"
         if n >= wanted:
             return body + paragraph(f"All {wanted} are taken.", GOOD)
+        if self._seen is not None:
+            body += paragraph(self._seen[1], GOOD if self._seen[0] else WRONG)
         shown = self._placement(n)
         enough = f" At least {step.least} are needed." if n < step.least else ""
         is_twin = self.bench is not None and self.bench.is_simulated
@@ -534,39 +485,40 @@ class ConsolePage:
             + paragraph(own, MUTED, 12)
         )
 
+    def _lacking(self) -> str:
+        """What the operator has to tell before this step makes sense; empty for nothing."""
+        needs_target = self.step in (StepName.CAMERA, StepName.LASER)
+        if needs_target and not self.journey.settings.target:
+            return (
+                "Write into 'Target' which one you hold, for example chessboard:9x6:10 for 9 by 6 "
+                "inner corners 10 mm apart."
+            )
+        is_real = self.bench is not None and not self.bench.is_simulated
+        if self.step is StepName.PROBING and is_real:
+            place = self.journey.folder / PROBE_FILE
+            if not place.is_file():
+                return f"Write first where the tip of the probe is, into {place}: see the how-to."
+        return ""
+
     def _placement(self, k: int) -> Placement:
         known = BY_NAME[self.step].placements
         return known[k % len(known)]
 
     def _told(self, state: StepState) -> str:
-        problem = paragraph(self._problem, "#b3261e") if self._problem else ""
+        problem = paragraph(self.controls.problem, WRONG) if self.controls.problem else ""
         if state.result is None or self.live is not None:
             return problem
         return problem + result_card(state, self._link(state.result.page, "All about it"))
 
-    def _redraw(self) -> None:
-        self._version = -1
-        if self._shown is not None:
-            by = self._colour.value
-            self._legend.content = _padded(
-                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
-            )
-
     def _show_stored(self) -> None:
         """The points that belong to this step."""
-        self._shown = None
+        shown = None
         if self.step in OF_A_SCAN and self.scan:
             try:
-                self._shown = self._stored_points()
+                shown = self._stored_points()
             except ArmscanError as error:
-                self._problem = str(error)
-        self.view.forget_view()
-        if self._shown is not None and self._shown.deviation_mm is not None:
-            _put(self._colour, "deviation")
-        if self._shown is None:
-            self.view.clear()
-            self._legend.content = _padded(paragraph("no points yet", MUTED, 12))
-        self._redraw()
+                self.controls.problem = str(error)
+        self.points.show(shown)
 
     def _stored_points(self) -> ShownPoints | None:
         compared = self.journey.folder / f"{self.scan}-cad.ply"
@@ -581,91 +533,6 @@ class ConsolePage:
             )
         path = self.journey.cloud_file(self.scan)
         return shown_points(read_cloud(path)) if path.is_file() else None
-
-    # while scanning
-
-    def _keep_fresh(self) -> None:
-        while not self._closing.wait(REFRESH_S):
-            live = self.live
-            if live is not None:
-                try:
-                    self._show_live(live)
-                except Exception as error:  # the page goes on showing what it can
-                    self._problem = told(error)
-
-    def _show_live(self, live: LiveScan) -> None:
-        shown = live.snapshot
-        self._hear(live)
-        sensor = None if self._scanner is None else self._scanner.sensor
-        if sensor is not None:
-            names = tuple(one.name for one in sensor.sheets)
-            handles = (self._picture, self._second)
-            for handle, view, camera in zip(handles, shown.cameras, live.rig.cameras, strict=False):
-                handle.image = live_image(view, names, camera.setup.window)
-                handle.visible = True
-            self._range.content = _padded(range_bar(shown.range_mm, *depths_mm(sensor)))
-        self._facts.content = _padded(self._live_facts(live, shown))
-        self._start.label = self._start_label()
-        is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
-        if shown.cloud_version != self._version and is_due:
-            self._version, self._drawn_at = shown.cloud_version, time.monotonic()
-            cloud = live.session.cloud()
-            self._shown = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm)
-            by = self._colour.value
-            self._legend.content = _padded(
-                paragraph(self.view.show(self._shown, by, DETAILS[self._detail.value]), MUTED, 12)
-            )
-            self.view.show_head(shown.base_from_tool, self._scanner)
-
-    def _hear(self, live: LiveScan) -> None:
-        while live.events:
-            event = live.events.popleft()
-            if event.kind == "button" and event.text == START_BUTTON:
-                self._tried(self.start_or_pause)
-            elif event.kind == "button" and event.text == UNDO_BUTTON:
-                self._tried(self.undo)
-            elif event.kind in ("fault", "warning"):
-                self._problem = event.text
-                self.refresh()
-            elif event.kind == "recovered":
-                self._problem = ""
-                self.refresh()
-
-    def _live_facts(self, live: LiveScan, shown: LiveSnapshot) -> str:
-        drift = live.drift_mm()
-        late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
-        lines = [
-            f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
-            f"{shown.n_passes} passes, {shown.n_points:,} points",
-            "passes do not meet yet"
-            if drift is None
-            else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
-        ]
-        still = shown.counts.get(LiveStatus.STILL, 0)
-        lines += [f"{still} dropped while the hand was still"] if still else []
-        lost = [
-            f"{n} {status.value}"
-            for status, n in shown.counts.items()
-            if status not in (LiveStatus.PLACED, LiveStatus.STILL)
-        ]
-        lines += [", ".join(lost)] if lost else []
-        if live.bench.is_over:
-            lines.append("the simulated hand has come to its end: finish")
-        return "".join(paragraph(line, INK, 13) for line in lines)
-
-
-def _padded(content: str) -> str:
-    """HTML as far from the column's edges as the controls."""
-    return f'<div style="padding:2px 10px">{content}</div>'
-
-
-def _put(handle: Any, value: object) -> None:
-    """Show a value; typed anew, for the library types values as what a person changes."""
-    handle.value = value
-
-
-def _is_usable(button: viser.GuiButtonHandle) -> bool:
-    return bool(button.visible) and not button.disabled
 
 
 def result_card(state: StepState, link: str) -> str:

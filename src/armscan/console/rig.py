@@ -5,6 +5,7 @@ or a scan while the hand moves.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -16,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from armscan.console.journey import SessionSettings, StepName
+from armscan.console.journey import BY_NAME, SessionSettings, StepName
 from armscan.console.scan import ArmReading, Bench, GrowingRecording, samples_of
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
@@ -46,7 +47,8 @@ from armscan.storage.arm import (
     read_probe_tip,
 )
 from armscan.storage.files import write_files
-from armscan.storage.recording import read_arm_track
+from armscan.storage.image_paths import are_simulated
+from armscan.storage.recording import read_arm_track, read_recording
 from armscan.storage.recording_session import SESSION_FILE, session_toml
 from armscan.storage.tables import csv_bytes
 
@@ -115,7 +117,8 @@ class _Hand:
             ids = arm.trigger_ids
             trigger = None if ids is None or ids[k] == NO_TRIGGER else int(ids[k])
             pose = arm.pose(k) if arm.is_known[k] else None
-            found.append(ArmSample(k, int(arm.t_ns[k]), now, pose, trigger_id=trigger))
+            joints = None if arm.joints_rad is None else arm.joints_rad[k]
+            found.append(ArmSample(k, int(arm.t_ns[k]), now, pose, joints, trigger_id=trigger))
         self._sample = max(stop, self._sample)
         if not found:
             time.sleep(min(timeout_s, 0.01))
@@ -201,6 +204,8 @@ class TwinBench:
         self._n_cameras = len(self.twin.scan("camera").session.cameras)
         self._sources: dict[str, ScanSource] = {}
         self._hand: _Hand | None = None
+        self._shot: tuple[TwinScene, int, Exposure] | None = None
+        self._seen: tuple[StepName, int] | None = None
         self.scan_source(self.scene)
 
     @property
@@ -240,8 +245,8 @@ class TwinBench:
 
     def take(self, step: StepName, folder: Path, k: int) -> Exposure | None:
         """As of `Bench`."""
-        source = self.scan_source(TAKEN_SCENES[step])
-        views = self._views(TAKEN_SCENES[step])
+        scene = TAKEN_SCENES[step]
+        source, views = self.scan_source(scene), self._views(scene)
         if k >= len(views):
             raise DeviceError(
                 "the simulated operator has shown all placements", remedy="calculate now"
@@ -249,7 +254,7 @@ class TwinBench:
         grown = GrowingRecording.of(folder, _session(source))
         shown = None
         for row in views[k]:
-            shot = source.exposure(row)
+            shot = self._rendered(scene, row)
             shown = shot if shown is None or shot.lasers else shown
             grown.add(source.rows[row], shot)
         if source.arm is not None:
@@ -259,6 +264,27 @@ class TwinBench:
                     grown.add_sample(t_ns, pose, trigger)
         grown.flush()
         return shown
+
+    def look(self, step: StepName, k: int) -> Exposure | None:
+        """As of `Bench`: what the simulated operator holds for the next take."""
+        if step not in TAKEN_SCENES or self._seen == (step, k):
+            return None
+        self._seen = step, k
+        scene = TAKEN_SCENES[step]
+        rows, source = self._views(scene), self.scan_source(scene)
+        if k >= len(rows):
+            return None
+        lit = [row for row in rows[k] if source.rows[row].lasers]
+        return self._rendered(scene, (lit or rows[k])[0])
+
+    def _rendered(self, scene: TwinScene, row: int) -> Exposure:
+        """An image of a scene; the latest is kept, for it is looked at before it is taken."""
+        kept = self._shot
+        if kept is not None and kept[:2] == (scene, row):
+            return kept[2]
+        shot = self.scan_source(scene).exposure(row)
+        self._shot = scene, row, shot
+        return shot
 
     def touch(self, folder: Path, k: int) -> None:
         """As of `Bench`."""
@@ -337,11 +363,11 @@ def _whole(values: dict[str, str], key: str, default: int) -> int:
 
 
 class _Latest:
-    """Keeps the latest instant; see `armscan.pipeline.live.acquire.Recorder`."""
+    """Keeps what came last; see `armscan.pipeline.live.acquire.Recorder`."""
 
     def __init__(self) -> None:
-        self.instants: deque[MatchedInstant] = deque(maxlen=64)
-        self.samples: deque[TimedSample] = deque(maxlen=4096)
+        self.instants: deque[MatchedInstant] = deque(maxlen=8)
+        self.samples: deque[TimedSample] = deque(maxlen=64)
 
     def add_frame(self, camera: int, frame: Frame, status: ElementStatus) -> None:
         """Instants hold the frames."""
@@ -373,6 +399,8 @@ class DeviceBench:
         self.rig, self.name = rig, name
         self.n_placements: dict[StepName, int] = {}
         self.is_over = self.is_simulated = False
+        self._lock = threading.RLock()
+        self._watched: tuple[LiveSession, _Latest] | None = None
 
     @property
     def settings(self) -> SessionSettings:
@@ -415,45 +443,61 @@ class DeviceBench:
         tip = read_probe_tip(folder.parents[1] / PROBE_FILE)
         if self.rig.arm is None:
             raise DeviceError("the rig has no arm", remedy="name it in rig.toml")
-        self.rig.arm.start()
-        try:
-            end = time.monotonic() + WAIT_S
-            found: tuple[ArmSample, ...] = ()
-            while not found and time.monotonic() < end:
-                found = tuple(one for one in self.rig.arm.read(0.1) if one.pose is not None)
-        finally:
-            self.rig.arm.stop()
-        if not found:
-            raise DeviceError("the arm gives no pose", remedy="reference it")
+        latest = self._watch()
+        latest.samples.clear()
+        end = time.monotonic() + WAIT_S
+        while not (found := [one for one in tuple(latest.samples) if one.pose is not None]):
+            if time.monotonic() > end:
+                raise DeviceError("the arm gives no pose", remedy="reference it")
+            time.sleep(0.01)
         before: list[ArmReading] = []
         with suppress(FileFormatError):
             before = list(samples_of(read_arm_track(folder)[0]))
-        t_ns = max(found[-1].t_host_ns, before[-1][0] + 1 if before else 0)
+        t_ns = max(found[-1].sample.t_host_ns, before[-1][0] + 1 if before else 0)
         _write_touches(folder, [*before, (t_ns, found[-1].pose, -1)], tip, is_simulated=False)
+
+    def look(self, step: StepName, k: int) -> Exposure | None:
+        """As of `Bench`: the latest image of the first camera."""
+        instants = tuple(self._watch().instants)
+        frames = [one.frames[0] for one in instants if one.frames[0] is not None]
+        if not frames:
+            return None
+        return exposure_of(frames[-1], self.rig.cameras[0].setup, instants[-1])
+
+    def _watch(self) -> _Latest:
+        """What comes while targets and head are put right; nothing of it is recorded."""
+        with self._lock:
+            if self._watched is None:
+                latest = _Latest()
+                session = LiveSession(self.rig, recorder=latest)
+                session.start()
+                self._watched = session, latest
+            return self._watched[1]
+
+    def _rest(self) -> None:
+        with self._lock:
+            if self._watched is not None:
+                self._watched[0].stop()
+            self._watched = None
 
     def _instants(
         self, states: Sequence[tuple[str, ...]], step: StepName
     ) -> Iterator[MatchedInstant]:
         """One complete instant of each state of the lasers."""
-        latest = _Latest()
-        session = LiveSession(self.rig, recorder=latest)
-        session.start()
-        try:
-            for state in states:
-                if self.rig.lasers is not None:
-                    self.rig.lasers.set_next(state)
-                latest.instants.clear()
-                end = time.monotonic() + WAIT_S
-                while (one := self._complete(latest, state, step)) is None:
-                    if time.monotonic() > end:
-                        raise DeviceError(
-                            f"no complete image came within {WAIT_S:g} s",
-                            remedy="check camera, trigger and arm in the list of devices",
-                        )
-                    time.sleep(0.01)
-                yield one
-        finally:
-            session.stop()
+        latest = self._watch()
+        for state in states:
+            if self.rig.lasers is not None:
+                self.rig.lasers.set_next(state)
+            latest.instants.clear()
+            end = time.monotonic() + WAIT_S
+            while (one := self._complete(latest, state, step)) is None:
+                if time.monotonic() > end:
+                    raise DeviceError(
+                        f"no complete image came within {WAIT_S:g} s",
+                        remedy="check camera, trigger and arm in the list of devices",
+                    )
+                time.sleep(0.01)
+            yield one
 
     def _complete(
         self, latest: _Latest, state: tuple[str, ...], step: StepName
@@ -468,6 +512,7 @@ class DeviceBench:
 
     def scan_rig(self, step: StepName) -> Rig:
         """As of `Bench`."""
+        self._rest()
         return self.rig
 
     def hold(self, is_held: bool) -> None:
@@ -475,7 +520,30 @@ class DeviceBench:
 
     def close(self) -> None:
         """As of `Bench`."""
+        self._rest()
         self.rig.close()
+
+
+def take_back(step: StepName, folder: Path) -> None:
+    """Take the latest placement or touch out of a step's recording.
+
+    Raises
+    ------
+    ArmscanError
+        If the recording is damaged, or cannot be written.
+    """
+    if BY_NAME[step].filling != "touches":
+        grown = GrowingRecording.of(folder, read_recording(folder).session)
+        grown.take_back()
+        grown.flush()
+        return
+    track = read_arm_track(folder)[0]
+    is_simulated = are_simulated([folder / ARM_FILE])
+    left = list(samples_of(track))[:-1]
+    if left:
+        _write_touches(folder, left, read_probe_tip(folder / PROBE_FILE), is_simulated=is_simulated)
+    else:
+        (folder / ARM_FILE).unlink()
 
 
 def _later(grown: GrowingRecording, instant: MatchedInstant) -> int:

@@ -14,18 +14,25 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from armscan.console.journey import SessionSettings, StepName
+from armscan.console.quality import Incidence, passes_apart_mm
 from armscan.devices.clocks import ElementStatus
 from armscan.devices.matching import MatchedInstant, TimedSample, arm_track
 from armscan.devices.protocols import Frame, LaserEvent
-from armscan.geometry.arrays import BoolArray, FloatArray
+from armscan.geometry.arrays import FloatArray
 from armscan.geometry.poses import Base, Pose, Tool
+from armscan.models.arm import axis_frames
 from armscan.models.calibration import ScannerCalibration
 from armscan.pipeline.live.acquire import LiveEvent
 from armscan.pipeline.live.rig import Rig
-from armscan.pipeline.live.session import LiveSession, LiveSnapshot, ShownCloud, exposure_of
+from armscan.pipeline.live.session import (
+    LiveOptions,
+    LiveSession,
+    LiveSnapshot,
+    ShownCloud,
+    exposure_of,
+)
 from armscan.records.cloud import PointCloud
 from armscan.records.exposure import Exposure
 from armscan.records.recording import NO_TRIGGER, ArmTrack, ExposureRow, Session
@@ -96,6 +103,15 @@ class GrowingRecording:
         write_files({path: content}, is_overwriting=True)
         self.rows.append(row)
 
+    def take_back(self) -> None:
+        """Take the latest view out of the list, and samples of the arm that came after the rest."""
+        views = [row.t_ns if row.view is None else row.view for row in self.rows]
+        self.leave_out(
+            [row for row, view in zip(self.rows, views, strict=True) if view == views[-1]]
+        )
+        until = max((row.t_ns for row in self.rows), default=-1)
+        self.samples = [one for one in self.samples if one[0] <= until]
+
     def add_sample(self, t_ns: int, pose: Pose[Base, Tool] | None, trigger_id: int | None) -> None:
         """Keep a sample of the arm; one that is not later than the last is passed over."""
         if not self.samples or t_ns > self.samples[-1][0]:
@@ -160,6 +176,15 @@ class Bench(Protocol):
     def touch(self, folder: Path, k: int) -> None:
         """Record touch ``k``; raises as `take`."""
 
+    def look(self, step: StepName, k: int) -> Exposure | None:
+        """What a camera sees now, before placement ``k`` is taken; None if there is nothing new.
+
+        Raises
+        ------
+        ArmscanError
+            If a device does not open.
+        """
+
     def scan_rig(self, step: StepName) -> Rig:
         """Opened devices for a scan, with the thing that the step is about before them."""
 
@@ -193,6 +218,9 @@ class ScanRecorder:
         # one clock for all where ids decide nothing: the times are then this computer's
         session = Session("scan", tuple(self.setups), is_simulated=is_simulated)
         self.grown = GrowingRecording.of(folder, session)
+        self.pose_of: dict[int, Pose[Base, Tool] | None] = {}
+        """By number of the frame."""
+        self.latest_joints_rad: FloatArray | None = None
         self._rows_of: dict[int, list[ExposureRow]] = {}
         self._lock = threading.Lock()
         self._written = time.monotonic()
@@ -207,6 +235,8 @@ class ScanRecorder:
         """Keep those that have a time."""
         with self._lock:
             for one in samples:
+                if one.sample.joints_rad is not None:
+                    self.latest_joints_rad = one.sample.joints_rad
                 t_ns = one.sample.t_device_ns if self.is_triggered else one.t_ns
                 if t_ns is not None:
                     self.grown.add_sample(t_ns, one.pose, one.sample.trigger_id)
@@ -231,6 +261,7 @@ class ScanRecorder:
                 )
                 shot = exposure_of(frame, self.setups[camera], instant, camera)
                 self.grown.add(row, shot)
+                self.pose_of[frame.number] = instant.pose
                 self._rows_of.setdefault(frame.number, []).append(row)
             if time.monotonic() - self._written > TABLES_EVERY_S:
                 self._written = time.monotonic()
@@ -254,11 +285,6 @@ class ScanRecorder:
             self.grown.flush()
 
 
-DRIFT_MM = 1.5
-"""Points of an earlier pass within this distance carry the comparison of passes."""
-LEAST_SHARED = 60
-
-
 class LiveScan:
     """One scan of a session: the live session, its recording, and what a page shows of them.
 
@@ -279,13 +305,19 @@ class LiveScan:
     ) -> None:
         self.bench, self.step, self.folder = bench, step, folder
         self.rig = bench.scan_rig(step)
-        is_simulated = bench.is_simulated
-        self.recorder = ScanRecorder(folder, self.rig, is_simulated=is_simulated)
+        self.recorder = ScanRecorder(folder, self.rig, is_simulated=bench.is_simulated)
         self.events: deque[LiveEvent] = deque(maxlen=50)
+        self._scanner = scanner
         self._frame_of: dict[int, int] = {}
         self._starts: list[int] = []
+        self._incidence = Incidence()
+        self._drift: tuple[int, float | None] = -1, None
         self.session = LiveSession(
-            self.rig, scanner, recorder=self.recorder, keep_cloud=self._remember
+            self.rig,
+            scanner,
+            options=LiveOptions.of(self.rig.description),
+            recorder=self.recorder,
+            keep_cloud=self._remember,
         )
         self.session.add_listener(self._hear)
 
@@ -334,12 +366,30 @@ class LiveScan:
 
         None where they do not.
         """
-        cloud = self.session.cloud()
-        last = self._is_of_last_pass(cloud)
-        return passes_apart_mm(cloud.points_mm[~last], cloud.points_mm[last])
+        version = self.snapshot.cloud_version
+        if self._drift[0] != version:
+            cloud = self.session.cloud()
+            last = cloud.exposure >= (self._starts[-1] if self._starts else 0)
+            self._drift = version, passes_apart_mm(cloud.points_mm[~last], cloud.points_mm[last])
+        return self._drift[1]
 
-    def _is_of_last_pass(self, cloud: ShownCloud) -> BoolArray:
-        return np.asarray(cloud.exposure >= (self._starts[-1] if self._starts else 0))
+    def incidence_deg(self, cloud: ShownCloud) -> FloatArray:
+        """(N,) angle between surface and line of sight; nan where it is not known."""
+        hand_eye = None if self._scanner is None else self._scanner.hand_eye
+        seen_from: dict[int, FloatArray] = {}
+        for number in np.unique(cloud.exposure).tolist():
+            pose = self.recorder.pose_of.get(self._frame_of.get(number, -1))
+            if pose is not None and hand_eye is not None:
+                seen_from[number] = (pose @ hand_eye.tool_from_sensor).translation_mm
+        return self._incidence.angles_deg(cloud, seen_from)
+
+    def arm_mm(self, base_from_tool: Pose[Base, Tool]) -> FloatArray:
+        """(K, 3) from the arm's base along its axes to the tool; where they are not known, two."""
+        joints, model = self.recorder.latest_joints_rad, self.rig.arm_model
+        ends = [np.zeros(3), base_from_tool.translation_mm]
+        if joints is None or model is None or not np.isfinite(joints).all():
+            return np.array(ends)
+        return np.array([*axis_frames(model, joints).origins_mm[0], ends[1]])
 
     def _remember(self, number: int, cloud: PointCloud) -> None:
         """Which frame an instant is, and with which instant a pass begins."""
@@ -360,30 +410,3 @@ class LiveScan:
         )
         if not is_end:
             self.events.append(event)
-
-
-def passes_apart_mm(earlier_mm: FloatArray, latest_mm: FloatArray) -> float | None:
-    """Median signed distance of points (M, 3) from planes through their neighbours of (N, 3).
-
-    None where too few of them lie near each other. A pass that lies apart from an earlier one by
-    more than both scatter shows that arm, plate or scanner moved meanwhile.
-    """
-    if len(earlier_mm) < LEAST_SHARED or len(latest_mm) < LEAST_SHARED:
-        return None
-    step = max(1, len(latest_mm) // 2000)
-    chosen = latest_mm[::step]
-    distance, near = cKDTree(earlier_mm).query(chosen, k=12)
-    met: BoolArray = np.asarray(distance)[:, 7] < DRIFT_MM
-    if met.sum() < LEAST_SHARED // 4:
-        return None
-    neighbours = earlier_mm[np.asarray(near)[met]]
-    middle = neighbours.mean(axis=1)
-    spread = np.einsum("nki,nkj->nij", neighbours - middle[:, None], neighbours - middle[:, None])
-    values, vectors = np.linalg.eigh(spread)
-    is_flat = values[:, 1] > 25.0 * np.maximum(values[:, 0], 1e-9)
-    if is_flat.sum() < LEAST_SHARED // 4:
-        return None
-    normals = vectors[is_flat, :, 0]
-    apart = np.einsum("ni,ni->n", chosen[met][is_flat] - middle[is_flat], normals)
-    # normals have no common side on an open surface: what counts is how far, not where to
-    return float(np.median(np.abs(apart)))

@@ -15,6 +15,7 @@ import viser
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from armscan.console.quality import coverage
 from armscan.geometry.arrays import FloatArray, IntArray
 from armscan.geometry.poses import Base, Pose, Tool
 from armscan.models.calibration import ScannerCalibration, SensorCalibration
@@ -37,6 +38,7 @@ GROWN = 1.6
 """The view follows points that have spread by more than this since it was turned to them, or
 whose middle has gone half as far aside."""
 IMAGE_WIDTH = 640
+UNKNOWN = np.array([150, 150, 150])
 STEEP_DEG = 60.0
 """Lines seen at a steeper angle scatter; colours of incidence end here."""
 
@@ -97,17 +99,18 @@ def point_colours(shown: ShownPoints, by: ColourBy) -> tuple[Colours, str]:
         text = f"sigma from {low:.4f} mm (dark) to {high:.4f} mm (yellow)"
         return ramp_colours(shown.sigma_mm, low, high), text
     if by == "incidence" and shown.incidence_deg is not None:
-        text = f"seen square on (dark) to {STEEP_DEG:.0f}° or more aslant (yellow)"
-        return ramp_colours(shown.incidence_deg, 0.0, STEEP_DEG), text
+        text = f"seen square on (dark) to {STEEP_DEG:.0f}° or more aslant (yellow); grey: not known"
+        is_known = np.isfinite(shown.incidence_deg)
+        colours = ramp_colours(np.where(is_known, shown.incidence_deg, 0.0), 0.0, STEEP_DEG)
+        return np.where(is_known[:, None], colours, UNKNOWN).astype(np.uint8), text
     if by == "deviation" and shown.deviation_mm is not None:
         return _deviations(shown.deviation_mm, shown.limit_mm), (
             f"blue: {shown.limit_mm:g} mm too low, white: as the model, "
-            f"red: {shown.limit_mm:g} mm too high"
+            f"red: {shown.limit_mm:g} mm too high; grey: not of the part"
         )
     if by == "coverage" and len(shown.points_mm):
-        cells = np.floor(shown.points_mm / COVERED_MM).astype(np.int64)
-        _, place, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        share = np.clip(count[place.ravel()] / WELL_COVERED, 0.0, 1.0)[:, None]
+        count = coverage(shown.points_mm, COVERED_MM)
+        share = np.clip(count / WELL_COVERED, 0.0, 1.0)[:, None]
         thin, well = np.array(rgb(ALERT)), np.array([91, 140, 42])
         text = f"orange: few points in {COVERED_MM:g} mm, green: {WELL_COVERED} or more"
         return np.asarray(thin + share * (well - thin)).astype(np.uint8), text
@@ -117,10 +120,12 @@ def point_colours(shown: ShownPoints, by: ColourBy) -> tuple[Colours, str]:
 
 
 def _deviations(deviation_mm: FloatArray, limit_mm: float) -> Colours:
-    share = np.clip(deviation_mm / limit_mm, -1.0, 1.0)[:, None]
+    is_known = np.isfinite(deviation_mm)[:, None]
+    share = np.clip(np.nan_to_num(deviation_mm) / limit_mm, -1.0, 1.0)[:, None]
     low, middle, high = np.array([33, 102, 172]), np.array([240, 240, 240]), np.array([178, 24, 43])
     end = np.where(share < 0.0, low, high)
-    return np.asarray(middle + np.abs(share) * (end - middle)).astype(np.uint8)
+    colours = middle + np.abs(share) * (end - middle)
+    return np.where(is_known, colours, UNKNOWN).astype(np.uint8)
 
 
 def thinned(n: int, most: int = MOST_POINTS) -> slice:
@@ -195,8 +200,23 @@ class SceneView:
         """The next points decide where the view looks."""
         self._has_view = False
 
-    def show_head(self, pose: Pose[Base, Tool] | None, scanner: ScannerCalibration | None) -> None:
-        """Draw the head where it is, with its light sheets and the line to the arm's base."""
+    def show_head(
+        self,
+        pose: Pose[Base, Tool] | None,
+        scanner: ScannerCalibration | None,
+        arm_mm: FloatArray | None = None,
+    ) -> None:
+        """Draw the head where it is, with its light sheets, and the arm.
+
+        Parameters
+        ----------
+        pose
+            Of the tool; None to draw nothing.
+        scanner
+            What the head is.
+        arm_mm
+            (K, 3) from the arm's base along its axes to the tool; None for a straight line.
+        """
         with self._server.atomic():
             for handle in self._head:
                 handle.remove()
@@ -205,7 +225,9 @@ class SceneView:
                 return
             sensor = scanner.sensor
             base_from_sensor = pose @ scanner.hand_eye.tool_from_sensor
-            self._draw_arm(pose, base_from_sensor.translation_mm)
+            if arm_mm is None:
+                arm_mm = np.array([np.zeros(3), pose.translation_mm])
+            self._draw_arm(np.vstack([arm_mm, base_from_sensor.translation_mm]) / UNIT_MM)
             wxyz, place = _placed(base_from_sensor)
             camera = sensor.camera.camera
             fov = 2.0 * np.arctan(0.5 * camera.height_px / camera.matrix[1, 1])
@@ -238,18 +260,23 @@ class SceneView:
                     )
                 )
 
-    def _draw_arm(self, pose: Pose[Base, Tool], sensor_mm: FloatArray) -> None:
-        """Without a model of its links, the arm is the line from Base to Tool to the head."""
-        joints = np.array([[0.0, 0.0, 0.0], pose.translation_mm, sensor_mm]) / UNIT_MM
+    def _draw_arm(self, joints: FloatArray) -> None:
+        """Base, links between the axes as far as they are known, head."""
         self._head.append(
             self._scene.add_line_segments(
                 "/head/arm",
                 np.stack([joints[:-1], joints[1:]], axis=1),
                 colors=np.array(rgb(MUTED), dtype=np.uint8),
-                thickness=3.0,
+                thickness=6.0,
                 thickness_units="screen",
             )
         )
+        for k, place in enumerate(joints[:-1]):
+            self._head.append(
+                self._scene.add_icosphere(
+                    f"/head/joint{k}", radius=0.12, color=rgb(INK), position=tuple(place.tolist())
+                )
+            )
         self._head.append(self._scene.add_frame("/head/base", axes_length=0.6, axes_radius=0.02))
 
 
@@ -351,5 +378,7 @@ def _small(image: NDArray[Any]) -> tuple[Colours, float]:
 
 
 def paragraph(text: str, colour: str = INK, size: int = 14) -> str:
-    """HTML of one paragraph of plain text."""
+    """HTML of one paragraph of plain text; empty for no text."""
+    if not text:
+        return ""
     return f'<p style="margin:4px 0;color:{colour};font-size:{size}px">{escape(text)}</p>'

@@ -46,16 +46,21 @@ from armscan.jobs.sheets import SheetImages, calibrate_sheets
 from armscan.jobs.stereo import calibrate_stereo
 from armscan.jobs.verify import Standard, verify
 from armscan.pipeline.progress import Progress, ProgressEvent, silent
+from armscan.pipeline.targets import find_targets
 from armscan.report.page import Block, Facts, Links, Page, Section, footer, render_page
 from armscan.report.quantity import Summary, fact, sentence
 from armscan.storage.arm import ARM_FILE
 from armscan.storage.documents import new_provenance
 from armscan.storage.files import write_files
 from armscan.storage.image_paths import are_simulated
+from armscan.storage.recording import read_recording
 from armscan.storage.recording_session import EXPOSURES_FILE
+from armscan.vision.stripe.extract import extract_stripes
+from armscan.vision.targets.target import parse_target
 
 Result = TypeVar("Result")
-LEAST_APART_S = 0.05
+LEAST_LINE = 50
+"""A laser line of fewer points crosses the target or the plate hardly at all."""
 
 
 class WorkCancelledError(ArmscanError):
@@ -248,6 +253,44 @@ def run_step(
     write_files({place: json.dumps(asdict(result), indent=1).encode()}, is_overwriting=True)
     write_report(journey)
     return result
+
+
+def seen_in_take(folder: Path, step: StepName, progress: Progress = silent) -> tuple[bool, str]:
+    """Whether what was taken last is of use, and what is seen in it, in words.
+
+    Parameters
+    ----------
+    folder
+        The session.
+    step
+        Camera, light sheets or hand-eye.
+    progress
+        Not told.
+
+    Raises
+    ------
+    ArmscanError
+        If the recording or the target's specification is damaged.
+    """
+    journey = Journey(folder, read_settings(folder / SETTINGS_FILE))
+    source = read_recording(journey.recording(step))
+    views = [row.t_ns if row.view is None else row.view for row in source.rows]
+    rows = [k for k, view in enumerate(views) if view == views[-1]]
+    lit = [source.exposure(k) for k in rows if source.rows[k].lasers]
+    dark = [source.exposure(k) for k in rows if not source.rows[k].lasers]
+    seen, lacks = [], []
+    if step in (StepName.CAMERA, StepName.LASER):
+        found = find_targets(dark, parse_target(journey.settings.target))
+        seen += [f"{len(view.points_px)} points of the target" for view in found.views]
+        lacks += [reason for _, reason in found.not_found]
+    if step in (StepName.LASER, StepName.HAND_EYE):
+        n = [len(extract_stripes(one).points_px) for one in lit]
+        seen += [f"a laser line of {count} points" for count in n if count >= LEAST_LINE]
+        if not lit or min(n) < LEAST_LINE:
+            lacks.append("no laser line is seen: look at laser, exposure and distance")
+    if lacks:
+        return False, f"{sentence('; '.join(lacks))} Take it back and once more."
+    return True, f"Seen: {' and '.join(seen)}."
 
 
 def _inputs(journey: Journey, step: StepName, scan: str) -> list[Path]:

@@ -20,7 +20,7 @@ from armscan.console.journey import (
     open_journey,
     sessions_in,
 )
-from armscan.console.rig import open_bench
+from armscan.console.rig import open_bench, take_back
 from armscan.console.scan import GrowingRecording
 from armscan.console.work import run_step
 from armscan.errors import ArmscanError, FileFormatError, OptionError, OutputError
@@ -28,7 +28,7 @@ from armscan.geometry.poses import Pose
 from armscan.records.exposure import Exposure
 from armscan.records.recording import ArmTrack, CameraSetup, ExposureRow, Session
 from armscan.storage.arm import ProbeTip, write_probing
-from armscan.storage.recording import read_recording
+from armscan.storage.recording import read_arm_track, read_recording
 
 SETTINGS = SessionSettings(rig="twin:thesis-single?seed=1", target="chessboard:9x6:10", ball_mm=30)
 
@@ -85,6 +85,18 @@ def test_a_plate_is_probed_and_the_result_grows_old_with_another_touch(tmp_path:
     assert "old" in (journey.folder / "report.html").read_text() or run_step(
         journey.folder, StepName.PROBING
     )
+
+
+def test_the_last_touch_is_taken_back_and_at_last_the_first(tmp_path: Path) -> None:
+    journey = open_journey(tmp_path / "s", SETTINGS)
+    touch_plate(journey, 3)
+    before = read_arm_track(journey.recording(StepName.PROBING))[0].translations_mm
+    for n in (2, 1, 0):
+        take_back(StepName.PROBING, journey.recording(StepName.PROBING))
+        assert journey.n_taken(StepName.PROBING) == n
+        if n:
+            left = read_arm_track(journey.recording(StepName.PROBING))[0].translations_mm
+            np.testing.assert_allclose(left, before[:n], atol=1e-12)
 
 
 def test_a_refusal_is_a_result_with_its_sentence(tmp_path: Path) -> None:

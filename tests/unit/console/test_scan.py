@@ -24,8 +24,8 @@ from armscan.console.placements import (
     Placement,
     drawing,
 )
-from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera
-from armscan.console.scan import LiveScan, passes_apart_mm
+from armscan.console.rig import DeviceBench, _Hand, _HandArm, _HandCamera, take_back
+from armscan.console.scan import LiveScan
 from armscan.console.scene import ShownPoints, depths_mm, point_colours, range_bar, thinned
 from armscan.devices.sources import ScanSource
 from armscan.pipeline.live.rig import Rig, RigDescription
@@ -129,21 +129,14 @@ def test_devices_are_taken_from_one_placement_at_a_time(tmp_path: Path) -> None:
     found = read_recording(tmp_path / "r")
     assert [row.view for row in found.rows] == ["01", "01", "02", "02"]
     assert found.arm.is_known.all() and len(found.arm.t_ns) == 4
-
-
-@pytest.mark.parametrize("apart_mm", [0.0, 0.08, -0.08])
-def test_passes_that_lie_apart_are_noticed(apart_mm: float) -> None:
-    rng = np.random.default_rng(5)
-    first, second = (
-        np.column_stack([rng.uniform(0, 40, (4000, 2)), rng.normal(0, 0.005, 4000)])
-        for _ in range(2)
-    )
-    second[:, 2] += apart_mm
-    found = passes_apart_mm(first, second)
-    # median of |N(0, sqrt(1 + 1/12) 0.005)| where they agree
-    assert found == pytest.approx(max(abs(apart_mm), 0.0035), abs=0.002)
-    assert passes_apart_mm(first, second + np.array([0.0, 0.0, 50.0])) is None
-    assert passes_apart_mm(first[:10], second) is None
+    assert bench.look(StepName.HAND_EYE, 2) is not None
+    # what was taken last is taken back, and the next take goes on from there
+    take_back(StepName.HAND_EYE, tmp_path / "r")
+    found = read_recording(tmp_path / "r")
+    assert [row.view for row in found.rows] == ["01", "01"] and len(found.arm.t_ns) == 2
+    bench.take(StepName.HAND_EYE, tmp_path / "r", 1)
+    assert [row.view for row in read_recording(tmp_path / "r").rows] == ["01", "01", "02", "02"]
+    bench.close()
 
 
 @pytest.mark.parametrize("placement", [*CAMERA, *LASER, *HAND_EYE, *TOUCHES])

@@ -21,7 +21,7 @@ def console(
         typer.Argument(
             help="Folder of the session: new, empty, or one to go on with.", show_default=False
         ),
-    ] = Path("session"),
+    ],
     rig: Annotated[
         str | None,
         typer.Option(
@@ -31,13 +31,19 @@ def console(
         ),
     ] = None,
     port: Annotated[
-        int | None, typer.Option(help="Port of the page; another if it is taken.")
+        int | None,
+        typer.Option(help="Port of the page; 8270 or a free one unless said.", show_default=False),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="Address to listen at; any other than this asks for a token.")
-    ] = "127.0.0.1",
+        str | None,
+        typer.Option(
+            help="Address to listen at, 127.0.0.1 unless said; any other asks for a token.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Open the operator's console: a page in the browser from calibration to report."""
     from armscan.console.pages import run_console
 
-    run_console(folder, rig or "", host=host, port=port, tell=typer.echo)
+    where = {} if host is None else {"host": host}
+    run_console(folder, rig or "", port=port, tell=typer.echo, **where)

@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of the console's column that know no session: buttons with their keys, the points that are
+shown, and a scan while it runs.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Literal, cast
+
+import numpy as np
+import viser
+
+from armscan.console.quality import ModelWatch
+from armscan.console.scan import LiveScan
+from armscan.console.scene import (
+    COLOURED_BY,
+    MOST_POINTS,
+    SceneView,
+    ShownPoints,
+    depths_mm,
+    live_image,
+    paragraph,
+    range_bar,
+    taken_image,
+)
+from armscan.console.work import told
+from armscan.models.calibration import ScannerCalibration
+from armscan.pipeline.live.session import LiveSnapshot, LiveStatus
+from armscan.records.exposure import Exposure
+from armscan.report.drawing import ALERT, INK, MUTED
+
+REFRESH_S, CLOUD_EVERY_S = 0.3, 1.0
+DETAILS = {"up to 100,000": 100_000, "up to 500,000": 500_000, "up to 2 million": MOST_POINTS}
+DETAIL = "up to 500,000"
+"""Shown at first: a computer without graphics processor draws two million points once a second."""
+WINDOW_PX = 420.0
+START_BUTTON, UNDO_BUTTON = "0", "1"
+"""Buttons of the arm: start or pause, and take the last pass back."""
+
+
+class Controls:
+    """Buttons of a page, and what went wrong with the last one.
+
+    Parameters
+    ----------
+    server
+        Of the page.
+    refresh
+        Shows what became of a press.
+    """
+
+    def __init__(self, server: viser.ViserServer, refresh: Callable[[], None]) -> None:
+        self.gui = server.gui
+        self.refresh = refresh
+        self.problem = ""
+
+    def button(
+        self,
+        label: str,
+        work: Callable[[], object],
+        key: str,
+        hint: str,
+        colour: Literal["teal", "gray", "red"] = "gray",
+    ) -> viser.GuiButtonHandle:
+        """A button, and a key for it, that tell a failure as its sentence."""
+        named = f"{label} ({key})" if key else label
+        button = self.gui.add_button(named, hint=hint, color=colour)
+        button.on_click(lambda _: self.tried(work))
+        if key:
+            command = self.gui.add_command(label, hotkey=cast(Any, key), description=hint)
+            command.on_trigger(lambda _: self.tried(work) if _is_usable(button) else None)
+        return button
+
+    def tried(self, work: Callable[[], object]) -> None:
+        """Do what a button asks for."""
+        try:
+            self.problem = ""
+            work()
+        except Exception as error:  # every failure ends as a sentence on the page
+            self.problem = told(error)
+        self.refresh()
+
+
+class PointsPanel:
+    """Which points stand in space, how many of them, and what their colours mean.
+
+    Parameters
+    ----------
+    view
+        The space.
+    """
+
+    def __init__(self, view: SceneView) -> None:
+        self.view = view
+        self._shown: ShownPoints | None = None
+
+    def build(self, gui: viser.GuiApi) -> None:
+        """Add it to the column."""
+        with gui.add_folder("What is shown"):
+            self._colour = gui.add_dropdown("Colour by", COLOURED_BY)
+            self._colour.on_update(lambda _: self._redraw())
+            self._detail = gui.add_dropdown("Points", tuple(DETAILS), initial_value=DETAIL)
+            self._detail.on_update(lambda _: self._redraw())
+            self._legend = gui.add_html("")
+
+    @property
+    def colour(self) -> str:
+        """By what the points are coloured."""
+        return str(self._colour.value)
+
+    def show(self, shown: ShownPoints | None, *, is_new: bool = True) -> None:
+        """Show points in place of those before; new ones turn the view to themselves."""
+        if is_new:
+            self.view.forget_view()
+        self._shown = shown
+        if is_new and shown is not None and shown.deviation_mm is not None:
+            put(self._colour, "deviation")
+        if shown is None:
+            self.view.clear()
+            self._legend.content = padded(paragraph("no points yet", MUTED, 12))
+        self._redraw()
+
+    def _redraw(self) -> None:
+        if self._shown is not None:
+            text = self.view.show(self._shown, self._colour.value, DETAILS[self._detail.value])
+            self._legend.content = padded(paragraph(text, MUTED, 12))
+
+
+class ScanPanel:
+    """A scan while it runs: its buttons, images, range bar and figures.
+
+    Parameters
+    ----------
+    controls
+        Of the page.
+    points
+        Where the live cloud is shown.
+    finish
+        What ends a scan.
+    look
+        Gives what a camera sees now while no scan runs; None to leave what is shown.
+    """
+
+    def __init__(
+        self,
+        controls: Controls,
+        points: PointsPanel,
+        finish: Callable[[], object],
+        look: Callable[[], Exposure | None],
+    ) -> None:
+        self.live: LiveScan | None = None
+        self._look, self._model = look, cast(ModelWatch | None, None)
+        self._controls, self._points, self._finish_scan = controls, points, finish
+        self._scanner: ScannerCalibration | None = None
+        self._version, self._drawn_at = -1, 0.0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._keep_fresh, daemon=True)
+
+    def build(self, start: Callable[[], object]) -> None:
+        """Add buttons and range bar to the column, and begin to show what runs."""
+        self._range = self._controls.gui.add_html("", visible=False)
+        button = self._controls.button
+        self.start_button = button("Start", start, "S", "Begin, pause, go on", "teal")
+        self._undo = button("Undo last pass", self.undo, "U", "Take the last pass out")
+        self._clear = button("Clear", self.clear, "C", "Take all passes out of the scan")
+        self._finish = button(
+            "Finish", self._finish_scan, "F", "End the scan and calculate", "teal"
+        )
+        self._facts = self._controls.gui.add_html("", visible=False)
+        self._start = start
+
+    def build_pictures(self) -> None:
+        """Add the cameras' images, in a window of their own that can be moved."""
+        grey = np.full((8, 640, 3), 245, dtype=np.uint8)
+        gui = self._controls.gui
+        self._window = gui.add_panel(visible=False)
+        with self._window.add_tab("What the camera sees"):
+            self._pictures = [gui.add_image(grey, label=None, visible=False) for _ in range(2)]
+        self._window.float(x=12.0, y=12.0, width=WINDOW_PX)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End a scan, and show no more."""
+        self._closing.set()
+        if self.live is not None:
+            self.live.stop()
+        self._thread.join(5.0)
+
+    def begin(
+        self, live: LiveScan, scanner: ScannerCalibration, model: ModelWatch | None = None
+    ) -> None:
+        """Start a scan and show it, beside its model if there is one."""
+        self.live, self._scanner, self._model = live, scanner, model
+        self._version = -1
+        self._points.show(None)
+        live.start()
+
+    def end(self) -> int:
+        """End the scan; returns how many exposures it recorded, 0 where none runs."""
+        live, self.live = self.live, None
+        if live is None:
+            return 0
+        live.stop()
+        self._points.view.show_head(None, None)
+        return live.n_recorded
+
+    def undo(self) -> None:
+        """Take the last pass back."""
+        if self.live is not None:
+            self.live.undo_pass()
+
+    def clear(self) -> None:
+        """Take all passes back."""
+        if self.live is not None:
+            self.live.clear()
+
+    def arrange(self, *, is_motion: bool, can_start: bool, is_again: bool) -> None:
+        """Show the controls that a step has now."""
+        self.start_button.visible = can_start
+        self._label(is_again=is_again)
+        for handle in (self._undo, self._clear, self._finish, self._range, self._facts):
+            handle.visible = is_motion and self.live is not None
+
+    def show_image(self, exposure: Exposure | None) -> None:
+        """Show what a camera sees; None to show no image."""
+        if exposure is not None:
+            self._pictures[0].image = taken_image(exposure)
+        self._window.visible = self._pictures[0].visible = exposure is not None
+        self._pictures[1].visible = False
+
+    def _label(self, *, is_again: bool = False) -> None:
+        if self.live is None:
+            self.start_button.label = "Start a new scan (S)" if is_again else "Start (S)"
+        else:
+            runs = self.live.snapshot.state == "scanning"
+            self.start_button.label = "Pause (S)" if runs else "Go on (S)"
+
+    def _keep_fresh(self) -> None:
+        while not self._closing.wait(REFRESH_S):
+            try:
+                if (live := self.live) is not None:
+                    self._show(live)
+                elif (seen := self._look()) is not None:
+                    self.show_image(seen)
+            except Exception as error:  # the page goes on showing what it can
+                self._tell(told(error))
+
+    def _tell(self, problem: str) -> None:
+        if problem != self._controls.problem:
+            self._controls.problem = problem
+            self._controls.refresh()
+
+    def _show(self, live: LiveScan) -> None:
+        shown = live.snapshot
+        self._hear(live)
+        sensor = None if self._scanner is None else self._scanner.sensor
+        if sensor is not None:
+            names = tuple(one.name for one in sensor.sheets)
+            views = zip(self._pictures, shown.cameras, live.rig.cameras, strict=False)
+            for handle, view, camera in views:
+                handle.image = live_image(view, names, camera.setup.window)
+                self._window.visible = handle.visible = True
+            self._range.content = padded(range_bar(shown.range_mm, *depths_mm(sensor)))
+        self._facts.content = padded(_live_facts(live, shown, self._model))
+        self._label()
+        is_due = time.monotonic() - self._drawn_at > CLOUD_EVERY_S
+        if shown.cloud_version != self._version and is_due:
+            self._version = shown.cloud_version
+            self._points.show(self._points_of(live), is_new=False)
+            pose = shown.base_from_tool
+            arm_mm = None if pose is None else live.arm_mm(pose)
+            self._points.view.show_head(pose, self._scanner, arm_mm)
+            self._drawn_at = time.monotonic()
+
+    def _points_of(self, live: LiveScan) -> ShownPoints:
+        """The live cloud, with what its colours need."""
+        cloud, by = live.session.cloud(), self._points.colour
+        incidence = live.incidence_deg(cloud) if by == "incidence" else None
+        points = ShownPoints(cloud.points_mm, cloud.sheet, cloud.sigma_mm, incidence)
+        if by != "deviation" or self._model is None:
+            return points
+        # what was compared is a little older than the cloud
+        found, deviation = self._model.latest(cloud)
+        if not len(deviation):
+            return points
+        limit = float(np.nanquantile(np.abs(deviation), 0.95, method="nearest"))
+        return ShownPoints(
+            found.points_mm, found.sheet, found.sigma_mm, None, deviation, float(f"{limit:.1g}")
+        )
+
+    def _hear(self, live: LiveScan) -> None:
+        while live.events:
+            event = live.events.popleft()
+            if event.kind == "button" and event.text == START_BUTTON:
+                self._controls.tried(self._start)
+            elif event.kind == "button" and event.text == UNDO_BUTTON:
+                self._controls.tried(self.undo)
+            elif event.kind in ("fault", "warning"):
+                self._controls.problem = event.text
+                self._controls.refresh()
+            elif event.kind == "recovered":
+                self._controls.problem = ""
+                self._controls.refresh()
+
+
+def _live_facts(live: LiveScan, shown: LiveSnapshot, model: ModelWatch | None) -> str:
+    drift = live.drift_mm()
+    late = "" if shown.latency_ms is None else f", shown after {shown.latency_ms[0]:.0f} ms"
+    lines = [
+        f"{live.n_recorded} exposures recorded, {shown.rate_hz:.2g} a second{late}",
+        f"{shown.n_passes} passes, {shown.n_points:,} points",
+        "passes do not meet yet"
+        if drift is None
+        else f"the last pass lies {drift:.3f} mm from the earlier ones (median)",
+    ]
+    still = shown.counts.get(LiveStatus.STILL, 0)
+    lines += [f"{still} dropped while the hand was still"] if still else []
+    lost = [
+        f"{n} {status.value}"
+        for status, n in shown.counts.items()
+        if status not in (LiveStatus.PLACED, LiveStatus.STILL)
+    ]
+    lines += [", ".join(lost)] if lost else []
+    if live.bench.is_over:
+        lines.append("the simulated hand has come to its end: finish")
+    alerts = [model.problem] if model is not None and model.problem else []
+    if shown.state == "scanning" and not live.session.is_recording:
+        alerts.append("Nothing is recorded any more: finish, and see to the disk.")
+    return "".join(
+        [paragraph(text, ALERT, 14) for text in alerts]
+        + [paragraph(line, INK, 13) for line in lines]
+    )
+
+
+def padded(content: str) -> str:
+    """HTML as far from the column's edges as the controls."""
+    return f'<div style="padding:2px 18px 2px 10px">{content}</div>'
+
+
+def put(handle: Any, value: object) -> None:
+    """Show a value; typed anew, for the library types values as what a person changes."""
+    handle.value = value
+
+
+def _is_usable(button: viser.GuiButtonHandle) -> bool:
+    return bool(button.visible) and not button.disabled

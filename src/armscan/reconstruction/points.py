@@ -350,7 +350,7 @@ def fuse_points(
         points_mm=points,
         noise_mm=gain[:, :, 1:N_OBSERVED] * noise[:, None, : N_OBSERVED - 1],
         shape_mm=gain[:, :, N_OBSERVED] * noise[:, None, N_OBSERVED - 1],
-        by_sensor=-gain @ ddistance_dsensor,
+        dpoint_dsensor=-gain @ ddistance_dsensor,
         sheet=projected.sheet,
     )
 
@@ -421,7 +421,7 @@ def _left_alone(
         points_mm=projected.points_mm,
         noise_mm=noise,
         shape_mm=moved_by_shape(projected.points_mm, projected.points_mm, projected.sheet, sensor),
-        by_sensor=by_sensor,
+        dpoint_dsensor=by_sensor,
         sheet=projected.sheet,
         noise_length=None if length is None else length[row],
     )
@@ -490,7 +490,7 @@ def triangulate_right(
         points_mm=points,
         noise_mm=noise,
         shape_mm=shape,
-        by_sensor=by_sensor,
+        dpoint_dsensor=by_sensor,
         sheet=sheet[row],
         noise_length=None if profile.noise_length is None else profile.noise_length[row],
     ).select(is_met)

@@ -8,7 +8,13 @@ import math
 import numpy as np
 
 from armscan.kernels.arrays import FUSED, Floats, FloatsOut, Ints, Table, TableOut, compiled
-from armscan.kernels.rays import NEAREST_SOURCE, bow_and_slopes, lens_slopes
+from armscan.kernels.rays import (
+    NEAREST_SOURCE,
+    bow_and_slopes,
+    distort,
+    height_of,
+    lens_slopes,
+)
 
 LANES = 64
 """Points done together: their numbers stay in the nearest cache."""
@@ -117,7 +123,7 @@ def _know_points(points: Floats, camera: Floats, sheet: Floats, rows: FloatsOut)
         rows[BY_YY * LANES + i] = xx * det
         rows[DEPTH_X * LANES + i] = -gradient_x * depth * per_mm
         rows[DEPTH_Y * LANES + i] = -gradient_y * depth * per_mm
-        # the terms of the bow, as `_height` has them
+        # the terms of the bow, as `height_of` has them
         w = 1.0 + bow[19] * v
         w = w if w > NEAREST_SOURCE else NEAREST_SOURCE
         u0 = (u - lean * v) / w
@@ -460,3 +466,169 @@ def propagate_points(
                             total += arm[0, about] * (placed[i, c] - arm[about, c]) ** 2
                 covariance[i, 3 * a + b] = total
                 covariance[i, 3 * b + a] = total
+
+
+@compiled(error_model="numpy")
+def _weigh(rest: Table, covariance: Table, along: Floats, gain: TableOut) -> None:
+    """Least-squares change (3, 4) of a point by four distances, the first of which is exact.
+
+    ``rest``: (3, 3) derivatives of the three others by the point. ``covariance``: (3, 3) theirs.
+    ``along``: (3,) derivative of the first. Moving along the stripe changes the other distances
+    too, which the solution takes back.
+    """
+    free = np.zeros((2, 3))
+    size = along[0] * along[0] + along[1] * along[1] + along[2] * along[2]
+    for k in range(2):
+        other = rest[0] if k == 0 else free[0]
+        free[k, 0] = along[1] * other[2] - along[2] * other[1]
+        free[k, 1] = along[2] * other[0] - along[0] * other[2]
+        free[k, 2] = along[0] * other[1] - along[1] * other[0]
+        length = math.sqrt(free[k, 0] ** 2 + free[k, 1] ** 2 + free[k, 2] ** 2)
+        for a in range(3):
+            free[k, a] /= length
+    # Cholesky's factor of the covariance
+    l00 = math.sqrt(covariance[0, 0])
+    l10 = covariance[1, 0] / l00
+    l20 = covariance[2, 0] / l00
+    l11 = math.sqrt(covariance[1, 1] - l10 * l10)
+    l21 = (covariance[2, 1] - l20 * l10) / l11
+    l22 = math.sqrt(covariance[2, 2] - l20 * l20 - l21 * l21)
+    design = np.zeros((2, 3))
+    weighed = np.zeros((2, 3))
+    for k in range(2):
+        for r in range(3):
+            for a in range(3):
+                design[k, r] += rest[r, a] * free[k, a]
+        y0 = design[k, 0] / l00
+        y1 = (design[k, 1] - l10 * y0) / l11
+        y2 = (design[k, 2] - l20 * y0 - l21 * y1) / l22
+        weighed[k, 2] = y2 / l22
+        weighed[k, 1] = (y1 - l21 * weighed[k, 2]) / l11
+        weighed[k, 0] = (y0 - l10 * weighed[k, 1] - l20 * weighed[k, 2]) / l00
+    n00 = n01 = n11 = 0.0
+    for r in range(3):
+        n00 += weighed[0, r] * design[0, r]
+        n01 += weighed[0, r] * design[1, r]
+        n11 += weighed[1, r] * design[1, r]
+    det = n00 * n11 - n01 * n01
+    for a in range(3):
+        gain[a, 0] = along[a] / size
+    for r in range(3):
+        by_first = (n11 * weighed[0, r] - n01 * weighed[1, r]) / det
+        by_second = (n00 * weighed[1, r] - n01 * weighed[0, r]) / det
+        changed = (rest[r, 0] * along[0] + rest[r, 1] * along[1] + rest[r, 2] * along[2]) / size
+        for a in range(3):
+            gain[a, 1 + r] = free[0, a] * by_first + free[1, a] * by_second
+            gain[a, 0] -= gain[a, 1 + r] * changed
+
+
+@compiled(error_model="numpy", fastmath=FUSED)
+def _covariance_of_distances(by_distance: Table, covariance: Floats, found: TableOut) -> None:
+    """(3, 3) of distances across the left stripe, the right stripe and from the sheet.
+
+    ``by_distance``: (4, 32) derivatives by the sensor, zero but for a distance's own parameters:
+    of the left camera, the second camera, the sheet. ``covariance``: (1024,) of these.
+    """
+    width = by_distance.shape[1]
+    second = N_CAMERA + N_SHEET
+    begin = (0, second, N_CAMERA)
+    end = (N_CAMERA, width, second)
+    moved = np.zeros(width)
+    for a in range(3):
+        moved[:] = 0.0
+        for c in range(begin[a], end[a]):
+            share = by_distance[1 + a, c]
+            row = covariance[c * width : (c + 1) * width]
+            for d in range(width):
+                moved[d] += share * row[d]
+        for b in range(3):
+            total = 0.0
+            for d in range(begin[b], end[b]):
+                total += moved[d] * by_distance[1 + b, d]
+            found[a, b] = total
+
+
+@compiled(error_model="numpy")
+def fuse_stripes(
+    points: Table,
+    sheet: Ints,
+    normals: Table,
+    sigma: Table,
+    missed: Floats,
+    by_right: Table,
+    by_second: Table,
+    camera: Floats,
+    sheets: Table,
+    covariance: Table,
+    fused: TableOut,
+    moves: TableOut,
+    by_sensor: TableOut,
+) -> None:
+    """Points of which two cameras and the sheet each tell a distance, weighed against each other.
+
+    ``points``: (N, 3) of left pixels on their sheets. ``sheet``, ``camera``, ``sheets``: As for
+    `meet_sheets`. ``normals``: (N, 4) across the left and the right stripe. ``sigma``: (N, 3) of
+    both and of the sheet's shape. ``missed``: (N,) distance across the right stripe. ``by_right``,
+    ``by_second``: (N, 6) and (N, 30), the rows' (2, 3) and (2, 15) derivatives of the right pixel.
+    ``covariance``: (S, 1024) of the left camera, a sheet, and the second camera. ``fused``: (N, 3)
+    output. ``moves``: (N, 9) output, the rows' (3, 3) moves by one sigma of the left stripe, the
+    right stripe, the shape. ``by_sensor``: (N, 96) output, the rows' (3, 32).
+    """
+    second = N_CAMERA + N_SHEET
+    lens = np.zeros(7)
+    surface = np.zeros(12)
+    along = np.zeros(3)
+    rest = np.zeros((3, 3))
+    by_distance = np.zeros((4, 32))
+    joint = np.zeros((3, 3))
+    gain = np.zeros((3, 4))
+    for i in range(points.shape[0]):
+        z = points[i, 2]
+        x = points[i, 0] / z
+        y = points[i, 1] / z
+        distort(x, y, camera, lens)
+        height_of(points[i, 0], points[i, 1], z, sheets[sheet[i]], surface)
+        r2 = x * x + y * y
+        u, v = normals[i, 0], normals[i, 1]
+        for k in range(2):
+            across_x = (-v if k == 0 else u) * camera[0]
+            across_y = (u if k == 0 else v) * camera[1]
+            by_x = (across_x * lens[2] + across_y * lens[3]) / z
+            by_y = (across_x * lens[3] + across_y * lens[4]) / z
+            row = along if k == 0 else rest[0]
+            row[0] = by_x
+            row[1] = by_y
+            row[2] = -(by_x * x + by_y * y)
+            by_distance[k, 0] = across_x / camera[0] * lens[0]
+            by_distance[k, 1] = across_y / camera[1] * lens[1]
+            by_distance[k, 2] = across_x / camera[0]
+            by_distance[k, 3] = across_y / camera[1]
+            radial = across_x * x + across_y * y
+            by_distance[k, 4] = radial * r2
+            by_distance[k, 5] = radial * r2 * r2
+            by_distance[k, 6] = across_x * 2.0 * x * y + across_y * (r2 + 2.0 * y * y)
+            by_distance[k, 7] = across_x * (r2 + 2.0 * x * x) + across_y * 2.0 * x * y
+            by_distance[k, 8] = radial * r2 * r2 * r2
+        for a in range(3):
+            rest[1, a] = normals[i, 2] * by_right[i, a] + normals[i, 3] * by_right[i, 3 + a]
+            rest[2, a] = surface[1 + a]
+        for c in range(15):
+            both = normals[i, 2] * by_second[i, c] + normals[i, 3] * by_second[i, 15 + c]
+            by_distance[2, second + c] = both
+        for c in range(N_SHEET):
+            by_distance[3, N_CAMERA + c] = -surface[4 + c]
+        _covariance_of_distances(by_distance, covariance[sheet[i]], joint)
+        for a in range(3):
+            joint[a, a] += sigma[i, a] * sigma[i, a]
+        _weigh(rest, joint, along, gain)
+        for a in range(3):
+            fused[i, a] = points[i, a] - gain[a, 2] * missed[i]
+            for k in range(3):
+                moves[i, 3 * a + k] = gain[a, 1 + k] * sigma[i, k]
+            for c in range(N_CAMERA):
+                change = gain[a, 0] * by_distance[0, c] + gain[a, 1] * by_distance[1, c]
+                by_sensor[i, 32 * a + c] = -change
+            for c in range(N_CAMERA, second):
+                by_sensor[i, 32 * a + c] = -gain[a, 3] * by_distance[3, c]
+            for c in range(second, 32):
+                by_sensor[i, 32 * a + c] = -gain[a, 2] * by_distance[2, c]

@@ -35,7 +35,7 @@ NEAREST_SOURCE = 0.2
 
 
 @compiled(error_model="numpy")
-def _distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
+def distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
     """Distorted x and y, and their derivatives xx, xy = yx, yy, into ``out`` (5,)."""
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     r2 = x * x + y * y
@@ -51,13 +51,13 @@ def _distort(x: float, y: float, camera: Floats, out: FloatsOut) -> None:
 
 @compiled(error_model="numpy")
 def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
-    """Newton's inverse of `_distort`: x and y into ``out`` (7,) behind its five numbers."""
+    """Newton's inverse of `distort`: x and y into ``out`` (7,) behind its five numbers."""
     x = u
     y = v
     if not (math.isfinite(u) and math.isfinite(v)):
         return False
     for _ in range(RAY_STEPS):
-        _distort(x, y, camera, out)
+        distort(x, y, camera, out)
         det = out[2] * out[4] - out[3] * out[3]
         if not (det > 0.0 and out[2] > 0.0):
             return False
@@ -75,7 +75,7 @@ def _undistort(u: float, v: float, camera: Floats, out: FloatsOut) -> bool:
 
 
 @compiled(error_model="numpy")
-def _height(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None:
+def height_of(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None:
     """Distance from a sheet, its gradient, and by the parameters, into ``out`` (12,).
 
     ``sheet``: (20,) origin, axes, scale, bow, fan.
@@ -120,7 +120,7 @@ def _height(x: float, y: float, z: float, sheet: Floats, out: FloatsOut) -> None
 
 @compiled(error_model="numpy")
 def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
-    """Depth at which the ray (x, y, 1) meets a sheet, 0 if it does not; ``out`` as `_height`."""
+    """Depth at which the ray (x, y, 1) meets a sheet, 0 if it does not; ``out`` as `height_of`."""
     slope = x * sheet[9] + y * sheet[10] + sheet[11]
     if not abs(slope) > 1e-9 * math.sqrt(x * x + y * y + 1.0):
         return 0.0
@@ -130,7 +130,7 @@ def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
         is_bowed = is_bowed or sheet[i] != 0.0
     step = 0.0
     for _ in range(SHEET_STEPS if is_bowed else 0):
-        _height(x * depth, y * depth, depth, sheet, out)
+        height_of(x * depth, y * depth, depth, sheet, out)
         along = x * out[1] + y * out[2] + out[3]
         if not abs(along) > 1e-9:
             return 0.0
@@ -143,7 +143,7 @@ def _meet(x: float, y: float, sheet: Floats, out: FloatsOut) -> float:
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def bow_and_slopes(u: float, v: float, sheet: Floats) -> Three:
-    """Height of the bow over a sheet's plane, and its slopes by u and v; see `_height`."""
+    """Height of the bow over a sheet's plane, and its slopes by u and v; see `height_of`."""
     lean = sheet[18]
     w = 1.0 + sheet[19] * v
     spread = sheet[19] if w > NEAREST_SOURCE else 0.0
@@ -163,7 +163,7 @@ def bow_and_slopes(u: float, v: float, sheet: Floats) -> Three:
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def lens_slopes(x: float, y: float, camera: Floats) -> Four:
-    """What `_distort` gives: the derivatives xx, xy, yy of the lens, and its radial factor."""
+    """What `distort` gives: the derivatives xx, xy, yy of the lens, and its radial factor."""
     k1, k2, p1, p2, k3 = camera[4], camera[5], camera[6], camera[7], camera[8]
     r2 = x * x + y * y
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -176,7 +176,7 @@ def lens_slopes(x: float, y: float, camera: Floats) -> Four:
 
 @compiled(error_model="numpy", fastmath=FUSED, is_inlined=True)
 def _lens_step(x: float, y: float, u: float, v: float, camera: Floats, safe: float) -> Four:
-    """One of Newton's steps to the inverse of `_distort`.
+    """One of Newton's steps to the inverse of `distort`.
 
     The new place, the step's size, and the least of ``safe`` and what it divides by.
     """
@@ -315,7 +315,7 @@ def differentiate_sheets(
         x = points[i, 0] / depth
         y = points[i, 1] / depth
         # of the inverse of the lens, at a fixed pixel
-        _distort(x, y, camera, lens)
+        distort(x, y, camera, lens)
         det = lens[2] * lens[4] - lens[3] * lens[3]
         ixx = lens[4] / det
         ixy = -lens[3] / det
@@ -341,7 +341,7 @@ def differentiate_sheets(
         for j in range(2):
             by_camera[j, 0] = by_camera[j, 2] * lens[0]
             by_camera[j, 1] = by_camera[j, 3] * lens[1]
-        _height(points[i, 0], points[i, 1], depth, sheets[sheet[i]], surface)
+        height_of(points[i, 0], points[i, 1], depth, sheets[sheet[i]], surface)
         along = x * surface[1] + y * surface[2] + surface[3]
         ddepth_x = -surface[1] * depth / along
         ddepth_y = -surface[2] * depth / along
@@ -382,20 +382,13 @@ def sum_off_planes(
 
 
 @compiled(error_model="numpy")
-def move_by_shape(
-    points: Table, rays: Table, sheet: Ints, sheets: Table, size_mm: Floats, moved: TableOut
-) -> None:
-    """Move of points (N, 3) along their rays (N, 3) by a size (S,) across their sheets (N,).
-
-    ``sheets``: As for `meet_sheets`. ``moved``: (N, 3) output.
-    """
+def sheet_gradients(points: Table, sheet: Ints, sheets: Table, gradients: TableOut) -> None:
+    """Gradients (N, 3) of the distance from their sheets at points (N, 3); as `meet_sheets`."""
     surface = np.zeros(12)
     for i in range(points.shape[0]):
-        _height(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
-        along = surface[1] * rays[i, 0] + surface[2] * rays[i, 1] + surface[3] * rays[i, 2]
-        share = size_mm[sheet[i]] / along if abs(along) > 0.0 else 0.0
+        height_of(points[i, 0], points[i, 1], points[i, 2], sheets[sheet[i]], surface)
         for a in range(3):
-            moved[i, a] = rays[i, a] * share
+            gradients[i, a] = surface[1 + a]
 
 
 @compiled(fastmath=True)

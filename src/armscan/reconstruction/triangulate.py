@@ -14,7 +14,7 @@ from armscan.errors import InputError, OptionError
 from armscan.geometry.arrays import BoolArray, FloatArray, IntArray, RowRecord, floats, ints
 from armscan.geometry.poses import Pose, Sensor
 from armscan.kernels.placing import spread_stripe
-from armscan.kernels.rays import differentiate_sheets, meet_sheets, move_by_shape
+from armscan.kernels.rays import differentiate_sheets, meet_sheets, sheet_gradients
 from armscan.models.calibration import (
     SHEET_PARAMETER_NAMES,
     SensorCalibration,
@@ -98,31 +98,28 @@ def intersect_sheets(
     is_valid
         (N,) False without sheet, without inverse of the distortion, and where the ray misses.
     """
-    points = np.zeros((len(points_px), 3))
-    return points, _meet(points_px, sheet_of_point, sensor, points, at)
-
-
-def _meet(
-    points_px: FloatArray,
-    sheet_of_point: IntArray,
-    sensor: SensorCalibration,
-    points_mm: FloatArray,
-    at: Pose[Any, Sensor] | None = None,
-) -> BoolArray:
-    """Call the kernel `meet_sheets`, which writes points (N, 3); (N,) True where met."""
-    sheet = np.ascontiguousarray(sheet_of_point, dtype=np.int64)
-    is_met = np.zeros(len(sheet), dtype=np.int64)
     carried = None if at is None else np.column_stack([at.rotation, at.translation_mm])
-    meet_sheets(
-        np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1),
-        sheet,
-        lens_numbers(sensor),
-        sheet_numbers(sensor),
-        IN_SENSOR if carried is None else carried.ravel(),
-        points_mm.reshape(-1),
-        is_met,
-    )
-    return is_met.astype(np.bool_)
+    turn = IN_SENSOR if carried is None else carried.ravel()
+    return meet(points_px, sheet_of_point, lens_numbers(sensor), sheet_numbers(sensor), turn)
+
+
+def meet(
+    points_px: FloatArray,
+    sheet: IntArray,
+    lens: FloatArray,
+    sheets: FloatArray,
+    turn: FloatArray = IN_SENSOR,
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 3) of pixels (N, 2) on sheets (N,), and (N,) True where met, by `meet_sheets`.
+
+    ``lens`` and ``sheets`` are those of `lens_numbers` and `sheet_numbers`, in the frame of the
+    camera; ``turn`` leads from there to the points' frame.
+    """
+    own = np.ascontiguousarray(sheet, dtype=np.int64)
+    points, is_met = np.zeros((len(own), 3)), np.zeros(len(own), dtype=np.int64)
+    pixels = np.ascontiguousarray(points_px, dtype=np.float64).reshape(-1)
+    meet_sheets(pixels, own, lens, sheets, turn, points.reshape(-1), is_met)
+    return points, is_met.astype(np.bool_)
 
 
 @lru_cache(maxsize=8)
@@ -158,31 +155,37 @@ def intersect_with_jacobian(
     points_px: FloatArray, sheet_of_point: IntArray, sensor: SensorCalibration
 ) -> SheetPoints:
     """Intersect the rays of pixels (N, 2) with their sheets (N,), -1 for none; differentiate."""
-    points = np.zeros((len(points_px), 3))
+    points, is_met = np.zeros((len(points_px), 3)), np.zeros(len(points_px), dtype=np.bool_)
     # pixels on one sheet are met together, so they are brought together
     order = np.argsort(sheet_of_point, kind="stable")
-    is_met = np.zeros(len(points), dtype=np.bool_)
-    is_met[order] = _meet(points_px[order], sheet_of_point[order], sensor, points)
-    points[order] = points.copy()
+    points[order], is_met[order] = intersect_sheets(points_px[order], sheet_of_point[order], sensor)
     points[~is_met] = (0.0, 0.0, 1.0)
-    by_px, by_sensor = _differentiated(points, np.where(is_met, sheet_of_point, -1), sensor)
+    by_px, by_sensor = differentiated(
+        points,
+        np.where(is_met, sheet_of_point, -1),
+        lens_numbers(sensor),
+        sheet_numbers(sensor),
+    )
     # read-only and their own, so that records take them as they are
     for array in (points, by_px, by_sensor):
         array.setflags(write=False)
     return SheetPoints(points, is_met, by_px, by_sensor)
 
 
-def _differentiated(
-    points_mm: FloatArray, sheet: IntArray, sensor: SensorCalibration
+def differentiated(
+    points_mm: FloatArray, sheet: IntArray, lens: FloatArray, sheets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """(N, 3, 2) and (N, 3, 17) derivatives of points on their sheets; zero for a sheet of -1."""
+    """(N, 3, 2) and (N, 3, 17) derivatives of points on their sheets; zero for a sheet of -1.
+
+    ``lens`` and ``sheets`` as for `meet`; all in the frame of the camera.
+    """
     n, n_parameters = len(points_mm), N_CAMERA + N_SHEET
     by_px, by_sensor = np.zeros((n, 3, 2)), np.zeros((n, 3, n_parameters))
     differentiate_sheets(
         np.ascontiguousarray(points_mm),
         np.ascontiguousarray(sheet, dtype=np.int64),
-        lens_numbers(sensor),
-        sheet_numbers(sensor),
+        lens,
+        sheets,
         by_px.reshape(n, 6),
         by_sensor.reshape(n, 3 * n_parameters),
     )
@@ -239,7 +242,8 @@ class StripePoints(RowRecord):
             return self.dpoint_dsensor
         if self.sensor is None:
             raise InputError("points without derivatives and without the sensor that saw them")
-        found = _differentiated(self.points_mm, self.sheet, self.sensor)[1]
+        numbers = lens_numbers(self.sensor), sheet_numbers(self.sensor)
+        found = differentiated(self.points_mm, self.sheet, *numbers)[1]
         n_rest = len(sensor_columns(self.sensor, 0)) - found.shape[2]
         return np.concatenate([found, np.zeros((len(self), 3, n_rest))], axis=2)
 
@@ -341,8 +345,7 @@ def triangulate_stripe(
     row = np.flatnonzero(sheets >= 0)
     # what is complete is not copied
     chosen = slice(None) if len(row) == len(sheets) else row
-    points = np.zeros((len(row), 3))
-    is_met = _meet(profile.points_px[chosen], sheets[chosen], sensor, points)
+    points, is_met = intersect_sheets(profile.points_px[chosen], sheets[chosen], sensor)
     if not is_met.all():
         row, points = row[is_met], points[is_met]
         chosen = row
@@ -418,13 +421,24 @@ def moved_by_shape(
 
     All in the Sensor frame; ``sheet`` (M,) is the index of each point's sheet.
     """
-    moved = np.zeros((len(points_mm), 3))
-    size = np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
-    at = np.ascontiguousarray(points_mm, dtype=np.float64)
-    along = np.ascontiguousarray(rays, dtype=np.float64)
+    along = np.sum(gradients(points_mm, sheet, sensor) * rays, axis=1)
+    size = shapes_mm(sensor)[sheet]
+    return np.asarray(
+        rays * np.divide(size, along, out=np.zeros_like(along), where=along != 0)[:, None]
+    )
+
+
+def gradients(points_mm: FloatArray, sheet: IntArray, sensor: SensorCalibration) -> FloatArray:
+    """(M, 3) gradient of the distance from their sheets (M,) at points (M, 3) in Sensor."""
+    found = np.zeros((len(points_mm), 3))
     own = np.ascontiguousarray(sheet, dtype=np.int64)
-    move_by_shape(at, along, own, sheet_numbers(sensor), size, moved)
-    return moved
+    sheet_gradients(np.ascontiguousarray(points_mm), own, sheet_numbers(sensor), found)
+    return found
+
+
+def shapes_mm(sensor: SensorCalibration) -> FloatArray:
+    """(S,) standard deviation of each sheet's true surface about its model."""
+    return np.array([shape_mm(sensor, k) for k in range(len(sensor.sheets))])
 
 
 @lru_cache(maxsize=8)
